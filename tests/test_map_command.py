@@ -87,6 +87,24 @@ def test_map_uses_the_poses_of_the_recording(folder):
     assert ertis.read_map(folder / "given.h5").limits_m[0][0] > 9
 
 
+def test_map_uses_the_images_and_poses_of_an_energyscape_file(folder):
+    add_poses(folder / "both.h5", poses(x_m=-5.0), output=folder / "sited.h5")
+    done = CliRunner().invoke(cli, ["process", str(folder / "sited.h5"), "-q", "-o", str(folder / "images.h5")])
+    assert done.exit_code == 0, done.output
+    with ertis.open_recording(folder / "sited.h5", sensor="left") as recording:
+        expected = recording.trajectory
+    with ertis.open_energyscapes(folder / "images.h5", sensor="left") as found:
+        assert np.array_equal(found.trajectory.time_ns, expected.time_ns)
+        assert np.array_equal(found.trajectory.position_m, expected.position_m)
+        assert found.trajectory.source == expected.source
+    run(folder, "images.h5 -q -o of_images.h5")
+    run(folder, "sited.h5 -q -o of_words.h5")
+    maps = [ertis.read_map(folder / name) for name in ("of_images.h5", "of_words.h5")]
+    assert np.array_equal(maps[0].log_odds, maps[1].log_odds)
+    done = CliRunner().invoke(cli, ["map", str(folder / "images.h5"), "--preset", "2d_181_5m", "--force"])
+    assert (done.exit_code, "--preset applies to recordings" in done.stderr) == (2, True), done.output
+
+
 def test_map_writes_pictures_for_ros_and_points(folder):
     report = json.loads(run(folder, "both.h5 --poses poses.tum -q --json --cell 0.1 -o place.pgm").stdout)
     assert report["files"] == [str(folder / "place.pgm"), str(folder / "place.yaml")]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import _mountings, _presets, _results, options
+from ertis_cli._config import typed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -43,19 +44,32 @@ def processing(command: "Callable[..., Any]") -> "Callable[..., Any]":
     return command
 
 
-def open_sensors(paths: "Sequence[Path]", stack: ExitStack) -> "list[RecordingReader]":
-    """Open the recordings of all sensors until a stack closes; raise UsageError if a sensor occurs twice."""
-    from ertis_numba.storage import open_recording, sensor_names
+def open_sensors(paths: "Sequence[Path]", stack: ExitStack, *, images: bool = False) -> "list[Any]":
+    """Open the recordings of all sensors until a stack closes, and with ``images`` also energyscape files.
 
-    found: dict[str, RecordingReader] = {}
+    Raises
+    ------
+    UsageError
+        A sensor occurs twice, or images are fused already.
+    """
+    from ertis_numba.fusion import PLATFORM
+    from ertis_numba.storage import file_kind, open_energyscapes, open_recording, sensor_names
+
+    found: dict[str, Any] = {}
     for path in paths:
+        is_image = images and file_kind(path) == "energyscape"
+        opened: Any = open_energyscapes if is_image else open_recording
         for name in sensor_names(path):
+            if is_image and name == PLATFORM:
+                raise click.UsageError(
+                    f"{path} has fused images; give recordings, or images of each sensor", click.get_current_context()
+                )
             if name in found:
                 raise click.UsageError(
                     f"{path} and {found[name].path} have the same sensor {name!r}; give recordings of other sensors",
                     click.get_current_context(),
                 )
-            found[name] = stack.enter_context(open_recording(path, sensor=name))
+            found[name] = stack.enter_context(opened(path, sensor=name))
     return list(found.values())
 
 
@@ -121,8 +135,25 @@ class PipelinesBySensor:
         self._changed, self._stack, self._quiet, self._device = changed, stack, quiet, device
         self._made: dict[str, tuple[Settings, Pipeline]] = {}
 
-    def image(self, measurement: "Measurement") -> "Energyscape":
-        """Return the image of a measurement."""
+    def image(self, measurement: "Measurement | Energyscape") -> "Energyscape":
+        """Return the image of a measurement, or an image of a file itself.
+
+        Raises
+        ------
+        UsageError
+            Settings are given for an image of a file.
+        """
+        from ertis_numba.frames import Energyscape
+
+        if isinstance(measurement, Energyscape):
+            for name, option in (("preset", "--preset"), ("settings_file", "--settings")):
+                if typed(name):
+                    raise click.UsageError(
+                        f"{option} applies to recordings, but images keep their settings; give the recording, or leave "
+                        "it out",
+                        click.get_current_context(),
+                    )
+            return measurement
         sensor, settings = measurement.stamp.sensor, measurement.settings
         if sensor not in self._made or self._made[sensor][0] != settings:
             pipeline = options.pipeline(self._changed(settings), quiet=self._quiet, **self._device)

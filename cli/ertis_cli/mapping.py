@@ -77,8 +77,8 @@ def mapping(
     """Compute an occupancy map from recordings and poses.
 
     All sensors of the recordings belong to one platform. Their measurements are grouped by SYNC pulse and fused, as by
-    'ertis process --fuse'. Cells with echoes become occupied, and cells in front of the first clear echo of a direction
-    become free. Pulses outside of the time of the poses are left out.
+    'ertis process --fuse'. Images of 'ertis process' are used as they are. Cells with echoes become occupied, and cells
+    in front of the first clear echo of a direction become free. Pulses outside of the time of the poses are left out.
     """
     from ertis_numba.interop import map_files, write_map
     from ertis_numba.mapping import Mapper
@@ -89,7 +89,7 @@ def mapping(
         check_target(each, overwrite=force, sources=paths)
 
     with ExitStack() as stack:
-        readers = _pulses.open_sensors(paths, stack)
+        readers = _pulses.open_sensors(paths, stack, images=True)
         trajectory = _trajectory(poses_file, paths)
         pipelines = _pulses.PipelinesBySensor(
             _pulses.image_settings(settings_file, preset), stack, quiet=quiet, device=device, threads=threads, plan=plan

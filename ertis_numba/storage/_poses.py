@@ -103,7 +103,8 @@ def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
     require_times(trajectory, time_ns, group.name.rpartition("/")[2])
     if not len(time_ns):
         return
-    local_member(group, "axis", h5py.Dataset)
+    if "axis" in group:  # That of positions; files of images may have none.
+        local_member(group, "axis", h5py.Dataset)
     times, rows = np.unique(time_ns, return_inverse=True)  # Measurements may be out of order, or share a time.
     stored = trajectory.at(times)
     columns = {"pose_position": stored.position_m, "pose_rotation": stored.rotation_xyzw}

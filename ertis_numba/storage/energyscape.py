@@ -15,14 +15,23 @@ from ertis_numba import checks
 from ertis_numba.angles import DegreesFromRadians
 from ertis_numba.atomic_files import check_target
 from ertis_numba.errors import ArgumentError, DamagedError
-from ertis_numba.frames import Energyscape
+from ertis_numba.frames import Energyscape, Trajectory
 from ertis_numba.geometry import mounting as mounted, self_contained
 from ertis_numba.storage._mounting import read_mounting, write_mounting
+from ertis_numba.storage._poses import POSE_SIZES, read_poses, write_poses
 from ertis_numba.storage._reader import FileReader
-from ertis_numba.storage._rows import RowReader
+from ertis_numba.storage._rows import RowReader, RowWriter
 from ertis_numba.storage._writer import FileWriter
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import ENERGYSCAPE, Variable, create_variables, set_attributes, to_python
+from ertis_numba.storage.schema import (
+    ENERGYSCAPE,
+    FORMAT_VERSION,
+    POSES,
+    Variable,
+    create_variables,
+    set_attributes,
+    to_python,
+)
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]
@@ -41,7 +50,7 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         Path of the file.
     recording : RecordingReader or sequence of RecordingReader, optional
         Recording of the images: one reader, or one for each sensor of the same recording. The file stores its UUID and
-        SHA-256, and the ground truth of the measurements.
+        SHA-256, and the poses and the ground truth of the measurements.
     truth : mapping of str to GroundTruth, optional
         Ground truth by name of the sensor, instead of that of the recording.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
@@ -56,7 +65,7 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
 
     _kind: ClassVar[str] = "energyscape"
     _data: ClassVar[str] = "amplitude"
-    _table: ClassVar[tuple[Variable, ...]] = ENERGYSCAPE
+    _table: ClassVar[tuple[Variable, ...]] = (*ENERGYSCAPE, *POSES)
     _numbered: ClassVar[bool] = False
 
     def __init__(
@@ -79,6 +88,7 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         self._wavefront_errors_db: dict[str, float] = {}
         self._call_warnings: dict[str, str] = {}
         self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in readers if reader.truth}
+        self._trajectories = {reader.sensor: reader.trajectory for reader in readers if reader.trajectory is not None}
         self._given = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
         self._mounting = {
             reader.sensor: mounted(reader.sensor, reader.translation_m.tolist(), reader.rotation_xyzw.tolist())
@@ -177,6 +187,13 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         super()._finish(file)
         self._require_sensors("mounting", self._given)
 
+    def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
+        super()._complete(group, rows)
+        trajectory = self._trajectories.get(group.name.rpartition("/")[2])
+        if trajectory is not None:
+            write_poses(group, trajectory)
+            self._format_version = FORMAT_VERSION
+
     def _sensor_truth(self, sensor: str, group: h5py.Group) -> GroundTruth | GroundTruthLog | None:
         given = super()._sensor_truth(sensor, group)
         if given is not None or sensor not in self._recorded:
@@ -233,6 +250,8 @@ class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):
         Position of the sensor in metres; None if its mounting is unknown.
     rotation_xyzw : (4,) float64, or None
         Unit quaternion that rotates the sensor frame into the platform frame; None if the mounting is unknown.
+    trajectory : Trajectory, or None
+        Pose of the platform at each image, by increasing time; None if the poses are unknown.
     predicted_error_db, max_error_db : float, or None
         Error that the error model predicted for the first image, and the budget. None in older files and for images of
         the paper's method.
@@ -251,13 +270,14 @@ class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):
 
     _kind: ClassVar[str] = "energyscape"
     _data = "amplitude"
-    _table = ENERGYSCAPE
+    _table = (*ENERGYSCAPE, *POSES)
 
     azimuth_rad: NDArray[np.float64]
     elevation_rad: NDArray[np.float64]
     range_m: NDArray[np.float64]
     translation_m: NDArray[np.float64] | None
     rotation_xyzw: NDArray[np.float64] | None
+    trajectory: Trajectory | None
     predicted_error_db: float | None
     max_error_db: float | None
     budget_applies_to: str
@@ -277,9 +297,10 @@ class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):
             str(to_python(stated.get(name, ""))) for name in ("budget_applies_to", "error_warning", "call_warning")
         )
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
+        self.trajectory = read_poses(self._group, self.path)
 
     def _sizes(self) -> dict[str, int]:
-        return {"direction": len(self._group["azimuth"]), "range": len(self._group["range"])}
+        return {"direction": len(self._group["azimuth"]), "range": len(self._group["range"]), **POSE_SIZES}
 
     def _item(self, index: int) -> Energyscape:
         return Energyscape(

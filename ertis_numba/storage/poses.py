@@ -3,7 +3,7 @@
 import filecmp
 import os
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
@@ -15,7 +15,8 @@ from ertis_numba.atomic_files import atomic_write, check_target, remedy, require
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Trajectory
 from ertis_numba.storage._poses import checked_poses, remove_poses, require_times, write_poses
-from ertis_numba.storage._reader import sensor_names
+from ertis_numba.storage._reader import file_kind, sensor_names
+from ertis_numba.storage.energyscape import EnergyscapeReader, open_energyscapes
 from ertis_numba.storage.recording import RecordingReader, open_recording
 from ertis_numba.storage.schema import (
     FORMAT_VERSION,
@@ -152,7 +153,7 @@ def recorded_trajectory(path: str | Path, *, sensor: str | None = None) -> Traje
     Parameters
     ----------
     path : str or Path
-        Path of a recording.
+        Path of a recording or an energyscape file.
     sensor : str, optional
         Name of the sensor; all sensors by default.
 
@@ -168,11 +169,14 @@ def recorded_trajectory(path: str | Path, *, sensor: str | None = None) -> Traje
     DataError
         The recording cannot be read.
     """
+    opened: Callable[..., RecordingReader | EnergyscapeReader] = open_recording
+    if file_kind(path) == "energyscape":
+        opened = open_energyscapes
     found: dict[str, Trajectory] = {}
     for name in sensor_names(path) if sensor is None else (sensor,):
-        with open_recording(path, sensor=name) as recording:
-            if recording.trajectory is not None:
-                found[name] = recording.trajectory
+        with opened(path, sensor=name) as reader:
+            if reader.trajectory is not None:
+                found[name] = reader.trajectory
     return _merged(found, f"{path}: sensors", "choose one sensor")
 
 
