@@ -197,15 +197,50 @@ def test_two_pulses_make_a_cell_occupied_but_not_one():
     assert found == [False, True]
 
 
-def test_doubtful_echoes_behind_a_clear_one_weigh_less(monkeypatch):
+def share_behind(monkeypatch, obstacle_m, known):
+    """Evidence for an echo at 2 m, in a map and with an echo of an obstacle, relative to that without them."""
     monkeypatch.setattr(sensor_model, "_FREE", 0.0)
     monkeypatch.setattr(sensor_model, "_MOST", math.inf)
-    grid = CellGrid(0.05)
-    echoes = echoes_of(np.array([[1.0, 0.0], [2.0, 0.0]]), np.full((2, 2), 0.01), np.ones(2))
-    window = grid.window(np.zeros(2), 3.0)
-    add_evidence(window, np.zeros(2), 0.0, echoes, Coverage(np.ones((360, 60)), 0.05), near_m=0.0)
-    near, far = (window.around(np.array([x_m, 0.0]), 0.3).log_odds.sum() for x_m in (1.0, 2.0))
-    assert far == pytest.approx(0.1 * near, rel=0.1)
+    found = []
+    for places_m in ([obstacle_m, (2.0, 0.0)], [(2.0, 0.0)]):
+        window = CellGrid(0.05).window(np.zeros(2), 3.0)
+        window.log_odds[:] = known(*np.meshgrid(window.x_m, window.y_m)) if len(places_m) == 2 else 0.0
+        before = window.log_odds.copy()
+        echoes = echoes_of(np.array(places_m), np.full((len(places_m), 2), 0.01), np.ones(len(places_m)))
+        add_evidence(window, np.zeros(2), 0.0, echoes, Coverage(np.ones((360, 60)), 0.05), near_m=0.0)
+        change = window._replace(log_odds=window.log_odds - before)
+        found.append(float(change.around(np.array([2.0, 0.0]), 0.3).log_odds.sum()))
+    return found[0] / found[1]
+
+
+def test_clear_echo_in_unknown_space_hides_echoes_behind_it(monkeypatch):
+    """It may be part of a wall that fills the beam."""
+    assert share_behind(monkeypatch, (1.0, 0.0), lambda x_m, _: np.zeros_like(x_m)) == 0
+
+
+def test_post_in_free_space_hides_the_directions_that_it_covers(monkeypatch):
+    """Of the directions around 0°, from -4.5° to 5.5°, a post from 3° to 9° covers 3 of 11."""
+
+    def known(x_m, y_m):
+        return np.where((np.abs(x_m - 1.0) < 0.05) & (np.abs(y_m - 0.1) < 0.05), 4.0, -2.0)
+
+    assert share_behind(monkeypatch, (1.0, 0.1), known) == pytest.approx((8 / 11) ** 2)
+
+
+def test_mapped_wall_hides_echoes_behind_it_but_not_its_own(monkeypatch):
+    def share(wall_m):
+        return share_behind(
+            monkeypatch, (0.5, 2.0), lambda x_m, _: np.where(np.abs(x_m - wall_m) < 0.05, 4.0, -2.0 * (x_m < wall_m))
+        )
+
+    assert share(1.8) == 0
+    assert share(2.0) == pytest.approx(1.0)
+
+
+def test_strength_of_points_grows_with_their_amplitude_relative_to_the_usual_one():
+    strength = sensor_model.UsualAmplitude().strength(np.array([0.0, 0.2, 1.0, 1.0, 1.0], np.float32))
+    assert strength[:2] == pytest.approx([0.0, 0.5], abs=1e-6)
+    assert strength[2] > 0.95
 
 
 def test_coverage_is_that_of_the_emitters_beam_and_of_the_ranges():
@@ -389,7 +424,7 @@ def test_unknown_format_of_a_map_is_refused(tmp_path):
 
 def test_map_of_a_furnished_room_shows_its_walls():
     """`ertis bench map` measures maps of many rooms, with more poses."""
-    report = mapping.run(count=1, poses=6, length_m=0.0, seed=1, say=lambda _: None)
+    report = mapping.run(count=1, poses=6, length_m=0.0, rate_hz=2.5, seed=1, say=lambda _: None)
     (row,) = report["rows"]
     assert row["found"] > 0.5
     assert row["false"] < 0.06

@@ -35,7 +35,6 @@ Floats = NDArray[np.float64]
 _SPACING_M: Final = 0.05  # of the scatterers of walls
 _RANGE_M: Final = 4.0
 _IN_VIEW_M: Final = 3.7  # Distance of the platform up to which a sensor's image shows a wall.
-_TIME_S: Final = 0.4
 _STEP_S: Final = 0.05  # between the poses that state the velocity.
 _ELLIPSE_M: Final = 1.0, 0.7  # Half axes of the path through a room.
 _ON_WALL_M: Final = 0.1  # Distance from a wall within which a scatterer belongs to it.
@@ -138,7 +137,9 @@ def rated(found: OccupancyMap, place: MappedPlace, path_m: Floats) -> dict[str, 
     }
 
 
-def run(*, count: int, poses: int, length_m: float, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+def run(
+    *, count: int, poses: int, length_m: float, rate_hz: float, seed: int, say: Callable[[str], None]
+) -> dict[str, Any]:
     """Map random rooms and a hall.
 
     Parameters
@@ -149,6 +150,8 @@ def run(*, count: int, poses: int, length_m: float, seed: int, say: Callable[[st
         Number of poses in each room.
     length_m : float
         Length of the path through the hall; 0 leaves out the hall.
+    rate_hz : float
+        Pulses per second.
     seed : int
         Seed of the first room, and of the hall.
     say : callable
@@ -157,14 +160,14 @@ def run(*, count: int, poses: int, length_m: float, seed: int, say: Callable[[st
     rows = []
     for number in range(seed, seed + count):
         place = MappedPlace(*random_room(number, _SPACING_M), half_size_of_room_m(number))
-        rows.append(_mapped(f"room {number}", place, _round(poses), number, say))
+        rows.append(_mapped(f"room {number}", place, _round(poses), number, rate_hz, say))
     if length_m:
         scene = hall(seed, _SPACING_M)
         assert scene.platform is not None  # noqa: S101  halls have one
         place = MappedPlace(scene.points, (), (HALL_M[0] / 2, HALL_M[1] / 2))
-        motions = [Motion.of(scene.platform, time_s) for time_s in np.arange(0.0, length_m, _TIME_S)]  # at 1 m/s
-        rows.append(_mapped(f"hall {seed}", place, motions, seed, say))
-    return {"machine": machine.describe(), "seed": seed, "length_m": length_m, "rows": rows}
+        motions = [Motion.of(scene.platform, time_s) for time_s in np.arange(0.0, length_m, 1 / rate_hz)]  # at 1 m/s
+        rows.append(_mapped(f"hall {seed}", place, motions, seed, rate_hz, say))
+    return {"machine": machine.describe(), "seed": seed, "length_m": length_m, "rate_hz": rate_hz, "rows": rows}
 
 
 def form(report: dict[str, Any]) -> str:
@@ -213,14 +216,19 @@ def _round(count: int) -> list[Motion]:
 
 
 def _mapped(
-    name: str, place: MappedPlace, motions: Sequence[Motion], seed: int, say: Callable[[str], None]
+    name: str,
+    place: MappedPlace,
+    motions: Sequence[Motion],
+    seed: int,
+    rate_hz: float,
+    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Return the shares and times of the map of a place."""
     imager = PlatformImager((place.points, place.boxes), seed, max_range_m=_RANGE_M)
     mapper, fuser = ertis.Mapper(mountings()), ertis.Fuser(mountings())
     taken_s, fused_s = [], []
     for number, motion in enumerate(motions):
-        images = imager(motion, number, number * _TIME_S)
+        images = imager(motion, number, number / rate_hz)
         begin_s = time.perf_counter()
         fused = fuser(images)
         _ = fused.points

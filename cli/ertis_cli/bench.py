@@ -309,6 +309,15 @@ def motion(**given: Any) -> None:
     metavar="M",
     help="Length of the path through a hall; 0 leaves out the hall.",
 )
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=click.FloatRange(0.0, 20.0, min_open=True),
+    default=2.5,
+    show_default=True,
+    metavar="HZ",
+    help="Pulses per second, at 1 m/s.",
+)
 @_seed("Seed of the first room, and of the hall.", default=1)
 @_update
 @options.quiet

@@ -20,15 +20,19 @@ N_AZIMUTHS: Final = 360
 """Directions for free space, of 1°."""
 _OCCUPIED: Final = 5.0  # Log-odds of a clear echo, shared among the cells that may contain it.
 _MOST: Final = 0.6  # Log-odds of a cell from one pulse; ghosts seldom repeat, so that a single one is not enough.
-_FREE: Final = 0.4  # Log-odds of a cell in front of the first clear echo, near the platform.
+_FREE: Final = 0.6  # Log-odds of a cell in front of the first clear echo, near the platform.
 _FREE_M: Final = 1.0  # Free range in directions without any clear echo.
 _IN_FRONT_M: Final = 0.05  # Space in front of an echo that is not free yet.
-_BEHIND_M: Final = 0.3  # Distance behind the first clear echo of a direction from which others are doubtful.
+_BEHIND_M: Final = 0.3  # Distance behind an obstacle within the beam from which it hides echoes.
+_DEPTH_M: Final = 0.1  # The same for a wall of the map in the direction of the echo: the thickness of its cells.
 _WALL: Final = 1.5  # Log-odds from which a cell hides those behind it.
-_BEHIND: Final = 0.1  # Weight of doubtful echoes, which may have travelled over several reflectors.
+_OPEN: Final = -0.5  # Log-odds below which a cell lets sound pass.
 _CLEAR: Final = 0.6  # Weight of a clear echo.
 _HALF_BEAM: Final = 5  # Directions beside an echo in which it may hide others.
+_HALF_RAY: Final = 1  # The same for a wall of the map, whose directions are known.
 _USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that is the usual one.
+# Amplitude, relative to the usual one, at which one half of the points are ghosts, as measured in simulated places.
+_GHOST: Final = 0.2
 _DISTRUST: Final = 0.25  # Exponent of the coverage in the weight of echoes, of which more are ghosts at the edges.
 _SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.
 # Errors of positions that noise does not explain: overlapping echoes of rough walls, mountings and poses.
@@ -49,7 +53,7 @@ class LocatedEchoes(NamedTuple):
     sd_m : (point, 2) float64
         Standard deviations along and across the direction.
     strength : (point,) float64
-        Weight, at most 1, which grows with the amplitude.
+        Weight, at most 1: probability that the point is a reflector.
     """
 
     azimuth_rad: Floats
@@ -65,15 +69,16 @@ class UsualAmplitude:
         self._usual: float | None = None
 
     def strength(self, amplitude: Singles) -> Floats:
-        """Return the weight of the points of a pulse: (point,) float64, 1 from the usual amplitude.
+        """Return the probability that the points of a pulse are reflectors: (point,) float64.
 
-        It is the square root of the relative amplitude: weak points are more often ghosts, but also parts of walls.
+        It is a² / (a² + g²) for the amplitude a, where g is that of ghosts.
         """
         if not len(amplitude):
             return np.zeros(0)
         now = float(np.percentile(amplitude, _USUAL))
         self._usual = now if self._usual is None else (1 - _SMOOTHING) * self._usual + _SMOOTHING * now
-        return np.sqrt(np.minimum(1.0, amplitude.astype(np.float64) / max(self._usual, 1e-30)))
+        power = (amplitude.astype(np.float64) / max(self._usual, 1e-30)) ** 2
+        return np.asarray(power / (power + _GHOST**2))
 
 
 def echoes_of(offset_m: Floats, uncertainty_m: Floats, strength: Floats) -> LocatedEchoes:
@@ -174,10 +179,12 @@ def add_evidence(
         Radius of the platform, whose own place is free.
     """
     first_m, wall_m = _first_clear_m(echoes), _wall_m(window, place_m, heading_rad, coverage)
+    end_m: Floats = np.where(np.isfinite(first_m), first_m - _IN_FRONT_M, _FREE_M)
+    is_open = _log_odds(window, place_m, heading_rad, end_m[:, None] + _IN_FRONT_M)[:, 0] < _OPEN
+    hiding_m = np.minimum(np.where(is_open, np.inf, first_m), wall_m)
     trusted = echoes.strength * coverage.at(echoes.azimuth_rad, echoes.range_m) ** _DISTRUST
-    located = echoes._replace(strength=trusted)
-    occupied = _occupied(window, place_m, heading_rad, located, np.minimum(first_m, wall_m))
-    end_m = np.where(np.isfinite(first_m), first_m - _IN_FRONT_M, _FREE_M)
+    trusted *= _visible(echoes, hiding_m, wall_m)
+    occupied = _occupied(window, place_m, heading_rad, echoes._replace(strength=trusted))
     free = _free(window, place_m, heading_rad, np.minimum(end_m, wall_m), coverage, near_m=near_m)
     free[occupied > _TOUCHED] = 0.0
     window.log_odds[:] += np.minimum(_OCCUPIED * occupied, _MOST) - _FREE * free
@@ -192,28 +199,58 @@ def _first_clear_m(echoes: LocatedEchoes) -> Floats:
     """Return the range of the first clear echo in each direction, infinite without one: (azimuth,) float64."""
     first_m = np.full(N_AZIMUTHS, np.inf)
     is_clear = echoes.strength > _CLEAR
-    beam = np.arange(-_HALF_BEAM, _HALF_BEAM + 1)
-    around = (_direction(echoes.azimuth_rad[is_clear])[:, None] + beam) % N_AZIMUTHS
+    around = _beside(echoes.azimuth_rad[is_clear], _HALF_BEAM)
     np.minimum.at(first_m, around, echoes.range_m[is_clear][:, None])
     return first_m
 
 
+def _visible(echoes: LocatedEchoes, hiding_m: Floats, wall_m: Floats) -> Floats:
+    """Return the share of the amplitude that passes the obstacles in front of echoes: (point,) float64.
+
+    The share of directions that are open passes on the way to the reflector, and again on the way back. Around an echo,
+    obstacles within the beam count: a wall fills it, and a post does not. In the direction of the echo, a wall of the
+    map hides everything behind it.
+
+    Parameters
+    ----------
+    echoes : LocatedEchoes
+    hiding_m : (azimuth,) float64
+        Ranges of the first obstacles.
+    wall_m : (azimuth,) float64
+        Ranges of the first walls of the map.
+    """
+    passed = [
+        np.mean(first_m[_beside(echoes.azimuth_rad, half_width)] + behind_m >= echoes.range_m[:, None], axis=1)
+        for first_m, half_width, behind_m in ((hiding_m, _HALF_BEAM, _BEHIND_M), (wall_m, _HALF_RAY, _DEPTH_M))
+    ]
+    return np.asarray(np.minimum(*passed) ** 2)
+
+
+def _beside(azimuth_rad: Floats, half_width: int) -> NDArray[np.int64]:
+    """Return the directions beside azimuths, and their own: (point, direction) int64."""
+    beside = np.arange(-half_width, half_width + 1)
+    return np.asarray((_direction(azimuth_rad)[:, None] + beside) % N_AZIMUTHS)
+
+
 def _wall_m(window: Window, place_m: Floats, heading_rad: float, coverage: Coverage) -> Floats:
     """Return the range behind the first cell that earlier pulses have found occupied: (azimuth,) float64."""
-    n_rows, n_columns = window.log_odds.shape
+    range_m = np.asarray((np.arange(coverage.weight.shape[1]) + 0.5) * coverage.step_m, np.float64)
+    is_wall = _log_odds(window, place_m, heading_rad, range_m) > _WALL
+    first_m = range_m[is_wall.argmax(axis=1)] + float(window.x_m[1] - window.x_m[0])
+    return np.asarray(np.where(is_wall.any(axis=1), first_m, np.inf))
+
+
+def _log_odds(window: Window, place_m: Floats, heading_rad: float, range_m: Floats) -> Singles:
+    """Return the log-odds of a map along all directions, at (range,) or (azimuth, range): (azimuth, range) float32."""
     cell_m = float(window.x_m[1] - window.x_m[0])
-    range_m = (np.arange(coverage.weight.shape[1]) + 0.5) * coverage.step_m
     azimuth_rad = (np.arange(N_AZIMUTHS) + 0.5) * (2 * math.pi / N_AZIMUTHS) + heading_rad
     row, column = (
-        np.rint((place_m[axis] - centre_m[0] + unit[:, None] * range_m) / cell_m).astype(np.int64).clip(0, count - 1)
-        for axis, centre_m, unit, count in (
-            (1, window.y_m, np.sin(azimuth_rad), n_rows),
-            (0, window.x_m, np.cos(azimuth_rad), n_columns),
-        )
+        np.rint((place_m[axis] - centre_m[0] + unit[:, None] * range_m) / cell_m)
+        .astype(np.int64)
+        .clip(0, len(centre_m) - 1)
+        for axis, centre_m, unit in ((1, window.y_m, np.sin(azimuth_rad)), (0, window.x_m, np.cos(azimuth_rad)))
     )
-    is_wall = window.log_odds[row, column] > _WALL
-    first_m = range_m[is_wall.argmax(axis=1)] + cell_m
-    return np.asarray(np.where(is_wall.any(axis=1), first_m, np.inf))
+    return np.asarray(window.log_odds[row, column])
 
 
 def _free(
@@ -231,18 +268,16 @@ def _free(
     return np.asarray(free)
 
 
-def _occupied(window: Window, place_m: Floats, heading_rad: float, echoes: LocatedEchoes, first_m: Floats) -> Singles:
+def _occupied(window: Window, place_m: Floats, heading_rad: float, echoes: LocatedEchoes) -> Singles:
     """Return the expected number of echoes in each cell: (row, column) float32."""
     occupied = window._replace(log_odds=np.zeros_like(window.log_odds))
     cell_m = float(window.x_m[1] - window.x_m[0])
     azimuth_rad = echoes.azimuth_rad + heading_rad
     unit = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], axis=1)
-    behind = echoes.range_m > first_m[_direction(echoes.azimuth_rad)] + _BEHIND_M
-    weight = echoes.strength * np.where(behind, _BEHIND, 1.0)
     centre_m = place_m + unit * echoes.range_m[:, None]
     variance_m2 = echoes.sd_m**2 + cell_m**2 / 12
     reach_m = _REACH_SD * echoes.sd_m.max(axis=1, initial=0.0) + cell_m
-    peak = weight * cell_m**2 / (2 * math.pi * np.sqrt(variance_m2.prod(axis=1)))
+    peak = echoes.strength * cell_m**2 / (2 * math.pi * np.sqrt(variance_m2.prod(axis=1)))
     for number, (ahead, left) in enumerate(unit.tolist()):
         part = occupied.around(centre_m[number], float(reach_m[number]))
         dx_m, dy_m = (part.x_m - centre_m[number, 0])[None, :], (part.y_m - centre_m[number, 1])[:, None]
