@@ -32,6 +32,7 @@ from .figures import plot as plot
 from .frames import (
     AcousticMap as AcousticMap,
     Beams as Beams,
+    Bearing as Bearing,
     Energyscape as Energyscape,
     Measurement as Measurement,
     MicrophoneSignals as MicrophoneSignals,
@@ -68,7 +69,11 @@ from .network.central_client import CentralClient as CentralClient
 from .network.keys import ClientKeys as ClientKeys, KeyPair as KeyPair, ServerKeys as ServerKeys
 from .network.sensor_node import SensorNode as SensorNode
 from .network.subscriber import Subscriber as Subscriber
-from .passive import AcousticCamera as AcousticCamera
+from .passive import (
+    AcousticCamera as AcousticCamera,
+    BearingFinder as BearingFinder,
+    find_bearings as find_bearings,
+)
 from .pipeline import Pipeline as Pipeline
 from .settings import Settings as Settings, presets as presets
 from .simulation.render import Simulator as Simulator, render as render

@@ -2,6 +2,7 @@
 
 from ertis_numba.frames._acoustic_map import AcousticMap, Loudest
 from ertis_numba.frames._beams import Beams
+from ertis_numba.frames._bearings import Bearing
 from ertis_numba.frames._energyscape import Energyscape
 from ertis_numba.frames._gap import SequenceGap
 from ertis_numba.frames._measurement import Measurement, MicrophoneSignals
@@ -19,6 +20,7 @@ __all__ = [
     "OCCUPIED_ABOVE",
     "AcousticMap",
     "Beams",
+    "Bearing",
     "Behaviour",
     "Energyscape",
     "Loudest",

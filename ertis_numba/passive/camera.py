@@ -8,21 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import AcousticMap, Measurement, Stamp
 from ertis_numba.geometry import (
     Grid,
     direction_grid,
-    far_field_delays,
     microphones,
-    spherical_delays,
     unit_vectors,
 )
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.block_spectra import BlockSpectra
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.methods import METHODS, Waves
+from ertis_numba.passive.wave_delays import wave_delays
 from ertis_numba.settings import Settings
 
 __all__ = ["AcousticCamera", "is_passive"]
@@ -80,6 +78,8 @@ class AcousticCamera:
         Edges of the bands in hertz.
     frequency_hz : (bin,) float64
         Frequencies at which powers are computed, in hertz.
+    waves : Waves
+        Waves from each direction of the grid.
     n_measurements : int
         Measurements since the last `reset`.
 
@@ -117,14 +117,15 @@ class AcousticCamera:
         self.band_hz: NDArray[np.float64] = self._blocks.bands_hz
         self.frequency_hz: NDArray[np.float64] = self._blocks.frequency_hz
         self._shares = bin_shares(self.band_hz, self.frequency_hz)
-        delay_s = self._delays().T.copy()
+        directions = unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad)
+        delay_s = wave_delays(settings, directions).T.copy()
         steps = np.rint(delay_s * self._blocks.spacing_hz * _TURN).astype(np.int64).astype(np.uint32)
         self._memory = kernel_set.memory()
         self._lane = self._memory.lane()
         self._steps = self._memory.table(np.ascontiguousarray(steps))
         self._bins = self._memory.table(self._blocks.bins)
         self._powers = self._memory.zeros((len(self._blocks.bins), len(self.grid)), np.float32)
-        self._waves = Waves(delay_s, self._steer)
+        self.waves = Waves(delay_s, self._steer)
         self._masked_s = 0.0
         self.reset()
 
@@ -175,7 +176,7 @@ class AcousticCamera:
             There is no measurement, or too few blocks for the method.
         """
         passive = self.settings.passive
-        return METHODS[passive.method](self.cross_spectrum(), self._waves, passive)
+        return METHODS[passive.method](self.cross_spectrum(), self.waves, passive)
 
     def map(self) -> AcousticMap:
         """Return the map of the measurements since the last `reset`.
@@ -204,7 +205,7 @@ class AcousticCamera:
 
     def reset(self) -> None:
         """Forget all measurements."""
-        n_mics = self._waves.delay_s.shape[0]
+        n_mics = self.waves.delay_s.shape[0]
         self._sums: NDArray[Any] = np.zeros((len(self.frequency_hz), n_mics, n_mics), np.complex128)
         self._n_blocks = self.n_measurements = 0
         self._masked_s = 0.0
@@ -266,29 +267,16 @@ class AcousticCamera:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _steer(self, matrices: NDArray[np.complex64]) -> NDArray[np.float32]:
-        """Return the quadratic form of matrices for the wave from each direction: (bin, direction) float32."""
+    def _steer(self, matrices: NDArray[np.complex64], first: int = 0) -> NDArray[np.float32]:
+        """Return the quadratic form of the matrices of bins for the wave from each direction: (bin, direction)."""
+        stop = first + len(matrices)
         out = np.empty((len(matrices), len(self.grid)), np.float32)
         with self._kernels.threads(self._threads), self._lane.entered():
             here = self._lane.send(np.ascontiguousarray(matrices))
-            self._kernels.steer_power(here, self._steps, self._bins, self._powers)
-            self._lane.fetch(self._powers, out)
+            self._kernels.steer_power(here, self._steps, self._bins[first:stop], self._powers[first:stop])
+            self._lane.fetch(self._powers[first:stop], out)
             self._lane.wait()
         return out
-
-    def _delays(self) -> NDArray[np.float64]:
-        """Return the delays of the sound from each direction, with those of the calibration: (direction, mic)."""
-        settings = self.settings
-        layout = microphones(settings.array)
-        directions = unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad)
-        speed_m_s, focus_m = sound_speed_m_s(settings.air), settings.passive.focus_m
-        if focus_m is None:
-            delay_s = far_field_delays(layout.enabled_positions_m, directions, sound_speed_m_s=speed_m_s)
-        else:
-            delay_s = spherical_delays(
-                layout.enabled_positions_m, directions, range_m=focus_m, sound_speed_m_s=speed_m_s
-            )
-        return delay_s + layout.delay_s[layout.enabled]
 
     def _require_sources(self) -> None:
         """Refuse as many sources as microphones."""

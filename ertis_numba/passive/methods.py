@@ -32,11 +32,12 @@ class Waves:
     ----------
     delay_s : (mic, direction) float64
     steer : callable
-        Returns the quadratic form of matrices, ``v^H C v``: (bin, direction) float32.
+        Returns the quadratic form of matrices, ``v^H C v``: (bin, direction) float32. The second argument, 0 by
+        default, is the number of the first matrix's bin.
     """
 
     delay_s: NDArray[np.float64]
-    steer: Callable[[Matrices], Powers]
+    steer: Callable[..., Powers]
 
     def at(self, frequency_hz: float) -> NDArray[np.complex64]:
         """Return the waves at a frequency: (mic, direction) complex64."""

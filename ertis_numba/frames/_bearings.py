@@ -1,0 +1,55 @@
+"""Bearings: directions of sources of sound."""
+
+import math
+from dataclasses import dataclass
+
+from ertis_numba.angles import RadiansFromDegrees
+
+__all__ = ["Bearing"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bearing(RadiansFromDegrees):
+    """Direction of a source in a band of frequencies.
+
+    The properties ``azimuth_rad`` and ``elevation_rad`` are the angles in radians.
+
+    Attributes
+    ----------
+    azimuth_deg, elevation_deg : float
+        Direction in the sensor frame in degrees.
+    sideways_deg, upwards_deg : float
+        Standard deviations of the direction along the sphere, horizontally and vertically, in degrees. They include
+        noise only, not errors of the array. ``upwards_deg`` is 0 if the elevation was given, and both are infinite for
+        an array that cannot resolve the direction.
+    correlation : float
+        Correlation of both errors.
+    band_hz : (low, high)
+        Edges of the band in hertz.
+    level_dbfs : float
+        Level of the source in the band at the array, without noise, in dBFS.
+    snr_db : float
+        Power of the source relative to the noise of a microphone in the band, in decibels.
+
+    Examples
+    --------
+    >>> from ertis_numba.frames import Bearing
+    >>> found = Bearing(azimuth_deg=90.0, elevation_deg=0.0, sideways_deg=0.1, upwards_deg=0.2, correlation=0.0,
+    ...                 band_hz=(30e3, 40e3), level_dbfs=-70.0, snr_db=3.0)
+    >>> round(found.azimuth_rad, 4)
+    1.5708
+    """
+
+    azimuth_deg: float
+    elevation_deg: float
+    sideways_deg: float
+    upwards_deg: float
+    correlation: float
+    band_hz: tuple[float, float]
+    level_dbfs: float
+    snr_db: float
+
+    @property
+    def center_hz(self) -> float:
+        """Geometric centre of the band in hertz."""
+        return math.sqrt(self.band_hz[0] * self.band_hz[1])

@@ -1,0 +1,165 @@
+"""Bearings of sources: maxima of acoustic maps that noise does not explain, refined by maximum likelihood."""
+
+import functools
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.frames import Bearing
+from ertis_numba.geometry import microphones, spacing_rad, unit_vectors
+from ertis_numba.passive.bands import bin_shares
+from ertis_numba.passive.camera import AcousticCamera
+from ertis_numba.passive.noise_model import NoiseModel
+from ertis_numba.passive.scan_extent import is_level, scan_extent
+from ertis_numba.passive.source_search import BandSearch, FoundSource, Scan
+from ertis_numba.passive.wave_delays import wave_delays
+
+__all__ = ["BearingFinder", "find_bearings"]
+
+_REACH: Final = 1.5  # Largest distance from a direction of the grid to a maximum, in spacings of the grid.
+_MAX_SPACING_RAD: Final = 0.5
+_LEAST: Final = 1e-30
+
+
+class BearingFinder:
+    """Finder of the bearings of sources in the sound that an acoustic camera has heard.
+
+    In each band, the loudest direction relative to the noise is refined by maximum likelihood over continuous
+    directions. Its wave is then projected out, and the next direction is searched in the rest, until noise alone
+    explains the loudest one: see `exceedance`. Side lobes of a source therefore yield no bearings. After each new
+    source, the directions of all sources of its band are corrected. The noise is a mixture of white noise of the
+    microphones and of diffuse sound, whose shares are estimated in each band.
+
+    Parameters
+    ----------
+    camera : AcousticCamera
+        Camera whose measurements are searched. Its directions are searched, in its bands; sources elsewhere, such as
+        beside the elevation of a flat grid, yield wrong bearings. A grid coarser than half of the beam's width misses
+        weak sources. The method of its maps has no influence.
+    false_alarm : float
+        Probability that noise alone yields any bearing, 1e-9 to 0.5; 0.001 by default.
+    top : int
+        Largest number of bearings in a band; 8 by default.
+    min_level_db : float
+        Least level relative to the loudest source of the band; -20 by default, because errors of the array leave rests
+        of sources.
+
+    Raises
+    ------
+    ArgumentError
+        An argument is outside its limits.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     camera = ertis.AcousticCamera(recording.settings)
+    ...     camera.add(recording[0])
+    >>> finder = ertis.BearingFinder(camera, false_alarm=1e-4)
+    >>> all(bearing.snr_db > -40 for bearing in finder.find())
+    True
+    """
+
+    def __init__(
+        self, camera: AcousticCamera, *, false_alarm: float = 1e-3, top: int = 8, min_level_db: float = -20.0
+    ) -> None:
+        checks.instance("camera", camera, AcousticCamera, "AcousticCamera returns")
+        checks.between("false_alarm", false_alarm, 1e-9, 0.5)
+        self._camera, self._top = camera, checks.integer("top", top, 1)
+        self._least = 10 ** (checks.between("min_level_db", min_level_db, -200.0, 0.0) / 10)
+        self._false_alarm = 1 - (1 - false_alarm) ** (1 / len(camera.band_hz))
+        directions = unit_vectors(camera.grid.azimuth_rad, camera.grid.elevation_rad)
+        reach_rad = _REACH * min(spacing_rad(directions), _MAX_SPACING_RAD)
+        extent = scan_extent(directions, self._delays(directions))
+        scan = Scan(directions, extent, reach_rad, is_level(directions))
+        self._bins: list[NDArray[np.intp]] = []
+        self._searches: list[BandSearch] = []
+        for shares in bin_shares(camera.band_hz, camera.frequency_hz).astype(np.float64):
+            bins = np.flatnonzero(shares)
+            frequency_hz, steer = camera.frequency_hz[bins], functools.partial(camera.waves.steer, first=int(bins[0]))
+            noise = NoiseModel(
+                microphones(camera.settings.array).enabled_positions_m,
+                frequency_hz,
+                sound_speed_m_s=sound_speed_m_s(camera.settings.air),
+            )
+            self._bins.append(bins)
+            self._searches.append(BandSearch(scan, frequency_hz, shares[bins], noise, self._delays, steer))
+
+    def find(self) -> list[Bearing]:
+        """Return the bearings of the measurements since the camera's last `reset`, band by band, loudest first.
+
+        Returns
+        -------
+        list of Bearing
+
+        Raises
+        ------
+        DataError
+            The camera has no measurement.
+        """
+        spectrum = self._camera.cross_spectrum()
+        out = []
+        for bins, search, band_hz in zip(self._bins, self._searches, self._camera.band_hz, strict=True):
+            matrix = spectrum.matrix[bins].astype(np.complex128)
+            sources = search(matrix, spectrum.n_blocks, false_alarm=self._false_alarm, top=self._top, least=self._least)
+            sources.sort(key=lambda source: -source.power)
+            out += [_bearing(source, band_hz) for source in sources]
+        return out
+
+    def _delays(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        return wave_delays(self._camera.settings, directions)
+
+
+def find_bearings(
+    camera: AcousticCamera, *, false_alarm: float = 1e-3, top: int = 8, min_level_db: float = -20.0
+) -> list[Bearing]:
+    """Return the bearings of sources in the sound that an acoustic camera has heard, band by band, loudest first.
+
+    Parameters
+    ----------
+    camera : AcousticCamera
+    false_alarm, top, min_level_db
+        As for `BearingFinder`, which is faster for many maps.
+
+    Returns
+    -------
+    list of Bearing
+
+    Raises
+    ------
+    ArgumentError
+        An argument is outside its limits.
+    DataError
+        The camera has no measurement.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> with ertis.open_recording("reflectors.h5") as recording:
+    ...     camera = ertis.AcousticCamera(recording.settings)
+    ...     camera.add(recording[0])
+    >>> len(ertis.find_bearings(camera, top=1)) <= len(camera.band_hz)
+    True
+    """
+    return BearingFinder(camera, false_alarm=false_alarm, top=top, min_level_db=min_level_db).find()
+
+
+def _bearing(source: FoundSource, band_hz: NDArray[np.float64]) -> Bearing:
+    x, y, z = source.direction
+    sideways, upwards = np.sqrt(np.diag(source.covariance_rad2))
+    is_known = 0 < sideways < math.inf and 0 < upwards < math.inf
+    correlation = source.covariance_rad2[0, 1] / (sideways * upwards) if is_known else 0.0
+    return Bearing(
+        azimuth_deg=math.degrees(math.atan2(y, x)),
+        elevation_deg=math.degrees(math.asin(max(-1.0, min(1.0, z)))),
+        sideways_deg=math.degrees(sideways),
+        upwards_deg=math.degrees(upwards),
+        correlation=float(correlation),
+        band_hz=(float(band_hz[0]), float(band_hz[1])),
+        level_dbfs=10 * math.log10(max(source.power, _LEAST)),
+        snr_db=10 * math.log10(max(source.ratio, _LEAST)),
+    )

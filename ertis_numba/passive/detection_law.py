@@ -1,0 +1,109 @@
+"""Probability that noise alone looks like a source."""
+
+import functools
+import math
+from typing import Final
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from ertis_numba.passive.scan_extent import ScanExtent
+
+__all__ = ["exceedance", "independent_samples"]
+
+_SAMPLES: Final = 512  # of a block from which correlations are computed
+_LAGS: Final = 4  # Bins beyond which the spectra of Hann windows are uncorrelated.
+
+
+def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: ScanExtent) -> float:
+    """Return the probability that the beam of noise from any direction has at least a share of all power.
+
+    In white noise of unknown power, the share R of one direction in the power of D dimensions has the Beta law
+    ``R ~ Beta(K, K (D − 1))``, where K is the number of independent samples. This is nearly a Gamma law for many
+    dimensions. The largest share of a connected set of directions exceeds R with the probability
+
+    ``P(R) + L₁ g / √(2πn) + L₂ g′ / (2πn)`` with ``n = 2K (D − 1)``,
+
+    the expected Euler characteristic of the directions that exceed R (K. J. Worsley, Local maxima and the expected
+    Euler characteristic of excursion sets of χ², F and t fields, 1994). Here g is the density of
+    ``φ = arccos √R``, ``g′`` its derivative, and L₁ and L₂ are the length and the area of the set in units of the
+    array's resolution.
+
+    Parameters
+    ----------
+    share : float
+        Share R, 0 to 1.
+    n_samples : float
+        Number K of independent complex samples.
+    n_dimensions : int
+        Number D of dimensions: that of microphones, less those in which other sources lie.
+    extent : ScanExtent
+        Directions that are searched, at the frequency of the noise.
+
+    Returns
+    -------
+    float
+        Probability; 1 if the share is not above its mean.
+
+    Examples
+    --------
+    >>> from ertis_numba.passive.detection_law import exceedance
+    >>> from ertis_numba.passive.scan_extent import ScanExtent
+    >>> round(exceedance(0.5, n_samples=1, n_dimensions=4, extent=ScanExtent(1, 0, 0)), 6)  # (1 − R)³
+    0.125
+    """
+    if n_dimensions < 2 or share <= 1 / n_dimensions:
+        return 1.0
+    if share >= 1:
+        return 0.0
+    rest = n_samples * (n_dimensions - 1)
+    law = scipy.stats.beta(n_samples, rest)
+    density = float(law.pdf(share)) * 2 * math.sqrt(share * (1 - share))
+    ratio = math.sqrt(share / (1 - share))
+    slope = density * ((2 * rest - 1) * ratio - (2 * n_samples - 1) / ratio)
+    scale = 4 * math.pi * rest
+    expected = extent.n_parts * float(law.sf(share)) + extent.length_s * density / math.sqrt(scale)
+    return min(1.0, expected + extent.area_s2 * slope / scale)
+
+
+def independent_samples(shares: NDArray[np.floating], n_blocks: int) -> float:
+    """Return the number of independent samples with the same variance of their mean power as bins of blocks.
+
+    Hann windows that overlap by half leave 0.47 independent samples of each bin and block: neighbouring bins and blocks
+    are correlated (P. D. Welch, 1967).
+
+    Parameters
+    ----------
+    shares : (bin,) float
+        Weights of neighbouring bins.
+    n_blocks : int
+        Number of blocks, of which each shares half of its samples with the next one.
+
+    Returns
+    -------
+    float
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ertis_numba.passive.detection_law import independent_samples
+    >>> round(independent_samples(np.ones(1000), 1000) / 1e6, 3)
+    0.474
+    """
+    same, next_one = _correlations()
+    products = np.correlate(shares, shares, "full")[len(shares) - 1 :][: _LAGS + 1].astype(np.float64)
+    products[1:] *= 2
+    variance = products @ (n_blocks * same + 2 * (n_blocks - 1) * next_one)[: len(products)]
+    return float((n_blocks * shares.sum(dtype=np.float64)) ** 2 / variance)
+
+
+@functools.cache
+def _correlations() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the squared correlations of bins at each distance, within a block and from one block to the next."""
+    window = scipy.signal.get_window("hann", _SAMPLES)
+    turns = np.exp(2j * np.pi * np.outer(np.arange(_LAGS + 1), np.arange(_SAMPLES)) / _SAMPLES)
+    half = _SAMPLES // 2
+    within = np.abs(turns @ window**2) ** 2
+    across = np.abs(turns[:, half:] @ (window[half:] * window[:half])) ** 2
+    return within / within[0], across / within[0]

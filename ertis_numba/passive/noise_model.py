@@ -1,0 +1,63 @@
+"""Noise of microphones and of the surroundings, and its removal from cross-spectral matrices."""
+
+from typing import Final
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+__all__ = ["NoiseModel"]
+
+_MAX_DIFFUSE: Final = 0.999  # Some noise of the microphones remains, so that whitening stays finite.
+_TINY: Final = 1e-30
+
+
+class NoiseModel:
+    """Mixture of white noise of the microphones and of a diffuse field of sound.
+
+    The coherence of a diffuse field between microphones at a distance d is ``sin(k d) / (k d)`` (R. K. Cook et al.,
+    Measurement of correlation coefficients in reverberant sound fields, 1955).
+
+    Parameters
+    ----------
+    positions_m : (mic, axis) float64
+    frequency_hz : (bin,) float64
+    sound_speed_m_s : float
+    """
+
+    def __init__(
+        self, positions_m: NDArray[np.float64], frequency_hz: NDArray[np.float64], *, sound_speed_m_s: float
+    ) -> None:
+        apart_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=-1)
+        coherence = np.sinc(2 * apart_m / sound_speed_m_s * frequency_hz[:, None, None])
+        values, self._modes = np.linalg.eigh(coherence)
+        self._values = np.maximum(values, 0.0)
+
+    def diffuse_share(self, matrix: NDArray[np.complex128], weights: NDArray[np.float64]) -> float:
+        """Return the share of the diffuse field that is most likely, 0 to 1.
+
+        Parameters
+        ----------
+        matrix : (bin, mic, mic) complex128
+            Cross-spectral matrix of the noise.
+        weights : (bin,) float64
+            Number of samples of each bin.
+        """
+        modes = self._modes
+        powers = np.maximum(np.einsum("kim,kij,kjm->km", modes, matrix.real, modes, optimize=True), _TINY)
+        n_mics = powers.shape[1]
+
+        def misfit(share: float) -> float:
+            values = 1 - share + share * self._values
+            terms = np.log(values).sum(axis=1) + n_mics * np.log((powers / values).sum(axis=1))
+            return float(weights @ terms)
+
+        found = scipy.optimize.minimize_scalar(
+            misfit, bounds=(0.0, _MAX_DIFFUSE), method="bounded", options={"xatol": 1e-4}
+        )
+        return 0.0 if misfit(0.0) <= found.fun else float(found.x)
+
+    def whitening(self, share: float) -> NDArray[np.float64]:
+        """Return the matrices that make noise with a share of diffuse sound white: (bin, mode, mic) float64."""
+        values = 1 - share + share * self._values
+        return np.asarray(self._modes.transpose(0, 2, 1) / np.sqrt(values)[:, :, None])

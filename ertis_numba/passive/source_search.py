@@ -1,0 +1,211 @@
+"""Search for the sources of one band of a cross-spectral matrix."""
+
+import math
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.passive.detection_law import exceedance, independent_samples
+from ertis_numba.passive.likelihood import BandLikelihood, Delays
+from ertis_numba.passive.noise_model import NoiseModel
+from ertis_numba.passive.scan_extent import ScanExtent
+
+__all__ = ["BandSearch", "FoundSource", "Scan"]
+
+Floats = NDArray[np.float64]
+Matrices = NDArray[np.complex128]
+
+_BLIND: Final = 0.3  # Size of a wave outside of other sources, relative to its whole, below which it is theirs.
+_FLAT: Final = 1e-9  # Information relative to the largest, below which a direction is not resolved.
+_SWEEPS: Final = 2  # Corrections of all sources after each new one.
+
+
+class Scan(NamedTuple):
+    """Directions that are searched.
+
+    Attributes
+    ----------
+    directions : (direction, axis) float64
+        Unit vectors.
+    extent : ScanExtent
+    reach_rad : float
+        Largest distance from one of the directions to a maximum.
+    level : bool
+        True if all have one elevation, which maxima then keep.
+    """
+
+    directions: Floats
+    extent: ScanExtent
+    reach_rad: float
+    level: bool
+
+
+class FoundSource(NamedTuple):
+    """Source in a band.
+
+    Attributes
+    ----------
+    direction : (axis,) float64
+        Unit vector.
+    power : float
+        Mean square of its sound in the band, without noise.
+    ratio : float
+        This power relative to the noise of a microphone.
+    covariance_rad2 : (2, 2) float64
+        Covariance of the direction's errors sideways and upwards; infinite along directions that are not resolved.
+    """
+
+    direction: Floats
+    power: float
+    ratio: float
+    covariance_rad2: Floats
+
+
+class BandSearch:
+    """Search for the sources of one band.
+
+    Parameters
+    ----------
+    scan : Scan
+    frequency_hz, shares : (bin,) float64
+        Frequencies of the band's bins, and the share of each that lies within the band.
+    noise : NoiseModel
+        Noise at these frequencies.
+    delays : callable
+        Returns the delays of the sound from unit vectors, (direction, mic).
+    steer : callable
+        Returns the power of matrices, (bin, mic, mic) complex64, for the wave from each direction of the scan.
+    """
+
+    def __init__(
+        self,
+        scan: Scan,
+        frequency_hz: Floats,
+        shares: Floats,
+        noise: NoiseModel,
+        delays: Delays,
+        steer: Callable[[NDArray[np.complex64]], NDArray[np.float32]],
+    ) -> None:
+        self._scan, self._noise, self._delays, self._steer = scan, noise, delays, steer
+        self._shares, self._weights = shares, shares / shares.sum()
+        self._omega = 2 * np.pi * frequency_hz
+        scale = math.sqrt(float(self._weights @ self._omega**2))
+        extent = scan.extent
+        self._extent = ScanExtent(extent.n_parts, scale * extent.length_s, scale**2 * extent.area_s2)
+
+    def __call__(
+        self, matrix: Matrices, n_blocks: int, *, false_alarm: float, top: int, least: float
+    ) -> list[FoundSource]:
+        """Return the sources of a matrix that noise does not explain.
+
+        Parameters
+        ----------
+        matrix : (bin, mic, mic) complex128
+            Cross-spectral matrix.
+        n_blocks : int
+            Number of blocks of which it is the mean.
+        false_alarm : float
+            Probability that noise alone yields a source.
+        top : int
+            Largest number of sources.
+        least : float
+            Least power relative to the strongest source.
+        """
+        level = np.trace(matrix, axis1=1, axis2=2).real / matrix.shape[1]
+        if not level.all():
+            return []
+        scaled = matrix / level[:, None, None]
+        n_samples = independent_samples(self._shares, n_blocks)
+        places = np.zeros((0, 3))
+        likelihood = self._likelihood(scaled, places)
+        while len(places) < min(top, matrix.shape[1] - 1):
+            place = self._next(likelihood, places, n_samples, false_alarm=false_alarm, least=least)
+            if place is None:
+                break
+            places = np.concatenate([places, place[None]])
+            likelihood = self._likelihood(scaled, places)
+            places = self._corrected(likelihood, places)
+        return [self._source(likelihood, places, k, level, n_samples) for k in range(len(places))]
+
+    def _next(
+        self, likelihood: BandLikelihood, places: Floats, n_samples: float, *, false_alarm: float, least: float
+    ) -> Floats | None:
+        """Return the direction of a further source; None if noise or errors of the known sources may cause it."""
+        rest = likelihood.beside(places)
+        place = rest.maximum(self._loudest(rest, likelihood), reach_rad=self._scan.reach_rad, level=self._scan.level)
+        share = float(rest.relative_power(place[None])[0]) / rest.dimensions
+        chance = exceedance(share, n_samples=n_samples, n_dimensions=rest.dimensions, extent=self._extent)
+        known = [_powers(likelihood.beside(np.delete(places, k, axis=0)), each)[0] for k, each in enumerate(places)]
+        strongest = max((float(self._weights @ powers) for powers in known), default=0.0)
+        power = float(self._weights @ _powers(rest, place)[0])
+        size, whole = (float(self._weights @ each.beams(place[None])[1][:, 0]) for each in (rest, likelihood))
+        is_source = chance <= false_alarm and power >= least * strongest and size >= _BLIND * whole
+        return place if is_source else None
+
+    def _likelihood(self, matrix: Matrices, places: Floats) -> BandLikelihood:
+        """Return the likelihood of sources, in noise whose diffuse share is that of the matrix without sources."""
+        n_mics = matrix.shape[1]
+        identity = np.broadcast_to(np.eye(n_mics), matrix.shape)
+        plain = BandLikelihood(matrix, identity, self._omega, self._weights, self._delays)
+        rest = matrix
+        for k, place in enumerate(places):
+            waves = plain.waves(place[None])
+            power = np.maximum(_powers(plain.beside(np.delete(places, k, axis=0)), place)[0], 0)
+            rest = rest - power[:, None, None] * waves @ waves.conj().transpose(0, 2, 1)
+        whitening = self._noise.whitening(self._noise.diffuse_share(rest, self._weights))
+        white = whitening @ matrix @ whitening.transpose(0, 2, 1)
+        return BandLikelihood(white, whitening, self._omega, self._weights, self._delays)
+
+    def _corrected(self, likelihood: BandLikelihood, places: Floats) -> Floats:
+        """Return the directions of sources that are most likely together."""
+        places = places.copy()
+        for _ in range(_SWEEPS if len(places) > 1 else 1):
+            for k, place in enumerate(places):
+                beside = likelihood.beside(np.delete(places, k, axis=0))
+                places[k] = beside.maximum(place, reach_rad=self._scan.reach_rad, level=self._scan.level)
+        return places
+
+    def _loudest(self, rest: BandLikelihood, whole: BandLikelihood) -> Floats:
+        """Return the direction of the scan with the largest mean power relative to the noise."""
+        powers, sizes, every = (
+            self._steer(whole.unwhitened(each).astype(np.complex64))
+            for each in (rest.rest, rest.projection, whole.projection)
+        )
+        ratio = np.where(sizes >= _BLIND * every, powers / np.maximum(sizes, _BLIND * every), 0)
+        return np.asarray(self._scan.directions[int(((rest.weights / rest.power) @ ratio).argmax())])
+
+    def _source(
+        self, likelihood: BandLikelihood, places: Floats, k: int, level: Floats, n_samples: float
+    ) -> FoundSource:
+        """Return one of the sources with its power and uncertainty."""
+        place, others = places[k], np.delete(places, k, axis=0)
+        powers, noise = _powers(likelihood.beside(others), place)
+        ratio = max(0.0, float(self._weights @ (powers / noise)))
+        information = n_samples * likelihood.information(place, others, ratio, level=self._scan.level)
+        covariance = _inverse(information[:1, :1] if self._scan.level else information)
+        return FoundSource(place, max(0.0, float(self._shares @ (powers * level))), ratio, covariance)
+
+
+def _powers(beside: BandLikelihood, place: Floats) -> tuple[Floats, Floats]:
+    """Return the power of a source without noise, and that of the noise in each dimension, both (bin,)."""
+    powers, size = beside.beams(place[None])
+    noise = (beside.power - powers[:, 0]) / max(beside.dimensions - 1, 1)
+    return (powers[:, 0] - noise) / size[:, 0], noise
+
+
+def _inverse(information: Floats) -> Floats:
+    """Return the covariance (2, 2), infinite along directions without information; one row has a given elevation."""
+    out = np.zeros((2, 2))
+    n = len(information)
+    values, vectors = np.linalg.eigh(information)
+    if values[0] > _FLAT * values[-1]:
+        out[:n, :n] = (vectors / values) @ vectors.T
+        return out
+    blind = np.abs(vectors[:, 0]) > math.sqrt(_FLAT)
+    out[:n, :n] = np.where(np.eye(n, dtype=bool) & blind, math.inf, 0)
+    seen = np.flatnonzero(~blind)
+    if n > 1 and values[-1] > 0:
+        out[seen, seen] = 1 / values[-1]
+    return out

@@ -1,0 +1,193 @@
+"""Bearings: right laws of noise, and directions as accurate as the signals permit."""
+
+import numpy as np
+import pytest
+import scipy
+from ertis_bench import passive_bearings
+
+import ertis_numba as ertis
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.geometry import unit_vectors
+from ertis_numba.passive import AcousticCamera, BearingFinder, find_bearings
+from ertis_numba.passive.detection_law import exceedance, independent_samples
+from ertis_numba.passive.likelihood import BandLikelihood, moved
+from ertis_numba.passive.noise_model import NoiseModel
+from ertis_numba.passive.scan_extent import ScanExtent, scan_extent
+from tests.test_acoustic_camera import settings_of, sound
+
+SPACE = {"processing__directions": "3d:400", "passive__bands_hz": [[30e3, 45e3]]}
+
+
+def test_independent_samples_are_those_of_the_variance_of_powers():
+    random = np.random.default_rng(0)
+    window = scipy.signal.get_window("hann", 64)
+    shares, n_blocks = np.array([0.5, 1.0, 1.0, 1.0, 0.25]), 9
+    noise = random.standard_normal((4000, 32 * (n_blocks + 1)))
+    blocks = np.lib.stride_tricks.sliding_window_view(noise, 64, axis=1)[:, ::32]
+    powers = (np.abs(np.fft.rfft(blocks * window)[:, :, 10:15]) ** 2 @ shares).mean(axis=1)
+    assert powers.mean() ** 2 / powers.var() == pytest.approx(independent_samples(shares, n_blocks), rel=0.08)
+
+
+def test_exceedance_is_that_of_random_vectors():
+    """Draw vectors of noise, and compare the largest share along an arc of directions with the law."""
+    random, n_mics, n_samples = np.random.default_rng(1), 6, 5
+    delay_s = np.linspace(-1, 1, 60)[:, None] * np.linspace(-2.5, 2.5, n_mics)
+    waves = np.exp(1j * delay_s) / np.sqrt(n_mics)
+    noise = random.standard_normal((20_000, n_samples, n_mics, 2)) @ np.array([1, 1j])
+    shares = (np.abs(noise @ waves.T) ** 2).sum(axis=1) / (np.abs(noise) ** 2).sum(axis=(1, 2))[:, None]
+    extent = ScanExtent(1.0, float(np.linalg.norm(np.diff(delay_s, axis=0), axis=1).sum() / np.sqrt(n_mics)), 0.0)
+    for share in (0.3, 0.38):
+        expected = exceedance(share, n_samples=n_samples, n_dimensions=n_mics, extent=extent)
+        found = (shares.max(axis=1) > share).mean()
+        assert found == pytest.approx(expected, rel=0.1)
+
+
+def test_exceedance_has_simple_limits():
+    point = ScanExtent(1.0, 0.0, 0.0)
+    assert exceedance(0.1, n_samples=3, n_dimensions=5, extent=point) == 1
+    assert exceedance(1.0, n_samples=3, n_dimensions=5, extent=point) == 0
+    assert exceedance(0.9, n_samples=3, n_dimensions=1, extent=point) == 1
+
+
+def test_extent_of_a_plane_is_that_of_direction_cosines():
+    """A planar array sees a disc of direction cosines, whose area and perimeter are known."""
+    random = np.random.default_rng(2)
+    positions_m = np.zeros((12, 3))
+    positions_m[:, 1:] = random.normal(scale=0.02, size=(12, 2))
+    processing = ertis.Settings().replace("processing.directions", "3d:3000").processing
+    grid = ertis.geometry.direction_grid(processing)
+    directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+    found = scan_extent(directions, -directions @ positions_m.T / 340)
+    covariance = np.cov(positions_m[:, 1:].T, bias=True) / 340**2
+    assert found.area_s2 == pytest.approx(np.pi * np.sqrt(np.linalg.det(covariance)), rel=0.03)
+    turn = np.linspace(0, 2 * np.pi, 1000)
+    slopes = np.stack([-np.sin(turn), np.cos(turn)])
+    around = np.sqrt(np.einsum("it,ij,jt->t", slopes, covariance, slopes)).mean() * 2 * np.pi
+    assert found.length_s == pytest.approx(around / 2, rel=0.05)
+
+
+def test_extent_of_a_line_is_its_length():
+    directions = unit_vectors(np.radians(np.arange(-90, 91.0)), np.zeros(181))
+    found = scan_extent(directions, directions[:, 1:2] * np.array([[-1.0, 1.0]]))
+    assert found == pytest.approx((1.0, 2.0, 0.0), rel=1e-3)
+    assert scan_extent(directions[:2], directions[:2, 1:2] * np.ones(3)) == (2.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6])
+def test_share_of_diffuse_noise_is_found(share):
+    random = np.random.default_rng(3)
+    positions_m, frequency_hz = random.normal(scale=0.01, size=(8, 3)), np.linspace(20e3, 30e3, 6)
+    apart_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=-1)
+    coherence = share * np.sinc(2 * apart_m / 340 * frequency_hz[:, None, None]) + (1 - share) * np.eye(8)
+    drawn = random.standard_normal((6, 8, 400, 2)) @ np.array([1, 1j])
+    heard = np.linalg.cholesky(coherence) @ drawn
+    matrix = heard @ heard.conj().transpose(0, 2, 1) / 800
+    model = NoiseModel(positions_m, frequency_hz, sound_speed_m_s=340)
+    found = model.diffuse_share(matrix, np.full(6, 1 / 6))
+    assert found == pytest.approx(share, abs=0.05)
+    white = model.whitening(found) @ matrix @ model.whitening(found).transpose(0, 2, 1)
+    assert np.abs(white.mean(axis=0) - np.eye(8)).max() < 0.12
+
+
+def test_maximum_is_that_of_a_fine_search():
+    random = np.random.default_rng(4)
+    positions_m = random.normal(scale=0.02, size=(7, 3))
+
+    def delays(directions):
+        return -directions @ positions_m.T / 340
+
+    omega = 2 * np.pi * np.linspace(20e3, 24e3, 5)
+    truth = unit_vectors(np.radians([20.0, -15.0]), np.radians([10.0, 0.0]))
+    waves = np.exp(-1j * omega[:, None, None] * delays(truth).T)
+    matrix = waves @ waves.conj().transpose(0, 2, 1) + 0.3 * np.eye(7)
+    likelihood = BandLikelihood(matrix, np.broadcast_to(np.eye(7), matrix.shape), omega, np.full(5, 0.2), delays)
+    beside = likelihood.beside(truth[1:])
+    found = beside.maximum(moved(truth[0], np.radians([[2.0, -1.5]]), level=False)[0], reach_rad=0.1, level=False)
+    assert np.linalg.norm(found - truth[0]) < 1e-6
+    around = moved(found, np.radians(random.uniform(-1, 1, (200, 2))), level=False)
+    assert beside(found[None]) >= beside(around).max()
+
+
+@pytest.mark.parametrize("directions", ["2d:181", "3d:1500"])
+def test_false_alarms_have_the_asked_rate(directions):
+    settings, asked, n_seeds = settings_of(**SPACE | {"processing__directions": directions}), 0.1, 200
+    alarms = 0
+    with AcousticCamera(settings, "cpu", 1) as camera:
+        finder = BearingFinder(camera, false_alarm=asked, top=1)
+        for seed in range(n_seeds):
+            camera.reset()
+            camera.add(sound(settings, [], noise=0.1, seed=seed))
+            alarms += bool(finder.find())
+    low, high = scipy.stats.binom.interval(0.998, n_seeds, asked)
+    assert low <= alarms <= high
+
+
+def test_errors_are_those_of_the_bound_and_as_stated():
+    settings = passive_bearings.plane_wave_settings().replace("processing.directions", "3d:1500")
+    with AcousticCamera(settings, "cpu", 1) as camera:
+        finder = BearingFinder(camera)
+        for snr_db in (-5.0, 15.0):
+            row = passive_bearings.errors_at(camera, finder, snr_db, seeds=16, seed=0)
+            assert row["missed"] == 0
+            assert 0.5 < row["ratio"] < 1.5
+            assert 0.5 < row["relative_to_stated"] < 1.5
+
+
+def test_two_sources_have_their_directions_and_levels():
+    settings = settings_of(passive__resolution_hz=300.0, **SPACE)
+    with AcousticCamera(settings, "cpu") as camera:
+        camera.add(sound(settings, [(30, 0.1), (-42, 0.05)], noise=0.03))
+        first, second = find_bearings(camera, false_alarm=1e-6)
+    share = 15e3 / (settings.recording.sample_rate_hz / 2)
+    for found, azimuth_deg, rms in ((first, 30, 0.1), (second, -42, 0.05)):
+        assert found.azimuth_deg == pytest.approx(azimuth_deg, abs=5 * found.sideways_deg)
+        assert found.elevation_deg == pytest.approx(0, abs=5 * found.upwards_deg)
+        assert found.level_dbfs == pytest.approx(10 * np.log10(rms**2 * share), abs=0.7)
+        assert found.snr_db == pytest.approx(20 * np.log10(rms / 0.03), abs=0.7)
+        assert found.band_hz == (30e3, 45e3)
+
+
+def test_elevation_of_a_flat_grid_is_kept():
+    settings = settings_of(processing__directions="2d:61", processing__elevation_deg=1.0)
+    with AcousticCamera(settings, "cpu") as camera:
+        camera.add(sound(settings, [(30, 0.1)], noise=0.02))
+        found = find_bearings(camera, top=1)
+    assert len(found) == 2  # one in each band
+    for bearing in found:
+        assert bearing.elevation_deg == pytest.approx(1)
+        assert bearing.upwards_deg == 0
+        assert bearing.azimuth_deg == pytest.approx(30, abs=1)
+
+
+@pytest.mark.parametrize("directions", ["2d:61", "3d:400"])
+def test_array_on_a_line_resolves_one_angle(directions):
+    positions_m = [[0, y, 0] for y in (0, 0.004, 0.011, 0.02, 0.031, 0.04)]
+    settings = settings_of(array__positions_m=positions_m, **SPACE | {"processing__directions": directions})
+    with AcousticCamera(settings, "cpu") as camera:
+        camera.add(sound(settings, [(20, 0.1)], noise=0.02))
+        found = find_bearings(camera, top=1)[0]
+    sine = np.cos(np.radians(found.elevation_deg)) * np.sin(np.radians(found.azimuth_deg))
+    assert sine == pytest.approx(np.sin(np.radians(20)), abs=0.005)
+    assert found.upwards_deg == (0 if directions == "2d:61" else np.inf)
+    assert (found.sideways_deg < 1) == (directions == "2d:61")
+
+
+def test_silence_has_no_bearings():
+    settings = settings_of(**SPACE)
+    with AcousticCamera(settings, "cpu") as camera:
+        camera.add(sound(settings, []))
+        assert find_bearings(camera) == []
+        camera.reset()
+        with pytest.raises(DataError, match="no measurement"):
+            find_bearings(camera)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"false_alarm": 0.0}, "false_alarm"), ({"top": 0}, "top"), ({"min_level_db": 1.0}, "min_level_db")],
+)
+def test_arguments_outside_their_limits_are_refused(changes, words):
+    with AcousticCamera(settings_of(), "cpu") as camera, pytest.raises(ArgumentError, match=words):
+        BearingFinder(camera, **changes)
+    with pytest.raises(ArgumentError, match="camera"):
+        find_bearings(None)
