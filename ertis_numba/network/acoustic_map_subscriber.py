@@ -7,7 +7,7 @@ from typing import Any, Self
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import AcousticMap, Measurement
 from ertis_numba.network.keys import ClientKeys
-from ertis_numba.network.subscriber import Subscriber
+from ertis_numba.network.subscriber import Arrival, Subscriber
 from ertis_numba.passive import AcousticCamera, is_passive
 from ertis_numba.settings import Settings
 
@@ -87,6 +87,11 @@ class AcousticMapSubscriber:
     def connected(self) -> bool:
         """True if a central node answers."""
         return self._subscriber.connected
+
+    @property
+    def latest(self) -> Arrival | None:
+        """Details of the last received measurement: its number and times, and the mounting of its sensor."""
+        return self._subscriber.latest
 
     def receive(self, timeout_s: float | None = None) -> AcousticMap | None:
         """Return the next map; None after ``timeout_s``, or once the subscriber is closed.
