@@ -84,7 +84,7 @@ def test_rings_and_rays_match_their_labels():
 @pytest.mark.parametrize("range_m", [(0.0, 0.3), (0.5, 5.0), (2.0, 2.5), (3.0, 3.004), (4.9995, 5.0), (12.0, 12.0006)])
 def test_labels_do_not_overlap(half_deg, range_m, monkeypatch):
     drawn = []
-    monkeypatch.setattr(_axes, "_ink", drawn.append)
+    monkeypatch.setattr(_axes, "ink_of", drawn.append)
     fan = Fan.of(np.radians([-half_deg, 0, half_deg]), np.zeros(3), np.array(range_m))
     place = _axes.Place.of(fan, 640)
     _axes.draw_axes(place, fan, 40.0)

@@ -19,20 +19,22 @@ import numpy as np
 import plyfile
 import pytest
 from PIL import Image
-from scipy import ndimage
+from scipy import ndimage, signal as filters
 from scipy.spatial import KDTree
 
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import JournalEntry
 from ertis_numba.network.sensor_node import SensorNode
+from ertis_numba.passive import AcousticCamera
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording, Settings
 from ertis_numba.simulation import Scene, Sensor
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.targets import Point
-from ertis_numba.storage import open_recording, write_energyscapes
-from ertis_numba.viewer import Polar
+from ertis_numba.storage import open_recording, write_energyscapes, write_recording
+from ertis_numba.viewer import Choices, Polar, ReceivedImage, ViewedMaps
 from ertis_numba.viewer._choices import colour_table
+from tests.test_acoustic_camera import settings_of, sound
 from tests.test_serve import LOOPBACK, serving
 from tests.views import stamped
 
@@ -367,6 +369,64 @@ def test_live_view_lags_less_than_a_second(browser):
         assert process.wait(TIMEOUT_S) == 0, process.stderr.read()
         assert time.monotonic() - begun_s < 1
         live.close()
+
+
+def passive_recording(path):
+    """Recording with low sound from the left and high sound from the right, and its map."""
+    settings = settings_of()
+    rate_hz = settings.recording.sample_rate_hz
+    low, high = sound(settings, [(40, 0.01)], seed=1), sound(settings, [(-20, 0.02)], seed=2)
+    data = filters.sosfiltfilt(filters.butter(8, 26e3, fs=rate_hz, output="sos"), low.data, axis=0)
+    data += filters.sosfiltfilt(filters.butter(8, 28e3, "high", fs=rate_hz, output="sos"), high.data, axis=0)
+    made = Measurement(data.astype(np.float32), settings, Stamp(sensor="front", behaviour="passive"))
+    write_recording(path, [made])
+    with AcousticCamera(settings, "cpu") as camera:
+        return camera.process(made)
+
+
+def test_band_slider_and_levels_choose_the_shown_map(browser, tmp_path):
+    found = passive_recording(tmp_path / "rec.h5")
+    scene = ViewedMaps()
+    scene.take(ReceivedImage(found, None, 0.0))
+
+    def picture_of(**choices):
+        return scene.draw(Choices(dynamic_range_db=20, **choices)).sensors["front"].picture
+
+    pictures = {
+        "all": picture_of(),
+        "low": picture_of(band_hz=22e3),
+        "high": picture_of(band_hz=35e3),
+        "fixed": picture_of(band_hz=35e3, max_level_db=-20.0),
+    }
+    with viewing(tmp_path / "rec.h5") as (_, url):
+        page = Page(browser, url)
+
+        def shown():
+            """Name of the picture that is most similar to the shown one."""
+            pixels, _ = page.picture()
+            size = pixels.shape[1::-1]
+            expected = {name: np.asarray(Image.fromarray(each).resize(size), int) for name, each in pictures.items()}
+            return min(expected, key=lambda name: np.abs(pixels - expected[name]).mean())
+
+        page.wait_until("frames", "Number(text) > 0")
+        eventually(lambda: shown() == "all")
+        rows = page.page.locator("tr[data-band]").all_inner_texts()
+        assert [row.split("\t")[0] for row in rows] == ["all bands", "22.4 kHz", "34.6 kHz"]
+        for row, loudest in zip(rows[1:], found.loudest(), strict=True):
+            level, direction = row.split("\t")[2:]
+            assert float(level.replace("−", "-")) == pytest.approx(loudest.level_dbfs, abs=0.06)
+            assert float(direction.replace("−", "-").rstrip("°")) == pytest.approx(
+                math.degrees(loudest.azimuth_rad), abs=0.6
+            )
+        page.slide(re.compile("^Band"), 1)
+        eventually(lambda: shown() == "low")
+        page.slide(re.compile("^Band"), 2)
+        eventually(lambda: shown() == "high")
+        page.slide("Max. level (dB)", -20)
+        eventually(lambda: shown() == "fixed")
+        page.page.get_by_role("checkbox").check()
+        eventually(lambda: shown() == "high")
+        page.close()
 
 
 def test_each_browser_has_its_own_recording(playback, browser):

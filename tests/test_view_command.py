@@ -13,11 +13,12 @@ from click.testing import CliRunner
 from ertis_cli import view
 from ertis_cli.main import cli
 
-from ertis_numba.storage import write_energyscapes
+from ertis_numba.storage import write_energyscapes, write_recording
 from ertis_numba.viewer import ViewedScene, Viewer
 from ertis_numba.viewer._recordings import MAX_BYTES
 from tests.pages import commands_in, path_of, run_code_here, run_here
 from tests.publishing import Publisher, image as published
+from tests.test_view_maps import passive_noise
 from tests.views import PATIENCE_S, stamped
 
 BIND = socket.socket.bind
@@ -161,7 +162,8 @@ def test_commands_of_the_page_on_the_view_run(tmp_path):
     write_energyscapes(tmp_path / "IMG.h5", stamped(3))
     text = path_of("view").read_text("utf-8")
     commands = [command for command in commands_in(text) if command.startswith("view ")]
-    assert len(commands) == 4
+    assert len(commands) == 6
+    write_recording(tmp_path / "PASSIVE.h5", passive_noise(1))
     assert run_here(tmp_path, commands_in(text)[0]) == ""  # copies the recording
     with Publisher() as publisher, publisher.playing([]):
         for command in commands:

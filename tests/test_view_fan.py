@@ -77,7 +77,7 @@ def test_reflector_behind_is_drawn_at_its_position():
 )
 def test_rays_behind_are_labelled(azimuth_deg, rays, monkeypatch):
     drawn = []
-    monkeypatch.setattr(_axes, "_ink", drawn.append)
+    monkeypatch.setattr(_axes, "ink_of", drawn.append)
     fan = Fan.of(np.radians(azimuth_deg), np.zeros(len(azimuth_deg)), np.array([0.5, 5.0]))
     _axes.draw_axes(_axes.Place.of(fan, 640), fan, 40.0)
     names = [text.get_text() for text in drawn[0].axes[0].texts]

@@ -67,7 +67,7 @@ class Client:
 class Source:
     """Live source with a clock and images that a test controls."""
 
-    is_playback = False
+    is_playback, shows_maps = False, False
     title, state, connected = "source", "live", True
     dropped = skipped = received = 0
 

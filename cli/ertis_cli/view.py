@@ -10,6 +10,7 @@ import time
 import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,13 +21,15 @@ from ertis_cli import _mountings, _network, options
 from ertis_cli._stop_signals import Signals, stopped_by_signals
 
 if TYPE_CHECKING:
-    from ertis_numba.viewer import Live, Playback, Viewer
+    from ertis_numba.viewer import Choices, Live, Playback, Viewer
 
 __all__ = ["view"]
 
 _COLOURS = ("inferno", "viridis", "cividis", "magma")
 _LIVE, _PLAYBACK, _PAGE = "an address", "playback of a file", "a file that --save-html writes as a page"
 _HOST_PORT = re.compile(r"(tcp:)?([^/\\]+:\d{1,5})")
+_IMAGES, _MAPS = "images", "acoustic maps"
+_RANGE_DB, _MAP_RANGE_DB = 40.0, 20.0
 _PAGES = (".html", ".htm")
 _TWICE_S = 0.5  # between two signals of which the second is not an echo of the first
 _ENDING = "ending after the current image; press Ctrl-C to end at once ..."
@@ -38,9 +41,16 @@ _ONLY = {
     "duration": (_LIVE, _PLAYBACK),
     "key": (_LIVE,),
     "server_key": (_LIVE,),
-    "device": (_PLAYBACK, _PAGE),
+    "device": (_PLAYBACK, _PAGE, _MAPS),
+    "threshold": (_IMAGES,),
+    "range_m": (_IMAGES,),
+    "decay": (_IMAGES,),
+    "clean_within_db": (_IMAGES,),
+    "clean_above_mean_db": (_IMAGES,),
+    "band": (_MAPS,),
+    "max_level": (_MAPS,),
 }
-"""Kinds of views that each of these options is for."""
+"""Sources or contents of views that each of these options is for."""
 
 
 @click.command()
@@ -51,6 +61,13 @@ _ONLY = {
     multiple=True,
     metavar="NAME",
     help="Show this sensor only; repeatable; all sensors by default.",
+)
+@click.option(
+    "--acoustic-maps/--images",
+    "acoustic_maps",
+    default=None,
+    help="Show acoustic maps of the sound in measurements, or images of echoes; by default, maps of recordings without "
+    "calls, and images of others.",
 )
 @click.option(
     "--host",
@@ -80,7 +97,22 @@ _ONLY = {
     help="Level of the weakest points to show.",
 )
 @click.option(
-    "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Range of the colours."
+    "--dynamic-range",
+    type=float,
+    metavar="DB",
+    help="Range of the colours; 40 by default, and 20 for acoustic maps.",
+)
+@click.option(
+    "--max-level",
+    type=float,
+    metavar="DB",
+    help="Level of the brightest colour of acoustic maps; that of the loudest direction, rounded up, by default.",
+)
+@click.option(
+    "--band",
+    type=float,
+    metavar="HZ",
+    help="Show the band of acoustic maps that contains this frequency; the sum of all bands by default.",
 )
 @click.option("--range", "range_m", type=options.INTERVAL, metavar="A:B", help="Window of the range axis in metres.")
 @click.option(
@@ -109,11 +141,14 @@ def view(
     *,
     location: str,
     sensors: tuple[str, ...],
+    acoustic_maps: bool | None,
     host: str,
     port: int,
     opened: bool | None,
     threshold: float,
-    dynamic_range: float,
+    dynamic_range: float | None,
+    max_level: float | None,
+    band: float | None,
     range_m: tuple[float, float] | None,
     decay: float,
     colours: str,
@@ -130,14 +165,17 @@ def view(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Show live or recorded images in a browser.
+    """Show live or recorded images or acoustic maps in a browser.
 
     ADDRESS is the address at which a central node publishes. A recording is processed with its own settings during
-    playback, and is shown at its original speed. The page shows range versus azimuth for each sensor, and all sensors
-    on their platform in three dimensions. The command needs the extra 'view'; the page loads nothing from other hosts.
+    playback, and is shown at its original speed. The page shows range versus azimuth, or sound levels over direction,
+    for each sensor, and all sensors on their platform in three dimensions. The command needs the extra 'view'; the page
+    loads nothing from other hosts.
     """
     live = _is_address(location)
-    _require_use(_LIVE if live else _PLAYBACK if html is None else _PAGE)
+    kind = _LIVE if live else _PLAYBACK if html is None else _PAGE
+    is_known = live or acoustic_maps is not None
+    _require_use(kind, (_MAPS if acoustic_maps else _IMAGES,) if is_known else (_IMAGES, _MAPS))
     _network.require_duration(duration)
     if html is not None:
         from ertis_numba import checks
@@ -148,20 +186,33 @@ def view(
     from ertis_numba.viewer import Choices, Viewer
 
     choices = Choices(
-        threshold_db=threshold, dynamic_range_db=dynamic_range, range_m=range_m, decay_s=decay, colours=colours
+        threshold_db=threshold,
+        range_m=range_m,
+        decay_s=decay,
+        colours=colours,
+        band_hz=band,
+        max_level_db=max_level,
+        dynamic_range_db=_RANGE_DB if dynamic_range is None else dynamic_range,
     )
     at_once = html is not None and not live
     with (
         stopped_by_signals() as signals,
         _source(
-            location, sensors, live=live, keys=(key, server_key), device=device, loop=loop, mounting=mounting
+            location,
+            sensors,
+            live=live,
+            keys=(key, server_key),
+            device=device,
+            loop=loop,
+            mounting=mounting,
+            acoustic_maps=acoustic_maps,
         ) as source,
-        nullcontext() if live else _ended(source, signals, quiet=quiet),
+        nullcontext() if live and not acoustic_maps else _ended(source, signals, quiet=quiet),
         Viewer(
             source,
             host="127.0.0.1" if at_once else host,  # no other machine may connect while the page is written
             port=0 if at_once else port,
-            choices=choices,
+            choices=_fitting(choices, kind, source, dynamic_range=dynamic_range),
             clean_within_db=clean_within_db,
             clean_above_mean_db=clean_above_mean_db,
             on_note=lambda text: options.say(text, quiet=quiet),
@@ -196,15 +247,26 @@ def _is_address(location: str) -> bool:
     return live
 
 
-def _require_use(kind: str) -> None:
-    """Raise an error for options without effect, unless they come from a configuration file."""
+def _require_use(kind: str, contents: tuple[str, ...]) -> None:
+    """Raise an error for options without effect, unless they come from a configuration file.
+
+    ``contents`` has the possible contents of the view.
+    """
     context = click.get_current_context()
     names = {each.name: each.opts[0] for each in context.command.params}
     for name, kinds in _ONLY.items():
-        if kind not in kinds and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"{names[name]} is for {' or '.join(kinds)}; remove it with {kind}", context)
+        if not {kind, *contents} & {*kinds} and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            with_this = contents[0] if {*kinds} <= {_IMAGES, _MAPS} else kind
+            raise click.UsageError(f"{names[name]} is for {' or '.join(kinds)}; remove it with {with_this}", context)
     if context.params["html"] is None and context.get_parameter_source("force") is ParameterSource.COMMANDLINE:
         raise click.UsageError("--force is for --save-html; remove it", context)
+
+
+def _fitting(choices: "Choices", kind: str, source: "Live | Playback", *, dynamic_range: float | None) -> "Choices":
+    """Return choices with the default range of the colours, and raise an error for options without effect."""
+    _require_use(kind, (_MAPS if source.shows_maps else _IMAGES,))
+    by_default = _MAP_RANGE_DB if source.shows_maps else _RANGE_DB
+    return replace(choices, dynamic_range_db=by_default if dynamic_range is None else dynamic_range)
 
 
 def _source(
@@ -216,17 +278,27 @@ def _source(
     device: Any,
     loop: bool,
     mounting: Path | None,
+    acoustic_maps: bool | None,
 ) -> "Live | Playback":
     if live:
         from ertis_numba.viewer import Live
 
         given = _mountings.mountings(mounting, sensors or None)
-        return Live(location, sensors=sensors or None, keys=_network.client_keys(*keys), mounting=given)
+        return Live(
+            location,
+            sensors=sensors or None,
+            keys=_network.client_keys(*keys),
+            mounting=given,
+            acoustic_maps=bool(acoustic_maps),
+            device=device,
+        )
     from ertis_numba.storage import sensor_names
     from ertis_numba.viewer import Playback
 
     given = None if mounting is None else _mountings.mountings(mounting, sensors or sensor_names(location))
-    return Playback(location, sensors=sensors or None, device=device, loop=loop, mounting=given)
+    return Playback(
+        location, sensors=sensors or None, device=device, loop=loop, mounting=given, acoustic_maps=acoustic_maps
+    )
 
 
 @contextmanager

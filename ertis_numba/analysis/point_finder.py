@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ertis_numba.analysis.points import PointExtractor
-from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.frames import AcousticMap, Energyscape, PointCloud
 from ertis_numba.geometry import Grid
 
 __all__ = ["PointFinder", "same_directions"]
@@ -41,8 +41,8 @@ def _suits(image: Energyscape, other: Energyscape) -> bool:
     return ours.array == theirs.array and ours.call == theirs.call and same_directions(image, other)
 
 
-def same_directions(image: Energyscape, other: Energyscape) -> bool:
-    """Return True if two images have the same directions."""
+def same_directions(image: Energyscape | AcousticMap, other: Energyscape | AcousticMap) -> bool:
+    """Return True if two images or acoustic maps have the same directions."""
     return all(
         getattr(image, name) is getattr(other, name) or np.array_equal(getattr(image, name), getattr(other, name))
         for name in ("azimuth_rad", "elevation_rad")

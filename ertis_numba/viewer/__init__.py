@@ -1,17 +1,19 @@
 """Live view in the browser; the only package that imports viser.
 
-A source provides images: `Live` those that a central node publishes, `Playback` those of a file. `ViewedScene` computes
-the drawn objects from them, without a browser. `Viewer` shows these on the page and applies the choices made there.
+A source provides images or acoustic maps: `Live` those of a central node, `Playback` those of a file. `ViewedScene` and
+`ViewedMaps` compute the drawn objects from them, without a browser. `Viewer` shows these on the page and applies the
+choices made there.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 from ertis_numba.extras import extra
+from ertis_numba.viewer._acoustic_maps import ViewedMaps
 from ertis_numba.viewer._choices import COLOURS, Choices
 from ertis_numba.viewer._polar import Polar
 from ertis_numba.viewer._scene import ViewedScene
-from ertis_numba.viewer._shapes import Dome, Drawn, DrawnFrame, Pose, ReceivedImage, Sector
+from ertis_numba.viewer._shapes import BandLevel, Dome, Drawn, DrawnFrame, LevelScale, Pose, ReceivedImage, Sector
 
 if TYPE_CHECKING:
     from ertis_numba.viewer._live import Live
@@ -20,16 +22,19 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COLOURS",
+    "BandLevel",
     "Choices",
     "Dome",
     "Drawn",
     "DrawnFrame",
+    "LevelScale",
     "Live",
     "Playback",
     "Polar",
     "Pose",
     "ReceivedImage",
     "Sector",
+    "ViewedMaps",
     "ViewedScene",
     "Viewer",
 ]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import IdentityTransform
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from ertis_numba.figures.sector_grid import draw_grid, part_names
 from ertis_numba.figures.style import THEMES, minus
 from ertis_numba.geometry import Fan, plan_m
 
-__all__ = ["PAGE", "SIDE_PX", "STYLE", "Ink", "Place", "draw_axes", "draw_text"]
+__all__ = ["PAGE", "SIDE_PX", "STYLE", "Ink", "Place", "bare_axes", "draw_axes", "draw_text", "ink_of", "name_colours"]
 
 STYLE: Final = THEMES["dark"]
 """Style of the pictures."""
@@ -56,7 +57,12 @@ class Place:
     @classmethod
     def of(cls, fan: Fan, width_px: int) -> "Place":
         """Return the position of a sector in a picture of a given width."""
-        west, east, low, high = fan.extent_m(fan.range_m[0])
+        return cls.within(fan.extent_m(fan.range_m[0]), width_px)
+
+    @classmethod
+    def within(cls, extent_m: tuple[float, float, float, float], width_px: int) -> "Place":
+        """Return the position of an area, with limits to the right and ahead, in a picture of a given width."""
+        west, east, low, high = extent_m
         inner_px = width_px - 2 * SIDE_PX
         scale_px_m = min(inner_px / (east - west), inner_px * _MAX_RATIO / (high - low))
         tall_px = max(inner_px * _MIN_RATIO, (high - low) * scale_px_m)
@@ -127,39 +133,48 @@ class Ink:
 def draw_axes(place: Place, fan: Fan, dynamic_range_db: float) -> Ink:
     """Draw rings in metres, rays in degrees, the sensor, and the numbers of the colour bar."""
     (x, y), scale = place.sensor_px, place.scale_px_m
-    figure = _sheet(place)
-    axes = figure.add_axes((0, 0, 1, 1), frameon=False)
-    axes.set_xlim(-x / scale, (place.width_px - x) / scale)
-    axes.set_ylim((y - place.height_px) / scale, y / scale)
-    axes.set_axis_off()
+    figure, axes = bare_axes(place)
     (low_m, high_m), half_m = fan.range_m, 0.5 / scale
     rings = max(1, min(6, int((high_m - low_m) * scale / _RING_PX)))
     draw_grid(axes, STYLE, fan, first_m=low_m, largest=rings, spare_m=half_m)
     part_names(axes)
     if 0 <= x <= place.width_px and 0 <= y <= place.height_px - _FLOOR_PX + 1:
         axes.plot(0, 0, marker="^", markersize=8, color=STYLE.ink, scalex=False, scaley=False)
-    left, right, top, bottom = place.scale_px
-    pixels = IdentityTransform()  # From the lower left corner.
-    for share in (0.0, 0.5, 1.0):
-        name, name_px = minus(f"{-dynamic_range_db * (1 - share) + 0.0:g}"), left + share * (right - left)
-        axes.text(name_px, place.height_px - bottom - 3, name, ha="center", va="top", transform=pixels)
-    axes.text(right + 14, place.height_px - (top + bottom) / 2, "dB", va="center", transform=pixels)
-    return _ink(figure)
+    name_colours(axes, place, (-dynamic_range_db, 0.0), "dB")
+    return ink_of(figure)
 
 
 @STYLE.applied()
 def draw_text(place: Place, text: str) -> Ink:
     """Draw a text in the middle of an empty picture."""
-    figure = _sheet(place)
+    figure, _ = bare_axes(place)
     figure.text(0.5, 0.5, text, fontsize=_TEXT_PT, ha="center", va="center")
-    return _ink(figure)
+    return ink_of(figure)
 
 
-def _sheet(place: Place) -> Figure:
-    return Figure(figsize=(place.width_px / _DPI, place.height_px / _DPI), dpi=_DPI)
+def bare_axes(place: Place) -> tuple[Figure, Axes]:
+    """Return a picture with undrawn axes that fill it, in the coordinates of the sector."""
+    (x, y), scale = place.sensor_px, place.scale_px_m
+    figure = Figure(figsize=(place.width_px / _DPI, place.height_px / _DPI), dpi=_DPI)
+    axes = figure.add_axes((0, 0, 1, 1), frameon=False)
+    axes.set_xlim(-x / scale, (place.width_px - x) / scale)
+    axes.set_ylim((y - place.height_px) / scale, y / scale)
+    axes.set_axis_off()
+    return figure, axes
 
 
-def _ink(figure: Figure) -> Ink:
+def name_colours(axes: Axes, place: Place, limits_db: tuple[float, float], unit: str) -> None:
+    """Write the levels of the colour bar, and their unit."""
+    (low_db, high_db), (left, right, top, bottom) = limits_db, place.scale_px
+    pixels = IdentityTransform()  # From the lower left corner.
+    for share in (0.0, 0.5, 1.0):
+        name, name_px = minus(f"{low_db + share * (high_db - low_db) + 0.0:g}"), left + share * (right - left)
+        axes.text(name_px, place.height_px - bottom - 3, name, ha="center", va="top", transform=pixels)
+    axes.text(right + 14, place.height_px - (top + bottom) / 2, unit, va="center", transform=pixels)
+
+
+def ink_of(figure: Figure) -> Ink:
+    """Return a picture as an overlay."""
     file = io.BytesIO()
     figure.savefig(file, format="rgba", dpi=_DPI, transparent=True)
     drawn = np.frombuffer(file.getvalue(), np.uint8).reshape(-1, 4)

@@ -13,6 +13,7 @@ from ertis_numba import checks
 __all__ = [
     "COLOURS",
     "DYNAMIC_RANGE_DB",
+    "LEVELS_DB",
     "LOWEST_THRESHOLD_DB",
     "MAX_DECAY_S",
     "Choices",
@@ -31,6 +32,11 @@ DYNAMIC_RANGE_DB: Final = (10.0, 80.0)
 MAX_DECAY_S: Final = 10.0
 """Maximum persistence of points."""
 
+LEVELS_DB: Final = (-160.0, 160.0)
+"""Lowest and highest level that the brightest colour of acoustic maps can have."""
+
+_DIM: Final = 0.35  # Remaining brightness of an overdue sensor.
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choices:
@@ -47,6 +53,11 @@ class Choices:
     decay_s : float
         Time in which points fade; 0 shows points of the latest image only.
     colours : {"inferno", "viridis", "cividis", "magma"}
+    band_hz : float, optional
+        Frequency of the band that acoustic maps show; the sum of all bands by default.
+    max_level_db : float, optional
+        Level of the brightest colour of acoustic maps, in dBFS or in dB re 20 µPa as the maps have it; by default that
+        of the loudest direction, rounded up to 5 dB.
 
     Raises
     ------
@@ -59,6 +70,8 @@ class Choices:
     range_m: tuple[float, float] | None = None
     decay_s: float = 0.0
     colours: str = COLOURS[0]
+    band_hz: float | None = None
+    max_level_db: float | None = None
 
     def __post_init__(self) -> None:
         checks.between("threshold_db", self.threshold_db, LOWEST_THRESHOLD_DB, 0.0)
@@ -67,9 +80,14 @@ class Choices:
             checks.interval("range_m", self.range_m, 0.0, 10_000.0)
         checks.between("decay_s", self.decay_s, 0.0, MAX_DECAY_S)
         checks.choice("colours", self.colours, COLOURS)
+        if self.band_hz is not None:
+            checks.between("band_hz", self.band_hz, 1.0, 1e9)
+        if self.max_level_db is not None:
+            checks.between("max_level_db", self.max_level_db, *LEVELS_DB)
 
 
 @functools.cache
-def colour_table(colours: str) -> NDArray[np.uint8]:
-    """Return the colours of a map, the lowest level first: (256, 3) uint8."""
-    return np.asarray(mpl.colormaps[colours](np.arange(256), bytes=True)[:, :3], dtype=np.uint8)
+def colour_table(colours: str, *, dim: bool = False) -> NDArray[np.uint8]:
+    """Return the colours of a map, the lowest level first and dim for an overdue sensor: (256, 3) uint8."""
+    table = np.asarray(mpl.colormaps[colours](np.arange(256), bytes=True)[:, :3], dtype=np.uint8)
+    return np.asarray(table * _DIM, dtype=np.uint8) if dim else table

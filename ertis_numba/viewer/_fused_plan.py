@@ -40,7 +40,7 @@ class FusedPlan:
         self._sector: tuple[list[object], Sector] | None = None
         self._polar: tuple[list[object], Polar] | None = None
 
-    def __call__(self, several: Mapping[str, ReceivedImage], choices: Choices) -> Sector:
+    def __call__(self, several: Mapping[str, ReceivedImage[Energyscape]], choices: Choices) -> Sector:
         """Return the image, in the frame of the platform.
 
         Parameters
@@ -58,7 +58,7 @@ class FusedPlan:
             self._sector = made_for, Sector(sector, polar.extent_m)
         return self._sector[1]
 
-    def _image(self, several: Mapping[str, ReceivedImage]) -> Energyscape:
+    def _image(self, several: Mapping[str, ReceivedImage[Energyscape]]) -> Energyscape:
         """Return the fused image of the latest pulse of which all images are here."""
         images = [taken.image for taken in several.values()]
         now_s = max(taken.time_s for taken in several.values())

@@ -1,16 +1,18 @@
-"""Images published by a central node: the latest of each sensor."""
+"""Images or acoustic maps from a central node: the latest of each sensor."""
 
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Final, Literal, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
-from ertis_numba.frames import Energyscape
+from ertis_numba.frames import AcousticMap, Energyscape
+from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.status import Status
 from ertis_numba.network.subscriber import Arrival, Subscriber
 from ertis_numba.storage.recording import Mounting
+from ertis_numba.viewer._acoustic_maps import masked_note
 from ertis_numba.viewer._shapes import Pose, ReceivedImage
 from ertis_numba.viewer._time_steps import usual_s
 
@@ -38,11 +40,17 @@ class Live:
     keys : ClientKeys, optional
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Poses of sensors on their platform, in place of those that the central node sends.
+    acoustic_maps : bool
+        Show acoustic maps, which the thread makes from the measurements. Those with a call are used without its time.
+    device : {"auto", "cpu", "cuda", "numpy"}
+        Device that makes acoustic maps.
 
     Attributes
     ----------
     received : int
-        Number of received images.
+        Number of received images or maps.
+    shows_maps : bool
+        True for acoustic maps.
 
     Raises
     ------
@@ -59,25 +67,40 @@ class Live:
         sensors: Sequence[str] | None = None,
         keys: ClientKeys | None = None,
         mounting: Mapping[str, Mounting] | None = None,
+        acoustic_maps: bool = False,
+        device: Literal["auto", "cpu", "cuda", "numpy"] = "auto",
     ) -> None:
         self._given = {sensor: Pose.of(*place) for sensor, place in (mounting or {}).items()}
         self.title = address
-        self.received = 0
+        self.received, self.shows_maps = 0, acoustic_maps
         self._notes: deque[str] = deque(maxlen=16)
-        # The status lists the sensors. If all are subscribed, it would only take the bandwidth of images.
-        products: tuple[Product, ...] = ("energyscape", "status") if sensors else ("energyscape",)
-        self._subscriber: Subscriber[Item] = Subscriber(
-            address, sensors=sensors, products=products, keys=keys, on_note=self._notes.append
-        )
+        self._subscriber: Subscriber[Item] | AcousticMapSubscriber
+        if acoustic_maps:
+            self._subscriber = AcousticMapSubscriber(
+                address,
+                sensors=sensors,
+                keys=keys,
+                on_note=self._notes.append,
+                changes={"processing.mode": "passive"},
+                device=device,
+            )
+        else:
+            # The status lists the sensors. If all are subscribed, it would only take the bandwidth of images.
+            products: tuple[Product, ...] = ("energyscape", "status") if sensors else ("energyscape",)
+            self._subscriber = Subscriber(
+                address, sensors=sensors, products=products, keys=keys, on_note=self._notes.append
+            )
         self._wanted = set([sensors] if isinstance(sensors, str) else sensors or ())
         self._begun_s = time.monotonic()
         self._connected_s: float | None = None  # Time of the first connection.
         self._is_reported = False  # The missing answer.
         self._turn = threading.Lock()
-        self._waiting: dict[str, Arrival] = {}
+        self._waiting: dict[str, tuple[Energyscape | AcousticMap, Arrival]] = {}
         self._arrived_s: dict[str, deque[float]] = {}
         self._failure: Exception | None = None
         self._superseded = 0
+        self._masked: set[str] = set()  # Sensors whose measurements have a call.
+        self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="ertis-view", daemon=True)
         self._thread.start()
 
@@ -85,6 +108,9 @@ class Live:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._closed.set()
+        if isinstance(self._subscriber, AcousticMapSubscriber):  # It is in use until the thread ends.
+            self._thread.join()
         self._subscriber.close()
         self._thread.join(_STOP_S)
 
@@ -131,7 +157,7 @@ class Live:
         self._is_reported = True
         return reported
 
-    def take(self) -> list[ReceivedImage]:
+    def take(self) -> list[ReceivedImage[Any]]:
         """Return new images, the latest of each sensor.
 
         Raises
@@ -146,16 +172,15 @@ class Live:
             raise self._failure
         return [
             ReceivedImage(
-                arrival.item,
-                self._given.get(arrival.item.stamp.sensor) or Pose.of(arrival.translation_m, arrival.rotation_xyzw),
+                item,
+                self._given.get(item.stamp.sensor) or Pose.of(arrival.translation_m, arrival.rotation_xyzw),
                 arrival.arrived_ns / 1e9,
-                between_s[arrival.item.stamp.sensor],
+                between_s[item.stamp.sensor],
             )
-            for arrival in came
-            if isinstance(arrival.item, Energyscape)
+            for item, arrival in came
         ]
 
-    def latency_s(self, taken: Sequence[ReceivedImage]) -> float | None:
+    def latency_s(self, taken: Sequence[ReceivedImage[Any]]) -> float | None:
         """Return the time since the emission of the oldest of some images; None without timestamps."""
         known_ns = [each.image.stamp.timestamp_ns for each in taken if each.image.stamp.is_timed]
         return (time.time_ns() - min(known_ns)) / 1e9 if known_ns else None
@@ -171,18 +196,21 @@ class Live:
 
     def _run(self) -> None:
         try:
-            while not self._subscriber.closed:
+            while not self._closed.is_set():
                 item = self._subscriber.receive(_POLL_INTERVAL_S)
                 arrival = self._subscriber.latest
                 if isinstance(item, Status):
                     self._find_sensors(item)
-                if not isinstance(item, Energyscape) or arrival is None:
+                if not isinstance(item, Energyscape | AcousticMap) or arrival is None:
                     continue
                 sensor = item.stamp.sensor
+                if isinstance(item, AcousticMap) and item.masked_s and sensor not in self._masked:
+                    self._masked.add(sensor)
+                    self._notes.append(masked_note(sensor))
                 with self._turn:
                     self.received += 1
                     self._superseded += sensor in self._waiting
-                    self._waiting[sensor] = arrival
+                    self._waiting[sensor] = item, arrival
                     self._arrived_s.setdefault(sensor, deque(maxlen=_INTERVALS)).append(arrival.arrived_ns / 1e9)
         except Exception as error:  # noqa: BLE001  whoever looks is to know
             self._failure = error

@@ -15,6 +15,7 @@ import viser
 from ertis_numba.errors import NetworkError
 from ertis_numba.geometry import round_step
 from ertis_numba.viewer._choices import COLOURS, DYNAMIC_RANGE_DB, LOWEST_THRESHOLD_DB, MAX_DECAY_S, Choices
+from ertis_numba.viewer._level_controls import LevelControls
 from ertis_numba.viewer._origins import is_loopback, own_pages
 from ertis_numba.viewer._recordings import MAX_BYTES
 from ertis_numba.viewer._shapes import DrawnFrame
@@ -59,6 +60,8 @@ class ViewerPage:
         Initial choices.
     n_time_steps : int, optional
         Length of the time line; there is none by default.
+    shows_maps : bool
+        Controls of acoustic maps instead of those of images.
 
     Attributes
     ----------
@@ -72,7 +75,15 @@ class ViewerPage:
     """
 
     def __init__(
-        self, host: str, port: int, *, orders: Orders, title: str, choices: Choices, n_time_steps: int | None = None
+        self,
+        host: str,
+        port: int,
+        *,
+        orders: Orders,
+        title: str,
+        choices: Choices,
+        n_time_steps: int | None = None,
+        shows_maps: bool = False,
     ) -> None:
         _require_free(host, port)
         self._orders, self.is_seen = orders, False
@@ -87,12 +98,14 @@ class ViewerPage:
         self._space = Space(self._server)
         self._shown: dict[str, viser.GuiImageHandle] = {}
         self._line: Any = None
+        self._range: Any = None
+        self._level_controls: LevelControls | None = None
         self._recorders: dict[int, tuple[viser.GuiButtonHandle, viser.GuiHtmlHandle]] = {}
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_PX)
         pictures = gui.add_panel()
-        self._pictures = pictures.add_tab("Range and azimuth")
+        self._pictures = pictures.add_tab("Acoustic maps" if shows_maps else "Range and azimuth")
         pictures.dock_left()
         pictures.set_width(_PICTURES_PX)
         self._state = gui.add_html("")
@@ -107,7 +120,7 @@ class ViewerPage:
             )
             self._line = gui.add_slider("Measurement", 0, max(1, n_time_steps - 1), 1, 0, visible=n_time_steps > 1)
             self._obey(self._line, "seek")
-        self._controls(choices)
+        self._controls(choices, shows_maps=shows_maps)
 
     @property
     def url(self) -> str:
@@ -132,6 +145,8 @@ class ViewerPage:
                 shown.label, shown.visible = label, True
                 if shown.image is not drawn.picture:  # Assigning it encodes and sends it to all browsers.
                     shown.image = drawn.picture
+            if self._level_controls is not None and frame.scale is not None:
+                self._level_controls.show(frame.scale)
             for name in self._shown.keys() - frame.sensors.keys():
                 self._shown[name].visible = False
             if self._line is not None and self._line.value != place:
@@ -173,23 +188,30 @@ class ViewerPage:
         with _silence():
             self._server.stop()
 
-    def _controls(self, choices: Choices) -> None:
+    def _controls(self, choices: Choices, *, shows_maps: bool) -> None:
         gui = self._server.gui
-        self._obey(
-            gui.add_slider("Threshold (dB)", LOWEST_THRESHOLD_DB, 0.0, 1.0, choices.threshold_db), "threshold_db"
-        )
+        if shows_maps:
+            self._level_controls = LevelControls(
+                gui, choices, lambda name, value: self._orders.put(ControlRequest(name, value))
+            )
+        else:
+            self._obey(
+                gui.add_slider("Threshold (dB)", LOWEST_THRESHOLD_DB, 0.0, 1.0, choices.threshold_db), "threshold_db"
+            )
         self._obey(
             gui.add_slider("Dynamic range (dB)", *DYNAMIC_RANGE_DB, 1.0, choices.dynamic_range_db), "dynamic_range_db"
         )
-        self._range: Any = gui.add_multi_slider(_RANGE, 0.0, 1.0, 1 / _STEPS, (0.0, 1.0), min_range=2 / _STEPS)
-        self._range.visible = False  # Hidden until the extent of images is known.
-        self._obey(self._range, "range_m")
-        self._obey(gui.add_slider("Decay (s)", 0.0, MAX_DECAY_S, 0.1, choices.decay_s), "decay_s")
+        if not shows_maps:
+            self._range = gui.add_multi_slider(_RANGE, 0.0, 1.0, 1 / _STEPS, (0.0, 1.0), min_range=2 / _STEPS)
+            self._range.visible = False  # Hidden until the extent of images is known.
+            self._obey(self._range, "range_m")
+            self._obey(gui.add_slider("Decay (s)", 0.0, MAX_DECAY_S, 0.1, choices.decay_s), "decay_s")
         self._obey(gui.add_dropdown("Colours", COLOURS, initial_value=choices.colours), "colours")
         self._saving = gui.add_folder("Save")
         with self._saving:
             self._button("Picture (PNG)", "picture")
-            self._button("Points (PLY)", "points")
+            if not shows_maps:
+                self._button("Points (PLY)", "points")
         self._server.on_client_connect(self._greet)
         self._server.on_client_disconnect(self._forget)
 
@@ -227,9 +249,13 @@ class ViewerPage:
             value = getattr(choices, name, None)
             if value is not None and control.value != value:
                 control.value = value
+        if self._level_controls is not None:
+            self._level_controls.put_back(choices)
 
     def limit_range(self, farthest_m: float, window_m: tuple[float, float] | None) -> None:
-        """Set the limits of the range window, and the shown window."""
+        """Set the limits of the range window, and the shown window; acoustic maps have none."""
+        if self._range is None:
+            return
         far_m = max(farthest_m, 0.0 if window_m is None else window_m[1])
         step_m = round_step(far_m, _STEPS)
         top_m = math.ceil(far_m / step_m - 1e-9) * step_m

@@ -1,6 +1,6 @@
 """Paused live view, with single steps."""
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,8 +30,8 @@ class Pause:
         self._steps = 0
         self._first_s: float | None = None  # Arrival of the first image of a step.
         self._due_s: dict[str, float] = {}  # Time from which each sensor is overdue.
-        self._latest: dict[str, ReceivedImage] = {}  # Images that are not shown.
-        self._new: dict[str, ReceivedImage] = {}  # Images since the step.
+        self._latest: dict[str, ReceivedImage[Any]] = {}  # Images that are not shown.
+        self._new: dict[str, ReceivedImage[Any]] = {}  # Images since the step.
 
     def toggle(self, now_s: float) -> None:
         """Pause, or continue."""
@@ -45,7 +45,7 @@ class Pause:
             self.toggle(now_s)
         self._steps += 1
 
-    def shown(self, taken: "Sequence[ReceivedImage]", now_s: float) -> "list[ReceivedImage]":
+    def shown(self, taken: "Sequence[ReceivedImage[Any]]", now_s: float) -> "list[ReceivedImage[Any]]":
         """Return the images to show: all new ones, or during a pause those of a step."""
         came = {each.image.stamp.sensor: each for each in taken}
         self._due_s |= {name: each.due_s for name, each in came.items()}

@@ -6,11 +6,12 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final, Literal, Self
+from typing import Any, Final, Literal, Self
 
 from ertis_numba import kernels
-from ertis_numba.errors import DataError
-from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import AcousticMap, Energyscape, Measurement, Stamp
+from ertis_numba.passive import is_passive
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.storage import (
     EnergyscapeReader,
@@ -21,6 +22,8 @@ from ertis_numba.storage import (
     sensor_names,
 )
 from ertis_numba.storage.recording import Mounting
+from ertis_numba.viewer._acoustic_maps import masked_note
+from ertis_numba.viewer._map_sequence import MapSequence
 from ertis_numba.viewer._shapes import Pose, ReceivedImage
 from ertis_numba.viewer._time_steps import UNTIMED_S, SensorTimeline, TimeStep, time_steps_of
 
@@ -43,6 +46,9 @@ class Playback:
         Repeat at the end.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Poses of sensors on their platform, in place of those in the file.
+    acoustic_maps : bool, optional
+        Show acoustic maps of a recording; by default if none of its measurements is for images. Measurements with a
+        call are used without its time.
 
     Attributes
     ----------
@@ -53,6 +59,8 @@ class Playback:
     anew : bool
         True if the last images are unrelated to earlier ones, as after `seek`.
     playing : bool
+    shows_maps : bool
+        True for acoustic maps.
     held : bool
         Time does not start yet, because no browser is connected; the first time step is processed all the same.
     received, skipped : int
@@ -63,7 +71,7 @@ class Playback:
     DataError
         The file cannot be read or contains nothing.
     ArgumentError
-        A sensor does not exist.
+        A sensor does not exist, or acoustic maps are requested of a file of images.
     DeviceError
         The device does not exist.
     """
@@ -79,12 +87,14 @@ class Playback:
         device: Literal["auto", "cpu", "cuda", "numpy"] = "auto",
         loop: bool = False,
         mounting: Mapping[str, Mounting] | None = None,
+        acoustic_maps: bool | None = None,
     ) -> None:
         self._given = {sensor: Pose.of(*place) for sensor, place in (mounting or {}).items()}
         self.path = Path(path)
         self.title = self.path.name
         self._device, self._loop = device, loop
         self._pipelines: dict[str, Pipeline] = {}
+        self._map_sequences: dict[str, MapSequence] = {}
         self._readers: dict[str, RecordingReader | EnergyscapeReader] = {}
         self._stack = ExitStack()
         opened: Callable[..., RecordingReader | EnergyscapeReader] = (
@@ -96,11 +106,17 @@ class Playback:
                 self._stack.callback(reader.close)
             if device == "cuda" and any(isinstance(each, RecordingReader) for each in self._readers.values()):
                 kernels.load(device)  # A missing device is reported before anything is shown.
-            self.time_steps, self._notes = time_steps_of(
-                {name: reader.stamps() for name, reader in self._readers.items()}
-            )
+            stamps = {name: reader.stamps() for name, reader in self._readers.items()}
+            self.time_steps, self._notes = time_steps_of(stamps)
             if not self.time_steps:
                 raise DataError(f"{path} holds no measurement; give a file with one")
+            self.shows_maps = self._are_maps(stamps) if acoustic_maps is None else acoustic_maps
+            if self.shows_maps:
+                if opened is open_energyscapes:
+                    raise ArgumentError(f"{path} holds images; give a recording for acoustic maps")
+                self._notes += [
+                    masked_note(name) for name, each in stamps.items() if any(one.behaviour == "active" for one in each)
+                ]
             self._stack = self._stack.pop_all()
         self._tracks = {name: SensorTimeline.of(name, self.time_steps) for name in self._readers}
         self.playing, self.place, self.shown, self.anew = True, 0, 0, True
@@ -109,7 +125,7 @@ class Playback:
         self._begun: tuple[float, int] | None = None  # Start of the playback: time and time step.
         self._made: int | None = None  # None for images that stand alone.
         self._jumps = self._plays = self._made_in = 0  # Number of seeks, and of starts and stops.
-        self._ready: dict[str, ReceivedImage] = {}
+        self._ready: dict[str, ReceivedImage[Any]] = {}
         self._ready_for, self._ready_anew = 0, True
         self._turn = threading.Lock()
         self._closed = threading.Event()
@@ -123,6 +139,8 @@ class Playback:
         self._end()
         for pipeline in self._pipelines.values():
             pipeline.close()
+        for sequence in self._map_sequences.values():
+            sequence.close()
         self._stack.close()
 
     def _end(self) -> None:
@@ -173,7 +191,7 @@ class Playback:
         self._jumps += 1
         self._plays += 1
 
-    def take(self) -> list[ReceivedImage]:
+    def take(self) -> list[ReceivedImage[Any]]:
         """Return the images of the time step that was due last, nothing if they were taken.
 
         Playback has the recorded speed: time steps without enough time are skipped and counted. The last image of a
@@ -197,11 +215,11 @@ class Playback:
                 self.shown, self.anew = self._ready_for, self._ready_anew
         return ready
 
-    def at(self, place: int) -> list[ReceivedImage]:
+    def at(self, place: int) -> list[ReceivedImage[Any]]:
         """Return the images of a time step."""
         return [self._taken(name, place, number) for name, number in self.time_steps[place].measurements]
 
-    def latency_s(self, _: Sequence[ReceivedImage]) -> float | None:
+    def latency_s(self, _: Sequence[ReceivedImage[Any]]) -> float | None:
         """Return None: the age of a recording is not of interest."""
         return None
 
@@ -230,7 +248,7 @@ class Playback:
         except Exception as error:  # noqa: BLE001  whoever looks is to know
             self._failure = error
 
-    def _put(self, place: int, taken: dict[str, ReceivedImage], *, anew: bool) -> None:
+    def _put(self, place: int, taken: dict[str, ReceivedImage[Any]], *, anew: bool) -> None:
         """Store processed images, with untaken ones of the same playback."""
         self.received += len(taken)
         self._ready_anew = anew or (bool(self._ready) and self._ready_anew)
@@ -262,12 +280,29 @@ class Playback:
         else:
             self.playing = False
 
-    def _taken(self, name: str, place: int, number: int) -> ReceivedImage:
+    def _taken(self, name: str, place: int, number: int) -> ReceivedImage[Any]:
         reader = self._readers[name]
-        item = reader[number]
-        image = item if isinstance(item, Energyscape) else self._processed(name, item)
+        image: Energyscape | AcousticMap
+        if self.shows_maps and isinstance(reader, RecordingReader):
+            image = self._map(name, reader, number)
+        else:
+            item = reader[number]
+            image = item if isinstance(item, Energyscape) else self._processed(name, item)
         pose = self._given.get(name) or Pose.of(reader.translation_m, reader.rotation_xyzw)
         return ReceivedImage(image, pose, self.time_steps[place].time_s, self._tracks[name].interval_s)
+
+    def _are_maps(self, stamps: Mapping[str, Sequence[Stamp]]) -> bool:
+        """Return True for a recording without any measurement for images."""
+        return all(
+            isinstance(reader, RecordingReader) and all(is_passive(reader.settings, stamp) for stamp in stamps[name])
+            for name, reader in self._readers.items()
+        )
+
+    def _map(self, name: str, reader: RecordingReader, number: int) -> AcousticMap:
+        """Return the acoustic map that ends with a measurement."""
+        if name not in self._map_sequences:
+            self._map_sequences[name] = MapSequence(reader, device=self._device)
+        return self._map_sequences[name](number)
 
     def _processed(self, name: str, measurement: Measurement) -> Energyscape:
         """Return the image of a measurement; other air gives other ranges and needs another pipeline."""

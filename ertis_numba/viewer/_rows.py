@@ -74,8 +74,9 @@ def rows_of(
         "rate": ("rate", f"{counts.rate_hz:.1f} Hz"),
         "latency": ("capture to shown", _NONE if latency_s is None else f"{1e3 * latency_s:.0f} ms"),
         "dropped": ("dropped, skipped", f"{source.dropped}, {source.skipped}"),
-        "points": ("points", str(sum(each.n_points for each in sensors.values()))),
     }
+    if not source.shows_maps:
+        rows["points"] = ("points", str(sum(each.n_points for each in sensors.values())))
     if live:
         rows["held"] = ("not shown, paused", str(n_held))
     unplaced = [name for name, each in sensors.items() if each.pose is None]

@@ -90,9 +90,10 @@ def with_legend(page: str, title: str, frame: DrawnFrame | None) -> str:
     frame : DrawnFrame or None
         The pictures of its first four sensors are shown; they have colour bars.
     """
+    unit = "" if frame is None else frame.unit
     sensors = [] if frame is None else [*frame.sensors.items()][:_MAX_PICTURES]
     pictures = "".join(
-        f'<div>{html.escape(name)}, latest image: dB re strongest</div><img alt="range and azimuth" '
+        f'<div>{html.escape(name)}, latest image: {unit}</div><img alt="levels of directions" '
         f'src="data:image/png;base64,{base64.b64encode(_png(drawn.picture)).decode()}">'
         for name, drawn in sensors
     )

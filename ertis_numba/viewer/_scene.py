@@ -25,7 +25,6 @@ _MAX_POINTS: Final = 512  # Limit per image.
 # Limit on fading clouds of a sensor: fifteen per second for the maximum persistence, and some more.
 _MAX_CLOUDS: Final = 256
 _FARTHEST_DOME: Final = 0.25  # Radius of the dome, relative to the visible range.
-_DIM: Final = 0.35  # Remaining brightness of an overdue sensor.
 
 Table: TypeAlias = NDArray[np.uint8]
 
@@ -52,7 +51,7 @@ class _Cloud:
 class _SensorImages:
     """State of a sensor, with its last drawn objects for reuse."""
 
-    latest: ReceivedImage
+    latest: ReceivedImage[Energyscape]
     clouds: deque[_Cloud] = field(default_factory=lambda: deque(maxlen=_MAX_CLOUDS))
     polar: Polar | None = None
     polar_for: tuple[object, ...] = ()
@@ -107,7 +106,7 @@ class ViewedScene:
         """Discard all images, as after a seek."""
         self._sensors.clear()
 
-    def take(self, taken: ReceivedImage) -> None:
+    def take(self, taken: ReceivedImage[Energyscape]) -> None:
         """Add an image to draw next; points of later times are discarded, as after a restart of the playback."""
         if self._clean_db != (None, None):
             within_db, above_mean_db = self._clean_db
@@ -180,7 +179,7 @@ def _chosen(cloud: PointCloud, some: NDArray[np.bool_]) -> PointCloud:
     )
 
 
-def _cloud_of(cloud: PointCloud, taken: ReceivedImage) -> _Cloud:
+def _cloud_of(cloud: PointCloud, taken: ReceivedImage[Energyscape]) -> _Cloud:
     return _Cloud(
         cloud,
         (taken.pose or UNTURNED).placed(cloud.position_m),
@@ -190,7 +189,7 @@ def _cloud_of(cloud: PointCloud, taken: ReceivedImage) -> _Cloud:
     )
 
 
-def _is_level(taken: ReceivedImage) -> bool:
+def _is_level(taken: ReceivedImage[Energyscape]) -> bool:
     """Return True if an image lies in the horizontal plane of a platform, and its pose is known."""
     return taken.pose is not None and taken.image.is_planar and is_level(taken.pose)
 
@@ -202,18 +201,13 @@ def _until_s(timely: list[_SensorImages], sensors: dict[str, Drawn], choices: Ch
     return min((kept.latest.due_s for kept in timely), default=math.inf)
 
 
-def _table(choices: Choices, *, dim: bool) -> Table:
-    table = colour_table(choices.colours)
-    return np.asarray(table * _DIM, dtype=np.uint8) if dim else table
-
-
 def _drawn(
     kept: _SensorImages, choices: Choices, now_s: float, pose: Pose | None, *, overdue: bool, alone: bool
 ) -> Drawn:
     """Return the drawn objects of a sensor, whose shape is separate if it is ``alone``."""
     taken, polar = kept.latest, kept.polar
     assert polar is not None  # noqa: S101  it was prepared
-    table = _table(choices, dim=overdue)
+    table = colour_table(choices.colours, dim=overdue)
     shape = choices.threshold_db, kept.outside and choices.range_m
     drawn_for = (*kept.levels_for, choices.colours, overdue, alone, *shape)
     if kept.drawn_for != drawn_for:

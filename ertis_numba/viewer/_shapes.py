@@ -3,15 +3,31 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final, Generic, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.frames import Energyscape, PointCloud, Stamp
+from ertis_numba.frames import AcousticMap, Energyscape, PointCloud, Stamp
 from ertis_numba.settings import Settings
 
-__all__ = ["UNTURNED", "Dome", "Drawn", "DrawnFrame", "Pose", "ReceivedImage", "Sector"]
+__all__ = [
+    "UNTURNED",
+    "BandLevel",
+    "Dome",
+    "Drawn",
+    "DrawnFrame",
+    "LevelScale",
+    "Pose",
+    "ReceivedImage",
+    "Sector",
+    "Unit",
+]
+
+Unit: TypeAlias = Literal["dBFS", "dB re 20 µPa", "dB"]
+"""Unit of the levels of acoustic maps."""
+
+Shown_co = TypeVar("Shown_co", Energyscape, AcousticMap, covariant=True)
 
 _OVERDUE_S: Final = 1.0  # Lower limit, because images arrive in bursts on a busy network or computer.
 _UNKNOWN_S: Final = 10.0  # Time without an image after a single one, whose interval is unknown.
@@ -56,12 +72,12 @@ UNTURNED: Final = Pose()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReceivedImage:
-    """An image to show.
+class ReceivedImage(Generic[Shown_co]):
+    """An image or acoustic map to show.
 
     Attributes
     ----------
-    image : Energyscape
+    image : Energyscape or AcousticMap
     pose : Pose or None
         None if the mounting is unknown.
     time_s : float
@@ -70,7 +86,7 @@ class ReceivedImage:
         Typical interval between images of the sensor, if known.
     """
 
-    image: Energyscape
+    image: Shown_co
     pose: Pose | None
     time_s: float
     interval_s: float | None = None
@@ -100,7 +116,7 @@ class Sector:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dome:
-    """Maximum over range of each direction with an echo, on a sphere around the sensor.
+    """Levels of directions on a sphere around the sensor, those of echoes or of an acoustic map.
 
     Attributes
     ----------
@@ -131,7 +147,7 @@ class Drawn:
     overdue : bool
         True if the image is so old that the sensor may have failed. It is drawn dim, and not fused.
     picture : (row, column, 3) uint8
-        Picture of range and azimuth, with axes.
+        Picture of range and azimuth, or of an acoustic map, with axes.
     shape : Sector or Dome, optional
         Image on the platform; None if it is part of a fused image, or not drawn.
     position_m : (point, axis) float32
@@ -156,6 +172,60 @@ class Drawn:
     n_points: int
 
 
+@dataclass(frozen=True, slots=True)
+class BandLevel:
+    """Loudest direction of a band, of all sensors.
+
+    Attributes
+    ----------
+    band_hz : (low, high), optional
+        None for the sum of all bands.
+    level_db : float
+        -inf for silence.
+    sensor : str
+    azimuth_deg, elevation_deg : float
+    is_shown : bool
+        True for the band of the pictures.
+    """
+
+    band_hz: tuple[float, float] | None
+    level_db: float
+    sensor: str
+    azimuth_deg: float
+    elevation_deg: float
+    is_shown: bool
+
+    @property
+    def centre_hz(self) -> float | None:
+        """Geometric mean of the edges; None for the sum of all bands."""
+        return None if self.band_hz is None else math.sqrt(self.band_hz[0] * self.band_hz[1])
+
+
+@dataclass(frozen=True, slots=True)
+class LevelScale:
+    """Levels of the darkest and the brightest colour of acoustic maps, and the levels of the bands.
+
+    Attributes
+    ----------
+    low_db, high_db : float
+    unit : {"dBFS", "dB re 20 µPa", "dB"}
+        Sound pressure level if the settings of all sensors state the sensitivity of the microphones. ``dB`` for the
+        method ``music``, whose numbers have no reference.
+    bands : tuple of BandLevel
+        The sum of all bands, and each band by frequency.
+    """
+
+    low_db: float
+    high_db: float
+    unit: Unit
+    bands: tuple[BandLevel, ...]
+
+    def shade(self, level_db: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Return the colours of levels: 0 for the darkest, 255 for the brightest."""
+        share = np.clip((level_db - self.low_db) / (self.high_db - self.low_db), 0, 1)
+        return np.asarray(np.rint(255 * share), dtype=np.uint8)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnFrame:
     """Drawn objects of all sensors.
@@ -174,6 +244,8 @@ class DrawnFrame:
     until_s : float
         Time by the clock of the source until which the frame is valid without new images: then a point fades, or a
         sensor becomes overdue.
+    scale : LevelScale, optional
+        Colours of acoustic maps; None for images.
     """
 
     sensors: dict[str, Drawn]
@@ -181,6 +253,12 @@ class DrawnFrame:
     fused: Sector | None = None
     height_m: float = 0.0
     until_s: float = math.inf
+    scale: LevelScale | None = None
+
+    @property
+    def unit(self) -> str:
+        """Unit of the levels in the pictures."""
+        return "dB re strongest" if self.scale is None else self.scale.unit
 
     @property
     def centre_m(self) -> tuple[float, float, float]:

@@ -85,7 +85,8 @@ class Space:
             position=(0.0, 0.0, -_GROUND * half_m),
             fade_distance=8 * half_m,
         )
-        self._name_distances(half_m, step_m)
+        if frame.scale is None:  # The spheres of acoustic maps have no distance.
+            self._name_distances(half_m, step_m)
         x, y, z = frame.centre_m
         away_m = farthest_m * (1.2 if len(names) == 1 else 1.25)
         self._stand((x - away_m, y, z + away_m), (x, y, z))

@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from ertis_numba.errors import ArgumentError, ErtisError
+from ertis_numba.viewer._acoustic_maps import ViewedMaps
 from ertis_numba.viewer._choices import Choices
 from ertis_numba.viewer._origins import is_loopback
 from ertis_numba.viewer._page import ControlRequest, ViewerPage
@@ -36,7 +37,7 @@ _OURS: Final = "ours"  # name of the recording that no browser requested
 
 
 class Viewer:
-    """Page that shows the images of a source; use it in a ``with`` statement.
+    """Page that shows the images or acoustic maps of a source; use it in a ``with`` statement.
 
     Parameters
     ----------
@@ -80,7 +81,11 @@ class Viewer:
         self._source, self._on_note = source, on_note
         self._playback: Playback | None = source if source.is_playback is True else None
         self._orders: queue.SimpleQueue[ControlRequest | None] = queue.SimpleQueue()
-        self._scene = ViewedScene(clean_within_db=clean_within_db, clean_above_mean_db=clean_above_mean_db)
+        self._scene: ViewedScene | ViewedMaps = (
+            ViewedMaps()
+            if source.shows_maps
+            else ViewedScene(clean_within_db=clean_within_db, clean_above_mean_db=clean_above_mean_db)
+        )
         self._frame: DrawnFrame | None = None
         self.is_local = is_loopback(host)
         self._page = ViewerPage(
@@ -90,6 +95,7 @@ class Viewer:
             title=source.title,
             choices=self.choices,
             n_time_steps=None if self._playback is None else len(self._playback.time_steps),
+            shows_maps=source.shows_maps,
         )
         self._recordings = Recordings(self._page.serializer, self._completion)
         self._file: ToFile | None = None
@@ -282,7 +288,7 @@ class Viewer:
         self._page.show(self._frame, place)
         self._recordings.add(frames=int(new))
 
-    def _taken(self) -> "list[ReceivedImage]":
+    def _taken(self) -> "list[ReceivedImage[Any]]":
         """Return the images to show: none during a pause, except for steps."""
         taken = self._source.take()
         return taken if self._playback is not None else self._pause.shown(taken, self._source.clock_s)
