@@ -54,6 +54,18 @@ position_m = [-0.6, 2.9, 0.4]
 strength_db = -10.0
 
 [[points]]
+position_m = [-0.9, 1.7, 0.4]
+strength_db = -8.0
+
+[[points]]
+position_m = [-0.2, 2.5, 0.4]
+strength_db = -8.0
+
+[[points]]
+position_m = [-1.1, 2.6, 0.4]
+strength_db = -8.0
+
+[[points]]
 waypoints = [[0.0, -1.5, 2.0, 0.4], [1.0, -1.5, 1.9, 0.4]]
 
 [[spheres]]
@@ -294,16 +306,18 @@ def test_echoes_lie_at_their_range_and_on_their_side(exported):
 
 def test_reflectors_are_those_of_the_scene(exported):
     reflectors = exported.reflectors
-    assert [str(kind).strip() for kind in reflectors["type"]] == ["point", "point", "circle", "wall", "wall"]
-    np.testing.assert_allclose(reflectors["position"][:3], [[-0.3, 1.3, 0.4], [-0.6, 2.9, 0.4], [-1.4, 2.2, 0.4]])
-    np.testing.assert_allclose(reflectors["radius"][:, 0], [0, 0, 0.2, 0, 0])
-    np.testing.assert_allclose(reflectors["reflectivity"][:, 0], [10**-0.3, 10**-0.5, 1, 1, 1])
+    assert [str(kind).strip() for kind in reflectors["type"]] == [*["point"] * 5, "circle", "wall", "wall"]
+    np.testing.assert_allclose(
+        reflectors["position"][[0, 1, 5]], [[-0.3, 1.3, 0.4], [-0.6, 2.9, 0.4], [-1.4, 2.2, 0.4]]
+    )
+    np.testing.assert_allclose(reflectors["radius"][:, 0], [0, 0, 0, 0, 0, 0.2, 0, 0])
+    np.testing.assert_allclose(reflectors["reflectivity"][:, 0], [10**-0.3, 10**-0.5, *[10**-0.4] * 3, 1, 1, 1])
     assert not reflectors["has_signature"].any()
-    assert np.isnan(reflectors["endpoint1"][:3]).all()
-    np.testing.assert_allclose(reflectors["position"][4], [0, 4, 0], atol=1e-9)
-    ends = np.stack([reflectors[name][4] for name in ("endpoint1", "endpoint2")])
+    assert np.isnan(reflectors["endpoint1"][:6]).all()
+    np.testing.assert_allclose(reflectors["position"][7], [0, 4, 0], atol=1e-9)
+    ends = np.stack([reflectors[name][7] for name in ("endpoint1", "endpoint2")])
     np.testing.assert_allclose(np.sort(ends[:, 0]), [-1.5, 1.5], atol=1e-9)
-    ends = np.sort([reflectors[name][3, 1] for name in ("endpoint1", "endpoint2")])
+    ends = np.sort([reflectors[name][6, 1] for name in ("endpoint1", "endpoint2")])
     y = exported["gt_pose"][:, 1]
     np.testing.assert_allclose(ends, [y.min() - 3.0, y.max() + 3.0], atol=1e-9)
 
@@ -486,7 +500,7 @@ def test_commands_and_code_of_the_format_page_run(folder, tmp_path):
     (tmp_path / "HALL.toml").symlink_to(folder / "scene.toml")
     (command,) = commands_in(PAGE)
     run_here(tmp_path, command)
-    assert len(BatslamReader.of(tmp_path / "SET.mat").reflectors["type"]) == 5
+    assert len(BatslamReader.of(tmp_path / "SET.mat").reflectors["type"]) == 8
     (code,) = python_in(PAGE)
     run_code_here(tmp_path, code)
     found = BatslamReader.of(tmp_path / "SET.mat")
