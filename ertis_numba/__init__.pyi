@@ -80,9 +80,11 @@ from .simulation.render import Simulator as Simulator, render as render
 from .simulation.scene import Scene as Scene, load_scene as load_scene
 from .storage import (
     add_poses as add_poses,
+    open_acoustic_maps as open_acoustic_maps,
     open_energyscapes as open_energyscapes,
     open_recording as open_recording,
     read_map as read_map,
+    write_acoustic_maps as write_acoustic_maps,
     write_energyscapes as write_energyscapes,
     write_recording as write_recording,
 )

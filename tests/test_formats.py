@@ -7,6 +7,7 @@ import pytest
 
 from ertis_numba.settings import PRESETS, Settings
 from ertis_numba.storage.schema import (
+    ACOUSTIC_MAP,
     CONVENTIONS,
     ENERGYSCAPE,
     FORMAT_VERSION,
@@ -22,6 +23,7 @@ from tests.pages import page
 
 PAGE = page("formats")
 SHARED = [*STAMPS, *(variable for variable in RECORDING if variable.name == "settings")]
+SHARED_NAMES = {variable.name for variable in SHARED}
 PCM = next(variable for variable in RECORDING_OF_PCM if variable.name == "pcm")
 EITHER = [each for variable in RECORDING for each in ([variable, PCM] if variable.name == "pdm" else [variable])]
 
@@ -43,6 +45,7 @@ def rows(first):
         ("scene", TRUTH),
         ("log_odds", OCCUPANCY_MAP),
         ("amplitude", [variable for variable in ENERGYSCAPE if variable not in SHARED]),
+        ("power", [variable for variable in ACOUSTIC_MAP if variable.name not in SHARED_NAMES]),
     ],
 )
 def test_format_tables_match_the_code(first, table):
@@ -53,7 +56,7 @@ def test_format_tables_match_the_code(first, table):
         if variable.dtype:
             assert kinds == ["text" if variable.dtype == "str" else np.dtype(variable.dtype).name]
         else:
-            assert len(kinds) > 1
+            assert kinds == [np.dtype(kind).name for kind in kinds]
 
 
 def test_format_names_and_versions_match_the_code():

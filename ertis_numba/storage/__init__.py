@@ -1,7 +1,13 @@
-"""Files of recordings, energyscapes and occupancy maps; the only package that imports h5py."""
+"""Files of recordings, energyscapes, acoustic and occupancy maps; the only package that imports h5py."""
 
 from ertis_numba.atomic_files import atomic_write, check_target
 from ertis_numba.storage._reader import file_kind, sensor_names
+from ertis_numba.storage.acoustic_maps import (
+    AcousticMapReader,
+    AcousticMapWriter,
+    open_acoustic_maps,
+    write_acoustic_maps,
+)
 from ertis_numba.storage.energyscape import (
     EnergyscapeReader,
     EnergyscapeWriter,
@@ -19,6 +25,8 @@ from ertis_numba.storage.recording import (
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 
 __all__ = [
+    "AcousticMapReader",
+    "AcousticMapWriter",
     "EnergyscapeReader",
     "EnergyscapeWriter",
     "GroundTruth",
@@ -30,6 +38,7 @@ __all__ = [
     "check_target",
     "file_kind",
     "is_map",
+    "open_acoustic_maps",
     "open_energyscapes",
     "open_recording",
     "platform_trajectory",
@@ -37,6 +46,7 @@ __all__ = [
     "recorded_trajectory",
     "require_fitting_poses",
     "sensor_names",
+    "write_acoustic_maps",
     "write_energyscapes",
     "write_map_file",
     "write_recording",

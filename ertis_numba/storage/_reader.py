@@ -1,4 +1,4 @@
-"""Base class of the readers of both kinds of file."""
+"""Base class of the readers of files with one row per measurement."""
 
 import errno
 import hashlib
@@ -33,29 +33,33 @@ _OPEN_FOR_WRITE = "already open for write"  # HDF5 marks a file as open, and a k
 _OPTIONAL_DIMS = {"word"}  # The axis is left out if its length is one.
 _MAX_NAMES = 64  # Limit on sensors in an error.
 _STORED_END = re.compile(r"stored_eof = (\d+)")
-_KIND_NAMES = {"recording": "a recording", "energyscape": "an energyscape file"}
+_KIND_NAMES = {
+    "recording": "a recording",
+    "energyscape": "an energyscape file",
+    "acoustic_map": "a file of acoustic maps",
+}
 _WANTED = "a recording or an energyscape file"
 
 
 def file_kind(path: str | Path) -> str:
-    """Return ``recording`` or ``energyscape``.
+    """Return ``recording``, ``energyscape`` or ``acoustic_map``.
 
     Raises
     ------
     DataError
-        The file cannot be read, or is neither.
+        The file cannot be read, or is none of them.
     """
     with open_file(Path(path)) as file:
         return _kind(file, Path(path), _WANTED)
 
 
 def sensor_names(path: str | Path) -> tuple[str, ...]:
-    """Return the names of the sensors in a recording or an energyscape file, in the order of the file.
+    """Return the names of the sensors in a recording or a result of processing, in the order of the file.
 
     Raises
     ------
     DataError
-        The file cannot be read, or is neither.
+        The file cannot be read, or is of another kind.
     """
     with open_file(Path(path)) as file, reading(file, Path(path)):
         _kind(file, Path(path), _WANTED)
@@ -84,12 +88,13 @@ class FileReader(Sequence[Item]):
     """
 
     _kind: ClassVar[str]
+    _wanted: ClassVar[str] = _WANTED
     _data: str
     _table: tuple[Variable, ...]
 
     def __init__(self, path: str | Path, *, sensor: str | None = None) -> None:
         self.path = Path(path)
-        self._file = open_file(self.path)
+        self._file = open_file(self.path, self._wanted)
         try:
             with self._reading():
                 self._require_kind()
@@ -101,7 +106,7 @@ class FileReader(Sequence[Item]):
                 self._rows = RowReader(self._group, self._data)
                 self.attributes = {name: to_python(value) for name, value in self._file.attrs.items()}
                 self.settings = received_settings(
-                    self._group["settings"][()], f"{self.path}: settings", are_applied=self._kind == "energyscape"
+                    self._group["settings"][()], f"{self.path}: settings", are_applied=self._kind != "recording"
                 )
                 self._require_shapes()
                 self._load()
@@ -116,7 +121,7 @@ class FileReader(Sequence[Item]):
 
     @abstractmethod
     def _item(self, index: int) -> Item:
-        """Return one row as a measurement or an energyscape."""
+        """Return one row as a measurement, an energyscape or an acoustic map."""
 
     @abstractmethod
     def _load(self) -> None:

@@ -1,4 +1,4 @@
-"""Base class of the writers of both kinds of file: part file, rows, and verification."""
+"""Base class of the writers of files with one row per measurement: part file, rows, and verification."""
 
 import os
 import re
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.atomic_files import atomic_write, check_target, remedy, require_free_space
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.frames import AcousticMap, Energyscape, Measurement
 from ertis_numba.storage._rows import RowReader, RowWriter
 from ertis_numba.storage.schema import (
     CONVENTIONS,
@@ -32,7 +32,7 @@ from ertis_numba.storage.truth import GroundTruth, GroundTruthLog, write_truth
 
 __all__ = ["FileWriter"]
 
-Item = TypeVar("Item", Measurement, Energyscape)
+Item = TypeVar("Item", Measurement, Energyscape, AcousticMap)
 
 
 class FileWriter(ABC, Generic[Item]):

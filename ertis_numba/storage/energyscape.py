@@ -19,6 +19,7 @@ from ertis_numba.frames import Energyscape, Trajectory
 from ertis_numba.geometry import mounting as mounted, self_contained
 from ertis_numba.storage._mounting import read_mounting, write_mounting
 from ertis_numba.storage._poses import POSE_SIZES, read_poses, write_poses
+from ertis_numba.storage._provenance import provenance, recorded_mountings
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowReader, RowWriter
 from ertis_numba.storage._writer import FileWriter
@@ -81,7 +82,7 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         checks.choice("dtype", dtype, ("float32", "float16"))
         readers = [recording] if isinstance(recording, RecordingReader) else [*(recording or ())]
         check_target(Path(path), overwrite=overwrite, sources=[reader.path for reader in readers])
-        super().__init__(path, overwrite=overwrite, attributes=_provenance(readers), truth=truth)
+        super().__init__(path, overwrite=overwrite, attributes=provenance(readers), truth=truth)
         self._dtype = np.dtype(dtype).newbyteorder("<").str
         self._first: dict[str, Energyscape] = {}
         self._predicted: dict[str, dict[str, float | str]] = {}
@@ -90,11 +91,7 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in readers if reader.truth}
         self._trajectories = {reader.sensor: reader.trajectory for reader in readers if reader.trajectory is not None}
         self._given = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
-        self._mounting = {
-            reader.sensor: mounted(reader.sensor, reader.translation_m.tolist(), reader.rotation_xyzw.tolist())
-            for reader in readers
-            if reader.translation_m is not None and reader.rotation_xyzw is not None
-        } | self._given
+        self._mounting = recorded_mountings(readers) | self._given
 
     def note_mounting(self, sensor: str, translation_m: Sequence[float], rotation_xyzw: Sequence[float]) -> None:
         """Set the mounting of a sensor.
@@ -217,22 +214,6 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
             reflectors=tuple(truth.reflectors[row] for row in rows),
             sources=tuple(truth.sources[row] for row in rows if truth.sources),
         )
-
-
-def _provenance(readers: Sequence[RecordingReader]) -> dict[str, str]:
-    """Return the attributes of the file that describe its recording."""
-    if not readers:
-        return {"source": "", "history": ""}
-    first = readers[0]
-    for reader in readers:
-        if reader.uuid != first.uuid:
-            raise ArgumentError(f"{reader.path} is not the same recording as {first.path}; write one file for each")
-    return {
-        "source": first.path.name,
-        "history": f"processed from recording {first.uuid}",
-        "recording_uuid": first.uuid,
-        "recording_sha256": first.sha256(),
-    }
 
 
 class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):

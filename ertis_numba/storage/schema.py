@@ -1,6 +1,6 @@
 """Variables and format version of each kind of file.
 
-Both kinds are HDF5 and netCDF-4 at once: every axis is a dimension scale, so that xarray, h5dump and MATLAB show the
+All kinds are HDF5 and netCDF-4 at once: every axis is a dimension scale, so that xarray, h5dump and MATLAB show the
 same names. One group ``/sensors/<name>`` holds one sensor.
 """
 
@@ -22,6 +22,7 @@ from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 
 __all__ = [
+    "ACOUSTIC_MAP",
     "CHUNK_ROWS",
     "CONVENTIONS",
     "ENERGYSCAPE",
@@ -161,6 +162,25 @@ ENERGYSCAPE: Final = (
     Variable("range", ("range",), "<f8", "half of the sound path", "m"),
     _SETTINGS,
 )
+
+ACOUSTIC_MAP: Final = (
+    *STAMPS[:-1],
+    Variable("crc32", ("time",), "<u4", "CRC-32 of the row of power, as its bytes lie in the file"),
+    Variable(
+        "power",
+        ("time", "direction", "band"),
+        "",
+        "mean square of the sound from a direction at the array; full scale is 1, so that a full-scale tone has 1/2",
+    ),
+    Variable("azimuth", ("direction",), "<f8", "azimuth, from x forward towards y", "radian"),
+    Variable("elevation", ("direction",), "<f8", "elevation, from the horizontal plane towards z", "radian"),
+    Variable("band_edge", ("band", "edge"), "<f8", "lower and upper edge of each band", "Hz"),
+    Variable("n_measurements", ("time",), "<i8", "measurements whose powers were averaged"),
+    Variable("n_blocks", ("time",), "<i8", "blocks of samples whose powers were averaged"),
+    Variable("masked", ("time",), "<f8", "time of the call, left out at the start of each measurement", "s"),
+    _SETTINGS,
+)
+"""Variables of acoustic maps; the stamp of a map is that of its last measurement."""
 
 OCCUPANCY_MAP: Final = (
     Variable("log_odds", ("y", "x"), "<f4", "logarithm of p / (1 - p) of the probability p that a cell is occupied"),
