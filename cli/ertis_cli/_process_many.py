@@ -209,7 +209,7 @@ def _lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
             yield from _plan_lines(event, reported=reported)
             yield f"{event.output}: exists already, kept"
         case "skipped":
-            yield f"{event.recording}: an energyscape file, not a recording; skipped"
+            yield f"{event.recording}: a result of processing, not a recording; skipped"
 
 
 def _plan_lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:

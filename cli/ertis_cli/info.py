@@ -13,7 +13,9 @@ from ertis_cli import _tables, options
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.health import Health
-    from ertis_numba.storage import EnergyscapeReader, RecordingReader
+    from ertis_numba.storage import AcousticMapReader, EnergyscapeReader, RecordingReader
+
+    _Reader = RecordingReader | EnergyscapeReader | AcousticMapReader
 
 __all__ = ["info"]
 
@@ -38,7 +40,7 @@ _COLUMNS = {  # name: digits in the report, and in the table
 )
 @options.as_json
 def info(*, path: Path, of_health: bool, as_json: bool) -> None:
-    """Show the contents of a recording, an image file or a map.
+    """Show the contents of a recording, an image file, or a file of acoustic maps or of an occupancy map.
 
     In JSON, "sensors" lists the properties of each sensor. If there is only one sensor, the top level repeats its
     properties.
@@ -66,18 +68,22 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
 
 
 def _by_sensor(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the properties of a recording or an energyscape file, and those of each sensor."""
-    from ertis_numba.storage import file_kind, open_energyscapes, open_recording
+    """Return the properties of a recording or of its results, and those of each sensor."""
+    from ertis_numba.storage import file_kind, open_acoustic_maps, open_energyscapes, open_recording
 
     kind = file_kind(path)
     about: dict[str, Any] = {}
     sections: list[dict[str, Any]] = []
-    reader: RecordingReader | EnergyscapeReader
+    reader: _Reader
     for name in options.sensors_of(path, None):
         if kind == "recording":
             with open_recording(path, sensor=name) as reader:
                 about = _file(reader)
                 sections.append({**_sensor(reader), **_recording(reader)})
+        elif kind == "acoustic_map":
+            with open_acoustic_maps(path, sensor=name) as reader:
+                about = {**_file(reader), **_origin(reader)}
+                sections.append({**_sensor(reader), **_maps_of_sound(reader)})
         else:
             with open_energyscapes(path, sensor=name) as reader:
                 about = {**_file(reader), **_origin(reader)}
@@ -128,7 +134,7 @@ def _readable(value: Any) -> str:
     return f"{time[1]} {time[2]}{(time[3] or '')[:4]} UTC" if time else str(value)
 
 
-def _file(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
+def _file(reader: "_Reader") -> dict[str, Any]:
     attributes = reader.attributes
     return {
         "file": str(reader.path),
@@ -141,11 +147,11 @@ def _file(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
     }
 
 
-def _origin(reader: "EnergyscapeReader") -> dict[str, Any]:
+def _origin(reader: "EnergyscapeReader | AcousticMapReader") -> dict[str, Any]:
     return {name: reader.attributes.get(name, "") for name in ("recording_uuid", "recording_sha256")}
 
 
-def _sensor(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
+def _sensor(reader: "_Reader") -> dict[str, Any]:
     from ertis_numba.air import sound_speed_m_s
     from ertis_numba.geometry import microphones
 
@@ -160,7 +166,7 @@ def _sensor(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
         "temperature_c": settings.air.temperature_c,
         "humidity_percent": settings.air.humidity_percent,
         "sound_speed_m_s": round(sound_speed_m_s(settings.air), 2),
-        "simulated": reader.truth is not None,
+        **({} if reader.attributes["ertis_format"] == "acoustic_map" else {"simulated": reader.truth is not None}),
     }
 
 
@@ -197,7 +203,22 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
     }
 
 
-def _mounting(reader: "RecordingReader | EnergyscapeReader") -> dict[str, Any]:
+def _maps_of_sound(reader: "AcousticMapReader") -> dict[str, Any]:
+    passive = reader.settings.passive
+    return {
+        "measurements": int(reader.n_measurements.sum()),
+        "maps": len(reader),
+        "directions": len(reader.azimuth_rad),
+        "bands": len(reader.band_hz),
+        "band_hz": [round(float(edge_hz), 1) for edge_hz in (reader.band_hz.min(), reader.band_hz.max())],
+        "method": passive.method,
+        "averages": passive.averages,
+        **({} if passive.focus_m is None else {"focus_m": passive.focus_m}),
+        **_mounting(reader),
+    }
+
+
+def _mounting(reader: "_Reader") -> dict[str, Any]:
     if reader.translation_m is None or reader.rotation_xyzw is None:
         return {"mounting": "unknown"}
     return {"translation_m": reader.translation_m.tolist(), "rotation_xyzw": reader.rotation_xyzw.tolist()}

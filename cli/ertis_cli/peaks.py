@@ -1,4 +1,4 @@
-"""``ertis peaks``: reflectors in an energyscape file."""
+"""``ertis peaks``: reflectors in an energyscape file, or the loudest directions of acoustic maps."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _tables, options
+from ertis_cli import _acoustic_maps, _tables, options
+from ertis_cli._config import typed
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison, Match
@@ -28,11 +29,16 @@ _ERROR_COLUMNS: dict[str, _tables.Side] = {
     "level_error_db": "right",
     "reflector": "left",
 }
+_LOUDEST_COLUMNS: dict[str, _tables.Side] = {
+    "sensor": "left",
+    **dict.fromkeys(("measurement", "band_khz", "azimuth_deg", "elevation_deg"), "right"),
+}
+_OF_IMAGES = ("top", "min_level", "detector", "false_alarm", "everything", "truth")
 _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "level_db": 4, "level_dbfs": 4}
 
 
 @click.command()
-@options.input_file("IMG.h5")
+@options.input_file("IMG.h5|MAPS.h5")
 @options.sensor("List this sensor only; all sensors by default.")
 @click.option(
     "--top", type=int, metavar="N", help=f"Largest number per measurement; {_TOP} by default, all with --truth."
@@ -73,7 +79,7 @@ def peaks(
     truth: bool,
     as_json: bool,
 ) -> None:
-    """List the reflectors in an energyscape file.
+    """List the reflectors in an energyscape file, or the loudest directions of acoustic maps.
 
     There is one entry per reflector, the strongest of each measurement first. level_db is relative to the strongest
     peak, and level_dbfs to a full-scale echo in every microphone. Maxima that noise alone may cause in
@@ -87,7 +93,13 @@ def peaks(
     that no reflector explains, as spurious, and peaks of reflectors that do not count, as explained (see
     'ertis compare --help'). In JSON, "truth" of each peak is its true reflector or null, "spurious" is true or
     false, and "missed" lists missed reflectors.
+
+    For a file of acoustic maps, there is one entry per map and band: the loudest direction. level_dbfs is its
+    mean square, where a full-scale tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones.
+    Maps of the method music have no levels. Only --sensor, --measurement and --json apply to them.
     """
+    from ertis_numba.storage import file_kind
+
     if truth and top is not None:
         raise click.UsageError(
             "--top would omit reflectors that --truth compares; give one of them", click.get_current_context()
@@ -106,6 +118,9 @@ def peaks(
             "--false-alarm needs --detector cfar; add it, or remove --false-alarm", click.get_current_context()
         )
     sensors = options.sensors_of(path, sensor)
+    if file_kind(path) == "acoustic_map":
+        _list_loudest(path, sensors, measurement, as_json=as_json)
+        return
     options.note_unlisted_directions(path, sensors)
     if truth:
         compared: list[tuple[dict[str, Any], Comparison]] = [
@@ -134,6 +149,39 @@ def peaks(
         click.echo("nothing found", err=True)
         return
     table.print()
+
+
+def _list_loudest(path: Path, sensors: tuple[str, ...], measurement: int | None, *, as_json: bool) -> None:
+    """Print the loudest direction of each band of acoustic maps."""
+    from ertis_numba.storage import open_acoustic_maps
+
+    for name in _OF_IMAGES:
+        if typed(name):
+            option = {"everything": "all"}.get(name, name.replace("_", "-"))
+            raise click.UsageError(
+                f"--{option} is for images, but {path} holds acoustic maps; leave it out", click.get_current_context()
+            )
+    rows: list[dict[str, Any]] = []
+    for name in sensors:
+        with open_acoustic_maps(path, sensor=name) as maps:
+            for index in options.places(measurement, len(maps)):
+                found = maps[index]
+                place = {"sensor": name, "measurement": index}
+                rows += [place | row for row in _acoustic_maps.loudest_rows(found)]
+    if as_json:
+        options.print_json({"loudest": rows})
+        return
+    is_pressure = any(row["level_db"] is not None for row in rows)
+    levels = ("level_dbfs", "level_db") if is_pressure else ("level_dbfs",)
+    columns: dict[str, _tables.Side] = {**_LOUDEST_COLUMNS, **dict.fromkeys(levels, "right")}
+    _tables.TextTable(columns, [_loudest_cells(row, levels) for row in rows]).print()
+
+
+def _loudest_cells(row: dict[str, Any], levels: tuple[str, ...]) -> tuple[str, ...]:
+    band = "–".join(f"{edge_hz / 1e3:.1f}" for edge_hz in row["band_hz"])
+    angles = (f"{row[name]:+.2f}" for name in ("azimuth_deg", "elevation_deg"))
+    shown = ("-" if row[name] is None else f"{row[name]:.1f}" for name in levels)
+    return (row["sensor"], str(row["measurement"]), band, *angles, *shown)
 
 
 def _finder(

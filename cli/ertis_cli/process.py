@@ -1,4 +1,4 @@
-"""``ertis process``: process recordings into energyscapes."""
+"""``ertis process``: process recordings into energyscapes or acoustic maps."""
 
 import functools
 from contextlib import ExitStack, closing, contextmanager
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _fuse, _mountings, _plans, _presets, _process_many, _results, options
+from ertis_cli import _acoustic_maps, _fuse, _mountings, _plans, _presets, _process_many, _results, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -30,8 +30,8 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     "target",
     type=click.Path(),
     metavar="FILE|DIR",
-    help="Energyscape file to write, REC.energy.h5 beside the recording by default; a folder for several recordings; "
-    "FILE.npz for signals or beams.",
+    help="File to write, by default REC.energy.h5 beside the recording, or REC.acoustic.h5 for acoustic maps; a folder "
+    "for several recordings; FILE.npz for signals or beams.",
 )
 @options.sensor("Process this sensor only; all sensors by default.")
 @click.option(
@@ -71,6 +71,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     metavar="DB|PRESET",
     help="Error budget of images, as in -40, or draft, standard, fine, exact; the settings' own by default.",
 )
+@_acoustic_maps.map_options
 @options.plan
 @click.option("--explain", is_flag=True, help="First print the plan with its predicted error and time.")
 @click.option(
@@ -153,7 +154,11 @@ def process(
     as_json: bool,
     **other: Any,
 ) -> None:
-    """Process recordings into energyscapes.
+    """Process recordings into energyscapes, or passive measurements into acoustic maps.
+
+    Measurements without a call become acoustic maps: sound power from each direction, in bands of frequencies. If only
+    some measurements of a recording are passive, they are left out, and the others become images. With --mode passive,
+    all become maps, without the time of the call.
 
     With --fuse, all sensors of the recordings belong to one platform, and there is one image around it per SYNC pulse.
     Echoes of a sensor's call that another sensor received appear where their reflector is.
@@ -169,6 +174,7 @@ def process(
     The fast method chooses the fastest plan whose predicted error meets --max-error. The error is relative to the exact
     image, over all directions and ranges.
     """
+    keys = {name: other.pop(name) for name in [*other] if name.startswith("passive_")}
 
     def changed(recorded: "Settings") -> "Settings":
         settings = options.settings_with(
@@ -186,6 +192,7 @@ def process(
             wavefront=wavefront,
             max_error_db=max_error_db,
         )
+        settings = _acoustic_maps.with_map_options(settings, keys)
         if not _results.is_results_file(target):
             _results.require_image(settings)
         _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
@@ -193,6 +200,7 @@ def process(
 
     _require_options_of(fuse=fuse, target=target)
     if fuse:
+        _acoustic_maps.require_none("--fuse makes images; leave out --fuse")
         _fuse.write_fused(
             [Path(each) for each in paths],
             Path(target) if target else Path(paths[0]).with_suffix(".fused.h5"),
@@ -224,6 +232,7 @@ def process(
         verify=verify,
     )
     if _process_many.are_meant(paths, target):
+        _acoustic_maps.require_none("several recordings become images; give one recording")
         _process_many.process_many(
             paths, target, wanted, workers=workers, scheduler=scheduler, quiet=quiet, as_json=as_json
         )
@@ -231,6 +240,7 @@ def process(
     _require_options_of_one(target)
     path = Path(paths[0])
     if target is not None and _results.is_results_file(target):
+        _acoustic_maps.require_none(f"{target} holds signals or beams; give a .h5 file")
         _results.write_results(
             path,
             Path(target),
@@ -244,6 +254,23 @@ def process(
             plan=plan,
         )
         return
+    sensors = options.sensors_of(path, sensor)
+    if _acoustic_maps.are_wanted(path, sensors, changed):
+        _acoustic_maps.write_maps(
+            path,
+            Path(target) if target else path.with_suffix(".acoustic.h5"),
+            changed,
+            sensors=sensors,
+            mounting=wanted.mounting,
+            strict=strict,
+            force=force,
+            quiet=quiet,
+            as_json=as_json,
+            device=device,
+            threads=threads,
+        )
+        return
+    _acoustic_maps.require_none("measurements were emitted, which become images; give --mode passive")
     target_file = Path(target) if target else path.with_suffix(".energy.h5")
     report = _process_one(path, target_file, wanted, quiet=quiet, as_json=as_json)
     _note_mountings(target_file, quiet=quiet)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba import checks
+from ertis_numba.campaign.echo_measurements import count_images, passive_note, require_images
 from ertis_numba.campaign.events import Event, Outcome, RecordingEnded, RecordingProgress, RecordingStarted
 from ertis_numba.campaign.existing_output import difference
 from ertis_numba.campaign.folder import clear_parts, exclusive_folder
@@ -41,6 +42,7 @@ class _RecordingState:
     target: Path
     measurements: int = 0
     wanted: dict[str, Settings] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
     is_kept: bool = False
 
     def ended(self, outcome: Outcome, **more: Any) -> RecordingEnded:
@@ -222,17 +224,15 @@ class Campaign:
         elif task.action == "look":
             yield from self._handle_inspection(case, news.result)
         else:
-            yield case.ended("kept" if case.is_kept else "made", made=news.result)
+            warnings = [*case.notes, *news.result["warnings"]]
+            yield case.ended("kept" if case.is_kept else "made", made=news.result | {"warnings": warnings})
 
     def _handle_inspection(self, case: _RecordingState, reported: dict[str, Any]) -> Iterator[Event]:
         if reported.get("skipped"):
             yield case.ended("skipped")
             return
         try:
-            for name, text in reported["sensors"].items():
-                recorded = Settings.from_toml(text, f"{case.found.path}: settings")
-                case.wanted[name] = self_contained(_absolute(self._options.settings(recorded)))
-            case.measurements = reported["measurements"]
+            self._choose_images(case, reported)
             made = reported["made"]
             differs = "" if made is None else difference(made, case.wanted, self._options.mounting)
         except (ErtisError, OSError) as error:
@@ -245,6 +245,20 @@ class Campaign:
             yield case.ended("failed", error=f"output {case.target} exists and {differs}; {remedy}")
         else:
             yield from self._advance(case)
+
+    def _choose_images(self, case: _RecordingState, reported: dict[str, Any]) -> None:
+        """Set the settings of each sensor that has images, and the number of images."""
+        for name, text in reported["sensors"].items():
+            recorded = Settings.from_toml(text, f"{case.found.path}: settings")
+            settings = self_contained(_absolute(self._options.settings(recorded)))
+            behaviours = reported["behaviours"][name]
+            n_images = count_images(settings, behaviours)
+            case.measurements += n_images
+            if n_images:  # Otherwise, the sensor has no measurement that a worker could report.
+                case.wanted[name] = settings
+            else:
+                case.notes.append(passive_note(case.found.path, name, 0, sum(behaviours.values())))
+        require_images(case.found.path, case.measurements)
 
     def _handle_existing(self, case: _RecordingState, sensors: dict[str, Any]) -> Iterator[Event]:
         """Report an existing output, or examine its processing first if the options request that."""

@@ -11,6 +11,7 @@ from typing import Any
 
 from ertis_numba import kernels
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
+from ertis_numba.campaign.echo_measurements import EchoMeasurements, require_images
 from ertis_numba.campaign.sensor_processing import SensorProcessing, describe_faults
 from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.errors import DataError
@@ -19,7 +20,7 @@ from ertis_numba.prediction import planner_of, predict
 from ertis_numba.settings import Settings
 from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.wavefronts import plane_wave_error_db
-from ertis_numba.storage import EnergyscapeWriter, RecordingReader, open_recording
+from ertis_numba.storage import EnergyscapeWriter, open_recording
 
 __all__ = ["RecordingJob", "check_recording", "prepare_recording"]
 
@@ -32,7 +33,7 @@ class RecordingJob:
     """A recording that is ready to be processed; nothing is written yet."""
 
     def __init__(
-        self, recordings: Sequence[RecordingReader], runs: Sequence[SensorProcessing], writer: EnergyscapeWriter
+        self, recordings: Sequence[EchoMeasurements], runs: Sequence[SensorProcessing], writer: EnergyscapeWriter
     ) -> None:
         self._recordings, self._runs, self._writer = recordings, runs, writer
         self.measurements = sum(map(len, recordings))
@@ -95,7 +96,7 @@ def prepare_recording(
         Limit on images that wait to be written, in bytes. See `SensorProcessing`.
     warn : callable
         Called with a line for each sensor that has faulty microphones, whose echoes do not match the call, or whose
-        images may exceed the error budget.
+        images may exceed the error budget, and for each sensor with passive measurements, which are left out.
     show : callable
         Called with the name of a sensor and each result about its plan.
 
@@ -108,19 +109,27 @@ def prepare_recording(
     ------
     DataError
         Microphones are faulty and ``options.strict`` is set, or the error of an image exceeds its budget and
-        ``options.verify`` is set.
+        ``options.verify`` is set, or all measurements are passive.
     ErtisError
         The recording, its settings or the target is invalid.
     """
     with ExitStack() as stack:
-        recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in sensors]
-        chosen = [
-            options.settings(recording.settings) if settings is None else settings[recording.sensor]
-            for recording in recordings
-        ]
-        mounting = {name: place for name, place in (options.mounting or {}).items() if name in sensors}
+        readers = [stack.enter_context(open_recording(path, sensor=name)) for name in sensors]
+        every = {
+            name: options.settings(reader.settings) if settings is None else settings[name]
+            for name, reader in zip(sensors, readers, strict=True)
+        }
+        recordings, chosen = _with_echoes(
+            [EchoMeasurements(reader, every[reader.sensor]) for reader in readers], every, warn
+        )
+        imaged = [recording.sensor for recording in recordings]
+        mounting = {name: place for name, place in (options.mounting or {}).items() if name in imaged}
         writer = EnergyscapeWriter(
-            target, recording=recordings, mounting=mounting, dtype=options.dtype, overwrite=options.overwrite
+            target,
+            recording=[recording.recording for recording in recordings],
+            mounting=mounting,
+            dtype=options.dtype,
+            overwrite=options.overwrite,
         )
         checks = _begin_checks(stack, recordings, chosen)
         runs = [
@@ -165,7 +174,10 @@ def check_recording(
         The recording is invalid.
     """
     with ExitStack() as stack:
-        recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in settings]
+        recordings = [
+            EchoMeasurements(stack.enter_context(open_recording(path, sensor=name)), each)
+            for name, each in settings.items()
+        ]
         checks = _begin_checks(stack, recordings, list(settings.values()))
         runs = [
             SensorProcessing(pipeline, batch=1) for pipeline in stack.enter_context(pipelines(list(settings.values())))
@@ -176,7 +188,19 @@ def check_recording(
         return {**(runs[0].reported if len(runs) == 1 else {}), "sensors": rows}
 
 
-def _wavefront(planner: Planner, recording: RecordingReader, show: _Show) -> dict[str, float]:
+def _with_echoes(
+    several: Sequence[EchoMeasurements], settings: Mapping[str, Settings], warn: Callable[[str], None]
+) -> tuple[list[EchoMeasurements], list[Settings]]:
+    """Return the sensors that have images, and their settings; report measurements that are left out."""
+    require_images(several[0].path, sum(map(len, several)))
+    for each in several:
+        if each.note:
+            warn(each.note)
+    kept = [each for each in several if len(each)]
+    return kept, [settings[each.sensor] for each in kept]
+
+
+def _wavefront(planner: Planner, recording: EchoMeasurements, show: _Show) -> dict[str, float]:
     """Return, and report, the error of plane wavefronts at the first range if it exceeds the budget."""
     settings = planner.settings
     if settings.processing.wavefront != "plane":
@@ -190,7 +214,7 @@ def _wavefront(planner: Planner, recording: RecordingReader, show: _Show) -> dic
 
 
 def _begin_checks(
-    stack: ExitStack, recordings: Sequence[RecordingReader], settings: Sequence[Settings]
+    stack: ExitStack, recordings: Sequence[EchoMeasurements], settings: Sequence[Settings]
 ) -> list[Future[_Checks]]:
     """Start the checks of all sensors' signals in a thread, in parallel with planning and loading of pipelines."""
     thread = ThreadPoolExecutor(1, thread_name_prefix="ertis-checks")
@@ -198,7 +222,7 @@ def _begin_checks(
     return [thread.submit(_check, *each) for each in zip(recordings, settings, strict=True)]
 
 
-def _check(recording: RecordingReader, settings: Settings) -> _Checks:
+def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
     """Return the faults of a sensor's microphones, empty if there are none, and the match of its call."""
     first = recording[0]
     faults = describe_faults(f"{recording.path}: sensor {recording.sensor}", replace(first, settings=settings))
@@ -209,7 +233,7 @@ def _check(recording: RecordingReader, settings: Settings) -> _Checks:
 
 def _check_sensor(
     run: SensorProcessing,
-    recording: RecordingReader,
+    recording: EchoMeasurements,
     checks: _Checks,
     options: CampaignOptions,
     warn: Callable[[str], None],

@@ -9,17 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 from ertis_numba.analysis.health import health
 from ertis_numba.analysis.health.kinds import DISABLE
+from ertis_numba.campaign.echo_measurements import EchoMeasurements
 from ertis_numba.campaign.tasks import MAX_WAITING_BYTES
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
-from ertis_numba.storage import EnergyscapeWriter, RecordingReader
+from ertis_numba.storage import EnergyscapeWriter
 
 if TYPE_CHECKING:
     from ertis_numba.prediction import Prediction
 
-__all__ = ["SensorProcessing", "describe_faults"]
+__all__ = ["SensorProcessing", "describe_faults", "require_same_air"]
 
 
 def describe_faults(name: str, measurement: Measurement) -> str:
@@ -79,7 +80,7 @@ class SensorProcessing:
         """Return a measurement with the settings of the pipeline, which may correct its array, call or air."""
         return replace(measurement, settings=self.pipeline.settings)
 
-    def write(self, recording: RecordingReader, writer: EnergyscapeWriter) -> Iterator[None]:
+    def write(self, recording: EchoMeasurements, writer: EnergyscapeWriter) -> Iterator[None]:
         """Process a recording and write its images; yield after each.
 
         Raises
@@ -93,7 +94,7 @@ class SensorProcessing:
         while group := list(itertools.islice(measurements, self._size)):
             if as_recorded:
                 for measurement in group:
-                    _require_same_air(measurement, settings)
+                    require_same_air(measurement, settings)
             images = self._processed([self.with_pipeline_settings(measurement) for measurement in group])
             images.reverse()
             while images:  # Written images are released: on a GPU, the next batch needs their memory.
@@ -122,8 +123,14 @@ class SensorProcessing:
         }
 
 
-def _require_same_air(measurement: Measurement, settings: Settings) -> None:
-    """Refuse a measurement in other air, because its ranges would differ from the range axis."""
+def require_same_air(measurement: Measurement, settings: Settings) -> None:
+    """Refuse a measurement in other air, because its ranges and delays would differ from those of the others.
+
+    Raises
+    ------
+    DataError
+        The air differs from that of the settings.
+    """
     came, wanted = measurement.settings.air, settings.air
     if came != wanted:
         raise DataError(

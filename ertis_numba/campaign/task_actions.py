@@ -6,6 +6,7 @@ Arguments and results can be represented in JSON, so that an action runs in any 
 import functools
 import os
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -61,16 +62,21 @@ def _one_line(error: OSError | MemoryError) -> str:
 
 
 def _inspect(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
-    """Return sensors, settings and number of measurements of a recording, and a description of its existing output."""
+    """Return sensors, settings and measurements of a recording, and a description of its existing output.
+
+    ``behaviours`` has the number of measurements of each sensor by their behaviour.
+    """
     path = Path(arguments["path"])
-    if not arguments["named"] and file_kind(path) == "energyscape":
+    if not arguments["named"] and file_kind(path) != "recording":
         return {"skipped": True}
     names = sensor_names(path) if arguments["sensor"] is None else (arguments["sensor"],)
     with ExitStack() as stack:
         recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in names]
         return {
             "sensors": {recording.sensor: recording.settings.to_toml() for recording in recordings},
-            "measurements": sum(map(len, recordings)),
+            "behaviours": {
+                recording.sensor: Counter(stamp.behaviour for stamp in recording.stamps()) for recording in recordings
+            },
             "made": inspect_output(Path(arguments["target"]), recordings[0], arguments["dtype"]),
         }
 

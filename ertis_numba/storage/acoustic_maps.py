@@ -108,6 +108,8 @@ class AcousticMapReader(FileReader[AcousticMap], DegreesFromRadians):
         Directions in the sensor frame, in radians.
     band_hz : (band, 2) float64
         Lower and upper edge of each band in hertz.
+    n_measurements : (map,) int64
+        Measurements in each map.
     translation_m : (3,) float64, or None
         Position of the sensor in metres; None if its mounting is unknown.
     rotation_xyzw : (4,) float64, or None
@@ -122,12 +124,14 @@ class AcousticMapReader(FileReader[AcousticMap], DegreesFromRadians):
     azimuth_rad: NDArray[np.float64]
     elevation_rad: NDArray[np.float64]
     band_hz: NDArray[np.float64]
+    n_measurements: NDArray[np.int64]
     translation_m: NDArray[np.float64] | None
     rotation_xyzw: NDArray[np.float64] | None
 
     def _load(self) -> None:
         for name, field in _AXES.items():
             setattr(self, field, np.asarray(self._group[name][:]))
+        self.n_measurements = np.asarray(self._group["n_measurements"][:])
         self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
 
     def _sizes(self) -> dict[str, int]:
@@ -142,7 +146,7 @@ class AcousticMapReader(FileReader[AcousticMap], DegreesFromRadians):
                 band_hz=self.band_hz,
                 settings=self.settings,
                 stamp=self._rows.stamp(index, self.sensor),
-                n_measurements=self._rows.column("n_measurements", index),
+                n_measurements=int(self.n_measurements[index]),
                 n_blocks=self._rows.column("n_blocks", index),
                 masked_s=self._rows.column("masked", index),
             )

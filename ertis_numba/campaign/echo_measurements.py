@@ -1,0 +1,89 @@
+"""Measurements of a recording that become images: those that are not passive."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import overload
+
+from ertis_numba.errors import DataError
+from ertis_numba.frames import Behaviour, Measurement, Stamp
+from ertis_numba.passive import is_passive
+from ertis_numba.settings import Settings
+from ertis_numba.storage import RecordingReader
+
+__all__ = ["EchoMeasurements", "count_images", "passive_note", "require_images"]
+
+
+class EchoMeasurements(Sequence[Measurement]):
+    """Measurements of one sensor that become images of echoes, each read when it is indexed.
+
+    Parameters
+    ----------
+    recording : RecordingReader
+    settings : Settings
+        Their ``processing.mode`` decides, as for `is_passive`.
+
+    Attributes
+    ----------
+    recording : RecordingReader
+    path : Path
+    sensor : str
+    settings : Settings
+        Settings of the recording.
+    """
+
+    def __init__(self, recording: RecordingReader, settings: Settings) -> None:
+        self.recording = recording
+        self.path: Path = recording.path
+        self.sensor, self.settings = recording.sensor, recording.settings
+        self._places = [place for place, stamp in enumerate(recording.stamps()) if not is_passive(settings, stamp)]
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @overload
+    def __getitem__(self, index: int) -> Measurement: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Measurement]: ...
+    def __getitem__(self, index: int | slice) -> Measurement | list[Measurement]:
+        if isinstance(index, slice):
+            return [self.recording[place] for place in self._places[index]]
+        return self.recording[self._places[index]]
+
+    def __iter__(self) -> Iterator[Measurement]:
+        return (self.recording[place] for place in self._places)
+
+    @property
+    def note(self) -> str:
+        """Line on the passive measurements that are left out; empty if there are none."""
+        return passive_note(self.path, self.sensor, len(self), len(self.recording))
+
+
+def count_images(settings: Settings, behaviours: Mapping[Behaviour, int]) -> int:
+    """Return the number of measurements that become images, of their numbers by behaviour."""
+    return sum(count for behaviour, count in behaviours.items() if not is_passive(settings, Stamp(behaviour=behaviour)))
+
+
+def passive_note(path: Path, sensor: str, n_images: int, n_measurements: int) -> str:
+    """Return a line on passive measurements, which have no image; empty if there are none."""
+    if n_images == n_measurements:
+        return ""
+    count = f"{n_measurements - n_images} of {n_measurements}"
+    return (
+        f"{path}: {count} measurements of sensor {sensor} are passive and left out; give --mode passive for acoustic "
+        "maps, or --mode active for images of all"
+    )
+
+
+def require_images(path: Path, n_images: int) -> None:
+    """Refuse a recording of which no measurement becomes an image.
+
+    Raises
+    ------
+    DataError
+        All measurements of all sensors are passive.
+    """
+    if not n_images:
+        raise DataError(
+            f"{path}: all measurements are passive, and become acoustic maps only if a recording is processed alone; "
+            "do that, or give --mode active for images"
+        )

@@ -1,0 +1,221 @@
+"""Acoustic maps on the command line: `ertis process`, `ertis info` and `ertis peaks`."""
+
+import dataclasses
+import json
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli import process
+from ertis_cli.main import cli
+
+import ertis_numba as ertis
+from ertis_numba.frames import Stamp
+from ertis_numba.settings import MAP_METHODS
+from tests.test_acoustic_camera import settings_of, sound
+
+SETTINGS = settings_of(processing__range_m=(0.5, 0.9), passive__averages=2)
+TURNED = (0.0, 0.0, 0.0, 1.0)
+
+pytestmark = pytest.mark.usefixtures("folder")
+
+
+def heard(behaviours, sensor="sensor", settings=SETTINGS):
+    """Return a measurement of a source at 20 degrees for each behaviour."""
+    return [
+        dataclasses.replace(
+            sound(settings, [(20, 0.1)], noise=0.01, seed=number),
+            stamp=Stamp(sensor=sensor, sequence=number, behaviour=behaviour, timestamp_ns=10**9 + number),
+        )
+        for number, behaviour in enumerate(behaviours)
+    ]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    made = tmp_path_factory.mktemp("recorded")
+    ertis.write_recording(made / "passive.h5", heard(["passive"] * 3))
+    ertis.write_recording(made / "active.h5", heard(["active"] * 2))
+    ertis.write_recording(made / "mixed.h5", heard(["active", "passive", "active", "passive"]))
+    both = [*heard(["active"], "left"), *heard(["passive", "passive"], "right")]
+    ertis.write_recording(made / "both.h5", both, mounting={"right": ((0.1, 0.0, 0.0), TURNED)})
+    return made
+
+
+@pytest.fixture
+def folder(recorded, tmp_path, monkeypatch):
+    for path in recorded.iterdir():
+        (tmp_path / path.name).symlink_to(path)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(line, *, code=0):
+    done = CliRunner().invoke(cli, line.split())
+    assert done.exit_code == code, done.output
+    return done
+
+
+def azimuths_deg(rows):
+    return [row["azimuth_deg"] for row in rows]
+
+
+def test_passive_recording_becomes_acoustic_maps():
+    done = run("process passive.h5 --device cpu --json")
+    report = json.loads(done.stdout)
+    assert (report["output"], report["kind"]) == ("passive.acoustic.h5", "acoustic_map")
+    assert (report["measurements"], report["maps"], report["directions"], report["bands"]) == (3, 2, 61, 2)
+    assert "2 acoustic maps of 3 measurements, 61 directions × 2 bands on cpu" in done.stderr
+    with ertis.open_acoustic_maps("passive.acoustic.h5") as found, ertis.open_recording("passive.h5") as recording:
+        assert [each.n_measurements for each in found] == [2, 1]
+        assert found.attributes["recording_uuid"] == recording.uuid
+        with ertis.AcousticCamera(recording.settings, "cpu") as camera:
+            expected = list(camera.process_many(recording))
+        for one, other in zip(found, expected, strict=True):
+            assert np.array_equal(one.power, other.power)
+        mean = sum(each.power for each in found) / 2
+    assert [row["level_dbfs"] for row in report["loudest"]] == pytest.approx(10 * np.log10(mean.max(axis=0)), abs=1e-3)
+    assert azimuths_deg(report["loudest"]) == pytest.approx([21, 21], abs=3.1)  # directions are 3 degrees apart
+    assert report["sensors"][0]["loudest"] == report["loudest"]
+
+
+def test_options_of_maps_override_the_settings(folder):
+    (folder / "given.toml").write_text('[passive]\nmethod = "music"\naverages = 9\nfocus_m = 3\n')
+    run(
+        "process passive.h5 -o maps.h5 --settings given.toml --bands 25000:30000,30000:35000 --map-method functional "
+        "--average 3 --focus 2 --device numpy"
+    )
+    with ertis.open_acoustic_maps("maps.h5") as found:
+        assert found.band_hz.tolist() == [[25e3, 30e3], [30e3, 35e3]]
+        assert (len(found), found[0].n_measurements) == (1, 3)
+        assert (found.settings.passive.method, found.settings.passive.focus_m) == ("functional", 2.0)
+
+
+def test_emission_is_masked_and_reported():
+    done = run("process mixed.h5 -o maps.h5 --mode passive --device cpu")
+    assert "note: sensor sensor emitted its call in 2 of 4 measurements; the first " in done.stderr
+    assert "ms of each are left out, but maps contain its echoes" in done.stderr
+    with ertis.open_acoustic_maps("maps.h5") as found:
+        assert [each.masked_s > found.settings.call.duration_s for each in found] == [True, True]
+    assert "emitted" not in run("process passive.h5 -o quiet.h5 --device cpu").stderr
+
+
+def test_mixed_recording_becomes_images_of_its_calls():
+    done = run("process mixed.h5 -o img.h5 --device cpu --json")
+    assert "mixed.h5: 2 of 4 measurements of sensor sensor are passive and left out; give --mode passive" in done.stderr
+    assert json.loads(done.stdout)["measurements"] == 2
+    with ertis.open_energyscapes("img.h5") as images:
+        assert [stamp.sequence for stamp in images.stamps()] == [0, 2]
+    run("process mixed.h5 -o all.h5 --mode active --device cpu")
+    with ertis.open_energyscapes("all.h5") as images:
+        assert len(images) == 4
+
+
+def test_sensor_without_calls_is_left_out_of_images():
+    done = run("process both.h5 -o img.h5 --device cpu")
+    assert "2 of 2 measurements of sensor right are passive and left out" in done.stderr
+    assert ertis.storage.sensor_names("img.h5") == ("left",)
+    run("process both.h5 -o maps.h5 --sensor right --device cpu")
+    with ertis.open_acoustic_maps("maps.h5") as maps:
+        assert (maps.sensors, maps.translation_m.tolist()) == (("right",), [0.1, 0.0, 0.0])
+
+
+def test_several_recordings_become_images_only(folder):
+    (folder / "both.h5").unlink()
+    done = run("process active.h5 mixed.h5 passive.h5 -o images/ --device cpu --workers 1", code=1)
+    assert "passive.h5: all measurements are passive, and become acoustic maps only if" in done.stderr
+    assert "mixed.h5: 2 of 4 measurements of sensor sensor are passive" in done.stderr
+    assert sorted(path.name for path in (folder / "images").glob("*.h5")) == ["active.energy.h5", "mixed.energy.h5"]
+    run("process passive.h5 -o images/passive.energy.h5 --device cpu")
+    run("process images -o more/ --device cpu", code=0)  # results of processing are skipped
+    assert not list((folder / "more").glob("*.h5"))
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("active.h5 --average 2", "--average is for acoustic maps, but measurements were emitted, which become images"),
+        ("passive.h5 --range 0.5:1", "--range is for images, but all measurements are passive and become acoustic"),
+        ("passive.h5 --verify", "--verify is for images, but all measurements are passive"),
+        ("passive.h5 --bands wide", "'wide' is not a list of bands; give third_octaves, octaves, or edges in Hz"),
+        ("passive.h5 --bands 20000:30000:40000", "is not a list of bands"),
+        ("passive.h5 active.h5 -o out/ --focus 2", "--focus is for acoustic maps, but several recordings become"),
+        ("passive.h5 -o s.npz --last-stage demodulation --bands octaves", "--bands is for acoustic maps, but s.npz"),
+        ("both.h5 --fuse --map-method capon", "--map-method is for acoustic maps, but --fuse makes images"),
+    ],
+)
+def test_options_without_effect_are_refused(folder, line, message):
+    assert message in " ".join(run(f"process {line} --device numpy", code=2).stderr.split())
+    assert not list(folder.glob("*.energy.h5")) + list(folder.glob("*.acoustic.h5"))
+
+
+def test_errors_of_maps_leave_no_file(folder):
+    done = run("process passive.h5 --bands 80000:100000 --device numpy", code=1)
+    assert "passive.bands_hz[0] ends at 100000 Hz, but the record reaches only 90000 Hz" in done.stderr
+    (folder / "passive.acoustic.h5").write_bytes(b"old")
+    assert "exists" in run("process passive.h5 --device numpy", code=1).stderr
+    assert (folder / "passive.acoustic.h5").read_bytes() == b"old"
+
+
+def test_methods_are_those_of_the_settings():
+    option = next(each for each in process.process.params if each.name == "passive_method")
+    assert isinstance(option.type, click.Choice)
+    assert tuple(option.type.choices) == MAP_METHODS
+
+
+def test_info_describes_acoustic_maps():
+    run("process both.h5 -o maps.h5 --mode passive --device numpy --average 2 --focus 2")
+    report = json.loads(run("info maps.h5 --json").stdout)
+    assert report["kind"] == "acoustic_map"
+    assert [(row["sensor"], row["measurements"], row["maps"]) for row in report["sensors"]] == [
+        ("left", 1, 1),
+        ("right", 2, 1),
+    ]
+    section = report["sensors"][1]
+    assert (section["method"], section["averages"], section["focus_m"], section["bands"]) == ("delay_and_sum", 2, 2, 2)
+    assert section["band_hz"] == [20e3, 40e3]
+    text = run("info maps.h5").stdout
+    assert "acoustic_map" in text
+    assert "simulated" not in text
+
+
+def test_peaks_are_the_loudest_directions():
+    run("process passive.h5 -o maps.h5 --device numpy")
+    rows = json.loads(run("peaks maps.h5 --json").stdout)["loudest"]
+    with ertis.open_acoustic_maps("maps.h5") as maps:
+        expected = [each for found in maps for each in found.loudest()]
+    assert [(row["measurement"], *row["band_hz"]) for row in rows] == [
+        (number, *band) for number in (0, 1) for band in ((20e3, 25e3), (30e3, 40e3))
+    ]
+    assert azimuths_deg(rows) == pytest.approx([np.degrees(each.azimuth_rad) for each in expected], abs=1e-3)
+    assert [row["level_dbfs"] for row in rows] == pytest.approx([each.level_dbfs for each in expected], abs=1e-3)
+    shown = run("peaks maps.h5 -m 1").stdout.splitlines()
+    assert shown[0].split() == ["sensor", "measurement", "band_khz", "azimuth_deg", "elevation_deg", "level_dbfs"]
+    assert [line.split()[:3] for line in shown[1:]] == [["sensor", "1", "20.0–25.0"], ["sensor", "1", "30.0–40.0"]]
+
+
+def test_levels_are_sound_pressures_if_the_sensitivity_is_known(folder):
+    (folder / "given.toml").write_text("[array]\nsensitivity_dbfs = -26\n")
+    report = json.loads(run("process passive.h5 -o maps.h5 --settings given.toml --device numpy --json").stdout)
+    for row in report["loudest"]:
+        assert row["level_db"] - row["level_dbfs"] == pytest.approx(94 + 26 + 3, abs=0.05)
+    heading, first, *_ = run("peaks maps.h5").stdout.splitlines()
+    assert heading.split()[-2:] == ["level_dbfs", "level_db"]
+    with ertis.open_acoustic_maps("maps.h5") as maps:
+        assert float(first.split()[-1]) == pytest.approx(maps[0].level_db[:, 0].max(), abs=0.06)
+    run("process passive.h5 -o unknown.h5 --device numpy")
+    assert {row["level_db"] for row in json.loads(run("peaks unknown.h5 --json").stdout)["loudest"]} == {None}
+
+
+def test_maps_of_music_have_no_level():
+    report = json.loads(run("process passive.h5 -o maps.h5 --map-method music --device numpy --json").stdout)
+    assert [row["level_dbfs"] for row in report["loudest"]] == [None, None]
+    assert run("peaks maps.h5 -m 0").stdout.splitlines()[1].split()[-1] == "-"
+
+
+@pytest.mark.parametrize("option", ["--top 3", "--min-level -10", "--all", "--truth"])
+def test_peaks_of_maps_refuse_options_of_images(option):
+    run("process passive.h5 -o maps.h5 --device numpy")
+    message = f"{option.split()[0]} is for images, but maps.h5 holds acoustic maps; leave it out"
+    assert message in run(f"peaks maps.h5 {option}", code=2).stderr
