@@ -25,6 +25,9 @@ _ELSEWHERE: Final = np.array([0.02, 0.02, math.radians(2.0)])  # Differences of 
 # In simulated rooms, correct displacements had ambiguities of at most 0.65. Wrong ones, by the spacing of equal posts,
 # had at least 0.75, as one post of four without a partner.
 _MAX_AMBIGUITY: Final = 0.7
+# Share of the echoes that a rival must explain otherwise. Other echoes, such as those of calls from behind, may move in
+# their own way, which makes nothing ambiguous; the stronger motion wins.
+_SHARED: Final = 0.2
 # Expected number of motions by which unrelated groups match as well; an upper limit of the rate of false alarms.
 _MAX_FALSE_ALARMS: Final = 1e-3
 _STRONGEST: Final = 40  # Number of echoes per sensor that the search uses.
@@ -55,7 +58,7 @@ class FlowFit(NamedTuple):
         Number of matches, weighted by the strengths of their echoes; the larger one of two fits to the same groups is
         more likely.
     ambiguity : float
-        Score of the best displacement elsewhere, relative to this one.
+        Score of the best displacement elsewhere that explains some of the same echoes, relative to this one.
     n_false_alarms : float
         Expected number of displacements that explain as many echoes of unrelated groups, by accident.
     """
@@ -256,9 +259,16 @@ def fit_flow(
     if len(pairs.before) < 4:
         return None
     found = [_annealed(flow, pairs, each) for each in _starts(flow, pairs, centre, limit)]
-    best, score = max(found, key=lambda each: each[1])
-    elsewhere = [each for each in found if np.any(np.abs(each[0] - best) > _ELSEWHERE)]
-    other, second = max(elsewhere, key=lambda each: each[1], default=(best, 0.0))
+    strengths = flow.strengths(pairs)
+    best, weight = max(found, key=lambda each: float(each[1] @ strengths))
+    score = float(weight @ strengths)
+    explained = np.bincount(pairs.before, weight, len(before.level))[pairs.before]
+    rivals = [
+        (displacement, float(weights @ strengths))
+        for displacement, weights in found
+        if np.any(np.abs(displacement - best) > _ELSEWHERE) and (weights * explained) @ strengths > _SHARED * score
+    ]
+    other, second = max(rivals, key=lambda each: each[1], default=(best, 0.0))
     fit = _final(flow, pairs, best)
     if fit is None:
         return None
@@ -334,8 +344,8 @@ def _weights(square: Floats, pairs: _EchoPairs, n_before: int, n_after: int) -> 
     return likelihood / (np.maximum(of_before, of_after) + _OUTLIER)
 
 
-def _annealed(flow: _Flow, pairs: _EchoPairs, displacement: Floats) -> tuple[Floats, float]:
-    """Return the displacement after a fit with decreasing tolerance, and its score."""
+def _annealed(flow: _Flow, pairs: _EchoPairs, displacement: Floats) -> tuple[Floats, Floats]:
+    """Return the displacement after a fit with decreasing tolerance, and the probabilities of pairs."""
     sd = flow.deviations(pairs)
     weight = np.zeros(len(pairs.before))
     for scale in (*_SCALES, *([1.0] * _ROUNDS)):
@@ -344,7 +354,7 @@ def _annealed(flow: _Flow, pairs: _EchoPairs, displacement: Floats) -> tuple[Flo
         weight = _weights(np.sum(residual**2, axis=0) / scale**2, pairs, len(flow.before.level), len(flow.after.level))
         step = _solved(slopes, residual, weight)
         displacement = displacement + step
-    return displacement, float(weight @ flow.strengths(pairs))
+    return displacement, weight
 
 
 def _solved(slopes: Floats, residual: Floats, weight: Floats) -> Floats:
