@@ -14,7 +14,7 @@ from ertis_numba.frames import AcousticMap, Measurement, Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.passive import AcousticCamera
 from ertis_numba.settings import Processing
-from ertis_numba.storage import open_recording, write_energyscapes, write_recording
+from ertis_numba.storage import open_recording, write_acoustic_maps, write_energyscapes, write_recording
 from ertis_numba.viewer import Choices, Dome, Live, Playback, Pose, ReceivedImage, Sector, ViewedMaps, Viewer
 from ertis_numba.viewer._axes import PAGE
 from ertis_numba.viewer._level_plane import LevelPlane
@@ -268,10 +268,21 @@ def test_maps_of_measurements_with_a_call_are_noted(tmp_path):
         assert playback.at(0)[0].image.masked_s > SMALL.call.duration_s
 
 
-def test_maps_of_a_file_of_images_are_refused(tmp_path):
-    path = write_energyscapes(tmp_path / "img.h5", stamped(1))
-    with pytest.raises(ArgumentError, match=r"img\.h5 holds images; give a recording for acoustic maps"):
-        Playback(path, acoustic_maps=True)
+def test_file_of_acoustic_maps_is_played(tmp_path):
+    maps = [sounds((10, 0, 0, -40.0 - number), sequence=number) for number in range(2)]
+    path = write_acoustic_maps(tmp_path / "maps.h5", maps)
+    with Playback(path) as playback:
+        assert playback.shows_maps
+        np.testing.assert_array_equal(playback.at(1)[0].image.power, maps[1].power)
+
+
+def test_other_content_than_that_of_the_file_is_refused(tmp_path):
+    images = write_energyscapes(tmp_path / "img.h5", stamped(1))
+    with pytest.raises(ArgumentError, match=r"img\.h5 holds images only; give a recording for others"):
+        Playback(images, acoustic_maps=True)
+    maps = write_acoustic_maps(tmp_path / "maps.h5", [sounds()])
+    with pytest.raises(ArgumentError, match=r"maps\.h5 holds acoustic maps only; give a recording for others"):
+        Playback(maps, acoustic_maps=False)
 
 
 def test_live_maps_are_those_of_the_camera():
@@ -302,7 +313,7 @@ def measured(camera, original):
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
-        (("IMG", "--acoustic-maps"), "holds images; give a recording for acoustic maps"),
+        (("IMG", "--acoustic-maps"), "holds images only; give a recording for others"),
         (("REC", "--range", "1:2"), "--range is for images; remove it with acoustic maps"),
         (("REC", "--threshold", "-3"), "--threshold is for images; remove it with acoustic maps"),
         (("REC", "--images", "--band", "30000"), "--band is for acoustic maps; remove it with images"),

@@ -54,7 +54,7 @@ _ONLY = {
 
 
 @click.command()
-@click.argument("location", metavar="ADDRESS|REC.h5|IMG.h5")
+@click.argument("location", metavar="ADDRESS|REC.h5|IMG.h5|MAPS.h5")
 @click.option(
     "--sensor",
     "sensors",

@@ -20,6 +20,7 @@ _LINES: Final = 5  # Largest number of parts between rings.
 _BEYOND: Final = 96  # Opacity of a polar plot beyond its levels.
 _MARK_PX: Final = (5.0, 6.5)  # Radii of the ring around the loudest direction.
 _MAX_INKS: Final = 8
+_THIN: Final = 2  # Pixels of a picture per pixel of a polar plot on the platform, along each axis.
 _GRID: Final[dict[str, Any]] = {
     "color": STYLE.faint,
     "alpha": 0.35,
@@ -70,6 +71,8 @@ class LevelPlane:
         # The radius of a polar plot, as a level; a plane shows all levels.
         radius = np.hypot(right, ahead)[self._sampling.places] if self._fan is not None else np.zeros(1)
         self._least = np.asarray(np.rint(255 * radius), np.uint8)
+        self._page = np.full((rows, columns, 3), PAGE, dtype=np.uint8)
+        self._box, self._kept, self._kept_places = self._thinned()
         self._inks: dict[tuple[float, float, str], Ink] = {}
 
     @property
@@ -109,7 +112,7 @@ class LevelPlane:
         -------
         (row, column, 3) uint8
         """
-        made = np.full((*self.shape, 3), PAGE, dtype=np.uint8)
+        made = self._page.copy()
         flat = made.reshape(-1, 3)
         flat[self._sampling.places] = table[self._shown(shades)]
         left, right, top, bottom = self._place.scale_px
@@ -122,23 +125,32 @@ class LevelPlane:
 
     def empty(self, text: str) -> NDArray[np.uint8]:
         """Return an empty picture with a text: (row, column, 3) uint8."""
-        made = np.full((*self.shape, 3), PAGE, dtype=np.uint8)
+        made = self._page.copy()
         draw_text(self._place, text).onto(made.reshape(-1, 3))
         return made
 
-    def sector(self, shades: NDArray[np.uint8], table: NDArray[np.uint8], *, thin: int = 2) -> NDArray[np.uint8]:
-        """Return a polar plot alone, translucent beyond its levels: (row, column, 4) uint8, one pixel of ``thin``."""
-        left, top, right, bottom = self._place.box_px
-        made = np.zeros((*self.shape, 4), dtype=np.uint8)
-        flat, shown = made.reshape(-1, 4), self._shown(shades)
-        flat[self._sampling.places, :3] = table[shown]
-        flat[self._sampling.places, 3] = np.where(shown, 255, _BEYOND)
-        return np.ascontiguousarray(made[top:bottom:thin, left:right:thin])
+    def sector(self, shades: NDArray[np.uint8], table: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return a polar plot alone, translucent beyond its levels: (row, column, 4) uint8, one pixel of two."""
+        made = np.zeros((*self._box, 4), dtype=np.uint8)
+        flat, shown = made.reshape(-1, 4), self._shown(shades)[self._kept]
+        flat[self._kept_places, :3] = table[shown]
+        flat[self._kept_places, 3] = np.where(shown, 255, _BEYOND)
+        return made
 
     def _shown(self, shades: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the colour of each drawn point: 0 beyond the level of a polar plot."""
         shade = self._sampling(shades if self._fan is None else self._fan.strongest(shades))
         return np.where(shade >= self._least, shade, np.uint8(0))
+
+    def _thinned(self) -> tuple[tuple[int, int], NDArray[np.intp], NDArray[np.intp]]:
+        """Return the shape of `sector`, the drawn points in it, and their places there."""
+        left, top, right, bottom = self._place.box_px
+        shape = (math.ceil((bottom - top) / _THIN), math.ceil((right - left) / _THIN))
+        row, column = np.divmod(self._sampling.places, self.shape[1])
+        row, column = row - top, column - left
+        inside = (row >= 0) & (row < bottom - top) & (column >= 0) & (column < right - left)
+        kept = np.flatnonzero(inside & (row % _THIN == 0) & (column % _THIN == 0))
+        return shape, kept, row[kept] // _THIN * shape[1] + column[kept] // _THIN
 
     def _near(self, right: NDArray[np.float64], ahead: NDArray[np.float64]) -> PolarSampling:
         """Return the direction nearest to each point of a plane."""

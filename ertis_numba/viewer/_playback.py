@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal, Self, TypeAlias
 
 from ertis_numba import kernels
 from ertis_numba.errors import ArgumentError, DataError
@@ -14,9 +14,11 @@ from ertis_numba.frames import AcousticMap, Energyscape, Measurement, Stamp
 from ertis_numba.passive import is_passive
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.storage import (
+    AcousticMapReader,
     EnergyscapeReader,
     RecordingReader,
     file_kind,
+    open_acoustic_maps,
     open_energyscapes,
     open_recording,
     sensor_names,
@@ -31,9 +33,19 @@ __all__ = ["Playback", "TimeStep"]
 
 _POLL_INTERVAL_S: Final = 1 / 60
 
+Reader: TypeAlias = RecordingReader | EnergyscapeReader | AcousticMapReader
+
+_OPENERS: Final[dict[str, Callable[..., Reader]]] = {
+    "recording": open_recording,
+    "energyscape": open_energyscapes,
+    "acoustic_map": open_acoustic_maps,
+}
+"""Function that opens a sensor of each kind of file."""
+_CONTENTS: Final = {"energyscape": "images", "acoustic_map": "acoustic maps"}
+
 
 class Playback:
-    """A recording or an energyscape file as time steps, one of which is shown.
+    """A recording, or a file of images or acoustic maps, as time steps, one of which is shown.
 
     Parameters
     ----------
@@ -71,7 +83,7 @@ class Playback:
     DataError
         The file cannot be read or contains nothing.
     ArgumentError
-        A sensor does not exist, or acoustic maps are requested of a file of images.
+        A sensor does not exist, or acoustic maps are requested of a file of images, or the reverse.
     DeviceError
         The device does not exist.
     """
@@ -95,14 +107,12 @@ class Playback:
         self._device, self._loop = device, loop
         self._pipelines: dict[str, Pipeline] = {}
         self._map_sequences: dict[str, MapSequence] = {}
-        self._readers: dict[str, RecordingReader | EnergyscapeReader] = {}
+        self._readers: dict[str, Reader] = {}
         self._stack = ExitStack()
-        opened: Callable[..., RecordingReader | EnergyscapeReader] = (
-            open_energyscapes if file_kind(path) == "energyscape" else open_recording
-        )
+        kind = file_kind(path)
         with self._stack:
             for name in [sensors] if isinstance(sensors, str) else sensors or sensor_names(path):
-                self._readers[name] = reader = opened(path, sensor=name)
+                self._readers[name] = reader = _OPENERS[kind](path, sensor=name)
                 self._stack.callback(reader.close)
             if device == "cuda" and any(isinstance(each, RecordingReader) for each in self._readers.values()):
                 kernels.load(device)  # A missing device is reported before anything is shown.
@@ -110,10 +120,13 @@ class Playback:
             self.time_steps, self._notes = time_steps_of(stamps)
             if not self.time_steps:
                 raise DataError(f"{path} holds no measurement; give a file with one")
-            self.shows_maps = self._are_maps(stamps) if acoustic_maps is None else acoustic_maps
+            if kind == "recording":
+                self.shows_maps = self._are_maps(stamps) if acoustic_maps is None else acoustic_maps
+            else:
+                self.shows_maps = kind == "acoustic_map"
+                if acoustic_maps is not None and acoustic_maps != self.shows_maps:
+                    raise ArgumentError(f"{path} holds {_CONTENTS[kind]} only; give a recording for others")
             if self.shows_maps:
-                if opened is open_energyscapes:
-                    raise ArgumentError(f"{path} holds images; give a recording for acoustic maps")
                 self._notes += [
                     masked_note(name) for name, each in stamps.items() if any(one.behaviour == "active" for one in each)
                 ]
@@ -287,15 +300,14 @@ class Playback:
             image = self._map(name, reader, number)
         else:
             item = reader[number]
-            image = item if isinstance(item, Energyscape) else self._processed(name, item)
+            image = self._processed(name, item) if isinstance(item, Measurement) else item
         pose = self._given.get(name) or Pose.of(reader.translation_m, reader.rotation_xyzw)
         return ReceivedImage(image, pose, self.time_steps[place].time_s, self._tracks[name].interval_s)
 
     def _are_maps(self, stamps: Mapping[str, Sequence[Stamp]]) -> bool:
         """Return True for a recording without any measurement for images."""
         return all(
-            isinstance(reader, RecordingReader) and all(is_passive(reader.settings, stamp) for stamp in stamps[name])
-            for name, reader in self._readers.items()
+            is_passive(reader.settings, stamp) for name, reader in self._readers.items() for stamp in stamps[name]
         )
 
     def _map(self, name: str, reader: RecordingReader, number: int) -> AcousticMap:
