@@ -65,3 +65,61 @@ def test_only_the_upper_triangle_and_the_real_diagonal_are_read(device):
     spoilt[:, np.arange(5), np.arange(5)] += 3j
     KERNELS[device].steer_power(spoilt, steps, bins, found[1])
     assert np.array_equal(*found)
+
+
+def reference_sources(matrix, waves, power, *, hollow):
+    """Return the sources of CLEAN-SC in float64, with the components solved to rounding."""
+    n_mics = len(matrix)
+    norm = n_mics**2 - n_mics if hollow else n_mics**2
+    rest, left, found, peaks = matrix * (1 - hollow * np.eye(n_mics)), power.copy(), np.zeros_like(power), []
+    while len(peaks) < 2 * n_mics and left.max() > 0:
+        place, peak = left.argmax(), left.max()
+        peaks.append(peak)
+        found[place] += 0.6 * peak
+        if len(peaks) > 5 and peak > peaks[-4]:
+            break
+        weights = waves[:, place] / np.sqrt(norm)
+        component = seen = rest @ weights / peak
+        for _ in range(100 if hollow else 0):
+            own = np.abs(component) ** 2
+            component = (seen + own * weights) / np.sqrt(1 + own.sum() / norm)
+        shared = 0.6 * peak * np.outer(component, component.conj()) * (1 - hollow * np.eye(n_mics))
+        rest = rest - shared
+        left = left - np.einsum("id,ij,jd->d", waves.conj(), shared, waves, optimize=True).real / norm
+    return found
+
+
+@pytest.mark.parametrize("hollow", [False, True])
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "least"])  # one microphone finds no directions
+def test_sources_equal_their_reference(kernel_set, name, hollow):
+    """Two incoherent sources of 10 and 4, and noise of 0.01: their powers do not depend on the order of rounds."""
+    n_mics, _, _, _, n_bins, n_directions = SHAPES[name]
+    n_bins = min(n_bins, 5)
+    random = np.random.default_rng(4)
+    steps = random.integers(0, 2**32, (n_mics, n_directions), dtype=np.uint32)
+    bins = np.arange(7, 7 + n_bins, dtype=np.uint32)
+    waves = np.exp(-2j * np.pi * (bins[:, None, None].astype(float) * steps / 2**32 % 1))
+    first, second = waves[:, :, 0], waves[:, :, -1]
+    matrices = 10 * first[:, :, None] * first[:, None].conj() + 4 * second[:, :, None] * second[:, None].conj()
+    matrices = np.ascontiguousarray(matrices + 0.01 * np.eye(n_mics), np.complex64)
+    taken = matrices * (1 - hollow * np.eye(n_mics))
+    norm = n_mics**2 - n_mics if hollow else n_mics**2
+    powers = np.einsum("kid,kij,kjd->kd", waves.conj(), taken, waves, optimize=True).real / norm
+    out = np.full((n_bins, n_directions), GARBAGE, np.float32)
+    kernel_set.clean_sources(matrices, steps, bins, np.ascontiguousarray(powers, np.float32), hollow, out)
+    cases = zip(matrices.astype(complex), waves, powers, strict=True)
+    expected = np.array([reference_sources(*case, hollow=hollow) for case in cases])
+    large = expected > 0.05
+    assert out[large] == pytest.approx(expected[large], rel=0.02)
+    assert np.abs(out - expected)[~large].max(initial=0) < 0.1
+
+
+@pytest.mark.parametrize("device", KERNELS)
+@pytest.mark.parametrize("hollow", [False, True])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_map_without_positive_powers_has_no_sources(device, value, hollow):
+    steps, bins = np.zeros((3, 5), np.uint32), np.array([4, 5], np.uint32)
+    out = np.full((2, 5), GARBAGE, np.float32)
+    powers = np.full((2, 5), value, np.float32)
+    KERNELS[device].clean_sources(np.zeros((2, 3, 3), np.complex64), steps, bins, powers, hollow, out)
+    assert not out.any()

@@ -74,6 +74,7 @@ class KernelSet(AdaptiveKernels):
     modulate_pdm: _contract.ModulatePdm
     cross_spectra: _contract.CrossSpectra
     steer_power: _contract.SteerPower
+    clean_sources: _contract.CleanSources
 
     @classmethod
     def of(cls, twins: Mapping[str, Any], **facts: Any) -> Self:

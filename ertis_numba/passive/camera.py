@@ -125,7 +125,7 @@ class AcousticCamera:
         self._steps = self._memory.table(np.ascontiguousarray(steps))
         self._bins = self._memory.table(self._blocks.bins)
         self._powers = self._memory.zeros((len(self._blocks.bins), len(self.grid)), np.float32)
-        self.waves = Waves(delay_s, self._steer)
+        self.waves = Waves(self._steer, self._clean)
         self._masked_s = 0.0
         self.reset()
 
@@ -205,7 +205,7 @@ class AcousticCamera:
 
     def reset(self) -> None:
         """Forget all measurements."""
-        n_mics = self.waves.delay_s.shape[0]
+        n_mics = self._steps.shape[0]
         self._sums: NDArray[Any] = np.zeros((len(self.frequency_hz), n_mics, n_mics), np.complex128)
         self._n_blocks = self.n_measurements = 0
         self._masked_s = 0.0
@@ -275,6 +275,16 @@ class AcousticCamera:
             here = self._lane.send(np.ascontiguousarray(matrices))
             self._kernels.steer_power(here, self._steps, self._bins[first:stop], self._powers[first:stop])
             self._lane.fetch(self._powers[first:stop], out)
+            self._lane.wait()
+        return out
+
+    def _clean(self, matrices: NDArray[np.complex64], powers: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the sources of matrices with given maps: (bin, direction) float32."""
+        out, hollow = np.empty_like(powers), self.settings.passive.diagonal_removal
+        with self._kernels.threads(self._threads), self._lane.entered():
+            here = self._lane.send(np.ascontiguousarray(matrices))
+            self._kernels.clean_sources(here, self._steps, self._bins, self._lane.send(powers), hollow, self._powers)
+            self._lane.fetch(self._powers, out)
             self._lane.wait()
         return out
 

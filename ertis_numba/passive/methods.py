@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
-from ertis_numba.passive.clean_sc import clean_sc
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.settings import MapMethod, Passive
 
@@ -30,18 +29,15 @@ class Waves:
 
     Attributes
     ----------
-    delay_s : (mic, direction) float64
     steer : callable
         Returns the quadratic form of matrices, ``v^H C v``: (bin, direction) float32. The second argument, 0 by
         default, is the number of the first matrix's bin.
+    clean : callable
+        Returns the sources of CLEAN-SC, (bin, direction) float32, of matrices and their map of delay-and-sum.
     """
 
-    delay_s: NDArray[np.float64]
     steer: Callable[..., Powers]
-
-    def at(self, frequency_hz: float) -> NDArray[np.complex64]:
-        """Return the waves at a frequency: (mic, direction) complex64."""
-        return np.asarray(np.exp(-2j * np.pi * frequency_hz * self.delay_s), np.complex64)
+    clean: Callable[[Matrices, Powers], Powers]
 
 
 Method = Callable[[CrossSpectrum, Waves, Passive], Powers]
@@ -70,10 +66,11 @@ def functional(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Power
 
 def capon(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
     """Return ``1 / (v^H (C + loading · mean power)^−1 v)`` (J. Capon, 1969)."""
-    values, vectors = _eigen(spectrum)
-    mean = np.maximum(values.mean(axis=1, keepdims=True), _LEAST)
-    loaded = np.maximum(values, 0) + passive.diagonal_loading * mean
-    powers = waves.steer(_matrices(mean / loaded, vectors))
+    matrix = spectrum.matrix.astype(np.complex128)
+    n_mics = matrix.shape[1]
+    mean = np.maximum(np.trace(matrix, axis1=1, axis2=2).real[:, None] / n_mics, _LEAST)
+    loaded = matrix / mean[:, :, None] + passive.diagonal_loading * np.eye(n_mics)
+    powers = waves.steer(np.linalg.inv(loaded).astype(np.complex64))
     return np.asarray(mean / np.maximum(powers, _LEAST), np.float32)
 
 
@@ -91,13 +88,9 @@ def music(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
     return np.asarray(n_mics / np.maximum(powers, 1e-6 * n_mics), np.float32)
 
 
-def clean(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
-    """Return the powers of the sources that CLEAN-SC finds; see `clean_sc`."""
-    powers = _steered(spectrum, waves, passive)
-    for number, frequency_hz in enumerate(spectrum.frequency_hz):
-        wave = waves.at(float(frequency_hz))
-        powers[number] = clean_sc(spectrum.matrix[number], wave, powers[number], hollow=passive.diagonal_removal)
-    return powers
+def clean_sc(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
+    """Return the powers of sources whose coherent sound is subtracted from the map (P. Sijtsma, 2007)."""
+    return waves.clean(spectrum.matrix, _steered(spectrum, waves, passive))
 
 
 def _hollow(matrices: Matrices) -> Matrices:
@@ -124,6 +117,6 @@ METHODS: Final[dict[MapMethod, Method]] = {
     "functional": functional,
     "capon": capon,
     "music": music,
-    "clean_sc": clean,
+    "clean_sc": clean_sc,
 }
 """Function of each method of `Passive`."""

@@ -86,7 +86,9 @@ def _each(kernels):
     blocks, matrices = np.zeros((8, 6, 129), np.complex64), np.zeros((20, 8, 8), np.complex64)
     kernels.cross_spectra(blocks, 5, matrices)
     steps, bins = np.zeros((8, 90), np.uint32), np.arange(20, dtype=np.uint32)
-    kernels.steer_power(matrices, steps, bins, np.zeros((20, 90), np.float32))
+    powers, hollow = np.zeros((20, 90), np.float32), True
+    kernels.steer_power(matrices, steps, bins, powers)
+    kernels.clean_sources(matrices, steps, bins, powers, hollow, powers)
     kernels.add_paths(
         np.zeros((1, 251), np.complex128),
         np.zeros((5, 8)),

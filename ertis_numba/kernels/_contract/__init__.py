@@ -18,7 +18,7 @@ from ertis_numba.kernels._contract.beams import (
     RectifyAndDecimate,
     SumDelayedInt16,
 )
-from ertis_numba.kernels._contract.passive import CrossSpectra, SteerPower
+from ertis_numba.kernels._contract.passive import CleanSources, CrossSpectra, SteerPower
 from ertis_numba.kernels._contract.scenes import AddPaths, ModulatePdm
 from ertis_numba.kernels._contract.signals import (
     Decimate,
@@ -35,6 +35,7 @@ from ertis_numba.kernels._contract.streams import CombineStreamsInt16, QuantiseS
 
 __all__ = [
     "AddPaths",
+    "CleanSources",
     "CombineDelayed",
     "CombineStreamsInt16",
     "Complex",

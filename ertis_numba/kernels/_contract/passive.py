@@ -1,10 +1,32 @@
 """Contracts of passive listening: signals to cross-spectral matrices, and these to the power from each direction."""
 
-from typing import Protocol
+from typing import Final, Protocol
+
+import numpy as np
 
 from ertis_numba.kernels._contract.arrays import Complex, Real, Turns
 
-__all__ = ["CrossSpectra", "SteerPower"]
+__all__ = [
+    "CLEAN_GROWTH",
+    "CLEAN_HOLLOW_ROUNDS",
+    "CLEAN_LOOP_GAIN",
+    "CLEAN_ROUNDS_PER_MICROPHONE",
+    "CleanSources",
+    "CrossSpectra",
+    "SteerPower",
+]
+
+CLEAN_LOOP_GAIN: Final = np.float32(0.6)
+"""Share of a component that a round of CLEAN-SC subtracts, as in Acoular."""
+
+CLEAN_ROUNDS_PER_MICROPHONE: Final = 2
+"""Largest number of rounds of CLEAN-SC, relative to the number of microphones, as in Acoular."""
+
+CLEAN_GROWTH: Final = 3
+"""Rounds of CLEAN-SC over which the peak may not grow, as in Acoular."""
+
+CLEAN_HOLLOW_ROUNDS: Final = 12
+"""Repetitions that find a component without the diagonal; each leaves about a sixteenth of the error."""
 
 
 class CrossSpectra(Protocol):
@@ -41,3 +63,44 @@ class SteerPower(Protocol):
     """
 
     def __call__(self, matrices: Complex, steps: Turns, bins: Turns, out: Real) -> None: ...
+
+
+class CleanSources(Protocol):
+    """Find the sources of each bin, by subtracting all sound that is coherent with the loudest direction.
+
+    This is CLEAN-SC (P. Sijtsma, CLEAN based on spatial source coherence, 2007). With the waves ``v`` of `SteerPower`
+    and M microphones, ``norm`` is M², or M² − M if the diagonal is left out. Each round takes the first direction with
+    the largest power P, adds ``CLEAN_LOOP_GAIN · P`` to its element of ``out``, and subtracts a component c from matrix
+    and powers: ``matrix −= CLEAN_LOOP_GAIN · P · c c^H`` and ``powers −= CLEAN_LOOP_GAIN · P · |v^H c|² / norm``.
+
+    With ``w = v / sqrt(norm)``, the component is ``matrix · w / P``. If the diagonal is left out, it is the solution of
+    ``c = (matrix · w / P + |c|² w) / sqrt(1 + Σ |w|² |c|²)``, and ``|v^H c|² − Σ |c|²`` replaces ``|v^H c|²``.
+
+    The rounds of a bin end if P is not positive or exceeds that of `CLEAN_GROWTH` rounds before, apart from the first
+    rounds, or after `CLEAN_ROUNDS_PER_MICROPHONE` · M rounds.
+
+    Parameters
+    ----------
+    matrices : (bin, mic, mic) complex64
+        Hermitian matrices.
+    steps : (mic, direction) uint32
+        As for `SteerPower`.
+    bins : (bin,) uint32
+        As for `SteerPower`.
+    powers : (bin, direction) float32
+        Map of the matrices, ``v^H matrix v / norm``, with the diagonal or without it.
+    hollow : bool
+        Leave out the diagonal of the matrices.
+    out : (bin, direction) float32
+        Sum of the shares of each direction.
+    """
+
+    def __call__(
+        self,
+        matrices: Complex,
+        steps: Turns,
+        bins: Turns,
+        powers: Real,
+        hollow: bool,  # noqa: FBT001 - kernels have no keywords
+        out: Real,
+    ) -> None: ...
