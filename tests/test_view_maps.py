@@ -72,7 +72,7 @@ def test_polar_plot_reaches_the_level_in_the_direction(azimuth_deg, level_db):
     assert np.hypot(right, ahead).max() == pytest.approx((level_db + 60) / 20, abs=0.02)
     assert math.degrees(math.atan2(-right[farthest], ahead[farthest])) == pytest.approx(azimuth_deg, abs=2)
     assert front.position_m[0] == pytest.approx(
-        1.02 * (level_db + 60) / 20 * unit_vectors(np.radians([azimuth_deg]), np.zeros(1))[0], abs=0.01
+        (level_db + 60) / 20 * unit_vectors(np.radians([azimuth_deg]), np.zeros(1))[0], abs=0.01
     )
 
 
@@ -164,7 +164,7 @@ def test_spheres_of_a_platform_do_not_overlap():
         scene.take(taken(sounds((0, 0, 0, -40.0), sensor=sensor, directions="3d:300"), Pose((x, 0.0, 0.0))))
     frame = scene.draw(MAPS)
     assert {round(float(np.linalg.norm(each.shape.position_m[0])), 6) for each in frame.sensors.values()} == {0.2}
-    assert frame.range_m == pytest.approx(0.4)
+    assert 0.4 <= frame.range_m < 0.6
     scene.take(ReceivedImage(sounds(sensor="lost"), None, 0.0))
     assert len(scene.draw(MAPS).sensors["lost"].position_m) == 0  # it has no place on the platform
 

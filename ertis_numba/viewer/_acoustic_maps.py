@@ -32,8 +32,9 @@ __all__ = ["ViewedMaps", "masked_note"]
 
 _STEP_DB: Final = 5.0  # The automatic scale moves in steps, because its axes are drawn anew.
 _RADIUS_M: Final = (0.05, 1.0)
-_BEFORE: Final = 1.02  # Distance of the mark of the loudest direction, relative to the radius.
-_MARK: Final = np.full((1, 3), 255, np.uint8)
+_MARKS: Final = np.array([[0.96], [1.04]])  # Marks of the loudest direction inside and outside a sphere of radius 1.
+_WHITE: Final = np.full((2, 3), 255, np.uint8)
+_AROUND: Final = 1.3  # Visible range around a sphere of radius 1.
 
 Edges = tuple[float, float]
 
@@ -115,7 +116,7 @@ class ViewedMaps:
             sensors[name] = _drawn(each, poses[name], radius_m, overdue=overdue)
         return DrawnFrame(
             sensors,
-            radius_m + max((math.hypot(*place_m) for place_m in places_m), default=0.0),
+            _AROUND * radius_m + max((math.hypot(*place_m) for place_m in places_m), default=0.0),
             until_s=min((each.due_s for each in timely), default=math.inf),
             scale=scale,
         )
@@ -224,7 +225,7 @@ def _drawn(kept: _SensorMaps, pose: Pose | None, radius_m: float, *, overdue: bo
     position_m = np.empty((0, 3), np.float32)
     if kept.loudest is not None and pose is not None:
         place, shade = kept.loudest
-        found, away_m = kept.latest.image, _BEFORE * radius_m * (shade / 255 if kept.plane.is_planar else 1)
+        found, away_m = kept.latest.image, radius_m * (np.array([[shade / 255]]) if kept.plane.is_planar else _MARKS)
         direction = unit_vectors(found.azimuth_rad[place : place + 1], found.elevation_rad[place : place + 1])
         position_m = pose.placed(np.asarray(away_m * direction, np.float32))
     return Drawn(
@@ -235,7 +236,7 @@ def _drawn(kept: _SensorMaps, pose: Pose | None, radius_m: float, *, overdue: bo
         picture=kept.picture,
         shape=kept.shape,
         position_m=position_m,
-        colours=_MARK[: len(position_m)],
+        colours=_WHITE[: len(position_m)],
         share_left=np.ones(len(position_m), np.float32),
         n_points=0,
     )
