@@ -71,8 +71,12 @@ from .network.sensor_node import SensorNode as SensorNode
 from .network.subscriber import Subscriber as Subscriber
 from .passive import (
     AcousticCamera as AcousticCamera,
+    BeamSound as BeamSound,
     BearingFinder as BearingFinder,
     find_bearings as find_bearings,
+    heterodyned as heterodyned,
+    listen_to as listen_to,
+    time_expanded as time_expanded,
 )
 from .pipeline import Pipeline as Pipeline
 from .settings import Settings as Settings, presets as presets

@@ -1,4 +1,4 @@
-"""WAV files: checks of the header, and reading of the samples."""
+"""WAV files: checks of the header, reading and writing of samples."""
 
 import struct
 import warnings
@@ -6,13 +6,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
 
-__all__ = ["read_wav"]
+__all__ = ["read_wav", "wav_bytes"]
 
 _UNFINISHED_SIZES = {0, 2**32 - 1}  # sizes that programs write before the length is known
+_FLOAT = 3  # format of floating-point samples
 _RF64 = b"RF64"  # The sizes are in a separate chunk.
 
 
@@ -40,6 +42,23 @@ def read_wav(path: Path) -> tuple[float, NDArray[Any]]:
     if not rate_hz or not numbers.size:
         raise DataError(f"{path} has {rate_hz} Hz and {numbers.size} numbers; save it again as WAV")
     return float(rate_hz), numbers if numbers.ndim > 1 else numbers[:, None]
+
+
+def wav_bytes(rate_hz: float, samples: NDArray[np.float32]) -> bytes:
+    """Return a WAV file of one channel of 32-bit floating-point samples, in bytes.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Sample rate, which the file holds in whole hertz.
+    samples : (sample,) float32
+    """
+    rate, data = round(rate_hz), samples.astype("<f4").tobytes()
+    header = struct.pack("<HHIIHHH", _FLOAT, 1, rate, 4 * rate, 4, 32, 0)
+    fact = struct.pack("<I", len(samples))
+    chunks = ((b"fmt ", header), (b"fact", fact), (b"data", data))
+    body = b"".join(name + struct.pack("<I", len(content)) + content for name, content in chunks)
+    return b"RIFF" + struct.pack("<I", len(body) + 4) + b"WAVE" + body
 
 
 def _require_complete(path: Path, file: BinaryIO) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _export_drive, _export_poses, _mountings, options
+from ertis_cli import _export_drive, _export_poses, _export_sound, _mountings, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ __all__ = ["export"]
 
 FORMATS = ("mcap", "ply", "pcd", "csv", "npz", "acoular", "batslam")
 FORMATS_OF_POSES = ("tum",)
+FORMATS_OF_SOUND = ("wav",)
 TOPICS = ("points", "scan", "image", "sonar_image")
 
 
@@ -44,12 +45,12 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
     type=click.Path(path_type=Path),
     metavar="OUT",
     required=True,
-    help="File to write: .mcap, .ply, .pcd, .csv, .npz, .tum, .mat for BatSLAM, or .h5 and .xml for Acoular.",
+    help="File to write: .mcap, .ply, .pcd, .csv, .npz, .tum, .wav, .mat for BatSLAM, or .h5 and .xml for Acoular.",
 )
 @click.option(
     "--format",
     "file_format",
-    type=click.Choice((*FORMATS, *FORMATS_OF_POSES)),
+    type=click.Choice((*FORMATS, *FORMATS_OF_POSES, *FORMATS_OF_SOUND)),
     help="Output format; chosen by the suffix of OUT by default.",
 )
 @options.sensor("Export this sensor only; all sensors by default.")
@@ -79,6 +80,7 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
 @_mountings.mounting
 @click.option("--ascii", "text", is_flag=True, help="Write PLY and PCD as text.")
 @_export_drive.drive_options
+@_export_sound.sound_options
 @options.force
 @options.quiet
 @options.as_json
@@ -94,6 +96,10 @@ def export(
     min_level_db: float | None,
     mounting: Path | None,
     text: bool,
+    direction: tuple[float, float] | None,
+    heterodyne_hz: float | None,
+    expansion: float | None,
+    with_silence: bool,
     force: bool,
     quiet: bool,
     as_json: bool,
@@ -104,14 +110,25 @@ def export(
     MCAP contains ROS 2 messages. PLY, PCD and CSV contain the points of images, and NPZ the images of one sensor. The
     files for Acoular contain the microphone signals of one measurement. TUM files contain the poses of a recording.
     BatSLAM 2.0 reads the echoes at two virtual ears, true poses and odometry; several recordings then belong to one
-    platform. Except for Acoular, TUM and BatSLAM, a recording is first processed with its own settings.
+    platform. WAV files contain the sound
+    from one direction. Except for Acoular, TUM, BatSLAM and WAV, a recording is first processed with its own settings.
     """
     if _export_poses.is_chosen(target, file_format):
         _export_drive.require_fitting("tum", paths)
         _export_poses.export_poses(paths[0], target, sensor, force=force, quiet=quiet, as_json=as_json)
         return
+    from ertis_numba.storage import check_target, file_kind, open_recording
+
+    if _export_sound.is_chosen(target, file_format):
+        _export_drive.require_fitting("wav", paths)
+        sound = _export_sound.SoundOptions(direction, heterodyne_hz, expansion, with_silence)
+        _export_sound.require_possible(sound)
+        with open_recording(paths[0], sensor=sensor) as reader:
+            _export_sound.export_sound(
+                reader, _between(places, len(reader)), target, sound, force=force, quiet=quiet, as_json=as_json
+            )
+        return
     from ertis_numba import interop
-    from ertis_numba.storage import check_target, file_kind
 
     name = interop.choose_format(target, file_format)
     for file in interop.output_files(target, name):

@@ -1,16 +1,23 @@
 """Passive listening: maps of the sound that arrives from each direction, without an own call."""
 
 from ertis_numba.passive.bands import band_edges, octave_bands
+from ertis_numba.passive.beam_sound import BeamSound, heterodyned, listen_to, time_expanded
 from ertis_numba.passive.bearings import BearingFinder, find_bearings
 from ertis_numba.passive.camera import AcousticCamera, is_passive
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
+from ertis_numba.passive.heard_signals import HeardSignals
 
 __all__ = [
     "AcousticCamera",
+    "BeamSound",
     "BearingFinder",
     "CrossSpectrum",
+    "HeardSignals",
     "band_edges",
     "find_bearings",
+    "heterodyned",
     "is_passive",
+    "listen_to",
     "octave_bands",
+    "time_expanded",
 ]
