@@ -76,6 +76,7 @@ from .passive import (
     find_bearings as find_bearings,
     heterodyned as heterodyned,
     listen_to as listen_to,
+    time_differences as time_differences,
     time_expanded as time_expanded,
 )
 from .pipeline import Pipeline as Pipeline

@@ -147,7 +147,6 @@ def test_command_writes_sound(recording, tmp_path, options, rate_hz, duration_s)
     [
         (["-o", "x.wav"], "--listen AZ,EL"),
         (["-o", "x.wav", "--listen", "20"], "is not a direction"),
-        (["-o", "x.wav", "--listen", "20,95"], "outside"),
         (["-o", "x.wav", "--listen", "0,0", "--top", "3"], "--top is not for sound"),
         (["-o", "x.wav", "--listen", "0,0", "--expand", "3", "--heterodyne", "3"], "give one of them"),
         (["-o", "x.npz", "--listen", "0,0"], "--listen is for sound"),

@@ -295,7 +295,7 @@ def test_export_page_commands_and_code_run(place):
     made = {path.name for path in place.iterdir()} - {"data", "FOLDER"}
     assert made == {
         *("REC.mcap", "CLOUD.ply", "CLOUD.pcd", "POINTS.csv", "IMG.npz", "SIGNALS.h5", "SIGNALS.xml", "REC.h5"),
-        *("reflectors.h5", "reflectors.toml"),
+        *("SOUND.wav", "SHIFTED.wav", "reflectors.h5", "reflectors.toml"),
     }
     with ertis.open_recording("REC.h5") as recording:
         assert [stamp.sequence for stamp in recording.stamps()] == [3, 4]

@@ -49,19 +49,6 @@ class SoundOptions(NamedTuple):
     with_silence: bool
 
 
-class _Direction(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
-    name = "AZ,EL"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        try:
-            azimuth_deg, elevation_deg = (float(part) for part in str(value).split(","))
-        except ValueError:
-            return self.fail(f"{value!r} is not a direction; give azimuth and elevation as in 20,-5", param, ctx)
-        if not (-180 <= azimuth_deg <= 180 and -90 <= elevation_deg <= 90):
-            self.fail(f"{value!r} is outside of ±180° of azimuth and ±90° of elevation", param, ctx)
-        return azimuth_deg, elevation_deg
-
-
 def sound_options(command: Any) -> Any:
     """Add the options of format wav."""
     for option in (
@@ -88,7 +75,7 @@ def sound_options(command: Any) -> Any:
         click.option(
             "--listen",
             "direction",
-            type=_Direction(),
+            type=options.DIRECTION,
             metavar="AZ,EL",
             help="Direction in ° whose sound is written to a .wav file.",
         ),

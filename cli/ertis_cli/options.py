@@ -108,7 +108,7 @@ class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
     name = "AZ:EL"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        azimuth, colon, elevation = str(value).partition(":")
+        azimuth, colon, elevation = str(value).replace(",", ":").partition(":")
         if colon:
             with suppress(ValueError):
                 angles_deg = float(azimuth), float(elevation)

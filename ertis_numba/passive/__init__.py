@@ -6,6 +6,7 @@ from ertis_numba.passive.bearings import BearingFinder, find_bearings
 from ertis_numba.passive.camera import AcousticCamera, is_passive
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.heard_signals import HeardSignals
+from ertis_numba.passive.time_differences import TimeDifference, time_differences
 
 __all__ = [
     "AcousticCamera",
@@ -13,11 +14,13 @@ __all__ = [
     "BearingFinder",
     "CrossSpectrum",
     "HeardSignals",
+    "TimeDifference",
     "band_edges",
     "find_bearings",
     "heterodyned",
     "is_passive",
     "listen_to",
     "octave_bands",
+    "time_differences",
     "time_expanded",
 ]

@@ -38,6 +38,8 @@ class HeardSignals:
     settings : Settings
     rate_hz : float
         Rate of the signals in hertz.
+    band_hz : (low, high)
+        Lowest and highest frequency of interest in hertz; the lowest is 0 if ``highest_hz`` is given.
 
     Raises
     ------
@@ -51,10 +53,12 @@ class HeardSignals:
         self, settings: Settings, *, highest_hz: float | None = None, device: str = "auto", threads: int | None = None
     ) -> None:
         self.settings, recording = settings, settings.recording
-        most_hz = recording.sample_rate_hz / _RATE
+        most_hz, lowest_hz = recording.sample_rate_hz / _RATE, 0.0
         if highest_hz is None:
-            highest_hz = float(band_edges(settings.passive, highest_hz=most_hz).max())
+            bands_hz = band_edges(settings.passive, highest_hz=most_hz)
+            lowest_hz, highest_hz = float(bands_hz.min()), float(bands_hz.max())
         checks.between("highest_hz", highest_hz, 1.0, most_hz)
+        self.band_hz = lowest_hz, highest_hz
         factor = max(1, math.floor(recording.sample_rate_hz / (_RATE * highest_hz)))
         self.rate_hz = recording.sample_rate_hz / factor
         layout = microphones(settings.array)
