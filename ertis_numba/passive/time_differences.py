@@ -132,7 +132,7 @@ def time_differences(
 
 
 class _Signals(NamedTuple):
-    """Signals of microphones, and what is known about their delays."""
+    """Signals of microphones, with their calibrated delays and their positions, if known."""
 
     rows: NDArray[np.float32]
     rate_hz: float
@@ -192,8 +192,8 @@ class _Correlator:
         lags = np.arange(-reach, reach + 1)
         top = int(lags[np.argmax(correlation[lags])])
         before, here, after = correlation[[top - 1, top, top + 1]]
-        bend = before - 2 * here + after
-        shift = float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5)) if bend < 0 else 0.0
+        curvature = before - 2 * here + after
+        shift = float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0
         found_s = (top + shift) / (_FINER * self._rate_hz)
         return TimeDifference(first, second, found_s, self._uncertainty_s(cross, scale), float(here / max(most, _TINY)))
 
