@@ -198,6 +198,7 @@ def view(
     with (
         stopped_by_signals() as signals,
         _source(
+            signals,
             location,
             sensors,
             live=live,
@@ -206,6 +207,7 @@ def view(
             loop=loop,
             mounting=mounting,
             acoustic_maps=acoustic_maps,
+            quiet=quiet,
         ) as source,
         nullcontext() if live and not acoustic_maps else _ended(source, signals, quiet=quiet),
         Viewer(
@@ -270,6 +272,7 @@ def _fitting(choices: "Choices", kind: str, source: "Live | Playback", *, dynami
 
 
 def _source(
+    signals: Signals,
     location: str,
     sensors: tuple[str, ...],
     *,
@@ -279,19 +282,21 @@ def _source(
     loop: bool,
     mounting: Path | None,
     acoustic_maps: bool | None,
+    quiet: bool,
 ) -> "Live | Playback":
     if live:
         from ertis_numba.viewer import Live
 
         given = _mountings.mountings(mounting, sensors or None)
-        return Live(
-            location,
-            sensors=sensors or None,
-            keys=_network.client_keys(*keys),
-            mounting=given,
-            acoustic_maps=bool(acoustic_maps),
-            device=device,
-        )
+        with _compiling(options.PREPARING, signals, quiet=quiet) if acoustic_maps else nullcontext():
+            return Live(
+                location,
+                sensors=sensors or None,
+                keys=_network.client_keys(*keys),
+                mounting=given,
+                acoustic_maps=bool(acoustic_maps),
+                device=device,
+            )
     from ertis_numba.storage import sensor_names
     from ertis_numba.viewer import Playback
 
