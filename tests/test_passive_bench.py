@@ -9,9 +9,10 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from ertis_bench import passive
-from ertis_bench.passive import agreement, times
+from ertis_bench.passive import agreement, separation, times
 
 from ertis_numba.errors import DataError
 
@@ -57,10 +58,22 @@ def test_report_without_acoular_has_times_of_this_package(monkeypatch):
     monkeypatch.setattr("ertis_bench.passive.table.PACKAGE", "no_such_package")
     monkeypatch.setattr(times, "DIRECTIONS", "90")
     monkeypatch.setattr(times, "_OURS", 2)
-    report = passive.run(count=1, seed=0, say=lambda _: None)
+    report = passive.run(count=1, seeds=2, bearings=0, seed=0, say=lambda _: None)
     assert report["differences"] == []
     assert [row["name"] for row in report["times"]] == list(agreement.CASES)
     assert all(row["ours"]["processor_ms"] > 0 and "acoular" not in row for row in report["times"])
     text = passive.form(report)
     assert "Acoular is not installed" in text
     assert "| signals to cross-spectral matrices |" in text
+    shares = {(row["name"], row["apart_deg"]): row["shares"] for row in report["separation"]}
+    assert shares["capon", 5.0] == shares["music", 5.0] == shares["clean_sc", 10.0] == [1.0, 1.0]
+    assert "| music | 100% / 100% |" in text
+
+
+def test_sources_are_separated_by_two_maxima_near_them():
+    azimuth_deg = np.arange(-10.0, 11.0)
+    power = np.exp(-((azimuth_deg + 3) ** 2)) + np.exp(-((azimuth_deg - 3) ** 2))
+    assert separation.are_separated(power, azimuth_deg, (-2.5, 2.5))
+    assert not separation.are_separated(power, azimuth_deg, (-5, 5))
+    assert not separation.are_separated(power, azimuth_deg, (-3.5, 0.5))
+    assert not separation.are_separated(np.exp(-(azimuth_deg**2)), azimuth_deg, (-1, 1))

@@ -333,14 +333,20 @@ def mapping(**given: Any) -> None:
 @click.option(
     "--count", type=click.IntRange(min=1), default=3, show_default=True, metavar="N", help="Maps of each by Acoular."
 )
-@_seed("Seed of the signals.")
+@click.option(
+    "--seeds", type=click.IntRange(min=0), default=100, show_default=True, metavar="N", help="Pairs of sources."
+)
+@click.option(
+    "--bearings", type=click.IntRange(min=0), default=20, show_default=True, metavar="N", help="Trials of bearings."
+)
+@_seed("Seed of the signals, and of the first trial.")
 @_update
 @options.quiet
 @options.as_json
 def passive(**given: Any) -> None:
-    """Compare acoustic maps with those of Acoular.
+    """Measure errors and times of acoustic maps.
 
-    Differences and times are left out if Acoular is not installed: pip install 'ertis-numba[peers]'.
+    Compares them with Acoular if it is installed: pip install 'ertis-numba[peers]'.
     """
     from ertis_bench import passive as benchmark
 

@@ -12,6 +12,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Settings
 
@@ -51,6 +52,8 @@ class AcousticMapper:
             window = Map({"Hann": functools.partial(scipy.signal.get_window, "hann")}, default_value="Hann")
 
         layout, grid = microphones(settings.array), direction_grid(settings.processing)
+        if settings.passive.focus_m is None:
+            raise ArgumentError("passive.focus_m is None, but Acoular's points need a distance; give focus_m")
         places_m = settings.passive.focus_m * unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         self._acoular, self._spectra, self._n_block = acoular, PeriodicSpectra, n_block
         self._settings = settings

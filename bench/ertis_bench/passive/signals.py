@@ -10,7 +10,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones, spherical_delays, unit_vectors
 from ertis_numba.settings import Settings
 
-__all__ = ["N_BLOCK", "Source", "listening", "noise"]
+__all__ = ["N_BLOCK", "OWN_RMS", "SOURCES", "NoiseSource", "listening", "noise"]
 
 N_BLOCK: Final = 256
 """Samples of a block, which Acoular requires to be a power of 2."""
@@ -20,7 +20,7 @@ _N_SAMPLES: Final = 8192  # 36.4 ms, of which 63 blocks result.
 _FOCUS_M: Final = 2.0
 
 
-class Source(NamedTuple):
+class NoiseSource(NamedTuple):
     """Source of white noise at the distance on which maps focus.
 
     Attributes
@@ -35,6 +35,13 @@ class Source(NamedTuple):
     rms: float
 
 
+SOURCES: Final = (NoiseSource(20, 5, 0.1), NoiseSource(-35, -10, 0.05), NoiseSource(3, 30, 0.03))
+"""Sources of the maps that are compared and timed."""
+
+OWN_RMS: Final = 0.01
+"""RMS value of the noise of a microphone in these maps."""
+
+
 def listening(**changes: Any) -> Settings:
     """Return settings of 36.4 ms of float32 signals of the eRTIS, with changes; ``__`` in a name stands for a dot."""
     chosen = {
@@ -47,14 +54,14 @@ def listening(**changes: Any) -> Settings:
     return Settings().replace(**(chosen | {name.replace("__", "."): value for name, value in changes.items()}))
 
 
-def noise(settings: Settings, sources: Sequence[Source], *, own_rms: float, seed: int) -> Measurement:
+def noise(settings: Settings, sources: Sequence[NoiseSource], *, own_rms: float, seed: int) -> Measurement:
     """Return the sound of incoherent sources, with white noise of each microphone itself.
 
     Parameters
     ----------
     settings : Settings
         Of `listening`.
-    sources : sequence of Source
+    sources : sequence of NoiseSource
     own_rms : float
         RMS value of the noise of a microphone.
     seed : int

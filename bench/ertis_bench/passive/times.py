@@ -9,7 +9,7 @@ import numpy as np
 
 from ertis_bench.passive._acoular import AcousticMapper
 from ertis_bench.passive.agreement import CASES, bins_of
-from ertis_bench.passive.signals import N_BLOCK, Source, listening, noise
+from ertis_bench.passive.signals import N_BLOCK, OWN_RMS, SOURCES, listening, noise
 from ertis_numba.frames import Measurement
 from ertis_numba.passive import AcousticCamera
 
@@ -19,7 +19,6 @@ DIRECTIONS: Final = "3000"
 
 _OURS: Final = 10  # runs of this package for one of Acoular, of which the first is not counted
 _SLOW_STEP: Final = 23  # bins of Acoular's CLEAN-SC
-_SOURCES: Final = (Source(20, 5, 0.1), Source(-35, -10, 0.05), Source(3, 30, 0.03))
 
 
 class Taken(NamedTuple):
@@ -67,7 +66,7 @@ def measure(*, count: int, seed: int, with_acoular: bool, say: Callable[[str], N
         settings = listening(
             processing__directions=DIRECTIONS, **{f"passive__{key}": value for key, value in case.passive.items()}
         )
-        heard = noise(settings, _SOURCES, own_rms=0.01, seed=seed)
+        heard = noise(settings, SOURCES, own_rms=OWN_RMS, seed=seed)
         with AcousticCamera(settings, "cpu") as camera:
             row: dict[str, Any] = {"name": name, "bins": len(camera.frequency_hz), "bands": len(camera.band_hz)}
             theirs = _Theirs(camera, heard) if with_acoular else None
@@ -115,7 +114,7 @@ def times_of_parts(*, count: int, seed: int) -> dict[str, dict[str, float]]:
         Seed of the signals.
     """
     settings = listening(processing__directions=DIRECTIONS)
-    heard = noise(settings, _SOURCES, own_rms=0.01, seed=seed)
+    heard = noise(settings, SOURCES, own_rms=OWN_RMS, seed=seed)
     with AcousticCamera(settings, "cpu") as camera:
         camera.process(heard)
         calls: dict[str, Callable[[], object]] = {
