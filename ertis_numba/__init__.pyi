@@ -40,6 +40,7 @@ from .frames import (
     Peak as Peak,
     PointCloud as PointCloud,
     Reflector as Reflector,
+    SoundEvent as SoundEvent,
     Stamp as Stamp,
     Trajectory as Trajectory,
 )
@@ -73,6 +74,7 @@ from .passive import (
     AcousticCamera as AcousticCamera,
     BeamSound as BeamSound,
     BearingFinder as BearingFinder,
+    BearingTracker as BearingTracker,
     find_bearings as find_bearings,
     heterodyned as heterodyned,
     listen_to as listen_to,

@@ -9,6 +9,7 @@ from ertis_numba.frames._measurement import Measurement, MicrophoneSignals
 from ertis_numba.frames._occupancy_map import FREE_BELOW, MAX_CELLS, OCCUPIED_ABOVE, OccupancyMap
 from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._reflectors import Peak, Reflector
+from ertis_numba.frames._sound_event import SoundEvent
 from ertis_numba.frames._stamp import BEHAVIOURS, Behaviour, Stamp
 from ertis_numba.frames._trajectory import Trajectory
 from ertis_numba.frames._true_source import TrueSource
@@ -31,6 +32,7 @@ __all__ = [
     "PointCloud",
     "Reflector",
     "SequenceGap",
+    "SoundEvent",
     "Stamp",
     "Trajectory",
     "TrueSource",

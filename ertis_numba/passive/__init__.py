@@ -2,6 +2,7 @@
 
 from ertis_numba.passive.bands import band_edges, octave_bands
 from ertis_numba.passive.beam_sound import BeamSound, heterodyned, listen_to, time_expanded
+from ertis_numba.passive.bearing_tracker import BearingTracker
 from ertis_numba.passive.bearings import BearingFinder, find_bearings
 from ertis_numba.passive.camera import AcousticCamera, is_passive
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
@@ -12,6 +13,7 @@ __all__ = [
     "AcousticCamera",
     "BeamSound",
     "BearingFinder",
+    "BearingTracker",
     "CrossSpectrum",
     "HeardSignals",
     "TimeDifference",
