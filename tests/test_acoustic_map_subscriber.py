@@ -1,15 +1,22 @@
 """Acoustic maps of a central node's measurements, as an application makes them."""
 
 import dataclasses
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
 
+import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
 from ertis_numba.passive import AcousticCamera
 from tests.publishing import Publisher, measurement
+
+ROOT = Path(__file__).parents[1]
 
 
 def passive(number, *, behaviour="passive", **changes):
@@ -93,3 +100,33 @@ def short():
     made = passive(0)
     settings = made.settings.replace("recording.n_samples", 81_920)
     return Measurement(made.data[:81_920], settings, made.stamp)
+
+
+def test_listen_prints_bearings():
+    scene = ertis.load_scene(ROOT / "data" / "synthetic" / "scenes" / "leak.toml")
+    changes = {"processing.directions": "3d:1000", "passive.bands_hz": [[40e3, 60e3]]}
+    sensor = scene.sensors[0]
+    heard = ertis.render(scene.replace(sensors=(sensor.replace(**{"processing.directions": "3d:1000"}),)))
+    settings = heard.settings.replace(**changes)
+    with Publisher() as publisher, publisher.playing([Measurement(heard.data, settings, heard.stamp)]):
+        arguments = ["--bearings", "--average", "1", "-n", "1", "--duration", "60", "-q"]
+        shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments, "--json"])
+    assert shown.exit_code == 0, shown.output
+    found, summary = map(json.loads, shown.stdout.splitlines())
+    assert (summary["received"], found["averages"], found["sensor"]) == (1, 1, "inspector")
+    (leak,) = found["bearings"]
+    assert (leak["azimuth_deg"], leak["elevation_deg"]) == (pytest.approx(28, abs=0.5), pytest.approx(12, abs=0.5))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--bearings", "--product", "raw"], "--product applies only without --bearings"),
+        (["--bearings", "--fuse"], "exclude each other"),
+        (["--average", "3"], "--average applies only with --bearings"),
+    ],
+)
+def test_listen_refuses_options_that_do_not_fit_bearings(arguments, message):
+    shown = CliRunner().invoke(cli, ["listen", "tcp://127.0.0.1:5602", *arguments])
+    assert shown.exit_code == 2
+    assert message in shown.stderr

@@ -46,6 +46,7 @@ def listen_pulses(
     show: Callable[[Arrival], None],
     *,
     head: str,
+    of: tuple[str, str] = ("pulse", "images"),
     at_end: Callable[[Any], None] = lambda _: None,
     n: int | None,
     duration: float | None,
@@ -64,6 +65,8 @@ def listen_pulses(
         Prints what arrived of a pulse.
     head : str
         Line above the lines of pulses; omitted with ``as_json``.
+    of : (str, str)
+        What is shown, in the singular, and what the central node may drop, in the plural.
     at_end : callable
         Called with the subscriber at the end, also after an error.
     n : int or None
@@ -96,8 +99,8 @@ def listen_pulses(
         dropped, skipped = subscriber.counts.dropped, subscriber.n_skipped
     if as_json:
         options.print_json({"event": "listened", "received": received, "dropped": dropped, "skipped": skipped})
-    options.say(f"{options.counted(received, 'pulse')}, {dropped} images dropped, {skipped} skipped", quiet=quiet)
+    options.say(f"{options.counted(received, of[0])}, {dropped} {of[1]} dropped, {skipped} skipped", quiet=quiet)
     if signals.came:
         sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
     if n is not None and received < n:
-        raise click.ClickException(f"received {received} of {n} pulses in {duration:g} s; give a longer --duration")
+        raise click.ClickException(f"received {received} of {n} {of[0]}s in {duration:g} s; give a longer --duration")

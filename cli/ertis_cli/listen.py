@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _listen_fused, _listen_odometry, _mountings, _network, options
+from ertis_cli import _listen_bearings, _listen_fused, _listen_odometry, _mountings, _network, options
 from ertis_cli._config import typed
 from ertis_cli._product_printer import PRINTERS, MicrophoneTable
 from ertis_cli._saving import PRODUCTS as FILED, saving
@@ -56,6 +56,13 @@ _POLL_INTERVAL_S = 0.1
 @click.option(
     "--odometry", is_flag=True, help="Print the pose and the velocity of the platform, one line per SYNC pulse."
 )
+@click.option("--bearings", is_flag=True, help="Print the bearings of sources of sound that the sensors did not emit.")
+@click.option(
+    "--average",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="With --bearings: measurements to average, of each sensor; by default those of its settings.",
+)
 @click.option(
     "--output",
     "-o",
@@ -80,6 +87,8 @@ def listen(
     target: Path | None,
     fuse: bool,
     odometry: bool,
+    bearings: bool,
+    average: int | None,
     trajectory: Path | None,
     mounting: Path | None,
     key: str | None,
@@ -99,16 +108,20 @@ def listen(
     With --fuse, this command fuses the images of all sensors. With --odometry, it computes the path of their platform,
     which starts at the origin and lies in the plane; -o writes the path when the command ends, also by Ctrl-C. The
     mountings are those that 'ertis capture' has sent, or those of --mounting.
+
+    With --bearings, this command makes acoustic maps of measurements without a call, and prints the directions, with
+    their standard deviations, and the levels of the sources in each band. 1 in 1000 maps of noise has a false source.
     """
-    _require_options_of(fuse=fuse, odometry=odometry)
-    if fuse or odometry:
-        _listen_by_pulse(
+    _require_options_of({"--fuse": fuse, "--odometry": odometry, "--bearings": bearings})
+    if fuse or odometry or bearings:
+        _listen_specially(
             address,
-            odometry=odometry,
-            target=trajectory,
+            name="bearings" if bearings else "odometry" if odometry else "fused",
+            average=average,
+            trajectory=trajectory,
+            mounting=mounting,
             force=force,
             sensors=sensors,
-            mountings=_mountings.mountings(mounting, sensors or None),
             keys=_network.client_keys(key, server_key),
             n=n,
             duration=duration,
@@ -158,10 +171,24 @@ def listen(
         )
 
 
-def _listen_by_pulse(address: str, *, odometry: bool, target: Path | None, force: bool, **common: Any) -> None:
+def _listen_specially(
+    address: str,
+    *,
+    name: str,
+    average: int | None,
+    trajectory: Path | None,
+    mounting: Path | None,
+    force: bool,
+    **common: Any,
+) -> None:
+    """Print what this command computes itself: bearings, odometry, or fused images."""
     _network.require_duration(common["duration"])
-    if odometry:
-        _listen_odometry.listen_odometry(address, target=target, force=force, **common)
+    if name == "bearings":
+        _listen_bearings.listen_bearings(address, average=average, **common)
+        return
+    common["mountings"] = _mountings.mountings(mounting, None)
+    if name == "odometry":
+        _listen_odometry.listen_odometry(address, target=trajectory, force=force, **common)
     else:
         _listen_fused.listen_fused(address, **common)
 
@@ -171,18 +198,20 @@ def _require_one_product(target: Path | None, products: tuple[str, ...]) -> None
         raise click.UsageError(f"--save writes one product; give only --product {' or '.join(FILED)}")
 
 
-def _require_options_of(*, fuse: bool, odometry: bool) -> None:
-    """Refuse options that do not apply to the requested output."""
+def _require_options_of(outputs: dict[str, bool]) -> None:
+    """Refuse options that do not apply to the requested output, which is that of products if none is chosen."""
     context = click.get_current_context()
-    if fuse and odometry:
-        raise click.UsageError("--fuse and --odometry exclude each other; run the command twice", context)
-    both = "--fuse and --odometry" if not (fuse or odometry) else "--fuse" if fuse else "--odometry"
-    for name, option in (("products", "--product"), ("target", "--save")) if fuse or odometry else ():
+    chosen = [name for name, is_chosen in outputs.items() if is_chosen]
+    if len(chosen) > 1:
+        raise click.UsageError(f"{' and '.join(chosen)} exclude each other; run the command twice", context)
+    for name, option in (("products", "--product"), ("target", "--save")) if chosen else ():
         if typed(name):
-            raise click.UsageError(f"{option} applies only without {both}", context)
-    if typed("mounting") and not (fuse or odometry):
+            raise click.UsageError(f"{option} applies only without {chosen[0]}", context)
+    if typed("mounting") and chosen not in (["--fuse"], ["--odometry"]):
         raise click.UsageError("--mounting applies only with --fuse or --odometry", context)
-    if typed("trajectory") and not odometry:
+    if typed("average") and chosen != ["--bearings"]:
+        raise click.UsageError("--average applies only with --bearings", context)
+    if typed("trajectory") and chosen != ["--odometry"]:
         raise click.UsageError("-o applies only with --odometry; --save FILE.h5 saves products", context)
 
 

@@ -2,13 +2,13 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import AcousticMap, Measurement
+from ertis_numba.frames import AcousticMap, Bearing, Measurement
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.subscriber import Arrival, Subscriber
-from ertis_numba.passive import AcousticCamera, is_passive
+from ertis_numba.passive import AcousticCamera, BearingFinder, is_passive
 from ertis_numba.settings import Settings
 
 __all__ = ["AcousticMapSubscriber"]
@@ -28,6 +28,8 @@ class AcousticMapSubscriber:
         All by default.
     changes : mapping of str to value, optional
         Changes of the settings of each sensor, such as ``{"passive.averages": 10, "processing.directions": "3000"}``.
+    false_alarm : float, optional
+        Find bearings with each map, with this probability that noise alone yields any; none by default.
     device : {"auto", "cpu", "cuda", "numpy"}
     threads : int, optional
         As for `AcousticCamera`.
@@ -40,6 +42,8 @@ class AcousticMapSubscriber:
     ----------
     counts : SubscriberCounts
         Counts of the measurements.
+    bearings : list of Bearing
+        Bearings of the last map, as by `BearingFinder`; empty without ``false_alarm``.
     n_active : int
         Measurements with a call, which become no map unless ``processing.mode`` is ``passive``.
 
@@ -61,14 +65,17 @@ class AcousticMapSubscriber:
         *,
         sensors: Sequence[str] | None = None,
         changes: Mapping[str, Any] | None = None,
+        false_alarm: float | None = None,
         device: str = "auto",
         threads: int | None = None,
         keys: ClientKeys | None = None,
         on_note: Callable[[str], None] | None = None,
     ) -> None:
         self._changes, self._device, self._threads = dict(changes or {}), device, threads
-        AcousticCamera(Settings().replace(**self._changes), device, threads).close()  # refuses changes, loads kernels
-        self._cameras: dict[str, tuple[Settings, AcousticCamera]] = {}
+        self._false_alarm = false_alarm
+        self._hearer_of(Settings()).close()  # refuses changes, and loads kernels
+        self._hearers: dict[str, _Hearer] = {}
+        self.bearings: list[Bearing] = []
         self.n_active = 0
         self._subscriber = Subscriber(address, sensors=sensors, products=["raw"], keys=keys, on_note=on_note, credit=8)
         self.counts = self._subscriber.counts
@@ -87,6 +94,11 @@ class AcousticMapSubscriber:
     def connected(self) -> bool:
         """True if a central node answers."""
         return self._subscriber.connected
+
+    @property
+    def n_skipped(self) -> int:
+        """Number of maps that were not used: 0, because the central node drops measurements instead."""
+        return 0
 
     @property
     def latest(self) -> Arrival | None:
@@ -120,12 +132,13 @@ class AcousticMapSubscriber:
     def close(self) -> None:
         """End the loop; waiting measurements are lost."""
         self._subscriber.close()
-        while self._cameras:
-            self._cameras.popitem()[1][1].close()
+        while self._hearers:
+            self._hearers.popitem()[1].close()
 
     def _added(self, measurement: Measurement) -> AcousticMap | None:
         """Return the map that a measurement completes; None if it completes none."""
-        camera = self._camera_of(measurement)
+        hearer = self._hearer(measurement)
+        camera = hearer.camera
         if not is_passive(camera.settings, measurement.stamp):
             self.n_active += 1
             return None
@@ -134,19 +147,35 @@ class AcousticMapSubscriber:
         if camera.n_measurements < camera.settings.passive.averages:
             return None
         found = camera.map()
+        self.bearings = [] if hearer.finder is None else hearer.finder.find()
         camera.reset()
         return found
 
-    def _camera_of(self, measurement: Measurement) -> AcousticCamera:
+    def _hearer(self, measurement: Measurement) -> "_Hearer":
+        """Return the camera of a measurement's sensor; a new one after a change of its settings."""
         sensor, settings = measurement.stamp.sensor, measurement.settings
-        known = self._cameras.get(sensor)
-        if known is not None and known[0] == settings.replace(air=known[0].air):
-            return known[1]
+        known = self._hearers.get(sensor)
+        if known is not None and known.settings == settings.replace(air=known.settings.air):
+            return known
         try:
-            camera = AcousticCamera(settings.replace(**self._changes), self._device, self._threads)
+            made = self._hearer_of(settings)
         except ArgumentError as error:
             raise DataError(f"settings of sensor {sensor!r} cannot be used for acoustic maps ({error})") from error
         if known is not None:
-            known[1].close()
-        self._cameras[sensor] = settings, camera
-        return camera
+            known.close()
+        self._hearers[sensor] = made
+        return made
+
+    def _hearer_of(self, settings: Settings) -> "_Hearer":
+        camera = AcousticCamera(settings.replace(**self._changes), self._device, self._threads)
+        alarm = self._false_alarm
+        return _Hearer(settings, camera, None if alarm is None else BearingFinder(camera, false_alarm=alarm))
+
+
+class _Hearer(NamedTuple):
+    settings: Settings
+    camera: AcousticCamera
+    finder: BearingFinder | None
+
+    def close(self) -> None:
+        self.camera.close()
