@@ -217,6 +217,23 @@ def test_page_has_controls_of_maps():
         assert controls._slider.max == 1  # noqa: SLF001
 
 
+def test_camera_does_not_depend_on_the_order_of_sensors():
+    maps = [
+        taken(sounds((0, 0, 0, -40.0), sensor=name), Pose((x, 0.0, 0.0)), 100.0)
+        for name, x in (("front", 0.2), ("back", -0.2))
+    ]
+    cameras = []
+    for groups in ([maps], [maps[:1], maps[1:]]):
+        source = MapSource()
+        with Viewer(source, port=0) as view:
+            for group in groups:
+                source.waiting = group
+                acked_through(view)
+            cameras.append(view._page._server.initial_camera)  # noqa: SLF001  where the page puts it
+    np.testing.assert_array_equal(cameras[0].position, cameras[1].position)
+    assert cameras[0].far == cameras[1].far
+
+
 def passive_noise(count, *, behaviour="passive", averages=1):
     settings = SMALL.replace(**{"passive.averages": averages})
     return [

@@ -67,7 +67,10 @@ class Space:
 
     def _look_at(self, frame: DrawnFrame) -> None:
         """Draw the ground, and position the camera for a complete view; again after the range grows or sensors join."""
-        farthest_m, names = max(self._farthest_m, frame.range_m), self._names | frame.sensors.keys()
+        names = self._names | frame.sensors.keys()
+        farthest_m = max(self._farthest_m, frame.range_m)
+        if frame.scale is not None and names != self._names:  # Spheres of acoustic maps shrink as sensors join.
+            farthest_m = frame.range_m
         if (farthest_m, names) == (self._farthest_m, self._names) or not frame.sensors:
             return
         self._farthest_m, self._names = farthest_m, names
