@@ -10,7 +10,7 @@ from ertis_cli.main import cli
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.passive import BeamSound, HeardSignals, heterodyned, listen_to, time_expanded
-from ertis_numba.passive.wave_delays import wave_delays
+from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.wav import read_wav
 from tests.test_acoustic_camera import settings_of, sound
 
@@ -29,7 +29,7 @@ def test_sound_equals_the_mean_of_signals_delayed_in_float64():
     settings = settings_of(recording__n_samples=600, array__delay_s=[1e-6, 0.0, 0.0, -2e-6, 0.0, 0.0])
     measurement = sound(settings, [(20, 0.1)])
     direction = ertis.geometry.unit_vectors(np.radians([20]), np.radians([5]))
-    delay_s = wave_delays(settings, direction)[0]
+    delay_s = WaveDelays(settings)(direction)[0]
     with HeardSignals(settings) as signals:
         rows, found = signals(measurement).astype(float), listen_to(measurement, 20, 5, signals=signals)
     samples = np.arange(rows.shape[1])

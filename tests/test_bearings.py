@@ -191,3 +191,12 @@ def test_arguments_outside_their_limits_are_refused(changes, words):
         BearingFinder(camera, **changes)
     with pytest.raises(ArgumentError, match="camera"):
         find_bearings(None)
+
+
+def test_bench_measures_bearings_and_leaks():
+    said = []
+    report = passive_bearings.measure(1, 3, said.append)
+    assert [row["snr_db"] for row in report["errors"]] == list(passive_bearings.SNRS_DB)
+    assert all(row["trials"] == 1 and row["bound_deg"] > 0 for row in report["errors"])
+    assert report["leak"]["trials"] == report["leak"]["found"] == 1
+    assert len(said) == len(passive_bearings.SNRS_DB) + 1

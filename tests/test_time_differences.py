@@ -6,7 +6,7 @@ import pytest
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError
 from ertis_numba.passive import HeardSignals, time_differences
-from ertis_numba.passive.wave_delays import wave_delays
+from ertis_numba.passive.wave_delays import WaveDelays
 from tests.test_acoustic_camera import settings_of, sound
 
 RATE_HZ = 200e3
@@ -82,7 +82,7 @@ def test_measurement_has_the_delays_of_its_direction():
     data = np.fft.irfft(np.fft.rfft(heard.data.T) * own, n).T
     found = time_differences(ertis.Measurement(np.ascontiguousarray(data, np.float32), settings))
     direction = ertis.geometry.unit_vectors(np.radians([20]), np.zeros(1))
-    delay_s = wave_delays(plain, direction)[0]
+    delay_s = WaveDelays(plain)(direction)[0]
     assert len(found) == 15
     for each in found:
         assert each.delay_s == pytest.approx(delay_s[each.second] - delay_s[each.first], abs=0.5e-6)

@@ -14,7 +14,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.passive.heard_signals import HeardSignals
-from ertis_numba.passive.wave_delays import wave_delays
+from ertis_numba.passive.wave_delays import WaveDelays
 
 __all__ = ["BeamSound", "heterodyned", "listen_to", "time_expanded"]
 
@@ -108,7 +108,7 @@ def listen_to(
             return listen_to(measurement, azimuth_deg, elevation_deg, signals=own)
     heard, rate_hz = signals(measurement), signals.rate_hz
     direction = unit_vectors(np.radians([azimuth_deg]), np.radians([elevation_deg]))
-    delay_s = wave_delays(signals.settings, direction)[0]
+    delay_s = WaveDelays(signals.settings)(direction)[0]
     n_samples = heard.shape[1]
     n_fft = scipy.fft.next_fast_len(n_samples + 2 * math.ceil(float(np.abs(delay_s).max()) * rate_hz) + 64, real=True)
     frequency_hz = np.fft.rfftfreq(n_fft, 1 / rate_hz)

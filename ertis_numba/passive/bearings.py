@@ -16,7 +16,7 @@ from ertis_numba.passive.camera import AcousticCamera
 from ertis_numba.passive.noise_model import NoiseModel
 from ertis_numba.passive.scan_extent import is_level, scan_extent
 from ertis_numba.passive.source_search import BandSearch, FoundSource, Scan
-from ertis_numba.passive.wave_delays import wave_delays
+from ertis_numba.passive.wave_delays import WaveDelays
 
 __all__ = ["BearingFinder", "find_bearings"]
 
@@ -74,7 +74,8 @@ class BearingFinder:
         self._false_alarm = 1 - (1 - false_alarm) ** (1 / len(camera.band_hz))
         directions = unit_vectors(camera.grid.azimuth_rad, camera.grid.elevation_rad)
         reach_rad = _REACH * min(spacing_rad(directions), _MAX_SPACING_RAD)
-        extent = scan_extent(directions, self._delays(directions))
+        delays = WaveDelays(camera.settings)
+        extent = scan_extent(directions, delays(directions))
         scan = Scan(directions, extent, reach_rad, is_level(directions))
         self._bins: list[NDArray[np.intp]] = []
         self._searches: list[BandSearch] = []
@@ -87,7 +88,7 @@ class BearingFinder:
                 sound_speed_m_s=sound_speed_m_s(camera.settings.air),
             )
             self._bins.append(bins)
-            self._searches.append(BandSearch(scan, frequency_hz, shares[bins], noise, self._delays, steer))
+            self._searches.append(BandSearch(scan, frequency_hz, shares[bins], noise, delays, steer))
 
     def find(self) -> list[Bearing]:
         """Return the bearings of the measurements since the camera's last `reset`, band by band, loudest first.
@@ -109,9 +110,6 @@ class BearingFinder:
             sources.sort(key=lambda source: -source.power)
             out += [_bearing(source, band_hz) for source in sources]
         return out
-
-    def _delays(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        return wave_delays(self._camera.settings, directions)
 
 
 def find_bearings(

@@ -20,7 +20,7 @@ from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.block_spectra import BlockSpectra
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.methods import METHODS, Waves
-from ertis_numba.passive.wave_delays import wave_delays
+from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.settings import Settings
 
 __all__ = ["AcousticCamera", "is_passive"]
@@ -118,7 +118,7 @@ class AcousticCamera:
         self.frequency_hz: NDArray[np.float64] = self._blocks.frequency_hz
         self._shares = bin_shares(self.band_hz, self.frequency_hz)
         directions = unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad)
-        delay_s = wave_delays(settings, directions).T.copy()
+        delay_s = WaveDelays(settings)(directions).T.copy()
         steps = np.rint(delay_s * self._blocks.spacing_hz * _TURN).astype(np.int64).astype(np.uint32)
         self._memory = kernel_set.memory()
         self._lane = self._memory.lane()

@@ -169,10 +169,12 @@ class BandSearch:
 
     def _loudest(self, rest: BandLikelihood, whole: BandLikelihood) -> Floats:
         """Return the direction of the scan with the largest mean power relative to the noise."""
-        powers, sizes, every = (
-            self._steer(whole.unwhitened(each).astype(np.complex64))
-            for each in (rest.rest, rest.projection, whole.projection)
+        powers, every = (
+            self._steer(whole.unwhitened(each).astype(np.complex64)) for each in (rest.rest, whole.projection)
         )
+        sizes = every
+        if rest.dimensions < whole.dimensions:
+            sizes = self._steer(whole.unwhitened(rest.projection).astype(np.complex64))
         ratio = np.where(sizes >= _BLIND * every, powers / np.maximum(sizes, _BLIND * every), 0)
         return np.asarray(self._scan.directions[int(((rest.weights / rest.power) @ ratio).argmax())])
 
