@@ -15,7 +15,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.settings import MapMethod, Passive
 
-__all__ = ["METHODS", "Waves"]
+__all__ = ["METHODS", "Waves", "capon", "clean_sc", "delay_and_sum", "functional", "music"]
 
 Matrices = NDArray[np.complex64]
 Powers = NDArray[np.float32]

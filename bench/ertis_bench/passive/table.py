@@ -67,7 +67,7 @@ def _differences(report: dict[str, Any]) -> str:
         [
             row["name"],
             f"{row['limit_db']:g}",
-            f"{row['largest_db']:.3f}",
+            f"{row['largest_db']:.4f}",
             f"{row['median_db']:.4f}",
             f"{row['levels']:,}",
         ]
