@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _acoustic_plots, options
+from ertis_cli._config import typed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -29,27 +30,32 @@ _KINDS = {
     "matched-filter": "output of the matched filter for each microphone",
     "array": "array layout and beam pattern",
     "map": "an occupancy map from above, chosen for its file",
+    **_acoustic_plots.KINDS,
     "calibration": "residuals and beam pattern before and after a calibration with all measurements of a reflector",
 }
 _OF_IMAGES = ("image", "polar", "projection", "slices")
 _OF_RECORDINGS = ("signals", "matched-filter")
+_OF_SOUND = tuple(_acoustic_plots.KINDS)
 _ONLY = {
-    "sensor": (*_OF_IMAGES, *_OF_RECORDINGS, "array", "calibration"),
-    "measurement": (*_OF_IMAGES, *_OF_RECORDINGS),
+    "sensor": (*_OF_IMAGES, *_OF_RECORDINGS, *_OF_SOUND, "array", "calibration"),
+    "measurement": (*_OF_IMAGES, *_OF_RECORDINGS, *_OF_SOUND),
     "peaks": _OF_IMAGES,
     "side-lobes": ("image", "polar", "projection"),
     "height": ("slices",),
     "left": ("slices",),
     "microphone": _OF_RECORDINGS,
     "frequency": ("array",),
-    "steer": ("array", "calibration"),
+    "steer": ("array", "calibration", "spectrum", "spectrogram"),
+    "band": ("acoustic_map",),
+    "photo": ("acoustic_map",),
+    "photo-fov": ("acoustic_map",),
     "dynamic-range": tuple(kind for kind in _KINDS if kind != "map"),
 }
 """Kinds that support each of these options."""
 
 
 @click.command(epilog="Kinds: " + "; ".join(f"{name}: {about}" for name, about in _KINDS.items()) + ".")
-@options.input_file("IMG.h5|REC.h5|MAP.h5|SETTINGS.toml|LAYOUT")
+@options.input_file("IMG.h5|REC.h5|MAPS.h5|SETTINGS.toml|LAYOUT")
 @click.option(
     "--kind",
     type=click.Choice(list(_KINDS)),
@@ -99,8 +105,12 @@ _ONLY = {
     help="Frequency of a beam pattern; repeatable up to five times.",
 )
 @click.option(
-    "--steer", type=options.DIRECTION, metavar="AZ:EL", help="Steering direction of beam patterns in degrees."
+    "--steer",
+    type=options.DIRECTION,
+    metavar="AZ:EL",
+    help="Direction of beam patterns, of a spectrum or of a spectrogram in degrees.",
 )
+@_acoustic_plots.plot_options
 @options.force
 @options.quiet
 @options.as_json
@@ -122,17 +132,20 @@ def plot(
     microphone: int | None,
     frequencies: tuple[float, ...],
     steer: tuple[float, float] | None,
+    band_hz: tuple[float, float] | None,
+    photo: Path | None,
+    photo_fov_deg: tuple[float, float] | None,
     force: bool,
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Plot a measurement or an array.
+    """Plot a measurement, an acoustic map or an array.
 
     To plot an image of a recording, the recording is first processed with its own settings.
     """
     from ertis_numba import checks, figures
     from ertis_numba.errors import DataError
-    from ertis_numba.storage import atomic_write, check_target, is_map, read_map
+    from ertis_numba.storage import atomic_write, check_target, read_map
 
     given: dict[str, object] = {
         "sensor": sensor,
@@ -141,11 +154,17 @@ def plot(
         "side-lobes": side_lobes,
         "height": height,
         "left": left,
+        "microphone": microphone,
+        "frequency": frequencies or None,
+        "steer": steer,
+        "band": band_hz,
+        "photo": photo,
+        "photo-fov": photo_fov_deg,
     }
-    given |= {"microphone": microphone, "frequency": frequencies or None, "steer": steer}
     source = click.get_current_context().get_parameter_source("dynamic_range")
     given["dynamic-range"] = dynamic_range if source is click.core.ParameterSource.COMMANDLINE else None
-    kind = "map" if kind == "image" and is_map(path) else kind
+    if not typed("kind"):
+        kind = _default_kind(path, sensor, measurement or 0, kind)
     _require_supported(kind, given)
     if kind != "array":
         _require_no_array(path)
@@ -160,9 +179,9 @@ def plot(
         "columns": columns,
         "font": font,
     }
+    azimuth_deg, elevation_deg = steer or (0.0, 0.0)
     report: dict[str, object] = {"output": str(target), "kind": kind}
     if kind == "array":
-        azimuth_deg, elevation_deg = steer or (0.0, 0.0)
         figure = figures.array(
             _settings(path, sensor),
             frequencies_hz=frequencies or None,
@@ -172,7 +191,6 @@ def plot(
         )
         reported = f"array of {path}"
     elif kind == "calibration":
-        azimuth_deg, elevation_deg = steer or (0.0, 0.0)
         made, settings = _calibrated(path, sensor)
         figure = figures.calibration(made, settings, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, **look)
         reported = f"calibration with {path}"
@@ -185,6 +203,19 @@ def plot(
             heard = _measurement(path, sensor, index)
             draw = figures.signals if kind == "signals" else figures.matched_filter
             figure, name = draw(heard, microphone=microphone, **look), heard.stamp.sensor
+        elif kind in _OF_SOUND:
+            figure, name = _acoustic_plots.draw(
+                kind,
+                path,
+                sensor,
+                index,
+                steer=steer,
+                band_hz=band_hz,
+                photo=photo,
+                photo_fov_deg=photo_fov_deg,
+                quiet=quiet,
+                look=look,
+            )
         else:
             image = _image(path, sensor, index, quiet=quiet)
             places = {"height_m": height, "left_m": left, "side_lobes": side_lobes}
@@ -197,6 +228,15 @@ def plot(
     options.say(f"{target}: {reported}", quiet=quiet)
     if as_json:
         options.print_json(report)
+
+
+def _default_kind(path: Path, sensor: str | None, index: int, kind: str) -> str:
+    """Return the kind of plot that suits a file, if none is typed."""
+    from ertis_numba.storage import is_map
+
+    if kind == "image" and is_map(path):
+        return "map"
+    return "acoustic_map" if kind == "image" and _acoustic_plots.is_acoustic(path, sensor, index) else kind
 
 
 def _require_supported(kind: str, given: "Mapping[str, object]") -> None:

@@ -7,26 +7,41 @@ return a figure, or the axes given as ``ax``; `save` writes a figure to a file. 
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Unpack, overload
+from typing import IO, Any, Unpack, overload
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import imread
+from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.analysis.side_lobes import without_side_lobes
 from ertis_numba.calibration import Calibration
-from ertis_numba.errors import ArgumentError
-from ertis_numba.figures import _array, _calibration, _captions, _images, _map, _pareto_front, _signals, _slices
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.figures import (
+    _acoustic,
+    _acoustic_signals,
+    _array,
+    _calibration,
+    _captions,
+    _images,
+    _map,
+    _pareto_front,
+    _signals,
+    _slices,
+)
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import compose
 from ertis_numba.figures._pareto_front import Rated
 from ertis_numba.figures.style import StyleOptions, parameters, style_of
-from ertis_numba.frames import Energyscape, Measurement, OccupancyMap, Peak
+from ertis_numba.frames import AcousticMap, Energyscape, Measurement, OccupancyMap, Peak
 from ertis_numba.settings import Array, Settings
 
 __all__ = [
     "Rated",
     "StyleOptions",
+    "acoustic_map",
     "array",
     "calibration",
     "front",
@@ -38,6 +53,8 @@ __all__ = [
     "save",
     "signals",
     "slices",
+    "spectrogram",
+    "spectrum",
 ]
 
 _FORMATS = ("pdf", "png", "svg")
@@ -244,6 +261,117 @@ def matched_filter(
     """
     checks.instance("measurement", measurement, Measurement, "a recording holds")
     return _signals.draw_echoes(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
+
+
+def acoustic_map(
+    found: AcousticMap,
+    *,
+    band_hz: tuple[float, float] | None = None,
+    photo: str | Path | None = None,
+    photo_fov_deg: tuple[float, float] | None = None,
+    dynamic_range_db: float = 40.0,
+    **look: Unpack[StyleOptions],
+) -> Figure:
+    """Draw an acoustic map over azimuth and elevation, or as a line over azimuth if it has one elevation.
+
+    Levels are in dBFS, or in dB re 20 µPa if the sensitivity of the microphones is known. Those of the method ``music``
+    are relative to the strongest.
+
+    Parameters
+    ----------
+    found : AcousticMap
+    band_hz : (low, high), optional
+        Limits of the centres of the bands to add, in hertz; all bands by default.
+    photo : str or Path, optional
+        Picture over which the map is drawn, half-transparent. The camera is at the sensor and looks along x.
+    photo_fov_deg : (azimuth, elevation), optional
+        Horizontal and vertical field of view of the picture in degrees, 1 to 170; needed with ``photo``.
+    dynamic_range_db, **look
+        As for `plot`.
+
+    Raises
+    ------
+    ArgumentError
+        An argument is invalid, no band lies within the limits, or a map of one elevation is to be drawn on a photo.
+    DataError
+        The picture cannot be read.
+    """
+    checks.instance("found", found, AcousticMap, "AcousticCamera.process returns")
+    canvas = _canvas(dynamic_range_db, look)
+    if (photo is None) != (photo_fov_deg is None):
+        raise ArgumentError("photo and photo_fov_deg need each other; give both or neither")
+    if photo is None or photo_fov_deg is None:
+        return _acoustic.draw(canvas, found, band_hz=band_hz)
+    for number, each_deg in enumerate(photo_fov_deg):
+        checks.between(f"photo_fov_deg[{number}]", each_deg, 1.0, 170.0)
+    return _acoustic.draw_on_photo(canvas, found, band_hz=band_hz, photo=_picture(photo), fov_deg=photo_fov_deg)
+
+
+def _picture(path: str | Path) -> NDArray[Any]:
+    try:
+        return np.asarray(imread(path))
+    except (OSError, ValueError, SyntaxError) as error:  # Errors of the readers of pictures.
+        reason = getattr(error, "strerror", None) or "not a readable picture"
+        raise DataError(f"photo {path}: {reason}; give a .png or .jpg") from error
+
+
+def spectrum(
+    source: AcousticMap | Measurement,
+    *,
+    direction_deg: tuple[float, float] | None = None,
+    dynamic_range_db: float = 40.0,
+    **look: Unpack[StyleOptions],
+) -> Figure:
+    """Draw the level over frequency: of each band of an acoustic map, or of each bin of a measurement.
+
+    Levels are those of `acoustic_map`.
+
+    Parameters
+    ----------
+    source : AcousticMap or Measurement
+    direction_deg : (azimuth, elevation), optional
+        Direction in degrees. By default the loudest direction of a map, or the mean of the microphones.
+    dynamic_range_db, **look
+        As for `plot`.
+
+    Raises
+    ------
+    ArgumentError
+        An argument is invalid.
+    """
+    canvas = _canvas(dynamic_range_db, look)
+    if isinstance(source, AcousticMap):
+        return _acoustic.draw_bands(canvas, source, direction_deg=direction_deg)
+    checks.instance("source", source, Measurement, "a recording holds, or an AcousticMap")
+    return _acoustic_signals.draw_spectrum(canvas, source, direction_deg=direction_deg)
+
+
+def spectrogram(
+    measurement: Measurement,
+    *,
+    direction_deg: tuple[float, float] | None = None,
+    dynamic_range_db: float = 40.0,
+    **look: Unpack[StyleOptions],
+) -> Figure:
+    """Draw the level over time and frequency, of the mean of the microphones or of a delay-and-sum beam.
+
+    Levels are those of `acoustic_map`, in bins of about 1 kHz.
+
+    Parameters
+    ----------
+    measurement : Measurement
+    direction_deg : (azimuth, elevation), optional
+        Direction of the beam in degrees.
+    dynamic_range_db, **look
+        As for `plot`.
+
+    Raises
+    ------
+    ArgumentError
+        An argument is invalid.
+    """
+    checks.instance("measurement", measurement, Measurement, "a recording holds")
+    return _acoustic_signals.draw_spectrogram(_canvas(dynamic_range_db, look), measurement, direction_deg=direction_deg)
 
 
 def array(

@@ -29,6 +29,8 @@ class Canvas:
     dynamic_range_db: float = 40.0
     peaks: tuple[Peak, ...] = ()
     is_searched: bool = False  # for peaks, which may be none
+    top_db: float = 0.0  # level of the brightest colour
+    unit: str = "dB re strongest"
 
     def level_db(self, amplitude: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the level relative to the strongest, limited to the dynamic range."""
@@ -48,8 +50,8 @@ class Canvas:
             extent=extent,
             origin="lower",
             aspect=aspect,
-            vmin=-self.dynamic_range_db,
-            vmax=0.0,
+            vmin=self.top_db - self.dynamic_range_db,
+            vmax=self.top_db,
             interpolation="antialiased",
         )
         axes.set_xlim(*extent[:2])

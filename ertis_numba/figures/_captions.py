@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.figures.style import angle, minus
-from ertis_numba.frames import Energyscape, Stamp
+from ertis_numba.frames import AcousticMap, Energyscape, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 
@@ -16,6 +16,7 @@ __all__ = [
     "highest_over",
     "khz",
     "number",
+    "of_acoustic_map",
     "of_array",
     "of_image",
     "of_measurement",
@@ -79,6 +80,25 @@ def of_measurement(title: str, settings: Settings, stamp: Stamp, *parts: str, va
             *parts,
             f"{minus(f'{settings.air.temperature_c:g}')} °C",
             *filter(None, [stamp.utc]),
+        ),
+    )
+
+
+def of_acoustic_map(title: str, found: AcousticMap, *parts: str) -> Heading:
+    """Return the words above an acoustic map."""
+    settings = found.settings
+    passive, count = settings.passive, found.n_measurements
+    return Heading(
+        (title, found.stamp.sensor, f"measurement {found.stamp.sequence}"),
+        (
+            settings.array.layout,
+            *parts,
+            f"method {passive.method.replace('_', ' ')}",
+            *((f"mean of {count} measurements",) if count > 1 else ()),
+            *(() if passive.focus_m is None else (f"focus at {passive.focus_m:g} m",)),
+            *((f"the first {number(1e3 * found.masked_s)} ms are left out",) if found.masked_s else ()),
+            f"{minus(f'{settings.air.temperature_c:g}')} °C",
+            *filter(None, [found.stamp.utc]),
         ),
     )
 

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, MultipleLocator
+from numpy.typing import NDArray
 
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._captions import highest_over
@@ -16,7 +17,7 @@ from ertis_numba.figures.style import minus
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import Fan, plan_m, spacing_rad, unit_vectors, unrolled_rad
 
-__all__ = ["curve", "direction_map", "sector"]
+__all__ = ["curve", "direction_map", "level_map", "sector"]
 
 _SECTOR_RATIOS, _MAP_RATIOS = (0.3, 0.95), (0.1, 1.05)  # limits of height to width
 _CURVE_RATIO = 0.42
@@ -54,10 +55,25 @@ def sector(canvas: Canvas, image: Energyscape, *, hidden: bool = False) -> Panel
 
 def direction_map(canvas: Canvas, image: Energyscape, *, hidden: bool) -> Panel:
     """Return the maximum over range as a map of azimuth, to the left, and elevation; side lobes may be ``hidden``."""
-    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    level_db = canvas.level_db(image.amplitude.max(axis=1))
+    return level_map(
+        canvas, level_db, image.azimuth_rad, image.elevation_rad, title=highest_over("range", hidden=hidden)
+    )
+
+
+def level_map(
+    canvas: Canvas,
+    level_db: NDArray[np.float32],
+    azimuth_rad: NDArray[np.float64],
+    elevation_rad: NDArray[np.float64],
+    *,
+    title: str = "",
+) -> Panel:
+    """Return levels as a map of azimuth, to the left, and elevation."""
+    directions = unit_vectors(azimuth_rad, elevation_rad)
     half_deg = math.degrees(spacing_rad(directions)) / 2 if len(directions) > 1 else 1.0
-    azimuth_deg = np.degrees(unrolled_rad(image.azimuth_rad, 3 * math.radians(half_deg)))
-    elevation_deg = np.degrees(image.elevation_rad)
+    azimuth_deg = np.degrees(unrolled_rad(azimuth_rad, 3 * math.radians(half_deg)))
+    elevation_deg = np.degrees(elevation_rad)
     west, east = float(azimuth_deg.max() + half_deg), float(azimuth_deg.min() - half_deg)
     if west - east > 360.0 - half_deg:  # all around
         west, east = 180.0, -180.0
@@ -66,7 +82,7 @@ def direction_map(canvas: Canvas, image: Energyscape, *, hidden: bool) -> Panel:
     def paint(axes: Axes) -> AxesImage:
         step_deg = max(west - east, high - low) / (PIXELS / 2)
         raster = sphere_raster(
-            canvas.level_db(image.amplitude.max(axis=1)),
+            level_db,
             directions,
             azimuth_rad=np.radians(np.arange(west - step_deg / 2, east, -step_deg)),
             elevation_rad=np.radians(np.arange(low + step_deg / 2, high, step_deg)),
@@ -88,7 +104,6 @@ def direction_map(canvas: Canvas, image: Energyscape, *, hidden: bool) -> Panel:
         canvas.mark_peaks(axes, lambda peak: (east + (peak.azimuth_deg - east) % 360.0, peak.elevation_deg))
 
     ratio = float(np.clip((high - low) / (west - east), *_MAP_RATIOS))
-    title = highest_over("range", hidden=hidden)
     return Panel(paint, lambda width_pt: ratio * width_pt, finish, title, box_aspect=ratio)
 
 

@@ -108,7 +108,7 @@ def compose(
         _place(figure, pictures, panels, heights_pt, (margin_pt, margin_pt + below_pt, width_pt - beside_pt, body_pt))
         if raster is not None:
             left_pt, tall_pt = (width_pt - beside_pt, body_pt) if wide else (margin_pt, below_pt)
-            _explain(figure, style, raster, rows, (left_pt, margin_pt, width_pt - left_pt - margin_pt, tall_pt))
+            _explain(figure, canvas, raster, rows, (left_pt, margin_pt, width_pt - left_pt - margin_pt, tall_pt))
         for panel, axes in zip(panels, pictures, strict=True):
             panel.finish(axes)
     return figure
@@ -141,12 +141,13 @@ def _place(
 
 def _explain(
     figure: Figure,
-    style: Style,
+    canvas: Canvas,
     raster: AxesImage,
     rows: list[str],
     box_pt: tuple[float, float, float, float],
 ) -> None:
     """Draw the colour bar into a box, which is left, bottom, width and height, and the list of reflectors below it."""
+    style = canvas.style
     (left_pt, bottom_pt, width_pt, tall_pt), em_pt = box_pt, style.em_pt
     bar_pt, top_pt = min(16 * em_pt, (0.45 if rows else _SHARE_ALONE) * tall_pt), bottom_pt + tall_pt
     upright = bar_pt >= _LABEL_EMS * em_pt and width_pt < 30 * em_pt
@@ -157,7 +158,7 @@ def _explain(
     across_pt, up_pt = 72 * figure.get_size_inches()
     axes = figure.add_axes((bar[0] / across_pt, bar[1] / up_pt, bar[2] / across_pt, bar[3] / up_pt))
     orientation = "vertical" if upright else "horizontal"
-    figure.colorbar(raster, cax=axes, orientation=orientation, label="dB re strongest")
+    figure.colorbar(raster, cax=axes, orientation=orientation, label=canvas.unit)
     for solid in axes.collections:
         solid.set_rasterized(True)  # hundreds of colours are one picture in a file of vectors
     top_pt = bar[1] - (2.0 if upright else 3.6) * em_pt

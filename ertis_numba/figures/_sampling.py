@@ -10,6 +10,7 @@ __all__ = [
     "PIXELS",
     "centres",
     "join_ranges",
+    "look_raster",
     "polar_raster",
     "sphere_raster",
     "thickened",
@@ -116,9 +117,24 @@ def sphere_raster(
     elevation_rad : (row,) float64
     """
     looks = unit_vectors(*(grid.ravel() for grid in np.meshgrid(azimuth_rad, elevation_rad)))
-    place, weight = _around(directions, looks)
-    levels = np.sum(weight * level_db[place], axis=1)
-    return np.asarray(levels, dtype=np.float32).reshape(len(elevation_rad), len(azimuth_rad))
+    return look_raster(level_db, directions, looks.reshape(len(elevation_rad), len(azimuth_rad), 3))
+
+
+def look_raster(
+    level_db: NDArray[np.float32], directions: NDArray[np.float64], looks: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return levels in the directions of pixels, interpolated as by `sphere_raster`: (row, column).
+
+    Parameters
+    ----------
+    level_db : (direction,) float32
+    directions : (direction, axis) float64
+        Unit vectors.
+    looks : (row, column, axis) float64
+        Unit vectors.
+    """
+    place, weight = _around(directions, looks.reshape(-1, 3))
+    return np.asarray(np.sum(weight * level_db[place], axis=1), np.float32).reshape(looks.shape[:2])
 
 
 def volume_raster(

@@ -1,0 +1,204 @@
+"""Acoustic maps: levels over direction, on a photo, and over the bands of one direction."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.ticker import FixedFormatter, FixedLocator
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.figures import _captions
+from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._images import level_map
+from ertis_numba.figures._page import Panel, compose
+from ertis_numba.figures._sampling import PIXELS, centres, look_raster
+from ertis_numba.figures.style import angle, minus
+from ertis_numba.frames import AcousticMap
+from ertis_numba.geometry import unit_vectors
+from ertis_numba.settings import Settings
+from ertis_numba.units import sound_pressure_level_db
+
+__all__ = ["draw", "draw_bands", "draw_on_photo", "level_offset_db"]
+
+_LINE_RATIO, _BAND_RATIO = 0.42, 0.42
+_SPARE_DB = 3.0
+_OPAQUE = 0.6  # of the colours over a photo
+_FADED = 0.3  # share of the dynamic range over which they fade in
+_TICKS_DEG = (-60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60)
+
+
+def draw(canvas: Canvas, found: AcousticMap, *, band_hz: tuple[float, float] | None) -> Figure:
+    """Draw the levels of a band over azimuth and elevation, or as a line over azimuth."""
+    canvas, level_db = _levels(canvas, found, band_hz)
+    heading = _heading(canvas, found, band_hz, level_db)
+    if np.ptp(found.elevation_rad) > 1e-9:
+        panel = level_map(canvas, level_db, found.azimuth_rad, found.elevation_rad)
+        return compose(canvas, heading, [_with_loudest(canvas, found, level_db, panel)])
+    _require_directions(found)
+    order = np.argsort(found.azimuth_rad)
+    azimuth_deg = np.degrees(found.azimuth_rad[order])
+
+    def paint(axes: Axes) -> None:
+        axes.plot(azimuth_deg, level_db[order], color=canvas.style.mark)
+        axes.set_xlim(azimuth_deg[-1], azimuth_deg[0])  # Positive azimuths are on the left.
+        axes.set_ylim(canvas.top_db - canvas.dynamic_range_db, canvas.top_db + _SPARE_DB)
+        axes.set_xlabel("azimuth (°)")
+        axes.set_ylabel(f"level ({canvas.unit})")
+        canvas.grid(axes)
+
+    return compose(canvas, heading, [Panel(paint, lambda width_pt: _LINE_RATIO * width_pt)])
+
+
+def draw_on_photo(
+    canvas: Canvas,
+    found: AcousticMap,
+    *,
+    band_hz: tuple[float, float] | None,
+    photo: NDArray[Any],
+    fov_deg: tuple[float, float],
+) -> Figure:
+    """Draw the levels of a band over the picture of a pinhole camera that looks along x."""
+    if np.ptp(found.elevation_rad) <= 1e-9:
+        raise ArgumentError(
+            "the directions of the acoustic map have one elevation, which a photo cannot show; process with directions "
+            "in space, such as 3000 or 3d:2000"
+        )
+    canvas, level_db = _levels(canvas, found, band_hz)
+    half_y, half_z = (math.tan(math.radians(each_deg) / 2) for each_deg in fov_deg)
+    extent = (half_y, -half_y, -half_z, half_z)
+    step = 2 * max(half_y, half_z) / PIXELS
+
+    def paint(axes: Axes) -> AxesImage:
+        y, z = np.meshgrid(centres(half_y, -half_y, step), centres(-half_z, half_z, step))
+        rays = np.stack([np.ones_like(y), y, z], axis=2)
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        raster = look_raster(level_db, unit_vectors(found.azimuth_rad, found.elevation_rad), rays)
+        axes.imshow(photo, extent=extent, aspect="auto", interpolation="antialiased", cmap="gray")
+        shown = canvas.show(axes, raster, extent=extent)
+        above = (raster - (canvas.top_db - canvas.dynamic_range_db)) / (_FADED * canvas.dynamic_range_db)
+        shown.set_alpha(_OPAQUE * np.clip(np.nan_to_num(above), 0.0, 1.0))
+        axes.set_xlabel("azimuth (°)")
+        axes.set_ylabel("elevation (°)")
+        for axis, half in ((axes.xaxis, half_y), (axes.yaxis, half_z)):
+            seen_deg = [at_deg for at_deg in _TICKS_DEG if abs(math.tan(math.radians(at_deg))) <= half]
+            axis.set_major_locator(FixedLocator([math.tan(math.radians(at_deg)) for at_deg in seen_deg]))
+            axis.set_major_formatter(FixedFormatter([minus(f"{at_deg}") for at_deg in seen_deg]))
+        return shown
+
+    ratio = half_z / half_y
+    view = f"field of view {fov_deg[0]:g}° × {fov_deg[1]:g}°"
+    heading = _heading(canvas, found, band_hz, level_db, view)
+    return compose(canvas, heading, [Panel(paint, lambda width_pt: ratio * width_pt, box_aspect=ratio)])
+
+
+def draw_bands(canvas: Canvas, found: AcousticMap, *, direction_deg: tuple[float, float] | None) -> Figure:
+    """Draw the level of each band in a direction, by default the loudest of all bands together."""
+    place = _place(found, direction_deg)
+    canvas, level_db = _scaled(canvas, found, found.power[place])
+    edges_khz = found.band_hz / 1e3
+    floor_db = canvas.top_db - canvas.dynamic_range_db
+
+    def paint(axes: Axes) -> None:
+        axes.bar(
+            edges_khz[:, 0],
+            np.maximum(level_db, floor_db) - floor_db,
+            np.diff(edges_khz, axis=1)[:, 0],
+            bottom=floor_db,
+            align="edge",
+            color=canvas.style.mark,
+            edgecolor=canvas.style.page,
+            linewidth=canvas.style.line_pt,
+        )
+        axes.set_xlim(edges_khz.min(), edges_khz.max())
+        axes.set_ylim(floor_db, canvas.top_db + _SPARE_DB)
+        axes.set_xlabel("frequency (kHz)")
+        axes.set_ylabel(f"level of a band ({canvas.unit})")
+        canvas.grid(axes)
+
+    place_deg = np.degrees([found.azimuth_rad[place], found.elevation_rad[place]])
+    towards = f"azimuth {angle(place_deg[0])}, elevation {angle(place_deg[1])}"
+    chosen = towards if direction_deg is not None else f"loudest direction: {towards}"
+    heading = _captions.of_acoustic_map("Spectrum", found, chosen)
+    return compose(canvas, heading, [Panel(paint, lambda width_pt: _BAND_RATIO * width_pt)])
+
+
+def level_offset_db(settings: Settings) -> tuple[float, str]:
+    """Return the level of a mean square of 1, and its unit: dB re 20 µPa if the sensitivity is known."""
+    sensitivity_dbfs = settings.array.sensitivity_dbfs
+    if sensitivity_dbfs is None:
+        return 0.0, "dBFS"
+    return sound_pressure_level_db(0.0, sensitivity_dbfs), "dB re 20 µPa"
+
+
+def _levels(
+    canvas: Canvas, found: AcousticMap, band_hz: tuple[float, float] | None
+) -> tuple[Canvas, NDArray[np.float32]]:
+    """Return the levels of a band in all directions, and a canvas with their scale."""
+    return _scaled(canvas, found, found.power.sum(axis=1) if band_hz is None else found.in_band(*band_hz))
+
+
+def _scaled(canvas: Canvas, found: AcousticMap, power: NDArray[np.float32]) -> tuple[Canvas, NDArray[np.float32]]:
+    """Return levels limited to the dynamic range below the highest, and a canvas with their scale."""
+    offset_db, unit = level_offset_db(found.settings) if found.has_level else (0.0, canvas.unit)
+    highest = float(power.max(initial=0.0)) or 1.0
+    top_db = 10 * math.log10(highest) + offset_db if found.has_level else 0.0
+    lowest = 10 ** (-canvas.dynamic_range_db / 10)
+    below_db = 10 * np.log10(np.maximum(power / highest, lowest))
+    return replace(canvas, top_db=top_db, unit=unit), np.asarray(top_db + below_db, np.float32)
+
+
+def _heading(
+    canvas: Canvas,
+    found: AcousticMap,
+    band_hz: tuple[float, float] | None,
+    level_db: NDArray[np.float32],
+    *parts: str,
+) -> _captions.Heading:
+    if band_hz is None:
+        shown_hz = found.band_hz
+    else:
+        centre_hz = np.sqrt(found.band_hz.prod(axis=1))
+        shown_hz = found.band_hz[(centre_hz >= band_hz[0]) & (centre_hz <= band_hz[1])]
+    place = int(np.argmax(level_db))
+    place_deg = np.degrees([found.azimuth_rad[place], found.elevation_rad[place]])
+    level = f": {minus(f'{canvas.top_db:.1f}')} {canvas.unit}" if found.has_level else ""
+    return _captions.of_acoustic_map(
+        "Acoustic map",
+        found,
+        f"{len(found.azimuth_rad)} directions",
+        f"{_captions.number(shown_hz.min() / 1e3)}–{_captions.number(shown_hz.max() / 1e3)} kHz",
+        f"loudest at azimuth {angle(place_deg[0])}, elevation {angle(place_deg[1])}{level}",
+        *parts,
+    )
+
+
+def _with_loudest(canvas: Canvas, found: AcousticMap, level_db: NDArray[np.float32], panel: Panel) -> Panel:
+    """Return a map with a ring around its loudest direction."""
+    place = int(np.argmax(level_db))
+
+    def finish(axes: Axes) -> None:
+        panel.finish(axes)
+        east = min(axes.get_xlim())
+        at_deg = east + (math.degrees(found.azimuth_rad[place]) - east) % 360.0
+        ring: dict[str, Any] = {"fillstyle": "none", "markersize": 1.1 * canvas.style.em_pt, "scalex": False}
+        axes.plot(at_deg, math.degrees(found.elevation_rad[place]), "o", color=canvas.style.mark, scaley=False, **ring)
+
+    return replace(panel, finish=finish)
+
+
+def _place(found: AcousticMap, direction_deg: tuple[float, float] | None) -> int:
+    """Return the index of the direction nearest to one, or of the loudest."""
+    if direction_deg is None:
+        return int(np.argmax(found.power.sum(axis=1)))
+    wanted = unit_vectors(*np.radians(direction_deg).reshape(2, 1))[0]
+    return int(np.argmax(unit_vectors(found.azimuth_rad, found.elevation_rad) @ wanted))
+
+
+def _require_directions(found: AcousticMap) -> None:
+    if len(found.azimuth_rad) < 2:
+        raise ArgumentError("the acoustic map has one direction; draw its spectrum instead, or give more directions")

@@ -1,0 +1,186 @@
+"""Spectrum and spectrogram of a recording, of the mean of its microphones or of a beam."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import scipy
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.errors import ArgumentError
+from ertis_numba.figures import _captions
+from ertis_numba.figures._acoustic import level_offset_db
+from ertis_numba.figures._canvas import Canvas
+from ertis_numba.figures._microphone_traces import signals
+from ertis_numba.figures._page import Panel, compose
+from ertis_numba.figures.style import angle
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
+from ertis_numba.settings import Settings
+
+__all__ = ["beam", "draw_spectrogram", "draw_spectrum", "power_spectra"]
+
+_RATIO = 0.5
+_SPARE_DB = 3.0
+_SPACING_HZ = 1e3
+_MAX_COLUMNS = 1000
+_CHUNK = 2**20  # samples of spectra at a time, so that memory stays bounded
+
+
+def draw_spectrum(canvas: Canvas, measurement: Measurement, *, direction_deg: tuple[float, float] | None) -> Figure:
+    """Draw the level in each bin, of the mean of the microphones or of a beam."""
+    settings = _calibrated(measurement.settings)
+    power, frequency_hz, _ = _spectra(measurement, direction_deg)
+    canvas, level_db = _scaled(canvas, settings, power.mean(axis=1))
+
+    def paint(axes: Axes) -> None:
+        axes.plot(frequency_hz / 1e3, level_db, color=canvas.style.mark)
+        axes.set_xlim(0.0, frequency_hz[-1] / 1e3)
+        axes.set_ylim(canvas.top_db - canvas.dynamic_range_db, canvas.top_db + _SPARE_DB)
+        axes.set_xlabel("frequency (kHz)")
+        axes.set_ylabel(f"level of a bin ({canvas.unit})")
+        canvas.grid(axes)
+
+    heading = _heading("Spectrum", measurement, direction_deg, frequency_hz, power)
+    return compose(canvas, heading, [Panel(paint, lambda width_pt: _RATIO * width_pt)])
+
+
+def draw_spectrogram(canvas: Canvas, measurement: Measurement, *, direction_deg: tuple[float, float] | None) -> Figure:
+    """Draw the level in each bin over time, of the mean of the microphones or of a beam."""
+    settings = _calibrated(measurement.settings)
+    power, frequency_hz, time_s = _spectra(measurement, direction_deg)
+    canvas, level_db = _scaled(canvas, settings, power)
+    half_s = (time_s[-1] - time_s[0]) / max(1, 2 * (len(time_s) - 1)) or 0.5e-3
+    half_hz = frequency_hz[1] / 2
+    edges = (time_s[0] - half_s, time_s[-1] + half_s, -half_hz, frequency_hz[-1] + half_hz)
+    extent = (1e3 * edges[0], 1e3 * edges[1], edges[2] / 1e3, edges[3] / 1e3)
+
+    def paint(axes: Axes) -> AxesImage:
+        shown = canvas.show(axes, level_db, extent=extent)
+        axes.set_ylim(0.0, frequency_hz[-1] / 1e3)
+        axes.set_xlabel("time (ms)")
+        axes.set_ylabel("frequency (kHz)")
+        canvas.grid(axes)
+        return shown
+
+    canvas = replace(canvas, unit=f"{canvas.unit} in a bin")
+    heading = _heading("Spectrogram", measurement, direction_deg, frequency_hz, power)
+    return compose(canvas, heading, [Panel(paint, lambda width_pt: _RATIO * width_pt)])
+
+
+def beam(values: NDArray[np.float32], settings: Settings, direction_deg: tuple[float, float]) -> NDArray[np.float32]:
+    """Return the delay-and-sum beam of signals, with exact delays of plane waves: (sample,) float32.
+
+    The delay of each microphone is undone by the phase of the spectrum of the whole record, padded with silence.
+
+    Parameters
+    ----------
+    values : (mic, sample) float32
+        Signals at ``settings.signal_rate_hz``.
+    settings : Settings
+    direction_deg : (azimuth, elevation)
+        Direction in degrees.
+    """
+    layout = microphones(settings.array)
+    azimuth_rad, elevation_rad = np.radians(direction_deg).reshape(2, 1)
+    delay_s = far_field_delays(
+        layout.enabled_positions_m,
+        unit_vectors(azimuth_rad, elevation_rad),
+        sound_speed_m_s=sound_speed_m_s(settings.air),
+    )[0]
+    delay_s = delay_s + layout.delay_s[layout.enabled]
+    rate_hz, count = settings.signal_rate_hz, values.shape[1]
+    n_fft = scipy.fft.next_fast_len(count + 2 * math.ceil(float(np.abs(delay_s).max()) * rate_hz) + 1, real=True)
+    frequency_hz = np.fft.rfftfreq(n_fft, 1 / rate_hz)
+    total = np.zeros(len(frequency_hz), np.complex128)
+    for row, gain, each_s in zip(values, layout.gain[layout.enabled], delay_s, strict=True):
+        total += np.fft.rfft(row, n_fft) / gain * np.exp(2j * np.pi * frequency_hz * each_s)
+    return np.asarray(np.fft.irfft(total / len(values), n_fft)[:count], np.float32)
+
+
+def power_spectra(
+    values: NDArray[np.float32], rate_hz: float
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+    """Return mean squares within bins of about 1 kHz: (bin, time) float32, their frequencies and times.
+
+    The window is Hann's, and spectra overlap by three quarters (P. D. Welch, 1967). Sums over all bins are the mean
+    square of the signals, of which the mean is taken. In a long record, a column is the mean of several spectra.
+
+    Parameters
+    ----------
+    values : (channel, sample) float32
+    rate_hz : float
+
+    Raises
+    ------
+    ArgumentError
+        The record is shorter than a window.
+    """
+    size = scipy.fft.next_fast_len(round(rate_hz / _SPACING_HZ), real=True)
+    size += size % 2
+    if values.shape[1] < size:
+        raise ArgumentError(f"the record has {values.shape[1]} samples, but a spectrum needs {size}; record longer")
+    window = scipy.signal.get_window("hann", size).astype(np.float32)
+    scale = np.full(size // 2 + 1, 2 / (size * float((window.astype(np.float64) ** 2).sum())), np.float32)
+    scale[[0, -1]] /= 2  # These frequencies have no negative twin.
+    starts = np.arange(0, values.shape[1] - size + 1, size // 4)
+    joined = -(-len(starts) // _MAX_COLUMNS)
+    power = np.zeros((len(starts), size // 2 + 1), np.float32)
+    step = max(1, _CHUNK // size)
+    for first in range(0, len(starts), step):
+        some = starts[first : first + step]
+        for row in values:
+            pieces = np.lib.stride_tricks.sliding_window_view(row, size)[some] * window
+            power[first : first + step] += np.abs(scipy.fft.rfft(pieces)) ** 2
+    power *= scale / np.float32(len(values))
+    begins = np.arange(0, len(starts), joined)
+    counts = np.diff(np.append(begins, len(starts)))
+    mean = np.asarray(np.add.reduceat(power, begins, axis=0) / counts[:, None], np.float32)
+    time_s = (np.add.reduceat(starts, begins) / counts + size / 2) / rate_hz
+    return mean.T, np.arange(size // 2 + 1) * rate_hz / size, time_s
+
+
+def _spectra(
+    measurement: Measurement, direction_deg: tuple[float, float] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+    settings = measurement.settings
+    values = signals(measurement).values
+    if direction_deg is not None:
+        values = beam(values, settings, direction_deg)[None]
+    else:
+        layout = microphones(settings.array)
+        values = np.asarray(values / layout.gain[layout.enabled, None], np.float32)
+    return power_spectra(values, settings.signal_rate_hz)
+
+
+def _calibrated(settings: Settings) -> Settings:
+    """Return settings with the sensitivity of the layout."""
+    return settings.replace("array.sensitivity_dbfs", microphones(settings.array).sensitivity_dbfs)
+
+
+def _scaled(canvas: Canvas, settings: Settings, power: NDArray[np.float32]) -> tuple[Canvas, NDArray[np.float32]]:
+    offset_db, unit = level_offset_db(settings)
+    highest = float(power.max(initial=0.0)) or 1.0
+    top_db = 10 * math.log10(highest) + offset_db
+    lowest = 10 ** (-canvas.dynamic_range_db / 10)
+    level_db = top_db + 10 * np.log10(np.maximum(power / highest, lowest))
+    return replace(canvas, top_db=top_db, unit=unit), np.asarray(level_db, np.float32)
+
+
+def _heading(
+    title: str,
+    measurement: Measurement,
+    direction_deg: tuple[float, float] | None,
+    frequency_hz: NDArray[np.float64],
+    power: NDArray[np.float32],
+) -> _captions.Heading:
+    n_mics = int(microphones(measurement.settings.array).enabled.sum())
+    heard = f"mean of {n_mics} microphones"
+    if direction_deg is not None:
+        heard = f"beam to azimuth {angle(direction_deg[0])}, elevation {angle(direction_deg[1])}"
+    bins = f"bins of {_captions.number(frequency_hz[1] / 1e3)} kHz"
+    return _captions.of_measurement(title, measurement.settings, measurement.stamp, heard, bins, values=np.sqrt(power))
