@@ -13,6 +13,7 @@ from ertis_cli.main import cli
 import ertis_numba as ertis
 from ertis_numba.frames import Stamp
 from ertis_numba.settings import MAP_METHODS
+from tests.pages import commands_in, page, python_in, run_code_here, run_here
 from tests.test_acoustic_camera import settings_of, sound
 
 SETTINGS = settings_of(processing__range_m=(0.5, 0.9), passive__averages=2)
@@ -219,3 +220,21 @@ def test_peaks_of_maps_refuse_options_of_images(option):
     run("process passive.h5 -o maps.h5 --device numpy")
     message = f"{option.split()[0]} is for images, but maps.h5 holds acoustic maps; leave it out"
     assert message in run(f"peaks maps.h5 {option}", code=2).stderr
+
+
+def test_commands_and_code_of_the_page_run(tmp_path):
+    text = page("passive")
+    for command in commands_in(text):
+        run_here(tmp_path, command)
+        if command == "example leak":
+            scene_file = tmp_path / "leak.toml"
+            scene_file.write_text(scene_file.read_text("utf-8").replace("count = 10", "count = 2"), "utf-8")
+    with ertis.open_acoustic_maps(tmp_path / "leak.acoustic.h5") as maps:
+        assert (len(maps), maps[0].n_measurements) == (1, 2)
+        found = {
+            round(np.sqrt(np.prod(each.band_hz)) / 1e3): np.degrees(each.azimuth_rad) for each in maps[0].loudest()
+        }
+    assert found[16] < -30  # the machine
+    assert found[63] == pytest.approx(28, abs=4)  # the leak
+    (code,) = python_in(text)
+    assert run_code_here(tmp_path, code).count("\n") == 10

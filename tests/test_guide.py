@@ -67,6 +67,8 @@ RUN_BY = {
     ],
     ("many", "python"): ["test_many_docs::test_code_of_the_page_runs"],
     ("motion", "$"): ["test_odometry::test_commands_of_the_motion_page_run"],
+    ("passive", "$"): ["test_acoustic_map_commands::test_commands_and_code_of_the_page_run"],
+    ("passive", "python"): ["test_acoustic_map_commands::test_commands_and_code_of_the_page_run"],
     ("network", "$"): [
         "test_network_page::test_network_page_on_one_machine_runs",
         "test_network_page::test_network_page_on_several_machines_runs",

@@ -3,6 +3,7 @@
 The real measurement comes with the package rtisdev; its code is not imported.
 """
 
+import dataclasses
 import importlib.metadata
 import io
 from pathlib import Path
@@ -55,6 +56,16 @@ def beamformers() -> None:
     sheet.save(HERE / "beamformers.png", optimize=True)
 
 
+def leak() -> None:
+    """Draw the acoustic map of a leak, the mean of ten measurements."""
+    scene = ertis.load_scene(HERE.parents[1] / "data" / "synthetic" / "scenes" / "leak.toml")
+    measurements = [ertis.render(scene, number) for number in range(10)]
+    settings = measurements[0].settings.replace("passive.averages", len(measurements))
+    with ertis.AcousticCamera(settings) as camera:
+        (found,) = camera.process_many(dataclasses.replace(each, settings=settings) for each in measurements)
+    figures.acoustic_map(found, band_hz=(50e3, 80e3), dynamic_range_db=20).savefig(HERE / "leak.png", dpi=80)
+
+
 def kinds() -> None:
     """Draw each kind of plot of the synthetic reflectors on one sheet."""
     takes = {}
@@ -85,3 +96,4 @@ if __name__ == "__main__":
     real()
     beamformers()
     kinds()
+    leak()
