@@ -15,7 +15,7 @@ from ertis_numba import figures
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.figures import _acoustic_signals
 from ertis_numba.frames import Stamp
-from ertis_numba.geometry import direction_grid, far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.settings import Settings
 from tests.test_acoustic_camera import settings_of, sound
 
@@ -181,21 +181,6 @@ def test_spectra_of_long_records_are_means():
     assert len(time_s) <= 1000
     assert np.all(np.diff(time_s) > 0)
     assert power.sum(axis=0).mean() == pytest.approx(float((values**2).mean()), rel=0.02)
-
-
-def test_beam_removes_delays_and_gains():
-    gain, own_s = (1.0, 0.5, 2.0, 1.0, -1.0, 1.0), (0.0, 2e-6, -3e-6, 1e-6, 0.0, 4e-6)
-    settings = settings_of(array__gain=gain, array__delay_s=own_s)
-    rate_hz = settings.signal_rate_hz
-    time_s = np.arange(4000) / rate_hz
-    layout = microphones(settings.array)
-    speed = ertis.air.sound_speed_m_s(settings.air)
-    looks = unit_vectors(np.radians([20.0]), np.radians([10.0]))
-    delay_s = far_field_delays(layout.positions_m, looks, sound_speed_m_s=speed)[0] + layout.delay_s
-    values = (layout.gain[:, None] * np.cos(2 * np.pi * 30e3 * (time_s - delay_s[:, None]))).astype(np.float32)
-    found = _acoustic_signals.beam(values, settings, (20.0, 10.0))
-    assert found[500:-500] == pytest.approx(np.cos(2 * np.pi * 30e3 * time_s)[500:-500], abs=0.01)
-    assert np.abs(_acoustic_signals.beam(values, settings, (-60.0, 0.0))[500:-500]).max() < 0.7
 
 
 def test_spectrum_and_spectrogram_show_a_source():

@@ -10,19 +10,18 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _captions
 from ertis_numba.figures._acoustic import level_offset_db
 from ertis_numba.figures._canvas import Canvas
-from ertis_numba.figures._microphone_traces import signals
 from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures.style import angle
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry import microphones
+from ertis_numba.passive import HeardSignals, listen_to
 from ertis_numba.settings import Settings
 
-__all__ = ["beam", "draw_spectrogram", "draw_spectrum", "power_spectra"]
+__all__ = ["draw_spectrogram", "draw_spectrum", "power_spectra"]
 
 _RATIO = 0.5
 _SPARE_DB = 3.0
@@ -72,36 +71,6 @@ def draw_spectrogram(canvas: Canvas, measurement: Measurement, *, direction_deg:
     return compose(canvas, heading, [Panel(paint, lambda width_pt: _RATIO * width_pt)])
 
 
-def beam(values: NDArray[np.float32], settings: Settings, direction_deg: tuple[float, float]) -> NDArray[np.float32]:
-    """Return the delay-and-sum beam of signals, with exact delays of plane waves: (sample,) float32.
-
-    The delay of each microphone is undone by the phase of the spectrum of the whole record, padded with silence.
-
-    Parameters
-    ----------
-    values : (mic, sample) float32
-        Signals at ``settings.signal_rate_hz``.
-    settings : Settings
-    direction_deg : (azimuth, elevation)
-        Direction in degrees.
-    """
-    layout = microphones(settings.array)
-    azimuth_rad, elevation_rad = np.radians(direction_deg).reshape(2, 1)
-    delay_s = far_field_delays(
-        layout.enabled_positions_m,
-        unit_vectors(azimuth_rad, elevation_rad),
-        sound_speed_m_s=sound_speed_m_s(settings.air),
-    )[0]
-    delay_s = delay_s + layout.delay_s[layout.enabled]
-    rate_hz, count = settings.signal_rate_hz, values.shape[1]
-    n_fft = scipy.fft.next_fast_len(count + 2 * math.ceil(float(np.abs(delay_s).max()) * rate_hz) + 1, real=True)
-    frequency_hz = np.fft.rfftfreq(n_fft, 1 / rate_hz)
-    total = np.zeros(len(frequency_hz), np.complex128)
-    for row, gain, each_s in zip(values, layout.gain[layout.enabled], delay_s, strict=True):
-        total += np.fft.rfft(row, n_fft) / gain * np.exp(2j * np.pi * frequency_hz * each_s)
-    return np.asarray(np.fft.irfft(total / len(values), n_fft)[:count], np.float32)
-
-
 def power_spectra(
     values: NDArray[np.float32], rate_hz: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
@@ -147,14 +116,14 @@ def power_spectra(
 def _spectra(
     measurement: Measurement, direction_deg: tuple[float, float] | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
-    settings = measurement.settings
-    values = signals(measurement).values
-    if direction_deg is not None:
-        values = beam(values, settings, direction_deg)[None]
-    else:
-        layout = microphones(settings.array)
-        values = np.asarray(values / layout.gain[layout.enabled, None], np.float32)
-    return power_spectra(values, settings.signal_rate_hz)
+    with HeardSignals(measurement.settings) as signals:
+        if direction_deg is None:
+            values = signals(measurement)
+        else:
+            values = listen_to(measurement, *direction_deg, signals=signals).samples[None]
+        power, frequency_hz, time_s = power_spectra(values, signals.rate_hz)
+        n_bins = int(np.searchsorted(frequency_hz, signals.band_hz[1], side="right"))  # Beyond, filters attenuate.
+        return power[:n_bins], frequency_hz[:n_bins], time_s
 
 
 def _calibrated(settings: Settings) -> Settings:
