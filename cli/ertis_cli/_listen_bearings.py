@@ -46,7 +46,7 @@ def listen_bearings(
     def show(found: "AcousticMap") -> None:
         _show(found, subscribers[0].bearings, _age_ms(subscribers[0]), as_json=as_json)
 
-    def tell_active(subscriber: AcousticMapSubscriber) -> None:
+    def report_active(subscriber: AcousticMapSubscriber) -> None:
         if subscriber.n_active:
             options.say(
                 f"{options.counted(subscriber.n_active, 'measurement')} with a call left out; record with "
@@ -61,7 +61,7 @@ def listen_bearings(
         show,
         head=_HEAD,
         of=("map", "measurements"),
-        at_end=tell_active,
+        at_end=report_active,
         n=n,
         duration=duration,
         quiet=quiet,

@@ -181,12 +181,12 @@ def _listen_specially(
     force: bool,
     **common: Any,
 ) -> None:
-    """Print what this command computes itself: bearings, odometry, or fused images."""
+    """Print bearings, odometry or fused images, which this command computes itself."""
     _network.require_duration(common["duration"])
     if name == "bearings":
         _listen_bearings.listen_bearings(address, average=average, **common)
         return
-    common["mountings"] = _mountings.mountings(mounting, None)
+    common["mountings"] = _mountings.mountings(mounting, common["sensors"] or None)
     if name == "odometry":
         _listen_odometry.listen_odometry(address, target=trajectory, force=force, **common)
     else:
