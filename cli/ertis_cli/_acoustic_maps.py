@@ -119,7 +119,7 @@ def are_wanted(path: Path, sensors: "Sequence[str]", changed: _Changed) -> bool:
 
 
 def require_none(reason: str) -> None:
-    """Raise an error for options of acoustic maps, which have no effect for a reason."""
+    """Raise an error for options of acoustic maps, with the reason for which they have no effect."""
     for name, option in _MAP_OPTIONS.items():
         if typed(_PREFIX + name):
             raise click.UsageError(

@@ -49,8 +49,8 @@ def listen_bearings(
     def report_active(subscriber: AcousticMapSubscriber) -> None:
         if subscriber.n_active:
             options.say(
-                f"{options.counted(subscriber.n_active, 'measurement')} with a call left out; record with "
-                "'ertis capture --passive', or give the settings processing.mode 'passive'",
+                f"left out {options.counted(subscriber.n_active, 'measurement')} with a call; record with "
+                "'ertis capture --passive', or set processing.mode to 'passive'",
                 quiet=quiet,
             )
 

@@ -61,7 +61,7 @@ _POLL_INTERVAL_S = 0.1
     "--average",
     type=click.IntRange(min=1),
     metavar="N",
-    help="With --bearings: measurements to average, of each sensor; by default those of its settings.",
+    help="With --bearings: number of measurements of each sensor to average; that of its settings by default.",
 )
 @click.option(
     "--output",

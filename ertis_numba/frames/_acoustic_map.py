@@ -135,14 +135,14 @@ class AcousticMap(DegreesFromRadians):
         Raises
         ------
         ArgumentError
-            No band lies within the limits.
+            No band has its centre within the limits.
         """
         centre_hz = np.sqrt(self.band_hz.prod(axis=1))
         chosen = (centre_hz >= low_hz) & (centre_hz <= high_hz)
         if not chosen.any():
             raise ArgumentError(
                 f"no band lies within {low_hz:g} to {high_hz:g} Hz; the map has bands from {self.band_hz.min():g} to "
-                f"{self.band_hz.max():g} Hz"
+                f"{self.band_hz.max():g} Hz; give wider limits"
             )
         return np.asarray(self.power[:, chosen].sum(axis=1), np.float32)
 

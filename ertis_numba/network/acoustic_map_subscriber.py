@@ -1,4 +1,4 @@
-"""Application node that makes acoustic maps from measurements as they arrive."""
+"""Application node that computes acoustic maps from measurements as they arrive."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,10 +15,10 @@ __all__ = ["AcousticMapSubscriber"]
 
 
 class AcousticMapSubscriber:
-    """Receiver of measurements that makes acoustic maps; use it in a ``with`` statement and a loop.
+    """Receiver of measurements that computes acoustic maps; use it in a ``with`` statement and a loop.
 
-    Maps are made here, not at the central node, which sends the measurements as they are: a measurement of 36 ms of an
-    eRTIS has 0.65 MB. An application that is too slow gets the latest measurements.
+    Maps are computed here, not at the central node, which sends the measurements as they are. A measurement of 36 ms of
+    an eRTIS takes 0.65 MB. An application that is too slow gets the latest measurements.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class AcousticMapSubscriber:
     bearings : list of Bearing
         Bearings of the last map, as by `BearingFinder`; empty without ``false_alarm``.
     n_active : int
-        Measurements with a call, which become no map unless ``processing.mode`` is ``passive``.
+        Measurements with a call. They are left out unless ``processing.mode`` is ``passive``.
 
     Raises
     ------

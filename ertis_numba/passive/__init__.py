@@ -1,4 +1,4 @@
-"""Passive listening: maps of the sound that arrives from each direction, without an own call."""
+"""Passive listening: maps, bearings and signals of sound that the sensor did not emit."""
 
 from ertis_numba.passive.bands import band_edges, octave_bands
 from ertis_numba.passive.beam_sound import BeamSound, heterodyned, listen_to, time_expanded

@@ -24,7 +24,7 @@ def octave_bands(low_hz: float, high_hz: float, *, fraction: int = 3) -> NDArray
     low_hz, high_hz : float
         Limits in hertz.
     fraction : {1, 3}
-        Bands of an octave.
+        Bands per octave.
 
     Returns
     -------
@@ -76,7 +76,7 @@ def band_edges(passive: Passive, *, highest_hz: float) -> NDArray[np.float64]:
         if high_hz > highest_hz:
             raise ArgumentError(
                 f"passive.bands_hz[{number}] ends at {high_hz:g} Hz, but the record reaches only {highest_hz:g} Hz; "
-                "give a lower edge"
+                "lower the upper edge of this band"
             )
     return np.array(given, np.float64)
 

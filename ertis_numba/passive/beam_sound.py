@@ -36,7 +36,7 @@ class BeamSound:
     Raises
     ------
     ArgumentError
-        The samples are not a row, or the rate is not positive.
+        The samples are not one-dimensional, or the rate is not positive.
 
     Examples
     --------
@@ -69,8 +69,8 @@ def listen_to(
 ) -> BeamSound:
     """Return the sound of a measurement from one direction, by delay-and-sum.
 
-    The signals of the microphones are delayed by exact fractions of a sample, as turns of their spectra, and averaged.
-    Sound from the direction keeps its level, and noise of 32 microphones loses 15 dB.
+    The signals of the microphones are delayed by exact fractions of a sample, as phase shifts of their spectra, and
+    averaged. Sound from the direction keeps its level, and noise of 32 microphones loses 15 dB.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def heterodyned(sound: BeamSound, shift_hz: float, rate_hz: float = 48e3) -> Bea
 
 
 def time_expanded(sound: BeamSound, factor: float) -> BeamSound:
-    """Return a sound that is played slower, so that its frequencies are lower by a factor.
+    """Return a sound that is played more slowly, so that its frequencies are lower by a factor.
 
     Parameters
     ----------

@@ -23,14 +23,14 @@ _TRIAL_BEARINGS: Final = 2
 class BearingTracker:
     """Tracker that joins bearings of successive maps into events, band by band.
 
-    A Kalman filter predicts each direction: see `DirectionFilter`. Bearings belong to the events whose distances in
-    units of their uncertainty have the least sum. An event begins with two bearings in its first three maps, and ends
-    after some maps without a bearing.
+    A Kalman filter predicts each direction: see `DirectionFilter`. Bearings are assigned to events so that the sum of
+    their distances, in units of their uncertainty, is least. An event begins with two bearings in its first three maps,
+    and ends after some maps without a bearing.
 
     Parameters
     ----------
     acceleration_deg_s : float
-        Change of velocity in a second, in degrees per second; 5 by default.
+        Typical change of velocity in a second, in degrees per second; 5 by default.
     speed_deg_s : float
         Typical velocity of a source, in degrees per second; 20 by default.
     array_error_deg : float
@@ -86,7 +86,7 @@ class BearingTracker:
         Returns
         -------
         list of SoundEvent
-            Events that last, and those that ended with this map.
+            Events that continue, and those that ended with this map.
 
         Raises
         ------

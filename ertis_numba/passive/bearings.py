@@ -37,16 +37,16 @@ class BearingFinder:
     Parameters
     ----------
     camera : AcousticCamera
-        Camera whose measurements are searched. Its directions are searched, in its bands; sources elsewhere, such as
-        beside the elevation of a flat grid, yield wrong bearings. A grid coarser than half of the beam's width misses
-        weak sources. The method of its maps has no influence.
+        Camera whose measurements are searched, in its directions and bands. Sources in other directions, such as above
+        or below a grid in one plane, yield wrong bearings. A grid coarser than half of the beam's width misses weak
+        sources. The method of its maps has no influence.
     false_alarm : float
         Probability that noise alone yields any bearing, 1e-9 to 0.5; 0.001 by default.
     top : int
         Largest number of bearings in a band; 8 by default.
     min_level_db : float
-        Least level relative to the loudest source of the band; -20 by default, because errors of the array leave rests
-        of sources.
+        Least level relative to the loudest source of the band; -20 by default, because errors of the array leave
+        remainders of sources.
 
     Raises
     ------

@@ -29,14 +29,14 @@ _TURN: Final = 2.0**32
 
 
 def is_passive(settings: Settings, stamp: Stamp) -> bool:
-    """Return True if a measurement shall become an acoustic map, and False if an image of echoes.
+    """Return True if a measurement becomes an acoustic map, and False if it becomes an image of echoes.
 
     Parameters
     ----------
     settings : Settings
         Their ``processing.mode`` decides.
     stamp : Stamp
-        Says whether the sensor emitted its call, for the mode ``auto``.
+        Stamp of the measurement; its ``behaviour`` decides in the mode ``auto``.
 
     Examples
     --------
@@ -50,18 +50,18 @@ def is_passive(settings: Settings, stamp: Stamp) -> bool:
 
 
 class AcousticCamera:
-    """Maker of acoustic maps from the measurements of one sensor.
+    """Camera that computes acoustic maps from the measurements of one sensor.
 
     Signals are cut into blocks that overlap by half. Their spectra, under a Hann window, give the cross-spectral matrix
     of the microphones, which is averaged over blocks and measurements. A map is the power of this matrix for the wave
-    from each direction. Measurements with a call are accepted; the time of the call is left out. Objects are for one
-    thread.
+    from each direction. Measurements with a call are accepted; the time of the call is left out. Use each object in one
+    thread only.
 
     Parameters
     ----------
     settings : Settings or str or Path
-        Settings, or the path of a TOML file with them. Directions are those of ``processing``, and all else that
-        concerns maps is in ``passive``.
+        Settings, or the path of a TOML file with them. Directions are those of ``processing``, and all other settings
+        of maps are in ``passive``.
     device : {"auto", "cpu", "cuda", "numpy"}
         Compute device, as for `Pipeline`.
     threads : int, optional
@@ -204,7 +204,7 @@ class AcousticCamera:
         )
 
     def reset(self) -> None:
-        """Forget all measurements."""
+        """Discard all measurements."""
         n_mics = self._steps.shape[0]
         self._sums: NDArray[Any] = np.zeros((len(self.frequency_hz), n_mics, n_mics), np.complex128)
         self._n_blocks = self.n_measurements = 0
@@ -212,7 +212,7 @@ class AcousticCamera:
         self._stamp = Stamp()
 
     def process(self, measurement: Measurement) -> AcousticMap:
-        """Return the map of one measurement; those added before are forgotten.
+        """Return the map of one measurement, and discard those added before.
 
         Parameters
         ----------
@@ -293,6 +293,6 @@ class AcousticCamera:
         passive, n_mics = self.settings.passive, int(microphones(self.settings.array).enabled.sum())
         if passive.method == "music" and passive.n_sources >= n_mics:
             raise ArgumentError(
-                f"passive.n_sources is {passive.n_sources}, but the array has {n_mics} microphones; give less than "
+                f"passive.n_sources is {passive.n_sources}, but the array has {n_mics} microphones; give fewer than "
                 f"{n_mics}"
             )

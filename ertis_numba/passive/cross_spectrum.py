@@ -12,7 +12,7 @@ __all__ = ["CrossSpectrum"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrossSpectrum:
-    """Mean products of the spectra of each two microphones (P. D. Welch, 1967).
+    """Mean products of the spectra of each pair of microphones (P. D. Welch, 1967).
 
     Attributes
     ----------

@@ -17,11 +17,11 @@ _LAGS: Final = 4  # Bins beyond which the spectra of Hann windows are uncorrelat
 
 
 def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: ScanExtent) -> float:
-    """Return the probability that the beam of noise from any direction has at least a share of all power.
+    """Return the probability that, in noise alone, the beam of any direction has at least a share of all power.
 
-    In white noise of unknown power, the share R of one direction in the power of D dimensions has the Beta law
-    ``R ~ Beta(K, K (D − 1))``, where K is the number of independent samples. This is nearly a Gamma law for many
-    dimensions. The largest share of a connected set of directions exceeds R with the probability
+    In white noise of unknown power, the share R of one direction in the power of D dimensions has the Beta distribution
+    ``R ~ Beta(K, K (D − 1))``, where K is the number of independent samples. For many dimensions, this is nearly a
+    Gamma distribution. The largest share of a connected set of directions exceeds R with the probability
 
     ``P(R) + L₁ g / √(2πn) + L₂ g′ / (2πn)`` with ``n = 2K (D − 1)``,
 
@@ -37,7 +37,7 @@ def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: Sca
     n_samples : float
         Number K of independent complex samples.
     n_dimensions : int
-        Number D of dimensions: that of microphones, less those in which other sources lie.
+        Number D of dimensions: the number of microphones minus that of other sources.
     extent : ScanExtent
         Directions that are searched, at the frequency of the noise.
 

@@ -44,7 +44,7 @@ class HeardSignals:
     Raises
     ------
     ArgumentError
-        ``highest_hz`` exceeds what the record has.
+        ``highest_hz`` exceeds the highest frequency of the record.
     DeviceError
         The device is not available.
     """

@@ -34,7 +34,7 @@ class NoiseModel:
         self._values = np.maximum(values, 0.0)
 
     def diffuse_share(self, matrix: NDArray[np.complex128], weights: NDArray[np.float64]) -> float:
-        """Return the share of the diffuse field that is most likely, 0 to 1.
+        """Return the most likely share of the diffuse field, 0 to 1.
 
         Parameters
         ----------

@@ -56,14 +56,14 @@ def time_differences(
     max_delay_s: float | None = None,
     resolution_hz: float = 1e3,
 ) -> list[TimeDifference]:
-    """Return the time differences of arrival between each two microphones, by generalised cross-correlation.
+    """Return the time difference of arrival of each pair of microphones, by generalised cross-correlation.
 
     The cross-spectrum G of two signals is averaged over blocks under Hann windows that overlap by half. The correlation
     of ``G / |G|`` (``phat``), ``G / √(G₁₁ G₂₂)`` (``scot``) or G (``none``) has its largest maximum at the delay (C.
     Knapp and G. Carter, The generalized correlation method for estimation of time delay, 1976). A parabola interpolates
-    it between samples. The uncertainty is that of the same work: ``1 / √(2 T ∫ ω² γ² / (1 − γ²) df)`` for the measured
-    coherence γ², less its bias, and the time T. It holds for the right maximum: in weak or narrow-band sound, a wrong
-    one may be larger.
+    it between samples. The uncertainty is that of the same work: ``1 / √(2 T ∫ ω² γ² / (1 − γ²) df)`` for the time T
+    and the measured coherence γ², corrected for its bias. It holds if the largest maximum is the right one; in weak or
+    narrow-band sound, another may be larger.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def time_differences(
         Largest delay in seconds; that of sound along the distance of the microphones for a measurement, else half of a
         block.
     resolution_hz : float
-        Spacing of frequencies in hertz; 1000 by default. A block has one period of it.
+        Spacing of frequencies in hertz; 1000 by default. A block lasts one period of it.
 
     Returns
     -------
@@ -89,7 +89,7 @@ def time_differences(
     Raises
     ------
     ArgumentError
-        There are less than two microphones, a rate is missing or superfluous, or an argument is outside its limits.
+        There are fewer than two microphones, a rate is missing or superfluous, or an argument is outside its limits.
     DataError
         The measurement is not valid.
 
@@ -162,8 +162,8 @@ class _Correlator:
         self._chosen &= (self._frequency_hz > 0) & (self._frequency_hz < rate_hz / 2)
         if not self._chosen.any():
             raise ArgumentError(
-                f"band_hz {band_hz[0]:g} to {band_hz[1]:g} has none of the frequencies {self._frequency_hz[1]:g} Hz "
-                "apart; give a wider band, or a smaller resolution_hz"
+                f"band_hz {band_hz[0]:g} to {band_hz[1]:g} contains none of the frequencies {self._frequency_hz[1]:g} "
+                "Hz apart; give a wider band, or a smaller resolution_hz"
             )
         pieces = np.lib.stride_tricks.sliding_window_view(signals.rows, n_block, axis=1)[:, :: n_block // 2]
         window = scipy.signal.get_window("hann", n_block)

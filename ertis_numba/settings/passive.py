@@ -35,13 +35,13 @@ class Passive(TomlTable, frozen=True, kw_only=True):
     functional_order : float, default 8
         Order of ``functional``, 1 to 100; 1 is delay-and-sum, and higher ones have narrower lobes.
     n_sources : int, default 1
-        Number of sources that ``music`` expects in a band, from 1 to the number of microphones less one.
+        Number of sources that ``music`` expects in a band, from 1 to the number of microphones − 1.
     diagonal_loading : float, default 0.01
         Diagonal loading of ``capon`` relative to the mean power of a microphone, 1e-6 to 1e6.
     resolution_hz : float, optional, default None
-        Largest spacing of frequencies in hertz. By default a third of the narrowest band, and at most 1 kHz.
+        Largest spacing of frequencies in hertz; by default a third of the narrowest band, and at most 1 kHz.
     averages : int, default 1
-        Measurements of a map, 1 to 100000, over which powers are averaged.
+        Number of measurements in a map, 1 to 100000, over which powers are averaged.
     focus_m : float, optional, default None
         Distance of the sources in metres, from 0.01. By default, waves are plane.
     """

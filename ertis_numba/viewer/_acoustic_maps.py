@@ -30,7 +30,7 @@ from ertis_numba.viewer._shapes import (
 
 __all__ = ["ViewedMaps", "masked_note"]
 
-_STEP_DB: Final = 5.0  # The automatic scale moves in steps, because its axes are drawn anew.
+_STEP_DB: Final = 5.0  # The automatic scale moves in steps, because each change redraws its axes.
 _RADIUS_M: Final = (0.05, 1.0)
 _MARKS: Final = np.array([[0.96], [1.04]])  # Marks of the loudest direction inside and outside a sphere of radius 1.
 _WHITE: Final = np.full((2, 3), 255, np.uint8)
@@ -98,8 +98,7 @@ class ViewedMaps:
         ----------
         choices : Choices
         now_s : float, optional
-            Present time by the clock of the source, from which overdue sensors follow; the time of the latest map by
-            default.
+            Present time by the clock of the source, to find overdue sensors; the time of the latest map by default.
         """
         kept = dict(sorted(self._sensors.items()))
         if now_s is None:

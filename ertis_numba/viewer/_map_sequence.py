@@ -13,7 +13,7 @@ class MapSequence:
     """Acoustic maps of one sensor; call it with the number of a measurement.
 
     Every ``passive.averages`` measurements form a group, as in `AcousticCamera.process_many`. The map of a measurement
-    is the mean of its group up to there. Measurements in order are therefore processed once.
+    is the mean of its group up to this measurement. Measurements in order are therefore processed once.
 
     Parameters
     ----------
