@@ -205,18 +205,19 @@ def test_levels_are_those_of_sound_pressure_if_the_sensitivity_is_known():
     assert found[1].level_db == pytest.approx(found[1].level_dbfs + 94 + 26 + 3, abs=0.1)
 
 
-def test_time_of_the_call_is_left_out():
-    settings = settings_of()
+@pytest.mark.parametrize("delay_s", [0.0, 0.01])
+def test_time_of_the_call_is_left_out(delay_s):
+    settings = settings_of(call__delay_s=delay_s)
     measurement = sound(settings, [(20, 0.01)])
     loud = measurement.data.copy()
-    n_call = int((settings.call.duration_s + 0.0005) * settings.recording.sample_rate_hz)
+    n_call = int((settings.call.end_s + 0.0005) * settings.recording.sample_rate_hz)
     loud[:n_call] += np.sin(np.arange(n_call) * 0.8)[:, None].astype(np.float32)
     levels = {}
     with AcousticCamera(settings, "cpu") as camera:
         for behaviour in ("passive", "active"):
             found = camera.process(ertis.Measurement(loud, settings, ertis.Stamp(behaviour=behaviour)))
             levels[behaviour] = found.level_dbfs.max()
-            assert (found.masked_s > settings.call.duration_s) == (behaviour == "active")
+            assert (found.masked_s > settings.call.end_s) == (behaviour == "active")
     assert levels["active"] < levels["passive"] - 10
 
 

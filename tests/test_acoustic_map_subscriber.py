@@ -14,7 +14,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
 from ertis_numba.passive import AcousticCamera
-from tests.publishing import Publisher, measurement
+from tests.publishing import PATIENCE_S, Publisher, measurement
 
 ROOT = Path(__file__).parents[1]
 
@@ -31,7 +31,7 @@ def test_maps_are_those_of_the_camera():
         publisher.playing(sent),
         AcousticMapSubscriber(publisher.address, device="cpu") as subscriber,
     ):
-        found = [subscriber.receive(20.0) for _ in range(2)]
+        found = [subscriber.receive(PATIENCE_S) for _ in range(2)]
     with AcousticCamera(sent[0].settings, "cpu") as camera:
         for each in found:
             (original,) = (
@@ -49,7 +49,7 @@ def test_measurements_are_averaged_by_sensor():
         AcousticMapSubscriber(publisher.address, changes={"passive.averages": 2}, device="cpu") as subscriber,
         publisher.playing(sent),
     ):
-        found = subscriber.receive(20.0)
+        found = subscriber.receive(PATIENCE_S)
     assert found.n_measurements == 2
 
 
@@ -60,14 +60,14 @@ def test_measurements_with_a_call_become_no_map_unless_asked():
         AcousticMapSubscriber(publisher.address, changes={"processing.mode": "passive"}, device="cpu") as subscriber,
         publisher.playing(sent),
     ):
-        found = subscriber.receive(20.0)
+        found = subscriber.receive(PATIENCE_S)
         assert found.masked_s > found.settings.call.duration_s
     with (
         Publisher() as publisher,
         AcousticMapSubscriber(publisher.address, device="cpu") as subscriber,
         publisher.playing([*sent, passive(2)]),
     ):
-        assert subscriber.receive(20.0).stamp.sequence == 2
+        assert subscriber.receive(PATIENCE_S).stamp.sequence == 2
         assert subscriber.n_active <= 2  # the central node may drop some for a slow application
 
 
@@ -86,7 +86,7 @@ def test_settings_that_cannot_be_used_are_an_error():
         publisher.playing([short()]),
         pytest.raises(DataError, match="cannot be used for acoustic maps"),
     ):
-        subscriber.receive(20.0)
+        subscriber.receive(PATIENCE_S)
 
 
 def test_closed_subscriber_ends_the_loop():

@@ -11,7 +11,7 @@ from ertis_cli.main import cli
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.fusion import Fuser
 from ertis_numba.network.fused_subscriber import FusedSubscriber
-from tests.publishing import Publisher, image
+from tests.publishing import PATIENCE_S, Publisher, image
 
 AHEAD, BEHIND = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0)
 MOUNTINGS = {"front": ((0.2, 0.0, 0.0), AHEAD), "back": ((-0.2, 0.0, 0.0), BEHIND)}
@@ -33,7 +33,7 @@ def test_each_pulse_is_fused_once():
         publisher.playing(pulses()),
         FusedSubscriber(publisher.address, mountings=MOUNTINGS) as subscriber,
     ):
-        arrivals = [subscriber.receive(60.0) for _ in range(2)]
+        arrivals = [subscriber.receive(PATIENCE_S) for _ in range(2)]
     counts = [arrival.fused.image.stamp.sync_count for arrival in arrivals]
     assert counts == sorted(set(counts))
     last = arrivals[-1].fused
@@ -57,7 +57,7 @@ def test_pulses_that_arrive_while_tables_are_computed_are_fused_later(monkeypatc
         publisher.playing(pulses(count=8)),
     ):
         monkeypatch.setattr(Fuser, "__call__", slowly)
-        counts = [subscriber.receive(60.0).fused.image.stamp.sync_count for _ in range(8)]
+        counts = [subscriber.receive(PATIENCE_S).fused.image.stamp.sync_count for _ in range(8)]
         assert (counts, subscriber.n_skipped) == ([*range(8)], 0)
 
 
@@ -67,7 +67,7 @@ def test_images_of_an_arrival_are_those_that_were_fused():
         publisher.playing(pulses(count=1)),
         FusedSubscriber(publisher.address, mountings=MOUNTINGS) as subscriber,
     ):
-        arrival = subscriber.receive(60.0)
+        arrival = subscriber.receive(PATIENCE_S)
     again = Fuser(MOUNTINGS, spacing_deg=2.0, range_step_m=0.02)(arrival.images.values())
     assert sorted(arrival.images) == ["back", "front"]
     np.testing.assert_array_equal(arrival.fused.image.amplitude, again.image.amplitude)
@@ -82,7 +82,7 @@ def test_pulse_without_all_images_is_fused_by_the_next_one():
     ):
         found = {}
         while 3 not in found:
-            fused = subscriber.receive(60.0).fused
+            fused = subscriber.receive(PATIENCE_S).fused
             found[fused.image.stamp.sync_count] = fused.sensors, fused.missing
     assert found.get(2, (("front",), ("back",))) == (("front",), ("back",))
     assert found[3] == (("front", "back"), ())
@@ -94,7 +94,7 @@ def test_mountings_of_the_central_node_are_used():
         publisher.playing(pulses(count=1)),
         FusedSubscriber(publisher.address) as subscriber,
     ):
-        fused = subscriber.receive(60.0).fused
+        fused = subscriber.receive(PATIENCE_S).fused
     x, y, z = fused.points.position_m[0].tolist()
     assert (x < 1.0, y < 2.0, round(z, 2)) == (True, True, 3.0)  # Both sensors are at (1, 2, 3) and look back.
 
@@ -107,7 +107,7 @@ def test_unknown_mounting_is_an_error():
             FusedSubscriber(publisher.address) as subscriber,
             pytest.raises(DataError, match="the mounting of sensor 'front' is unknown; pass mountings"),
         ):
-            subscriber.receive(60.0)
+            subscriber.receive(PATIENCE_S)
 
 
 def test_closed_subscriber_ends_the_loop():

@@ -22,7 +22,7 @@ import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.network.odometry_subscriber import OdometrySubscriber
 from tests.pages import environment
-from tests.publishing import Publisher, image
+from tests.publishing import PATIENCE_S, Publisher, image
 
 AHEAD, BEHIND = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0)
 MOUNTINGS = {"front": ((0.2, 0.0, 0.0), AHEAD), "back": ((-0.2, 0.0, 0.0), BEHIND)}
@@ -93,7 +93,7 @@ def received(sent, last, *, publisher_type=Publisher, notes=None, **options):
         OdometrySubscriber(publisher.address, **{"mountings": MOUNTINGS, "on_note": note} | options) as subscriber,
     ):
         while last not in found:
-            arrival = subscriber.receive(20.0)
+            arrival = subscriber.receive(PATIENCE_S)
             assert arrival is not None
             found[arrival.sync_count] = arrival
             used.release()
@@ -148,7 +148,7 @@ def test_slow_application_gets_the_latest_pulses():
         while subscriber.n_skipped < 4:
             assert time.monotonic() < end_s
             time.sleep(0.01)
-        arrivals = [subscriber.receive(20.0) for _ in range(2)]
+        arrivals = [subscriber.receive(PATIENCE_S) for _ in range(2)]
     assert [(arrival.sync_count, arrival.n_lost) for arrival in arrivals] == [(4, 0), (5, 0)]
     assert (subscriber.n_skipped, arrivals[1].pose.is_measured) == (4, True)
 
@@ -196,7 +196,7 @@ def test_sensor_that_given_mountings_lack_is_noted():
             publisher.address, mountings={"front": MOUNTINGS["front"]}, on_note=notes.append
         ) as subscriber,
     ):
-        while subscriber.receive(20.0).missing:
+        while subscriber.receive(PATIENCE_S).missing:
             pass
     assert "the given mountings lack sensor back; that of the central node applies" in notes
 
@@ -209,7 +209,7 @@ def test_unknown_mounting_of_a_sensor_is_an_error():
             OdometrySubscriber(publisher.address) as subscriber,
             pytest.raises(DataError, match="the mounting of sensor 'front' is unknown; pass mountings"),
         ):
-            subscriber.receive(20.0)
+            subscriber.receive(PATIENCE_S)
         assert subscriber.trajectory is None
 
 

@@ -65,6 +65,27 @@ def test_uncertainty_is_that_of_the_errors():
     assert np.std(errors) == pytest.approx(np.mean(stated), rel=0.35)
 
 
+def test_few_blocks_do_not_show_the_uncertainty():
+    for n in (200, 300):  # one block and two
+        (found,) = time_differences(delayed_noise((0.0, 7.7e-6), noise=1.0, n=n), rate_hz=RATE_HZ)
+        assert found.uncertainty_s == np.inf
+
+
+@pytest.mark.parametrize("n_blocks", [8, 40])
+def test_information_has_no_bias(n_blocks):
+    """Its mean over many signals is that of the true coherence, also if few blocks are measured."""
+    n, rms = 100 * (n_blocks + 1), 0.7
+    information = []
+    for seed in range(200):
+        rows = delayed_noise((0.0, 7.7e-6), noise=rms, n=n, seed=seed)
+        (found,) = time_differences(rows, rate_hz=RATE_HZ, band_hz=(20e3, 80e3), max_delay_s=12e-6)
+        information.append(1 / found.uncertainty_s**2)
+    coherence = 1 / (1 + rms**2) ** 2
+    omega = 2 * np.pi * np.arange(20e3, 80.5e3, 1e3)
+    expected = 2 * n / RATE_HZ * 1e3 * (omega**2).sum() * coherence / (1 - coherence)
+    assert np.mean(information) == pytest.approx(expected, rel=0.1)
+
+
 def test_peak_without_coherence_is_low():
     rows = np.random.default_rng(5).standard_normal((2, 8192))
     (found,) = time_differences(rows, rate_hz=RATE_HZ)

@@ -10,7 +10,7 @@ from ertis_numba.viewer._choices import colour_table
 from tests.files import image
 
 TABLE = colour_table("inferno")
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 def spot(azimuth_deg, range_m, *, sensor="front", sequence=0, level=0.5, **stamp):

@@ -90,7 +90,7 @@ class BlockSpectra:
         self._window = scipy.signal.get_window("hann", self._n_block).astype(np.float32)
         power = self._n_block * float((self._window.astype(np.float64) ** 2).sum())
         self._scale = 2 / power / np.outer(self._gain, self._gain)
-        self._masked = math.ceil((settings.call.duration_s + _RINGING_S) * rate_hz)
+        self._masked = math.ceil((settings.call.end_s + _RINGING_S) * rate_hz)
         self.masked_s = self._masked / rate_hz
         self._transforms: dict[int, tuple[NDArray[np.float32], fft.Transforms]] = {}
         self._sums = self._memory.zeros((len(self.bins), len(self._gain), len(self._gain)), np.complex64)

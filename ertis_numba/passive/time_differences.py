@@ -23,6 +23,7 @@ _WEIGHTINGS: Final = ("phat", "scot", "none")
 _FINER: Final = 8  # Samples of the correlation per sample of the signals.
 _TINY: Final = 1e-30
 _MAX_COHERENCE: Final = 1 - 1e-9
+_INDEPENDENT: Final = 0.947  # Share of independent blocks: neighbours have a correlation of 1/6 under Hann windows.
 
 
 class TimeDifference(NamedTuple):
@@ -35,7 +36,8 @@ class TimeDifference(NamedTuple):
     delay_s : float
         Time by which the sound arrives later at the second, in seconds.
     uncertainty_s : float
-        Standard deviation in seconds: the Cramér-Rao bound at the measured coherence. Infinite without coherence.
+        Standard deviation in seconds: the Cramér-Rao bound at the measured coherence. Infinite without coherence, and
+        with less than three blocks, which do not show it.
     peak : float
         Correlation at the delay, relative to that of equal signals.
     """
@@ -199,10 +201,14 @@ class _Correlator:
 
     def _uncertainty_s(self, cross: NDArray[np.complex128], scale: NDArray[np.float64]) -> float:
         """Return the Cramér-Rao bound at the coherence of the chosen frequencies."""
+        n_blocks = _INDEPENDENT * self._spectra.shape[1]
+        if n_blocks <= 2:
+            return math.inf
         coherence = (np.abs(cross) / np.maximum(scale, _TINY))[self._chosen] ** 2
-        n_blocks = max(1.0, 0.947 * self._spectra.shape[1])
-        coherence = np.minimum((coherence - 1 / n_blocks) / max(1 - 1 / n_blocks, _TINY), _MAX_COHERENCE)
+        coherence = np.minimum(coherence, _MAX_COHERENCE)
+        # The mean of γ² / (1 − γ²) as measured in n blocks is (1 + n γ² / (1 − γ²)) / (n − 2).
+        ratio = ((n_blocks - 2) * coherence / (1 - coherence) - 1) / n_blocks
         omega = 2 * np.pi * self._frequency_hz[self._chosen]
         spacing_hz = self._rate_hz / self._n_block
-        information = 2 * self._duration_s * spacing_hz * float((omega**2 * coherence / (1 - coherence)).sum())
+        information = 2 * self._duration_s * spacing_hz * float((omega**2 * ratio).sum())
         return 1 / math.sqrt(information) if information > 0 else math.inf
