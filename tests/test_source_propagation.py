@@ -214,6 +214,16 @@ def test_leak_has_the_spectrum_of_a_jet():
     assert far.argmax() == 2
 
 
+@pytest.mark.parametrize("velocity_m_s", [(0.0, 0.0, 0.0), (-4.0, 3.0, 0.0)])
+def test_noise_above_half_of_the_sample_rate_does_not_fold(velocity_m_s):
+    slow = ALONE.replace(recording=Recording(encoding="float32", sample_rate_hz=225e3, n_samples=8192))
+    inside = Noise(range_m=1.0, velocity_m_s=velocity_m_s, band_hz=(20e3, 80e3), level_db=0.0)
+    [signal] = heard(scene_of(sensor=slow, noises=(inside,)), *NAMES, "doppler")
+    assert_allclose(10 * np.log10(np.mean(signal**2)), 0.0, atol=0.6)
+    [signal] = heard(scene_of(sensor=slow, noises=(inside.replace(band_hz=(150e3, 200e3)),)), *NAMES, "doppler")
+    assert 10 * np.log10(np.mean(signal**2)) < -80
+
+
 def test_noise_follows_a_given_spectrum_and_keeps_its_level():
     given = ((20e3, -20.0), (40e3, 0.0), (80e3, 0.0))
     noise = Noise(range_m=1.0, spectrum=given, level_db=-20.0)

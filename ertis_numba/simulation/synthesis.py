@@ -179,9 +179,16 @@ def _spectrum(call: Call, rate_hz: float, n_fft: int) -> NDArray[np.complex128]:
     return np.asarray(scipy.fft.rfft(call_at(call, np.arange(n_fft) / rate_hz)))
 
 
+def _finer(call: Call | NoiseFrame, rate_hz: float) -> int:
+    """Return the factor by which a frame is oversampled, so that frequencies above half of the rate do not fold."""
+    return math.ceil(2 * noise_frames.top_hz(call.noise) / rate_hz) if isinstance(call, NoiseFrame) else 1
+
+
 def _framed(frame: NoiseFrame, rate_hz: float, n_fft: int) -> NDArray[np.complex128]:
-    time_s = np.arange(math.ceil(frame.end_s * rate_hz) + 1) / rate_hz
-    return np.asarray(scipy.fft.rfft(frame.at(time_s), n_fft))
+    finer = _finer(frame, rate_hz)
+    fine_hz = finer * rate_hz
+    time_s = np.arange(math.ceil(frame.end_s * fine_hz) + 1) / fine_hz
+    return np.asarray(scipy.fft.rfft(frame.at(time_s), finer * n_fft)[: n_fft // 2 + 1] / finer)
 
 
 def _stretched(
@@ -210,11 +217,11 @@ def _spectra(
     call: Call | NoiseFrame, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int
 ) -> NDArray[np.complex128]:
     """Return the spectrum of the call for each stretch, computed at the lowest sample rate that its band allows."""
-    step = _step(call, rate_hz)
+    step = _step(call, rate_hz) / _finer(call, rate_hz)  # One of both is 1.
     n_samples = math.ceil(call.end_s * stretch.max() * rate_hz / step) + 1
     time_s = np.arange(n_samples) * (step / rate_hz) / stretch[:, None]
     values = call.at(time_s) if isinstance(call, NoiseFrame) else call_at(call, time_s)
-    spectra = scipy.fft.rfft(values, n_fft // step)
+    spectra = scipy.fft.rfft(values, round(n_fft / step))
     wide = np.zeros((len(stretch), n_bins), dtype=np.complex128)
     kept = min(n_bins, spectra.shape[1])
     wide[:, :kept] = step * spectra[:, :kept]
