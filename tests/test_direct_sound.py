@@ -14,6 +14,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.fusion import DirectSoundCheck
 from ertis_numba.settings import Call, Processing, Recording
 from ertis_numba.simulation import Emitter, Point, Scene
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.storage import write_recording
 from tests import test_fusion
 
@@ -39,7 +40,8 @@ def scene(drifting="", drift_ppm=0.0, names=SENSORS, **emitter):
 
 
 def heard(made, index=0):
-    return [ertis.render(made, index, sensor=each.name) for each in made.sensors]
+    plan = make_plan(made)
+    return [ertis.Simulator(made, sensor=each.name, plan=plan).render(index) for each in made.sensors]
 
 
 def mountings(made, **moved_m):
@@ -136,10 +138,9 @@ def test_measurement_without_a_mounting_is_refused():
 def test_process_reports_direct_sound_and_warns(tmp_path):
     made = scene("left", 100.0, ("front", "left"))
     paths = []
-    for each in made.sensors:
+    for each, measurement in zip(made.sensors, heard(made, LATE), strict=True):
         paths.append(tmp_path / f"{each.name}.h5")
-        mounting = {each.name: (each.position_m, each.quaternion())}
-        write_recording(paths[-1], [ertis.render(made, LATE, sensor=each.name)], mounting=mounting)
+        write_recording(paths[-1], [measurement], mounting={each.name: (each.position_m, each.quaternion())})
     done = CliRunner().invoke(cli, ["process", *map(str, paths), "--fuse", "-o", str(tmp_path / "f.h5"), "--json"])
     assert done.exit_code == 0, done.output
     report = json.loads(done.stdout.splitlines()[-1])

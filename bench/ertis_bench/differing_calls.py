@@ -13,6 +13,7 @@ from ertis_numba.fusion import Fuser
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Call
 from ertis_numba.simulation import Scene, pulse
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.render import Simulator
 
 __all__ = ["form", "run"]
@@ -108,9 +109,9 @@ def _points(scene: Scene, diameter_m: float, *, with_pairs: bool) -> tuple[Point
     The image of a pair is that of a further, silent sensor at the place of the receiver.
     """
     mountings = {each.name: (each.position_m or (), each.quaternion().tolist()) for each in scene.sensors}
-    images, silent = [], []
+    images, silent, plan = [], [], make_plan(scene)
     for sensor in scene.sensors:
-        measurement = Simulator(scene, sensor=sensor.name).render(0)
+        measurement = Simulator(scene, sensor=sensor.name, plan=plan).render(0)
         for each in [measurement, *(_foreign(measurement, scene) if with_pairs else ())]:
             name = each.stamp.sensor
             if name != sensor.name:

@@ -18,6 +18,7 @@ from ertis_bench.platform_scenes import EMITTERS_M, platform_scene, random_refle
 from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Scene
+from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.render import Simulator
 
 __all__ = ["START_S", "measure"]
@@ -109,8 +110,9 @@ def _rendered(scene: Scene, folder: Path) -> tuple[Path, Path]:
     """Write the words of some measurements of each sensor, and their images, and return the files."""
     words: list[Any] = []
     images: dict[str, Any] = {}
+    plan = make_plan(scene)
     for sensor in scene.sensors:
-        simulator = Simulator(scene, sensor=sensor.name)
+        simulator = Simulator(scene, sensor=sensor.name, plan=plan)
         measurements = [simulator.render(number) for number in range(_N_MEASUREMENTS)]
         settings = SETTINGS.replace(processing=SETTINGS.processing.replace(directions=_DIRECTIONS))
         with Pipeline(settings) as pipeline:
