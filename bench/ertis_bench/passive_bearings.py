@@ -46,7 +46,7 @@ def measure(seeds: int, seed: int, say: Callable[[str], None] = lambda _: None) 
     dict
         ``errors``: for each SNR, the root mean square of the errors and of the bounds in degrees, their ratio, the root
         mean square of errors relative to their stated standard deviations, and the number of trials without a bearing.
-        ``leak``: trials, leaks found within 2°, false alarms with and without the leak, and the asked rate.
+        ``leak``: trials, leaks found within 2°, false alarms with and without the leak, and the requested rate.
     """
     settings = plane_wave_settings()
     errors = []

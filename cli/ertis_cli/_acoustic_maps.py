@@ -59,8 +59,8 @@ def map_options(command: Callable[..., Any]) -> Callable[..., Any]:
             click.option(
                 "--mode",
                 type=click.Choice(["auto", "active", "passive"]),
-                help="Kind of results: images with active, acoustic maps with passive. auto makes maps of passive "
-                "measurements and images of others; the recording's own by default.",
+                help="Results to compute: images (active), acoustic maps (passive), or maps of passive measurements "
+                "and images of others (auto); the recording's own by default.",
             ),
             click.option(
                 "--bands",

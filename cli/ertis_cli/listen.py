@@ -109,8 +109,8 @@ def listen(
     which starts at the origin and lies in the plane; -o writes the path when the command ends, also by Ctrl-C. The
     mountings are those that 'ertis capture' has sent, or those of --mounting.
 
-    With --bearings, this command makes acoustic maps of measurements without a call, and prints the directions, with
-    their standard deviations, and the levels of the sources in each band. 1 in 1000 maps of noise has a false source.
+    With --bearings, this command computes acoustic maps of measurements without a call. It prints the direction of each
+    source, with standard deviations, and its level, in each band. Of 1000 maps of noise, 1 has a false source.
     """
     _require_options_of({"--fuse": fuse, "--odometry": odometry, "--bearings": bearings})
     if fuse or odometry or bearings:

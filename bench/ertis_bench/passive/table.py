@@ -100,7 +100,7 @@ def _times(report: dict[str, Any]) -> str:
         f"36.4 ms of float32 signals of 32 microphones, with {first['bins']} bins and 63 blocks. Each is the least of "
         f"{report['count']} maps by Acoular, and of nine times as many by this package in between, after one round "
         "that is not counted. Processor times are sums over all cores, which other programs disturb less. Tables of "
-        "directions exist before. The time of Acoular's CLEAN-SC is extrapolated from four bins."
+        "directions are computed beforehand. The time of Acoular's CLEAN-SC is extrapolated from four bins."
     )
 
 
@@ -150,5 +150,5 @@ def _bearings(found: dict[str, Any]) -> str:
         f"{low_hz / 1e3:g}–{high_hz / 1e3:g} kHz of one measurement. The SNR is that of a microphone in this band.\n\n"
         f"A leak 10 dB below the ambient noise in the band, after ten averaged measurements: found within 2° in "
         f"{leak['found']} of {leak['trials']} trials. False alarms without the leak: {leak['false_alarms']} of "
-        f"{leak['trials']}, at an asked rate of {leak['asked_rate']:g} per map."
+        f"{leak['trials']}, at a requested rate of {leak['asked_rate']:g} per map."
     )
