@@ -23,7 +23,7 @@ class Bearing(RadiansFromDegrees):
         noise only, not errors of the array. ``upwards_deg`` is 0 if the elevation was given, and both are infinite for
         an array that cannot resolve the direction.
     correlation : float
-        Correlation of both errors.
+        Correlation of the two errors.
     band_hz : (low, high)
         Edges of the band in hertz.
     level_dbfs : float

@@ -37,7 +37,7 @@ class TimeDifference(NamedTuple):
         Time by which the sound arrives later at the second, in seconds.
     uncertainty_s : float
         Standard deviation in seconds: the Cramér-Rao bound at the measured coherence. Infinite without coherence, and
-        with less than three blocks, which do not show it.
+        with fewer than three blocks, which cannot show it.
     peak : float
         Correlation at the delay, relative to that of equal signals.
     """

@@ -217,7 +217,7 @@ def _spectra(
     call: Call | NoiseFrame, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int
 ) -> NDArray[np.complex128]:
     """Return the spectrum of the call for each stretch, computed at the lowest sample rate that its band allows."""
-    step = _step(call, rate_hz) / _finer(call, rate_hz)  # One of both is 1.
+    step = _step(call, rate_hz) / _finer(call, rate_hz)  # At least one of the two is 1.
     n_samples = math.ceil(call.end_s * stretch.max() * rate_hz / step) + 1
     time_s = np.arange(n_samples) * (step / rate_hz) / stretch[:, None]
     values = call.at(time_s) if isinstance(call, NoiseFrame) else call_at(call, time_s)
