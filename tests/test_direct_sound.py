@@ -80,6 +80,34 @@ def test_wrong_clock_is_found(drift_ppm):
     assert late_us == pytest.approx(abs(drift_ppm), abs=2.0)
 
 
+@pytest.mark.parametrize("deaf", [("right", "back"), ("left", "front"), ("left", "right")])
+def test_sensors_that_do_not_hear_each_other_are_compared_over_others(deaf):
+    made = scene("left", 100.0, ("front", "left", "right", "back"))
+    check = DirectSoundCheck(mountings(made))
+    measurements = heard(made, LATE)
+    alone = (
+        [each for each in measurements if each.stamp.sensor != deaf[0]],
+        [each for each in measurements if each.stamp.sensor != deaf[1]],
+    )
+    for group in alone:
+        check.add(group)
+    assert deaf not in {(each.emitter, each.receiver) for each in check.sounds}
+    (warning,) = check.warnings()
+    assert warning.startswith("left emits and records ")
+    assert float(warning.split()[4]) == pytest.approx(100, abs=2.0)
+
+
+def test_both_neighbours_of_a_wrong_clock_are_right():
+    made = scene("left", 100.0, ("front", "left", "back"))
+    check = DirectSoundCheck(mountings(made))
+    measurements = {each.stamp.sensor: each for each in heard(made, LATE)}
+    for other in ("front", "back"):
+        check.add([measurements["left"], measurements[other]])
+    (warning,) = check.warnings()
+    assert warning.startswith("left emits and records ")
+    assert float(warning.split()[4]) == pytest.approx(100, abs=2.0)
+
+
 def test_clock_is_right_at_the_sync_pulse():
     assert checked(scene("left", -300.0), 0).warnings() == ()
 

@@ -1,12 +1,13 @@
 """Direct sound between the sensors of a platform, which shows errors of clocks and mountings."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from ertis_numba import checks
@@ -170,27 +171,25 @@ class DirectSoundCheck:
 
     def _of_clocks(self, clocks_s: Mapping[tuple[str, str], tuple[float, float]]) -> Iterable[str]:
         """Yield a line for each sensor whose clock differs from most others, or for two that differ."""
-        names = dict.fromkeys(name for pair in clocks_s for name in pair)
-        if len(names) == 2:
-            for (one, other), (late_s, sd_s) in clocks_s.items():
+        for names in _linked(clocks_s):
+            pairs = {pair: value for pair, value in clocks_s.items() if pair[0] in names}
+            if len(names) == 2:
+                yield from self._of_two_clocks(pairs)
+                continue
+            for name, late_s in _lateness_s(names, pairs).items():
+                sd_s = float(np.median([sd for pair, (_, sd) in pairs.items() if name in pair]))
                 if self._is_wrong(late_s, sd_s):
                     yield (
-                        f"{one} emits and records {_microseconds(late_s)} than {other}, ± {1e6 * sd_s:.1f} µs; check "
-                        "the SYNC line"
+                        f"{name} emits and records {_microseconds(late_s)} than the other sensors, ± "
+                        f"{1e6 * sd_s:.1f} µs; check its SYNC line"
                     )
-            return
-        for name in names:
-            offsets = [
-                (late_s if name == one else -late_s, sd_s)
-                for (one, other), (late_s, sd_s) in clocks_s.items()
-                if name in (one, other)
-            ]
-            late_s = float(np.median([0.0, *(each for each, _ in offsets)]))
-            sd_s = float(np.median([sd for _, sd in offsets]))
+
+    def _of_two_clocks(self, pairs: Mapping[tuple[str, str], tuple[float, float]]) -> Iterable[str]:
+        for (one, other), (late_s, sd_s) in pairs.items():
             if self._is_wrong(late_s, sd_s):
                 yield (
-                    f"{name} emits and records {_microseconds(late_s)} than the other sensors, ± {1e6 * sd_s:.1f} µs; "
-                    "check its SYNC line"
+                    f"{one} emits and records {_microseconds(late_s)} than {other}, ± {1e6 * sd_s:.1f} µs; check the "
+                    "SYNC line"
                 )
 
     def _is_wrong(self, difference_s: float, sd_s: float) -> bool:
@@ -220,6 +219,37 @@ def _both_ways(
             mounting_s = math.sqrt(max(0.0, there.uncertainty_s**2 - there.noise_s**2 - chain_s**2))
             distances_s[one, other] = (there.difference_s + back.difference_s) / 2, math.hypot(noise_s, mounting_s)
     return clocks_s, distances_s
+
+
+def _linked(pairs: Iterable[tuple[str, str]]) -> list[list[str]]:
+    """Return the groups of sensors that pairs link, directly or over others."""
+    groups: list[list[str]] = []
+    for pair in pairs:
+        joined = [group for group in groups if set(group) & set(pair)]
+        groups = [group for group in groups if group not in joined]
+        groups.append([*dict.fromkeys([name for group in joined for name in group] + [*pair])])
+    return groups
+
+
+def _lateness_s(names: Sequence[str], pairs: Mapping[tuple[str, str], tuple[float, float]]) -> dict[str, float]:
+    """Return how late each sensor is relative to the median of all, with the least sum of absolute residuals.
+
+    Single wrong differences thus have no influence, and sensors that do not hear each other are compared over others.
+    """
+    places = {name: number for number, name in enumerate(names)}
+    signs = np.zeros((len(pairs), len(names)))
+    for row, (one, other) in enumerate(pairs):
+        signs[row, places[one]], signs[row, places[other]] = 1, -1
+    late_us = 1e6 * np.array([late_s for late_s, _ in pairs.values()])
+    unit = np.eye(len(pairs))
+    found = scipy.optimize.linprog(
+        np.repeat([0.0, 1.0], [len(names), len(pairs)]),
+        A_ub=np.block([[signs, -unit], [-signs, -unit]]),
+        b_ub=np.concatenate([late_us, -late_us]),
+        bounds=[(0, 0), *[(None, None)] * (len(names) - 1), *[(0, None)] * len(pairs)],
+    )
+    each_us = found.x[: len(names)]
+    return dict(zip(names, (1e-6 * (each_us - np.median(each_us))).tolist(), strict=True))
 
 
 def _arrivals(
