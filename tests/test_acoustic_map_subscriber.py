@@ -53,6 +53,22 @@ def test_measurements_are_averaged_by_sensor():
     assert found.n_measurements == 2
 
 
+def test_maps_follow_the_speed_of_sound():
+    sent = [passive(number, temperature_c=celsius) for number, celsius in enumerate((10.0, 10.2, 30.0))]
+    found = {}
+    with (
+        Publisher() as publisher,
+        AcousticMapSubscriber(publisher.address, device="cpu") as subscriber,
+        publisher.playing(sent),
+    ):
+        while 2 not in found:
+            each = subscriber.receive(PATIENCE_S)
+            found[each.stamp.sequence] = each
+    assert found[2].settings.air.temperature_c == 30.0
+    with AcousticCamera(sent[2].settings, "cpu") as camera:
+        np.testing.assert_array_equal(found[2].power, camera.process(sent[2]).power)
+
+
 def test_measurements_with_a_call_become_no_map_unless_asked():
     sent = [passive(number, behaviour="active") for number in range(2)]
     with (

@@ -2,8 +2,9 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import AcousticMap, Bearing, Measurement
 from ertis_numba.network.keys import ClientKeys
@@ -12,6 +13,8 @@ from ertis_numba.passive import AcousticCamera, BearingFinder, is_passive
 from ertis_numba.settings import Settings
 
 __all__ = ["AcousticMapSubscriber"]
+
+_MAX_CHANGE: Final = 2e-3  # of the speed of sound, by about 1 K; it turns directions 45° aside by 0.1°.
 
 
 class AcousticMapSubscriber:
@@ -155,7 +158,7 @@ class AcousticMapSubscriber:
         """Return the camera of a measurement's sensor; a new one after a change of its settings."""
         sensor, settings = measurement.stamp.sensor, measurement.settings
         known = self._hearers.get(sensor)
-        if known is not None and known.settings == settings.replace(air=known.settings.air):
+        if known is not None and known.suits(settings):
             return known
         try:
             made = self._hearer_of(settings)
@@ -176,6 +179,13 @@ class _Hearer(NamedTuple):
     settings: Settings
     camera: AcousticCamera
     finder: BearingFinder | None
+
+    def suits(self, settings: Settings) -> bool:
+        """Return True unless settings differ, or before the first measurement of a map, the speed of sound."""
+        known = self.settings
+        change = sound_speed_m_s(settings.air) / sound_speed_m_s(known.air) - 1
+        is_same_air = abs(change) < _MAX_CHANGE or self.camera.n_measurements > 0
+        return is_same_air and known == settings.replace(air=known.air)
 
     def close(self) -> None:
         self.camera.close()
