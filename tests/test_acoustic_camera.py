@@ -265,11 +265,20 @@ def test_octaves_are_those_of_the_standard():
         ({"passive__method": "music", "passive__n_sources": 6}, "6 microphones"),
         ({"passive__method": "capon", "passive__diagonal_removal": True}, "does not support"),
         ({"passive__method": "loudest"}, "passive.method"),
+        ({"array__disabled": (0, 1, 2, 3, 4)}, "array has 1 enabled microphone"),
     ],
 )
 def test_settings_that_cannot_be_used_are_refused(changes, words):
     with pytest.raises(ArgumentError, match=words.replace("[", r"\[").replace("]", r"\]")):
         AcousticCamera(settings_of(**changes), "cpu")
+
+
+def test_measurements_of_another_type_are_refused():
+    with AcousticCamera(settings_of(), "cpu") as camera:
+        with pytest.raises(ArgumentError, match="measurements is of type Measurement"):
+            list(camera.process_many(sound(settings_of(), [])))
+        with pytest.raises(ArgumentError, match=r"measurements\[0\] is of type int"):
+            list(camera.process_many([1]))
 
 
 def test_too_few_blocks_are_refused():

@@ -109,6 +109,12 @@ def test_measurement_has_the_delays_of_its_direction():
         assert each.delay_s == pytest.approx(delay_s[each.second] - delay_s[each.first], abs=0.5e-6)
 
 
+def test_bands_may_be_rows_of_arrays_and_delays_unlimited():
+    rows, bands_hz = delayed_noise((0.0, 7.7e-6), noise=0.1), np.array([[20e3, 80e3]])
+    expected = time_differences(rows, rate_hz=RATE_HZ, band_hz=(20e3, 80e3))
+    assert time_differences(rows, rate_hz=RATE_HZ, band_hz=bands_hz[0], max_delay_s=1e308) == expected
+
+
 def test_arguments_outside_their_limits_are_refused():
     rows, measurement = delayed_noise((0.0, 0.0)), sound(settings_of(), [])
     for words, arguments, options in (
@@ -122,7 +128,16 @@ def test_arguments_outside_their_limits_are_refused():
         ("band_hz", (rows,), {"rate_hz": RATE_HZ, "band_hz": (5e3, 1e6)}),
         ("none of the frequencies", (rows,), {"rate_hz": RATE_HZ, "band_hz": (5.1e3, 5.2e3)}),
         ("max_delay_s", (rows,), {"rate_hz": RATE_HZ, "max_delay_s": 0.0}),
-        ("heard", (rows * np.nan,), {"rate_hz": RATE_HZ}),
+        ("resolution_hz", (rows,), {"rate_hz": RATE_HZ, "resolution_hz": 1e-320}),
+        ("band_hz", (rows,), {"rate_hz": RATE_HZ, "band_hz": ()}),
+        ("band_hz", (rows,), {"rate_hz": RATE_HZ, "band_hz": np.zeros((2, 2))}),
+        ("heard holds nan", (rows * np.nan,), {"rate_hz": RATE_HZ}),
+        ("heard holds inf", (rows.astype(float) * 1e300,), {"rate_hz": RATE_HZ}),
+        ("heard is of type str", ("rows",), {"rate_hz": RATE_HZ}),
+        ("heard is of type list", ([[1.0, 2.0], [1.0]],), {"rate_hz": RATE_HZ}),
+        ("real numbers", (rows * 1j,), {"rate_hz": RATE_HZ}),
+        ("8 samples or more", (rows[:, :0],), {"rate_hz": RATE_HZ}),
+        ("8 samples or more", (rows[:, :7],), {"rate_hz": RATE_HZ}),
     ):
         with pytest.raises(ArgumentError, match=words):
             time_differences(*arguments, **options)

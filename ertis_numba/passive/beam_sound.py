@@ -106,6 +106,7 @@ def listen_to(
     if signals is None:
         with HeardSignals(measurement.settings) as own:
             return listen_to(measurement, azimuth_deg, elevation_deg, signals=own)
+    checks.instance("signals", signals, HeardSignals, "HeardSignals(measurement.settings) makes")
     heard, rate_hz = signals(measurement), signals.rate_hz
     direction = unit_vectors(np.radians([azimuth_deg]), np.radians([elevation_deg]))
     delay_s = WaveDelays(signals.settings)(direction)[0]

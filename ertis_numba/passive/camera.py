@@ -111,7 +111,7 @@ class AcousticCamera:
         sensitivity_dbfs = microphones(settings.array).sensitivity_dbfs  # of the layout, for the levels of maps
         settings = settings.replace("array.sensitivity_dbfs", sensitivity_dbfs)
         self._kernels, self.settings, self.device = kernel_set, settings, kernel_set.device
-        self._require_sources()
+        self._require_microphones()
         self.grid: Grid = direction_grid(settings.processing)
         self._blocks = BlockSpectra(settings, kernel_set, threads=self._threads)
         self.band_hz: NDArray[np.float64] = self._blocks.bands_hz
@@ -248,7 +248,7 @@ class AcousticCamera:
             As for `add` and `map`.
         """
         self.reset()
-        for measurement in measurements:
+        for measurement in checks.items("measurements", measurements, Measurement, "a recording holds"):
             self.add(measurement)
             if self.n_measurements == self.settings.passive.averages:
                 yield self.map()
@@ -288,9 +288,14 @@ class AcousticCamera:
             self._lane.wait()
         return out
 
-    def _require_sources(self) -> None:
-        """Refuse as many sources as microphones."""
+    def _require_microphones(self) -> None:
+        """Refuse a single microphone, and as many sources as microphones."""
         passive, n_mics = self.settings.passive, int(microphones(self.settings.array).enabled.sum())
+        if n_mics < 2:
+            raise ArgumentError(
+                "array has 1 enabled microphone, which hears no directions; give a layout with two or more, or disable "
+                "fewer"
+            )
         if passive.method == "music" and passive.n_sources >= n_mics:
             raise ArgumentError(
                 f"passive.n_sources is {passive.n_sources}, but the array has {n_mics} microphones; give fewer than "

@@ -52,6 +52,7 @@ class HeardSignals:
     def __init__(
         self, settings: Settings, *, highest_hz: float | None = None, device: str = "auto", threads: int | None = None
     ) -> None:
+        checks.instance("settings", settings, Settings, "a recording holds, or Settings.from_preset returns")
         self.settings, recording = settings, settings.recording
         most_hz, lowest_hz = recording.sample_rate_hz / _RATE, 0.0
         if highest_hz is None:

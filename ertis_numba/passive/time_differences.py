@@ -21,6 +21,8 @@ Weighting = Literal["phat", "scot", "none"]
 
 _WEIGHTINGS: Final = ("phat", "scot", "none")
 _FINER: Final = 8  # Samples of the correlation per sample of the signals.
+_MIN_BLOCK: Final = 8
+_MAX_BLOCK: Final = 1e15  # More than any record has.
 _TINY: Final = 1e-30
 _MAX_COHERENCE: Final = 1 - 1e-9
 _INDEPENDENT: Final = 0.947  # Share of independent blocks: neighbours have a correlation of 1/6 under Hann windows.
@@ -54,7 +56,7 @@ def time_differences(
     *,
     rate_hz: float | None = None,
     weighting: Weighting = "phat",
-    band_hz: tuple[float, float] | None = None,
+    band_hz: tuple[float, float] | NDArray[np.float64] | None = None,
     max_delay_s: float | None = None,
     resolution_hz: float = 1e3,
 ) -> list[TimeDifference]:
@@ -112,20 +114,22 @@ def time_differences(
     else:
         if rate_hz is None:
             raise ArgumentError("rate_hz is missing; give the sample rate of the signals")
-        rows = np.asarray(heard, np.float32)
-        checks.finite_array("heard", rows)
-        signals = _Signals(rows, checks.positive("rate_hz", rate_hz), (0.0, rate_hz / 2))
+        signals = _Signals(_of_array(heard), checks.positive("rate_hz", rate_hz), (0.0, rate_hz / 2))
     n_mics, n_samples = signals.rows.shape if signals.rows.ndim == 2 else (0, 0)
-    if n_mics < 2:
-        raise ArgumentError(f"heard has shape {signals.rows.shape}; give the signals of two microphones or more")
+    if n_mics < 2 or n_samples < _MIN_BLOCK:
+        raise ArgumentError(
+            f"heard has shape {signals.rows.shape}; give {_MIN_BLOCK} samples or more of two microphones or more"
+        )
     checks.positive("resolution_hz", resolution_hz)
-    n_block = round(signals.rate_hz / resolution_hz)
-    if not 8 <= n_block <= n_samples:
+    n_block = round(min(signals.rate_hz / resolution_hz, _MAX_BLOCK))
+    if not _MIN_BLOCK <= n_block <= n_samples:
         raise ArgumentError(
             f"resolution_hz is {resolution_hz:g}, which needs {n_block} of {n_samples} samples; give a number from "
-            f"{signals.rate_hz / n_samples:.4g} to {signals.rate_hz / 8:.4g}"
+            f"{signals.rate_hz / n_samples:.4g} to {signals.rate_hz / _MIN_BLOCK:.4g}"
         )
-    correlator = _Correlator(signals, n_block, band_hz or signals.band_hz, weighting)
+    if isinstance(band_hz, np.ndarray):  # such as a row of AcousticCamera.band_hz
+        band_hz = tuple(band_hz.tolist())
+    correlator = _Correlator(signals, n_block, signals.band_hz if band_hz is None else band_hz, weighting)
     if max_delay_s is not None:
         checks.positive("max_delay_s", max_delay_s)
     return [
@@ -141,6 +145,22 @@ class _Signals(NamedTuple):
     band_hz: tuple[float, float]
     delay_s: NDArray[np.float64] | None = None
     positions_s: NDArray[np.float64] | None = None  # relative to the speed of sound
+
+
+def _of_array(heard: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return signals in single precision; refuse what is no array of finite real numbers."""
+    try:
+        rows = np.asarray(heard)
+    except ValueError:  # rows of different lengths
+        rows = np.asarray(None)
+    if rows.dtype.kind not in "iuf":
+        raise ArgumentError(
+            f"heard is of type {type(heard).__name__}; give a Measurement, or real numbers with axes microphone, sample"
+        )
+    with np.errstate(over="ignore"):  # finite_array reports what exceeds single precision
+        rows = rows.astype(np.float32)
+    checks.finite_array("heard", rows)
+    return rows
 
 
 def _of_measurement(measurement: Measurement) -> _Signals:
@@ -190,7 +210,7 @@ class _Correlator:
         most = self._chosen.sum() if self._weighting == "phat" else (scale / size)[self._chosen].sum()
         n_fine = _FINER * self._n_block
         correlation = scipy.fft.irfft(weighted, n_fine) * n_fine / 2
-        reach = max(1, min(int(most_s * self._rate_hz * _FINER), n_fine // 2 - 2))
+        reach = max(1, int(min(most_s * self._rate_hz * _FINER, n_fine // 2 - 2)))
         lags = np.arange(-reach, reach + 1)
         top = int(lags[np.argmax(correlation[lags])])
         before, here, after = correlation[[top - 1, top, top + 1]]
