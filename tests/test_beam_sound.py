@@ -78,6 +78,8 @@ def test_arguments_outside_their_limits_are_refused():
         ("azimuth_deg", lambda: listen_to(measurement, 181)),
         ("elevation_deg", lambda: listen_to(measurement, 0, 91)),
         ("measurement", lambda: listen_to(None, 0)),
+        ("signals is of type str", lambda: listen_to(measurement, 0, signals="all")),
+        ("settings is of type NoneType", lambda: HeardSignals(None)),
         ("shift_hz", lambda: heterodyned(tone(1e3), 2e5)),
         ("rate_hz", lambda: heterodyned(tone(1e3), 1e3, 1e6)),
         ("too low", lambda: heterodyned(tone(1e3, rate_hz=1e9, n=100), 1e3, 1e3)),
@@ -156,3 +158,10 @@ def test_command_refuses_impossible_options(recording, arguments, words):
     done = run(recording, *arguments)
     assert done.exit_code == 2
     assert words in done.stderr
+
+
+def test_command_names_its_option_for_a_shift_above_the_sound(recording, tmp_path):
+    done = run(recording, "-o", tmp_path / "x.wav", "--listen", "0,0", "--heterodyne", "4e9")
+    assert done.exit_code == 2
+    assert "--heterodyne is 4e+09; give a number from 0 to 112500" in done.stderr
+    assert not (tmp_path / "x.wav").exists()

@@ -96,6 +96,22 @@ def test_export_reports_json_and_a_summary(files, tmp_path):
     assert run(files / "rec.h5", "-o", tmp_path / "b.csv", "--quiet").stderr == ""
 
 
+def test_export_leaves_out_measurements_without_a_call(tmp_path):
+    passive = [
+        Measurement(given.data, SMALL, Stamp(sequence=number, behaviour="active" if number == 1 else "passive"))
+        for number, given in enumerate(noise())
+    ]
+    write_recording(tmp_path / "rec.h5", passive)
+    done = run(tmp_path / "rec.h5", "-o", tmp_path / "a.npz", "--json")
+    assert "note: 2 measurements without a call left out; 'ertis process' makes acoustic maps" in done.stderr
+    assert json.loads(done.stdout[done.stdout.index("{") :])["measurements"] == 1
+    with np.load(tmp_path / "a.npz") as data:
+        assert data["sequence"].tolist() == [1]
+    done = run(tmp_path / "rec.h5", "-o", tmp_path / "b.npz", "--measurement", "2", code=1)
+    assert "all chosen measurements of sensor sensor are passive and have no images" in done.stderr
+    assert not (tmp_path / "b.npz").exists()
+
+
 def test_export_format_follows_suffix_or_option(files, tmp_path):
     run(files / "img.h5", "-o", tmp_path / "CLOUD.PLY")
     assert (tmp_path / "CLOUD.PLY").read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")

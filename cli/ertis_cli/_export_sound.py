@@ -120,6 +120,7 @@ def export_sound(
     """Write the sound of one direction in some measurements as WAV, amplified to a peak of -1 dBFS."""
     import numpy as np
 
+    from ertis_numba import checks
     from ertis_numba.atomic_files import atomic_write, check_target
     from ertis_numba.passive import heterodyned, time_expanded
     from ertis_numba.wav import wav_bytes
@@ -127,6 +128,7 @@ def export_sound(
     check_target(target, overwrite=force, sources=[reader.path])
     heard = _joined(reader, places, sound)
     if sound.heterodyne_hz is not None:
+        checks.between("--heterodyne", sound.heterodyne_hz, 0.0, heard.rate_hz / 2)
         heard = heterodyned(heard, sound.heterodyne_hz)
     if sound.expansion is not None:
         heard = time_expanded(heard, sound.expansion)

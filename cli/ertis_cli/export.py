@@ -217,7 +217,12 @@ class _Items:
         quiet: bool,
     ) -> None:
         self._chosen = [(reader, _between(places, len(reader))) for reader in readers]
+        self._kept = [_echoes(reader, chosen) if process else chosen for reader, chosen in self._chosen]
         self._process, self._quiet = process, quiet
+        n_passive = sum(map(len, self.indices)) - len(self)
+        if n_passive:
+            left_out = options.counted(n_passive, "measurement")
+            options.say(f"note: {left_out} without a call left out; 'ertis process' makes acoustic maps", quiet=quiet)
 
     @property
     def indices(self) -> tuple[range, ...]:
@@ -225,14 +230,14 @@ class _Items:
         return tuple(chosen for _, chosen in self._chosen)
 
     def __len__(self) -> int:
-        return sum(len(chosen) for _, chosen in self._chosen)
+        return sum(map(len, self._kept))
 
     def __iter__(self) -> "Iterator[_Exported]":
         with options.progress(self._each(), length=len(self), label="exporting", quiet=self._quiet) as shown:
             yield from shown
 
     def _each(self) -> "Iterator[_Exported]":
-        for reader, chosen in self._chosen:
+        for (reader, _), chosen in zip(self._chosen, self._kept, strict=True):
             read = (reader[index] for index in chosen)
             yield from self._processed(read) if self._process else read
 
@@ -242,6 +247,29 @@ class _Items:
             with options.pipeline(settings, quiet=self._quiet) as pipeline:
                 for measurement in group:
                     yield pipeline.result(measurement)
+
+
+def _echoes(reader: "RecordingReader | EnergyscapeReader", chosen: range) -> "Sequence[int]":
+    """Return the chosen measurements of a recording that become images.
+
+    Raises
+    ------
+    DataError
+        All are passive.
+    """
+    from ertis_numba.errors import DataError
+    from ertis_numba.passive import is_passive
+
+    if reader.settings.processing.last_stage != "envelope":  # signals, which need no call
+        return chosen
+    stamps = list(reader.stamps())
+    found = [place for place in chosen if not is_passive(reader.settings, stamps[place])]
+    if chosen and not found:
+        raise DataError(
+            f"{reader.path}: all chosen measurements of sensor {reader.sensor} are passive and have no images; make "
+            "acoustic maps with 'ertis process', or images with its option --mode active, and export these"
+        )
+    return found
 
 
 def _between(places: tuple[int, int] | None, count: int) -> range:
