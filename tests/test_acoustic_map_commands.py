@@ -136,7 +136,7 @@ def test_several_recordings_become_images_only(folder):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("active.h5 --average 2", "--average is for acoustic maps, but measurements were emitted, which become images"),
+        ("active.h5 --average 2", "--average is for acoustic maps, but measurements with a call become images"),
         ("passive.h5 --range 0.5:1", "--range is for images, but all measurements are passive and become acoustic"),
         ("passive.h5 --verify", "--verify is for images, but all measurements are passive"),
         ("passive.h5 --bands wide", "'wide' is not a list of bands; give third_octaves, octaves, or edges in Hz"),

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,8 @@ def folder(tmp_path_factory):
     write_recording(made / "both.h5", [each for several in recorded.values() for each in several], mounting=mounting)
     for name, several in recorded.items():
         write_recording(made / f"{name}.h5", several, mounting={name: mounting[name]})
+    passive = [replace(each, stamp=replace(each.stamp, behaviour="passive")) for each in recorded["left"]]
+    write_recording(made / "passive.h5", passive, mounting={"left": mounting["left"]})
     ertis.write_tum(made / "poses.tum", poses())
     return made
 
@@ -185,6 +188,7 @@ def test_map_refuses_poses_at_other_times(folder):
             "suffix of the map '.tif' is unknown; known are .h5, .mcap, .pgm, .ply",
         ),
         ("both.h5 --poses none.tum", 1, "none.tum"),
+        ("passive.h5 --poses poses.tum", 1, "passive.h5: all measurements are passive and have no echoes"),
         ("both.h5 --poses poses.tum --cell 0", 2, "--cell"),
         ("both.h5 --poses poses.tum -o both.h5", 1, "both.h5"),
     ],

@@ -71,6 +71,8 @@ def folder(tmp_path_factory):
         replace(each, stamp=replace(each.stamp, timestamp_ns=each.stamp.timestamp_ns * 20))
         for each in measurements[:COUNT]
     ]
+    passive = [replace(each, stamp=replace(each.stamp, behaviour="passive")) for each in measurements[:COUNT]]
+    write_recording(place / "passive.h5", passive, mounting={"front": mountings["front"]})
     write_recording(place / "slow.h5", slow, mounting={"front": mountings["front"]})
     return place
 
@@ -126,6 +128,7 @@ def test_odometry_command_takes_mountings_from_a_file(folder, tmp_path):
         (["timeless.h5"], 1, "timeless.h5 has different pulses at the same time"),
         (["front.h5", "late.h5"], 1, "no pulse has measurements of two sensors: front has pulses 0 to 2 from 0.000 s"),
         (["slow.h5"], 1, "slow.h5: no two successive pulses have enough echoes in common, at most a second apart"),
+        (["passive.h5"], 1, "passive.h5: all measurements are passive and have no echoes; give recordings of emitted"),
         (["both.h5", "--preset", "none"], 2, "preset 'none' is unknown"),
     ],
 )

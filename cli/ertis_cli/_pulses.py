@@ -115,6 +115,25 @@ def pulse_groups(readers: "Sequence[RecordingReader]") -> "Iterator[dict[str, St
         yield rest
 
 
+def active_groups(readers: "Sequence[RecordingReader]") -> "list[dict[str, StampedIndex]]":
+    """Return the measurements of each pulse in which a sensor emitted its call, by sensor; others have no echoes.
+
+    Raises
+    ------
+    DataError
+        No sensor emitted in any pulse.
+    """
+    from ertis_numba.errors import DataError
+
+    groups = list(pulse_groups(readers))
+    active = [group for group in groups if any(place.stamp.behaviour != "passive" for place in group.values())]
+    if groups and not active:
+        raise DataError(
+            f"{readers[0].path}: all measurements are passive and have no echoes; give recordings of emitted calls"
+        )
+    return active
+
+
 def image_settings(settings_file: "Path | None", preset: str | None) -> "Callable[[Settings], Settings]":
     """Return a function that updates the settings of a recording, and refuses those without an image."""
 

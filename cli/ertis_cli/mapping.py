@@ -101,7 +101,7 @@ def mapping(
             height_m=height_m,
             emitter_diameter_m=emitter_diameter_m,
         )
-        groups = [group for group in _pulses.pulse_groups(readers) if _is_active(group)]
+        groups = _pulses.active_groups(readers)
         located = _located(groups, trajectory)
         by_name = {reader.sensor: reader for reader in readers}
         with options.progress(located, length=len(located), label="mapping", quiet=quiet) as shown:
@@ -121,11 +121,6 @@ def mapping(
     )
     if as_json:
         options.print_json(report)
-
-
-def _is_active(group: "dict[str, StampedIndex]") -> bool:
-    """Return True if a sensor emitted in a pulse; passive pulses show neither walls nor free space."""
-    return any(place.stamp.behaviour != "passive" for place in group.values())
 
 
 def _trajectory(poses_file: Path | None, paths: "Sequence[Path]") -> "Trajectory":

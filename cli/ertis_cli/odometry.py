@@ -68,7 +68,7 @@ def odometry(
         pipelines = _pulses.PipelinesBySensor(
             _pulses.image_settings(settings_file, preset), stack, quiet=quiet, device=device, threads=threads, plan=plan
         )
-        found = odometry_of(readers, list(_pulses.pulse_groups(readers)), pipelines, mountings, quiet=quiet)
+        found = odometry_of(readers, _pulses.active_groups(readers), pipelines, mountings, quiet=quiet)
     write_tum(file, found.trajectory, overwrite=force)
     measured = sum(pose.is_measured for pose in found.poses[1:]) / (len(found.poses) - 1)
     duration_s = (found.poses[-1].timestamp_ns - found.poses[0].timestamp_ns) / _NS_PER_S

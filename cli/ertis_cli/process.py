@@ -270,7 +270,7 @@ def process(
             threads=threads,
         )
         return
-    _acoustic_maps.require_none("measurements were emitted, which become images; give --mode passive")
+    _acoustic_maps.require_none("measurements with a call become images; give --mode passive")
     target_file = Path(target) if target else path.with_suffix(".energy.h5")
     report = _process_one(path, target_file, wanted, quiet=quiet, as_json=as_json)
     _note_mountings(target_file, quiet=quiet)
