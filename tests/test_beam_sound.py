@@ -163,5 +163,5 @@ def test_command_refuses_impossible_options(recording, arguments, words):
 def test_command_names_its_option_for_a_shift_above_the_sound(recording, tmp_path):
     done = run(recording, "-o", tmp_path / "x.wav", "--listen", "0,0", "--heterodyne", "4e9")
     assert done.exit_code == 2
-    assert "--heterodyne is 4e+09; give a number from 0 to 112500" in done.stderr
+    assert "--heterodyne is 4e+09; give a number from 0 to 56250" in done.stderr
     assert not (tmp_path / "x.wav").exists()

@@ -148,7 +148,7 @@ class _Signals(NamedTuple):
 
 
 def _of_array(heard: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return signals in single precision; refuse what is no array of finite real numbers."""
+    """Return signals in single precision; refuse all but finite real numbers."""
     try:
         rows = np.asarray(heard)
     except ValueError:  # rows of different lengths
