@@ -41,6 +41,8 @@ def recorded(tmp_path_factory):
     ertis.write_recording(made / "mixed.h5", heard(["active", "passive", "active", "passive"]))
     both = [*heard(["active"], "left"), *heard(["passive", "passive"], "right")]
     ertis.write_recording(made / "both.h5", both, mounting={"right": ((0.1, 0.0, 0.0), TURNED)})
+    silent = [*heard(["passive"], "left"), *heard(["passive"], "right")]
+    ertis.write_recording(made / "silent.h5", silent, mounting=dict.fromkeys(("left", "right"), ((0, 0, 0), TURNED)))
     return made
 
 
@@ -131,6 +133,18 @@ def test_several_recordings_become_images_only(folder):
     run("process passive.h5 -o images/passive.energy.h5 --device cpu")
     run("process images -o more/ --device cpu", code=0)  # results of processing are skipped
     assert not list((folder / "more").glob("*.h5"))
+
+
+def test_images_of_silent_sensors_are_fused_only_if_asked(folder):
+    done = run("process silent.h5 --fuse --device cpu", code=1)
+    assert "silent.h5: all measurements are passive and have no echoes; give recordings of emitted calls" in done.stderr
+    assert not (folder / "silent.fused.h5").exists()
+    run("process silent.h5 --fuse --mode active --device cpu")
+
+
+def test_check_names_the_kind_of_a_file_of_maps():
+    run("process passive.h5 -o maps.h5 --device cpu")
+    assert "maps.h5 is a file of acoustic maps, wanted a recording" in run("check maps.h5", code=1).stderr
 
 
 @pytest.mark.parametrize(
