@@ -82,7 +82,8 @@ def check_recording(
         checks.between("nominal_rate_hz", nominal_rate_hz, 1e-6, 1e6)
     kind = file_kind(path)
     if kind != "recording":
-        raise DataError(f"{path} is an energyscape file, wanted a recording; give the recording it was made from")
+        name = "an energyscape file" if kind == "energyscape" else "a file of acoustic maps"
+        raise DataError(f"{path} is {name}, wanted a recording; give the recording it was made from")
     names = sensor_names(path)
     try:
         stored = {report.sensor: report for report in verify(path)}
