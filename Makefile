@@ -7,7 +7,7 @@ GPU ?= cu12
 WORKERS ?= 3
 unexport PYTHONDONTWRITEBYTECODE  # otherwise, each of hundreds of processes compiles every module again
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
-KERNELS := $(patsubst %,tests/test_%.py,kernels passive_kernels interpolated_beams phase_shifts beamformers modulator)
+KERNELS := $(patsubst %,tests/test_%.py,kernels passive_kernels fusion_kernels interpolated_beams phase_shifts beamformers modulator)
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
 
 .PHONY: demo test test-kernels test-host test-simulator test-ptx test-arm check docs data pictures bench peers soak gpu clean

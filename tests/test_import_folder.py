@@ -274,7 +274,7 @@ def test_folder_import_refuses_invalid_folders(tmp_path, made, message):
         (
             SHORT | {"microphoneSamples": 11_000},
             PLANAR,
-            "recording.n_samples gives a record of 2.444 ms, but the call lasts 2.5 ms; give more",
+            "recording.n_samples gives a record of 2.444 ms, but the call ends after 2.5 ms; give more",
         ),
     ],
 )

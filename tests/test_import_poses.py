@@ -159,13 +159,16 @@ def test_export_writes_poses_that_read_back(recording, trajectory, tmp_path):
 
 def test_export_of_poses_refuses_what_it_cannot_write(recording, trajectory, tmp_path):
     done = run("export", recording, "-o", tmp_path / "OUT.tum", code=1)
-    assert f"{recording} has no poses; add them with 'ertis import-poses {recording} TRAJ.tum'" in done.stderr
+    assert (
+        f"{recording} has no poses; add them to its recording with 'ertis import-poses RECORDING TRAJ.tum'"
+        in done.stderr
+    )
     run("import-poses", recording, trajectory)
     done = run("export", recording, "-o", tmp_path / "OUT.tum", "--top", "3", code=2)
     assert "--top is not for poses; remove it" in done.stderr
     write_energyscapes(tmp_path / "IMG.h5", [image()])
     done = run("export", tmp_path / "IMG.h5", "-o", tmp_path / "OUT.tum", code=1)
-    assert "is an energyscape file, wanted a recording" in done.stderr
+    assert "IMG.h5 has no poses; add them to its recording" in done.stderr
     assert not (tmp_path / "OUT.tum").exists()
 
 

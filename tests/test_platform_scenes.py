@@ -43,7 +43,7 @@ def test_sound_arrives_where_the_turning_microphones_are(emitter, receiver):
     sender, sensor = scene.sensors[emitter], scene.sensors[receiver]
     shot = snapshot(scene, sensor, start_s)
     (paths, *_) = echoes(shot, frozenset({"emitter_offset"}), emitter, CostStopwatch())
-    arrival_s, stretch = doppler.times(shot, paths, (np.zeros(0), None))
+    arrival_s, stretch = doppler.times(shot, paths, 0.0, (np.zeros(0), None))
     speed_m_s = shot.speed_m_s
 
     def arrival_of(offset_m, sent_s):

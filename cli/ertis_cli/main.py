@@ -34,7 +34,10 @@ COMMANDS = {
     "export": ("ertis_cli.export:export", "Export images or signals for other programs."),
     "import": ("ertis_cli.import_raw:import_raw", "Import raw eRTIS data or PCM into a recording."),
     "import-poses": ("ertis_cli.import_poses:import_poses", "Add the poses of a platform to recordings."),
-    "info": ("ertis_cli.info:info", "Show the contents of a recording, an image file or a map."),
+    "info": (
+        "ertis_cli.info:info",
+        "Show the contents of a recording, an image file, acoustic maps or an occupancy map.",
+    ),
     "keys": ("ertis_cli.keys:keys", "Create keys and manage the list of allowed keys."),
     "layouts": ("ertis_cli.layouts:layouts", "List the shipped layouts, or print one as TOML."),
     "listen": ("ertis_cli.listen:listen", "Show or save the products that a central node publishes."),
