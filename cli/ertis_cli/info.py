@@ -40,7 +40,7 @@ _COLUMNS = {  # name: digits in the report, and in the table
 )
 @options.as_json
 def info(*, path: Path, of_health: bool, as_json: bool) -> None:
-    """Show the contents of a recording, an image file, acoustic maps or an occupancy map.
+    """Show the contents of a recording, an image file or a map.
 
     In JSON, "sensors" lists the properties of each sensor. If there is only one sensor, the top level repeats its
     properties.

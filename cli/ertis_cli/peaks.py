@@ -79,7 +79,9 @@ def peaks(
     truth: bool,
     as_json: bool,
 ) -> None:
-    """List the reflectors in an energyscape file, or the loudest directions of acoustic maps.
+    """List the reflectors in an energyscape file.
+
+    In a file of acoustic maps, list the loudest direction of each band.
 
     There is one entry per reflector, the strongest of each measurement first. level_db is relative to the strongest
     peak, and level_dbfs to a full-scale echo in every microphone. Maxima that noise alone may cause in
