@@ -139,7 +139,7 @@ def plot(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Plot a measurement, an acoustic map or an array.
+    """Plot a measurement or an array.
 
     To plot an image of a recording, the recording is first processed with its own settings.
     """
