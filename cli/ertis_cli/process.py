@@ -154,7 +154,9 @@ def process(
     as_json: bool,
     **other: Any,
 ) -> None:
-    """Process recordings into energyscapes, or passive measurements into acoustic maps.
+    """Process recordings into energyscapes.
+
+    Passive measurements become acoustic maps.
 
     Measurements without a call become acoustic maps: sound power from each direction, in bands of frequencies. If only
     some measurements of a recording are passive, they are left out, and the others become images. With --mode passive,
