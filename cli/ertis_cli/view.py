@@ -165,7 +165,7 @@ def view(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Show live or recorded images or acoustic maps in a browser.
+    """Show live or recorded images in a browser.
 
     ADDRESS is the address at which a central node publishes. A recording is processed with its own settings during
     playback, and is shown at its original speed. The page shows range versus azimuth, or sound levels over direction,
