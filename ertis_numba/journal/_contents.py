@@ -192,11 +192,30 @@ class ReadableJournal:
         Raises
         ------
         DamagedError
-            A measurement does not match its CRC-32; `index` and `entry` give access to the others.
+            A measurement does not match its CRC-32, or the index does not list it; `index` and `entry` give access to
+            the others.
         DataError
             The disk fails.
         """
-        return (self.entry(key) for key in self.index(sensor))
+        numbers = set(self._ids.values()) if sensor is None else {self._ids[self._sensor(sensor).name]}
+        return self._in_order(self.index(sensor), numbers - self._unusable.keys())
+
+    def _in_order(self, keys: list[JournalKey], sensors: set[int]) -> Iterator[JournalEntry]:
+        """Yield measurements; before each, refuse rows of the sensors that a damaged index lists elsewhere, or not."""
+        before = 0
+        for key in keys:
+            if key.place > before + 1:
+                with self._lock:
+                    rows = self._database.execute(
+                        "SELECT sensor FROM measurements NOT INDEXED WHERE id > ? AND id < ?", (before, key.place)
+                    )
+                if any(number in sensors for (number,) in rows):
+                    raise DamagedError(
+                        f"{self.path} is damaged: its index omits a measurement before measurement {key.sequence} of "
+                        f"sensor {key.sensor}; copy it again if you can"
+                    )
+            yield self.entry(key)
+            before = key.place
 
     def _sensor(self, name: str) -> JournalSensor:
         if name not in self._sensors:
