@@ -58,6 +58,7 @@ _TESTED = (
     "tests/test_phase_shifts.py",
     "tests/test_beamformers.py",
     "tests/test_modulator.py",
+    "tests/test_passive_kernels.py",
     "tests/cuda",
 )
 _SANITIZED_TESTS = (
