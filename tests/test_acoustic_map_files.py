@@ -11,7 +11,7 @@ import pytest
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
 from ertis_numba.settings import Array, Settings
-from ertis_numba.storage import file_kind, sensor_names
+from ertis_numba.storage import file_kind, recorded_trajectory, sensor_names
 from tests.files import image, noise, open_dataset
 
 GROUP = "sensors/eRTIS-7"
@@ -80,6 +80,29 @@ def test_map_file_names_its_recording(tmp_path):
     with ertis.open_acoustic_maps(path) as reader:
         assert reader.attributes["recording_uuid"] == uuid
         assert reader.translation_m.tolist() == [0.5, 0.0, 0.0]
+
+
+def test_poses_are_those_at_the_last_measurements(tmp_path):
+    heard = noise(count=4)
+    drive = ertis.Trajectory(
+        [heard[0].stamp.timestamp_ns, heard[-1].stamp.timestamp_ns],
+        [[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]],
+        [[0.0, 0.0, 0.0, 1.0]] * 2,
+        source="file",
+    )
+    source = ertis.write_recording(tmp_path / "rec.h5", heard, poses=drive)
+    maps = [acoustic_map(stamp=heard[index].stamp) for index in (1, 3)]
+    with ertis.open_recording(source) as recording:
+        path = ertis.write_acoustic_maps(tmp_path / "maps.h5", maps, recording=recording)
+    with ertis.open_acoustic_maps(path) as reader:
+        assert reader.trajectory.time_ns.tolist() == [each.stamp.timestamp_ns for each in maps]
+        assert reader.trajectory.position_m[:, 0].tolist() == pytest.approx([1.0, 3.0])
+        assert reader.trajectory.source == "file"
+        assert recorded_trajectory(path).position_m.tolist() == reader.trajectory.position_m.tolist()
+    with h5py.File(path, "r+") as file:
+        file[f"{GROUP}/pose_position"][1, 0] = 2.0
+    with pytest.raises(DamagedError, match="has SHA-256"):
+        ertis.open_acoustic_maps(path)
 
 
 def test_identity_depends_on_content_only(tmp_path):

@@ -183,8 +183,7 @@ def _recording(reader: "RecordingReader") -> dict[str, Any]:
         "behaviour": dict(Counter(stamp.behaviour for stamp in stamps)),
         "missing": sum(gap.n_missing for gap in reader.gaps),
         **({"firmware": reader.firmware} if reader.firmware else {}),
-        **_mounting(reader),
-        **_poses(reader),
+        **_placement(reader),
     }
 
 
@@ -197,7 +196,7 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
         "method": processing.method,
         "beamformer": processing.beamformer,
         "weighting": processing.weighting,
-        **_mounting(reader),
+        **_placement(reader),
         **_error(reader),
         **({"call_warning": reader.call_warning} if reader.call_warning else {}),
     }
@@ -214,20 +213,18 @@ def _maps_of_sound(reader: "AcousticMapReader") -> dict[str, Any]:
         "method": passive.method,
         "averages": passive.averages,
         **({} if passive.focus_m is None else {"focus_m": passive.focus_m}),
-        **_mounting(reader),
+        **_placement(reader),
     }
 
 
-def _mounting(reader: "_Reader") -> dict[str, Any]:
-    if reader.translation_m is None or reader.rotation_xyzw is None:
-        return {"mounting": "unknown"}
-    return {"translation_m": reader.translation_m.tolist(), "rotation_xyzw": reader.rotation_xyzw.tolist()}
-
-
-def _poses(reader: "RecordingReader") -> dict[str, Any]:
+def _placement(reader: "_Reader") -> dict[str, Any]:
+    """Return the mounting of the sensor, and a summary of the platform's poses."""
+    found: dict[str, Any] = {"mounting": "unknown"}
+    if reader.translation_m is not None and reader.rotation_xyzw is not None:
+        found = {"translation_m": reader.translation_m.tolist(), "rotation_xyzw": reader.rotation_xyzw.tolist()}
     if reader.trajectory is None:
-        return {"poses": 0}
-    return {
+        return found | {"poses": 0}
+    return found | {
         "poses": len(reader.trajectory),
         "poses_source": reader.trajectory.source or "unknown",
         "path_length_m": round(reader.trajectory.length_m, 3),

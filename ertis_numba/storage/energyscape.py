@@ -5,42 +5,38 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Final, Literal
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.angles import DegreesFromRadians
-from ertis_numba.atomic_files import check_target
 from ertis_numba.errors import ArgumentError, DamagedError
-from ertis_numba.frames import Energyscape, Trajectory
-from ertis_numba.geometry import mounting as mounted, self_contained
-from ertis_numba.storage._mounting import read_mounting, write_mounting
-from ertis_numba.storage._poses import POSE_SIZES, read_poses, write_poses
-from ertis_numba.storage._provenance import provenance, recorded_mountings
-from ertis_numba.storage._reader import FileReader
-from ertis_numba.storage._rows import RowReader, RowWriter
-from ertis_numba.storage._writer import FileWriter
+from ertis_numba.frames import Energyscape
+from ertis_numba.storage._results import ResultFile, ResultReader, ResultWriter
+from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import (
-    ENERGYSCAPE,
-    FORMAT_VERSION,
-    POSES,
-    Variable,
-    create_variables,
-    set_attributes,
-    to_python,
-)
+from ertis_numba.storage.schema import ENERGYSCAPE, POSES, Variable, set_attributes, to_python
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]
 
-_AXES = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "range": "range_m"}
+_ERRORS_DB: Final = ("predicted_error_db", "max_error_db", "wavefront_error_db")
+_TEXTS: Final = ("budget_applies_to", "error_warning", "call_warning")
 
 
-class EnergyscapeWriter(FileWriter[Energyscape]):
+class _EnergyscapeFile(ResultFile):
+    _kind: ClassVar[str] = "energyscape"
+    _data: ClassVar[str] = "amplitude"
+    _table: ClassVar[tuple[Variable, ...]] = (*ENERGYSCAPE, *POSES)
+    _type: ClassVar[type[Any]] = Energyscape
+    _name: ClassVar[str] = "an energyscape"
+    _axes: ClassVar[Mapping[str, str]] = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "range": "range_m"}
+    _lengths: ClassVar[Mapping[str, int | str]] = {"direction": "azimuth", "range": "range"}
+
+
+class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
     """Writer of an energyscape file, one image at a time; use it in a ``with`` statement.
 
     Energyscapes of several sensors may come in any order.
@@ -64,11 +60,6 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         Replace an existing file.
     """
 
-    _kind: ClassVar[str] = "energyscape"
-    _data: ClassVar[str] = "amplitude"
-    _table: ClassVar[tuple[Variable, ...]] = (*ENERGYSCAPE, *POSES)
-    _numbered: ClassVar[bool] = False
-
     def __init__(
         self,
         path: str | Path,
@@ -80,30 +71,9 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         overwrite: bool = False,
     ) -> None:
         checks.choice("dtype", dtype, ("float32", "float16"))
-        readers = [recording] if isinstance(recording, RecordingReader) else [*(recording or ())]
-        check_target(Path(path), overwrite=overwrite, sources=[reader.path for reader in readers])
-        super().__init__(path, overwrite=overwrite, attributes=provenance(readers), truth=truth)
-        self._dtype = np.dtype(dtype).newbyteorder("<").str
-        self._first: dict[str, Energyscape] = {}
-        self._predicted: dict[str, dict[str, float | str]] = {}
-        self._wavefront_errors_db: dict[str, float] = {}
-        self._call_warnings: dict[str, str] = {}
-        self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in readers if reader.truth}
-        self._trajectories = {reader.sensor: reader.trajectory for reader in readers if reader.trajectory is not None}
-        self._given = {sensor: mounted(sensor, *given) for sensor, given in (mounting or {}).items()}
-        self._mounting = recorded_mountings(readers) | self._given
-
-    def note_mounting(self, sensor: str, translation_m: Sequence[float], rotation_xyzw: Sequence[float]) -> None:
-        """Set the mounting of a sensor.
-
-        Call this before the sensor's first energyscape is written; later calls have no effect.
-
-        Raises
-        ------
-        ArgumentError
-            A number is missing or not finite, or the length of the quaternion is not 1.
-        """
-        self._given[sensor] = self._mounting[sensor] = mounted(sensor, translation_m, rotation_xyzw)
+        super().__init__(path, recording=recording, mounting=mounting, dtype=dtype, overwrite=overwrite, truth=truth)
+        self._stated: dict[str, dict[str, float | str]] = {}
+        self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in self._readers if reader.truth}
 
     def note_error(
         self,
@@ -126,19 +96,20 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         for name, value in (("predicted_error_db", predicted_error_db), ("max_error_db", max_error_db)):
             if not math.isfinite(value):
                 raise ArgumentError(f"{name} is {value}; give a finite number of decibels")
-        self._predicted[sensor] = {
-            "predicted_error_db": predicted_error_db,
-            "max_error_db": max_error_db,
-            "budget_applies_to": budget_applies_to,
-            "error_warning": error_warning,
-        }
+        self._state(
+            sensor,
+            predicted_error_db=predicted_error_db,
+            max_error_db=max_error_db,
+            budget_applies_to=budget_applies_to,
+            error_warning=error_warning,
+        )
 
     def note_call(self, sensor: str, call_warning: str) -> None:
         """Store a warning that a sensor's echoes do not match the call of its settings; empty if they do.
 
         Call this before the sensor's first energyscape is written.
         """
-        self._call_warnings[sensor] = call_warning
+        self._state(sensor, call_warning=call_warning)
 
     def note_wavefront(self, sensor: str, wavefront_error_db: float | None) -> None:
         """Store the error of plane wavefronts at the first range of a sensor; None stores nothing.
@@ -146,50 +117,14 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         Call this before the sensor's first energyscape is written.
         """
         if wavefront_error_db is not None:
-            self._wavefront_errors_db[sensor] = wavefront_error_db
+            self._state(sensor, wavefront_error_db=wavefront_error_db)
+
+    def _state(self, sensor: str, **attributes: float | str) -> None:
+        self._stated.setdefault(sensor, {}).update(attributes)
 
     def _begin(self, group: h5py.Group, first: Energyscape) -> None:
-        self._first[first.stamp.sensor] = first
-        n_directions, n_ranges = len(first.azimuth_rad), len(first.range_m)
-        create_variables(
-            group,
-            ENERGYSCAPE,
-            sizes={"direction": n_directions, "range": n_ranges},
-            dtypes={"amplitude": self._dtype},
-            texts={"settings": self_contained(first.settings).to_toml()},
-        )
-        write_mounting(group, self._mounting.get(first.stamp.sensor, {}))
-        set_attributes(group, self._predicted.get(first.stamp.sensor, {}))
-        if first.stamp.sensor in self._call_warnings:
-            set_attributes(group, {"call_warning": self._call_warnings[first.stamp.sensor]})
-        if first.stamp.sensor in self._wavefront_errors_db:
-            set_attributes(group, {"wavefront_error_db": self._wavefront_errors_db[first.stamp.sensor]})
-        for name, field in _AXES.items():
-            group[name][:] = getattr(first, field)
-        set_attributes(group["amplitude"], {"coordinates": "azimuth elevation"})
-
-    def _row(self, item: Energyscape) -> tuple[NDArray[Any], dict[str, float]]:
-        first = self._first[item.stamp.sensor]
-        if item.settings is not first.settings and item.settings != first.settings:
-            raise ArgumentError("settings of an energyscape differ from those of the first; write it to another file")
-        for field in _AXES.values():
-            ours, theirs = getattr(item, field), getattr(first, field)
-            if ours is not theirs and not np.array_equal(ours, theirs):
-                raise ArgumentError(
-                    f"{field} of an energyscape differs from that of the first; write it to another file"
-                )
-        return item.amplitude, {}
-
-    def _finish(self, file: h5py.File) -> None:
-        super()._finish(file)
-        self._require_sensors("mounting", self._given)
-
-    def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
-        super()._complete(group, rows)
-        trajectory = self._trajectories.get(group.name.rpartition("/")[2])
-        if trajectory is not None:
-            write_poses(group, trajectory)
-            self._format_version = FORMAT_VERSION
+        super()._begin(group, first)
+        set_attributes(group, self._stated.get(first.stamp.sensor, {}))
 
     def _sensor_truth(self, sensor: str, group: h5py.Group) -> GroundTruth | GroundTruthLog | None:
         given = super()._sensor_truth(sensor, group)
@@ -216,7 +151,7 @@ class EnergyscapeWriter(FileWriter[Energyscape]):
         )
 
 
-class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):
+class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
     """Energyscape file as a sequence of energyscapes, each read when it is indexed.
 
     The properties ``azimuth_deg`` and ``elevation_deg`` are the angles in degrees.
@@ -249,16 +184,7 @@ class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):
         examined.
     """
 
-    _kind: ClassVar[str] = "energyscape"
-    _data = "amplitude"
-    _table = (*ENERGYSCAPE, *POSES)
-
-    azimuth_rad: NDArray[np.float64]
-    elevation_rad: NDArray[np.float64]
     range_m: NDArray[np.float64]
-    translation_m: NDArray[np.float64] | None
-    rotation_xyzw: NDArray[np.float64] | None
-    trajectory: Trajectory | None
     predicted_error_db: float | None
     max_error_db: float | None
     budget_applies_to: str
@@ -267,31 +193,12 @@ class EnergyscapeReader(FileReader[Energyscape], DegreesFromRadians):
     wavefront_error_db: float | None
 
     def _load(self) -> None:
-        for name, field in _AXES.items():
-            setattr(self, field, np.asarray(self._group[name][:]))
+        super()._load()
         stated = self._group.attrs
-        self.predicted_error_db, self.max_error_db, self.wavefront_error_db = (
-            _number(self.path, name, stated[name]) if name in stated else None
-            for name in ("predicted_error_db", "max_error_db", "wavefront_error_db")
-        )
-        self.budget_applies_to, self.error_warning, self.call_warning = (
-            str(to_python(stated.get(name, ""))) for name in ("budget_applies_to", "error_warning", "call_warning")
-        )
-        self.translation_m, self.rotation_xyzw = read_mounting(self._group, self.path)
-        self.trajectory = read_poses(self._group, self.path)
-
-    def _sizes(self) -> dict[str, int]:
-        return {"direction": len(self._group["azimuth"]), "range": len(self._group["range"]), **POSE_SIZES}
-
-    def _item(self, index: int) -> Energyscape:
-        return Energyscape(
-            amplitude=self._rows.row(index).astype(np.float32, copy=False),
-            azimuth_rad=self.azimuth_rad,
-            elevation_rad=self.elevation_rad,
-            range_m=self.range_m,
-            settings=self.settings,
-            stamp=self._rows.stamp(index, self.sensor),
-        )
+        for name in _ERRORS_DB:
+            setattr(self, name, _number(self.path, name, stated[name]) if name in stated else None)
+        for name in _TEXTS:
+            setattr(self, name, str(to_python(stated.get(name, ""))))
 
 
 def _number(path: Path, name: str, value: Any) -> float:

@@ -16,6 +16,7 @@ from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Trajectory
 from ertis_numba.storage._poses import checked_poses, remove_poses, require_times, write_poses
 from ertis_numba.storage._reader import file_kind, sensor_names
+from ertis_numba.storage.acoustic_maps import AcousticMapReader, open_acoustic_maps
 from ertis_numba.storage.energyscape import EnergyscapeReader, open_energyscapes
 from ertis_numba.storage.recording import RecordingReader, open_recording
 from ertis_numba.storage.schema import (
@@ -32,6 +33,11 @@ from ertis_numba.storage.schema import (
 
 __all__ = ["add_poses", "platform_trajectory", "recorded_trajectory", "require_fitting_poses"]
 
+_OPENERS: Final[dict[str, Callable[..., RecordingReader | EnergyscapeReader | AcousticMapReader]]] = {
+    "recording": open_recording,
+    "energyscape": open_energyscapes,
+    "acoustic_map": open_acoustic_maps,
+}
 _BYTES_PER_POSE: Final = 8 * (3 + 4 + 36)
 _BYTES_PER_SENSOR: Final = 200_000  # Chunks that are not full, and tables.
 _MAX_HISTORY: Final = 16_000  # Characters; an attribute of HDF5 is limited to 65,536 bytes.
@@ -153,7 +159,7 @@ def recorded_trajectory(path: str | Path, *, sensor: str | None = None) -> Traje
     Parameters
     ----------
     path : str or Path
-        Path of a recording or an energyscape file.
+        Path of a recording, an energyscape file or a file of acoustic maps.
     sensor : str, optional
         Name of the sensor; all sensors by default.
 
@@ -169,9 +175,7 @@ def recorded_trajectory(path: str | Path, *, sensor: str | None = None) -> Traje
     DataError
         The recording cannot be read.
     """
-    opened: Callable[..., RecordingReader | EnergyscapeReader] = open_recording
-    if file_kind(path) == "energyscape":
-        opened = open_energyscapes
+    opened = _OPENERS[file_kind(path)]
     found: dict[str, Trajectory] = {}
     for name in sensor_names(path) if sensor is None else (sensor,):
         with opened(path, sensor=name) as reader:

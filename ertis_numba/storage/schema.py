@@ -147,7 +147,7 @@ POSES: Final = (
     ),
     Variable("pose_source", (), "str", "origin of the poses", optional=True),
 )
-"""Variables of a recording with poses of its platform, which follow those of a recording."""
+"""Variables of files with poses of the platform; they follow all others."""
 
 ENERGYSCAPE: Final = (
     *STAMPS,
