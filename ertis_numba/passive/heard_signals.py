@@ -16,9 +16,20 @@ from ertis_numba.stages.demodulate import demodulation
 from ertis_numba.stages.time_window import TimeWindow
 from ertis_numba.waveform import decimation_taps, integer_taps
 
-__all__ = ["HeardSignals"]
+__all__ = ["HeardSignals", "heard_bands"]
 
 _RATE: Final = 2.5  # Least signal rate relative to the highest frequency.
+
+
+def heard_bands(settings: Settings) -> NDArray[np.float64]:
+    """Return the edges of the bands of ``settings.passive`` in hertz: (band, 2) float64.
+
+    Raises
+    ------
+    ArgumentError
+        The bands exceed the highest frequency of the record.
+    """
+    return band_edges(settings.passive, highest_hz=settings.recording.sample_rate_hz / _RATE)
 
 
 class HeardSignals:
@@ -38,6 +49,8 @@ class HeardSignals:
     settings : Settings
     rate_hz : float
         Rate of the signals in hertz.
+    shape : (n_mics, n_samples)
+        Shape of the signals.
     band_hz : (low, high)
         Lowest and highest frequency of interest in hertz; the lowest is 0 if ``highest_hz`` is given.
 
@@ -54,11 +67,11 @@ class HeardSignals:
     ) -> None:
         checks.instance("settings", settings, Settings, "a recording holds, or Settings.from_preset returns")
         self.settings, recording = settings, settings.recording
-        most_hz, lowest_hz = recording.sample_rate_hz / _RATE, 0.0
+        lowest_hz = 0.0
         if highest_hz is None:
-            bands_hz = band_edges(settings.passive, highest_hz=most_hz)
+            bands_hz = heard_bands(settings)
             lowest_hz, highest_hz = float(bands_hz.min()), float(bands_hz.max())
-        checks.between("highest_hz", highest_hz, 1.0, most_hz)
+        checks.between("highest_hz", highest_hz, 1.0, recording.sample_rate_hz / _RATE)
         self.band_hz = lowest_hz, highest_hz
         factor = max(1, math.floor(recording.sample_rate_hz / (_RATE * highest_hz)))
         self.rate_hz = recording.sample_rate_hz / factor
@@ -71,15 +84,24 @@ class HeardSignals:
         self._lane = self._memory.lane()
         n_samples = recording.n_samples // factor
         taps = decimation_taps(sample_rate_hz=recording.sample_rate_hz, decimation=factor, pass_hz=highest_hz)
+        if factor == 1 and not recording.is_pdm:
+            taps = taps[len(taps) // 2 :][:1]  # The other taps are 0.
         window = TimeWindow.from_start(n_samples, n_fft=n_samples)
         self._demodulate = demodulation(
             settings, layout, window, self._kernels, self._memory, taps=integer_taps(taps), factor=factor
         )
         self._room = self._demodulate.new_room()
-        self._signals = self._memory.zeros(self._demodulate.shape, np.float32)
+        self.shape: tuple[int, int] = self._demodulate.shape
+        self._signals = self._memory.zeros(self.shape, np.float32)
 
-    def __call__(self, measurement: Measurement) -> NDArray[np.float32]:
+    def __call__(self, measurement: Measurement, *, out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
         """Return the signals of the enabled microphones, (mic, sample), divided by the calibrated gains.
+
+        Parameters
+        ----------
+        measurement : Measurement
+        out : (n_mics, n_samples) float32, optional
+            Array for the signals; a new one by default.
 
         Raises
         ------
@@ -88,12 +110,13 @@ class HeardSignals:
         """
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         words, exponent = self._words.read(measurement)
-        out = np.empty(self._demodulate.shape, np.float32)
+        out = np.empty(self.shape, np.float32) if out is None else out
         with self._kernels.threads(self._threads), self._lane.entered():
             self._demodulate(self._lane.send(words), self._room, self._signals)
             self._lane.fetch(self._signals, out)
             self._lane.wait()
-        return np.asarray(out * (np.float32(2.0**exponent) / self._gain))
+        out *= np.float32(2.0**exponent) / self._gain
+        return out
 
     def close(self) -> None:
         """Free the memory of the device."""

@@ -64,22 +64,7 @@ class ResultFile:
 
 
 class ResultWriter(ResultFile, FileWriter[Result]):
-    """Writer of results, one at a time.
-
-    Parameters
-    ----------
-    path : str or Path
-    recording : RecordingReader or sequence of RecordingReader, optional
-        Recording of the results: one reader, or one for each sensor of the same recording.
-    mounting : mapping of str to (translation_m, rotation_xyzw), optional
-        Mounting by name of the sensor, instead of that of the recording.
-    dtype : str
-        Type of the stored arrays.
-    overwrite : bool
-        Replace an existing file.
-    truth : mapping of str to GroundTruth, optional
-        Ground truth by name of the sensor.
-    """
+    """Writer of results, one at a time; `EnergyscapeWriter` describes the parameters."""
 
     _numbered: ClassVar[bool] = False
 
@@ -154,19 +139,7 @@ class ResultWriter(ResultFile, FileWriter[Result]):
 
 
 class ResultReader(ResultFile, FileReader[Result], DegreesFromRadians):
-    """File of results as a sequence of them, each read when it is indexed.
-
-    Attributes
-    ----------
-    azimuth_rad, elevation_rad : (direction,) float64
-        Directions in the sensor frame, in radians.
-    translation_m : (3,) float64, or None
-        Position of the sensor in metres; None if its mounting is unknown.
-    rotation_xyzw : (4,) float64, or None
-        Unit quaternion that rotates the sensor frame into the platform frame; None if the mounting is unknown.
-    trajectory : Trajectory, or None
-        Pose of the platform at each row, by increasing time; None if the poses are unknown.
-    """
+    """File of results as a sequence of them; `EnergyscapeReader` describes the attributes."""
 
     azimuth_rad: NDArray[np.float64]
     elevation_rad: NDArray[np.float64]
