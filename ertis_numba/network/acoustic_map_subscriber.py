@@ -1,13 +1,13 @@
 """Application node that computes acoustic maps from measurements as they arrive."""
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Self
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import AcousticMap, Bearing, Measurement
 from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.result_subscriber import ResultSubscriber
 from ertis_numba.network.subscriber import Arrival, Subscriber
 from ertis_numba.passive import AcousticCamera, BearingFinder, is_passive
 from ertis_numba.settings import Settings
@@ -17,7 +17,7 @@ __all__ = ["AcousticMapSubscriber"]
 _MAX_CHANGE: Final = 2e-3  # of the speed of sound, by about 1 K; it turns directions 45° aside by 0.1°.
 
 
-class AcousticMapSubscriber:
+class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
     """Receiver of measurements that computes acoustic maps; use it in a ``with`` statement and a loop.
 
     Maps are computed here, not at the central node, which sends the measurements as they are. A measurement of 36 ms of
@@ -80,73 +80,30 @@ class AcousticMapSubscriber:
         self._hearers: dict[str, _Hearer] = {}
         self.bearings: list[Bearing] = []
         self.n_active = 0
-        self._subscriber = Subscriber(address, sensors=sensors, products=["raw"], keys=keys, on_note=on_note, credit=8)
-        self.counts = self._subscriber.counts
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __iter__(self) -> Iterator[AcousticMap]:
-        while (found := self.receive()) is not None:
-            yield found
-
-    @property
-    def connected(self) -> bool:
-        """True if a central node answers."""
-        return self._subscriber.connected
-
-    @property
-    def n_skipped(self) -> int:
-        """Number of maps that were not used: 0, because the central node drops measurements instead."""
-        return 0
+        self._subscriber: Subscriber[Measurement] = Subscriber(
+            address, sensors=sensors, products=["raw"], keys=keys, on_note=on_note, credit=8
+        )
+        super().__init__(self._subscriber)
 
     @property
     def latest(self) -> Arrival | None:
         """Details of the last received measurement: its number and times, and the mounting of its sensor."""
         return self._subscriber.latest
 
-    def receive(self, timeout_s: float | None = None) -> AcousticMap | None:
-        """Return the next map; None after ``timeout_s``, or once the subscriber is closed.
-
-        Parameters
-        ----------
-        timeout_s : float, optional
-            Time to wait; unlimited by default.
-
-        Raises
-        ------
-        RefusedError
-            The central node has refused this application from the start.
-        DataError
-            The settings of a sensor cannot be used for maps.
-        """
-        end_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while (
-            measurement := self._subscriber.receive(None if end_s is None else max(0.0, end_s - time.monotonic()))
-        ) is not None:
-            found = self._added(measurement)
-            if found is not None:
-                return found
-        return None
-
     def close(self) -> None:
         """End the loop; waiting measurements are lost."""
-        self._subscriber.close()
+        super().close()
         while self._hearers:
             self._hearers.popitem()[1].close()
 
-    def _added(self, measurement: Measurement) -> AcousticMap | None:
-        """Return the map that a measurement completes; None if it completes none."""
-        hearer = self._hearer(measurement)
+    def _result(self, received: Measurement) -> AcousticMap | None:
+        hearer = self._hearer(received)
         camera = hearer.camera
-        if not is_passive(camera.settings, measurement.stamp):
+        if not is_passive(camera.settings, received.stamp):
             self.n_active += 1
             return None
         # The air of each measurement may be measured; the delays of a map are those of the first one.
-        camera.add(Measurement(measurement.data, camera.settings, measurement.stamp))
+        camera.add(Measurement(received.data, camera.settings, received.stamp))
         if camera.n_measurements < camera.settings.passive.averages:
             return None
         found = camera.map()

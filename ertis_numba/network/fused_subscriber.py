@@ -10,7 +10,8 @@ from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.fusion.loading import load_kernels
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.network.keys import ClientKeys
-from ertis_numba.network.pulse_receiver import PulseReceiver, PulseSubscriber
+from ertis_numba.network.pulse_receiver import PulseReceiver, ReceivedPulse
+from ertis_numba.network.result_subscriber import ResultSubscriber
 
 __all__ = ["FusedArrival", "FusedSubscriber"]
 
@@ -45,7 +46,7 @@ class FusedArrival:
         return (self.ready_utc_ns - stamp.timestamp_ns) / 1e9 if stamp.is_timed else None
 
 
-class FusedSubscriber(PulseSubscriber[FusedArrival]):
+class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
     """Receiver of the images of a central node, fused for each SYNC pulse; use it in a ``with`` statement and a loop.
 
     Images are fused here, not at the central node, which therefore needs no more time. A pulse is complete when all
@@ -106,32 +107,16 @@ class FusedSubscriber(PulseSubscriber[FusedArrival]):
             "range_step_m": range_step_m,
         }
         load_kernels()
-        super().__init__(PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note))
+        self._receiver = PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note)
+        super().__init__(self._receiver)
         self._mountings: Mountings = {}
         self._fuser: Fuser | None = None
 
-    def receive(self, timeout_s: float | None = None) -> FusedArrival | None:
-        """Return the next fused pulse; None after ``timeout_s``, or once the subscriber is closed.
-
-        Parameters
-        ----------
-        timeout_s : float, optional
-            Time to wait; unlimited by default.
-
-        Raises
-        ------
-        RefusedError
-            The central node has refused this application from the start.
-        DataError
-            The mounting of a sensor is unknown.
-        """
-        pulse = self._receiver.receive(timeout_s)
-        if pulse is None:
-            return None
-        if self._fuser is None or pulse.mountings != self._mountings:
-            self._mountings = pulse.mountings
-            self._fuser = Fuser(pulse.mountings, **self._options)  # type: ignore[arg-type]  # all are numbers
-        images = pulse.images.values()
+    def _result(self, received: ReceivedPulse) -> FusedArrival:
+        if self._fuser is None or received.mountings != self._mountings:
+            self._mountings = received.mountings
+            self._fuser = Fuser(received.mountings, **self._options)  # type: ignore[arg-type]  # all are numbers
+        images = received.images.values()
         with nullcontext() if self._fuser.has_tables(images) else self._receiver.queue.keeping():
             fused = self._fuser(images)
-        return FusedArrival(fused, pulse.images, pulse.first_ns, time.monotonic_ns(), time.time_ns())
+        return FusedArrival(fused, received.images, received.first_ns, time.monotonic_ns(), time.time_ns())

@@ -9,7 +9,8 @@ from ertis_numba.fusion.rig import Mountings
 from ertis_numba.motion import EgoVelocity, PlanarPose
 from ertis_numba.motion.live import LiveOdometry
 from ertis_numba.network.keys import ClientKeys
-from ertis_numba.network.pulse_receiver import PulseReceiver, PulseSubscriber, ReceivedPulse
+from ertis_numba.network.pulse_receiver import PulseReceiver, ReceivedPulse
+from ertis_numba.network.result_subscriber import ResultSubscriber
 
 __all__ = ["OdometryArrival", "OdometrySubscriber"]
 
@@ -51,13 +52,14 @@ class OdometryArrival:
         return (self.ready_utc_ns - self.pose.timestamp_ns) / 1e9 if self.is_timed else None
 
 
-class OdometrySubscriber(PulseSubscriber[OdometryArrival]):
+class OdometrySubscriber(ResultSubscriber[ReceivedPulse, OdometryArrival]):
     """Receiver of the images of a central node that computes a pose and a velocity for each SYNC pulse.
 
     Use it in a ``with`` statement and a loop. All sensors belong to one platform. Images are grouped as by
     `FusedSubscriber`: if a sensor sends no image of a pulse, the others determine the motion. If the application is too
     slow, or pulses are lost, the next pulse is compared with the last one that was used. Pulses more than a second
-    apart have no velocity.
+    apart have no velocity. A pulse that is not later than the one before, because a clock was set back, is noted and
+    left out.
 
     Parameters
     ----------
@@ -107,45 +109,18 @@ class OdometrySubscriber(PulseSubscriber[OdometryArrival]):
         """Poses at all pulses so far, as those of `Odometry.trajectory`; None before the first pulse."""
         return self._odometry.trajectory
 
-    def receive(self, timeout_s: float | None = None) -> OdometryArrival | None:
-        """Return the pose and velocity at the next pulse; None after ``timeout_s``, or once the subscriber is closed.
-
-        A pulse that is not later than the one before, because a clock was set back, is noted and left out.
-
-        Parameters
-        ----------
-        timeout_s : float, optional
-            Time to wait; unlimited by default.
-
-        Raises
-        ------
-        RefusedError
-            The central node has refused this application from the start.
-        DataError
-            The mounting of a sensor is unknown.
-        """
-        end_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while (
-            pulse := self._receiver.receive(None if end_s is None else max(0.0, end_s - time.monotonic()))
-        ) is not None:
-            arrival = self._added(pulse)
-            if arrival is not None:
-                return arrival
-        return None
-
-    def _added(self, pulse: ReceivedPulse) -> OdometryArrival | None:
-        """Return the pose at a pulse; None if it is not later than the one before."""
-        found = self._odometry.add(pulse.images, pulse.mountings)
+    def _result(self, received: ReceivedPulse) -> OdometryArrival | None:
+        found = self._odometry.add(received.images, received.mountings)
         if found is None:
             return None
-        stamps = {name: image.stamp for name, image in pulse.images.items()}
+        stamps = {name: image.stamp for name, image in received.images.items()}
         n_lost, self._stamps = _lost_between(self._stamps, stamps), stamps
         first = next(iter(stamps.values()))
         return OdometryArrival(
             *found,
             first.sync_count,
-            tuple(name for name in pulse.mountings if name in stamps),
-            pulse.missing,
+            tuple(name for name in received.mountings if name in stamps),
+            received.missing,
             n_lost,
             time.time_ns(),
             first.is_timed,

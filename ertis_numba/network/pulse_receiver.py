@@ -2,10 +2,9 @@
 
 import threading
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Generic, Self, TypeAlias, TypeVar
+from typing import Final, TypeAlias
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Stamp
@@ -15,9 +14,7 @@ from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.pulse_queue import PulseQueue
 from ertis_numba.network.subscriber import Subscriber, SubscriberCounts
 
-__all__ = ["PulseReceiver", "PulseSubscriber", "ReceivedPulse"]
-
-Arrival = TypeVar("Arrival")
+__all__ = ["PulseReceiver", "ReceivedPulse"]
 
 _Place: TypeAlias = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 
@@ -124,6 +121,11 @@ class PulseReceiver:
         """True if a central node answers."""
         return self._subscriber.connected
 
+    @property
+    def n_skipped(self) -> int:
+        """Pulses that were not used, because the application was too slow."""
+        return self.queue.n_skipped
+
     def receive(self, timeout_s: float | None = None) -> ReceivedPulse | None:
         """Return the images of the next pulse; None after ``timeout_s``, or once the receiver is closed.
 
@@ -189,47 +191,6 @@ class PulseReceiver:
 
     def _put(self, group: dict[str, _Received]) -> None:
         self.queue.put(group, sum(each.image.amplitude.nbytes for each in group.values()))
-
-
-class PulseSubscriber(ABC, Generic[Arrival]):
-    """Application node that computes something from each pulse of a receiver.
-
-    Parameters
-    ----------
-    receiver : PulseReceiver
-    """
-
-    def __init__(self, receiver: PulseReceiver) -> None:
-        self._receiver = receiver
-        self.counts = receiver.counts
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __iter__(self) -> Iterator[Arrival]:
-        while (arrival := self.receive()) is not None:
-            yield arrival
-
-    @property
-    def connected(self) -> bool:
-        """True if a central node answers."""
-        return self._receiver.connected
-
-    @property
-    def n_skipped(self) -> int:
-        """Pulses that were not used, because the application was too slow."""
-        return self._receiver.queue.n_skipped
-
-    @abstractmethod
-    def receive(self, timeout_s: float | None = None) -> Arrival | None:
-        """Return the next result; None after ``timeout_s``, or once the subscriber is closed."""
-
-    def close(self) -> None:
-        """End the loop."""
-        self._receiver.close()
 
 
 def _as_tuples(translation_m: Sequence[float], rotation_xyzw: Sequence[float]) -> _Place:

@@ -3,9 +3,9 @@
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final, Generic, Literal, Self, TypedDict, TypeVar, Unpack, cast, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, TypeVar, Unpack, cast, overload
 
 import zmq
 
@@ -16,6 +16,7 @@ from ertis_numba.network._subscription import SubscriberCounts, Subscription
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import PRODUCTS, Group, Product
 from ertis_numba.network.products import Arrival, trace
+from ertis_numba.network.result_subscriber import ReceivingLoop
 from ertis_numba.network.wakeup_socket import WakeupSocket
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class _Options(TypedDict, total=False):
     credit: int
 
 
-class Subscriber(Generic[Kind_co]):
+class Subscriber(ReceivingLoop[Kind_co]):
     """Receiver of a central node's products; use it in a ``with`` statement and a loop.
 
     The loop ends when another thread or a signal handler calls `close`. The subscriber reconnects to a central node
@@ -169,20 +170,15 @@ class Subscriber(Generic[Kind_co]):
         self._thread = threading.Thread(target=self._run, name="ertis-subscriber", daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __iter__(self) -> Iterator[Kind_co]:
-        while (item := self.receive()) is not None:
-            yield item
-
     @property
     def connected(self) -> bool:
         """Return True if a publisher answers."""
         return self._subscription.connected
+
+    @property
+    def n_skipped(self) -> int:
+        """Return 0: the central node drops products for a slow application, and counts them."""
+        return 0
 
     @property
     def closed(self) -> bool:
