@@ -1,4 +1,4 @@
-"""Loop over what a receiver of a central node's products gets, and over results computed from it."""
+"""Base classes of subscribers: the loop over received items, and over results computed from them."""
 
 import time
 from abc import ABC, abstractmethod
