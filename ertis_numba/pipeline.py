@@ -53,8 +53,8 @@ class Pipeline:
         Threads of one call of `process`; all cores by default. Neither the plan nor the result depends on it.
     max_error_db : float or {"draft", "standard", "fine", "exact"}, optional
         Error budget of the images in dB; that of ``settings.accuracy`` by default.
-    graphs : bool
-        Record the chain as a CUDA graph, which saves the time to launch its kernels.
+    graphs : bool, optional
+        Record the chain as a CUDA graph, which saves the time to launch its kernels; True by default on a GPU.
     max_bytes : int, optional
         Limit on the predicted memory, checked before any is allocated. By default, only the tables of a plan are
         limited: to 2 GiB, or to the available memory if no plan within 2 GiB keeps the error budget.
@@ -107,7 +107,7 @@ class Pipeline:
         threads: int | None = None,
         *,
         max_error_db: float | str | None = None,
-        graphs: bool = False,
+        graphs: bool | None = None,
         max_bytes: int | None = None,
         predict: bool = True,
         plan: PlanCosts = "nominal",
@@ -460,7 +460,7 @@ class Pipeline:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _build_chain(self, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
+    def _build_chain(self, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool | None) -> Chain:
         """Return the chain with compiled kernels and allocated buffers."""
         try:
             chain = _chain(self.settings, kernel_set, threads, graphs=graphs)
@@ -514,7 +514,7 @@ def _without_cleaning(settings: Settings) -> Settings:
     return settings.replace(**{"processing.clean_within_db": None, "processing.clean_above_mean_db": None})
 
 
-def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool) -> Chain:
+def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool | None) -> Chain:
     if settings.processing.method == "fast":
         return FastChain(settings, kernel_set, threads=threads, graphs=graphs)
     if kernel_set.device == "numpy":

@@ -62,6 +62,21 @@ PARTS = {
         ],
         "wall_s": 20.0,
     },
+    "acoustic maps": {
+        "status": "done",
+        "rows": [
+            {
+                "method": "clean_sc",
+                "directions": 3000,
+                "bands": 10,
+                "bins": 190,
+                "ours_ms": 3.0,
+                "cpu_ms": 40.0,
+                "off_cpu_db": -46.0,
+            }
+        ],
+        "wall_s": 20.0,
+    },
     "ceilings": {
         "status": "done",
         "rows": [
@@ -155,7 +170,7 @@ def test_tables_show_the_newest_results_without_a_gpu(report, tmp_path):
     assert "Medians on NVIDIA Test GPU, 20" in text
     assert [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| ")][2:] == [
         "one at a time, words to image",
-        "streamed, images to the host, plain",
+        "streamed, images to the host",
         "the paper's GTX 1080 Ti",
     ]
 

@@ -21,22 +21,25 @@ from ertis_bench import checks, input_measurements, rivals, timing
 from ertis_bench.gpu import REFUSED
 from ertis_bench.gpu_stages import stages
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RANGE_M
+from ertis_bench.passive.signals import OWN_RMS, SOURCES, listening, noise
 from ertis_bench.plans import in_words
 from ertis_numba import kernels, verification
 from ertis_numba.errors import DataError, DeviceError
 from ertis_numba.frames import Measurement
 from ertis_numba.kernels._cuda import ceilings
+from ertis_numba.passive import AcousticCamera
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
 from ertis_numba.stages.fast_chain import FastChain
 
-__all__ = ["FULL", "PARTS", "Scale", "ceilings_of", "machine", "paper", "side_by_side"]
+__all__ = ["FULL", "PARTS", "Scale", "acoustic_maps", "ceilings_of", "machine", "paper", "side_by_side"]
 
 _MAX_DIFFERENCE_DB = -100.0  # between devices that add the same terms in another order
 _MAX_DIFFERENCE_16_BIT_DB = -80.0  # limit where intermediate numbers are rounded to 16 bits
 _PUBLISHED_MS = dict(zip(map(str, DIRECTIONS), PUBLISHED_MS["GPU GTX 1080 Ti"], strict=True))
 _N_OPERATIONS, _N_BYTES = 8, 8  # per term and range: a complex multiply-add, and a complex64 to load
 _N_IMAGES = 8  # pinned images that a stream fills in turn
+_N_MAPS = 10  # per device and method
 _PACKAGES = ("numba-cuda", "cupy-cuda12x", "cupy-cuda13x", "cuda-bindings", "torch", "mach-beamform")
 _SMI_FIELDS = (
     "driver_version",
@@ -72,6 +75,10 @@ class Scale:
         Measurements per compared library.
     ceilings : tuple of (str, int)
         Names and values of further parameters of `ceilings.ceilings`.
+    listening : tuple of (str, object)
+        Names and values of settings of acoustic maps.
+    methods : tuple of str
+        Methods of acoustic maps.
     """
 
     subject: Callable[[], tuple[Measurement, str]] = input_measurements.measurement
@@ -82,6 +89,8 @@ class Scale:
     streams: int = 7
     rivals: int = 30
     ceilings: tuple[tuple[str, int], ...] = ()
+    listening: tuple[tuple[str, Any], ...] = (("processing__directions", "3000"),)
+    methods: tuple[str, ...] = ("delay_and_sum", "capon", "music", "clean_sc")
 
     def settings(self, directions: str) -> tuple[Settings, Measurement]:
         """Return settings for a direction grid, and the measurement."""
@@ -134,7 +143,7 @@ def paper(scale: Scale) -> Iterator[dict[str, Any]]:
     for directions in scale.directions:
         settings, measurement = scale.settings(directions)
         words = _words(measurement)
-        with Pipeline(settings, device="cuda") as plain, Pipeline(settings, device="cuda", graphs=True) as recorded:
+        with Pipeline(settings, device="cuda", graphs=False) as plain, Pipeline(settings, device="cuda") as recorded:
             plan = plain.settings
             row: dict[str, Any] = {
                 "directions": directions,
@@ -154,6 +163,31 @@ def paper(scale: Scale) -> Iterator[dict[str, Any]]:
             best_ms = min(summary["median_ms"] for summary in row["one_at_a_time"].values())
             row["times_faster_than_published"] = round(_PUBLISHED_MS[directions][0] / best_ms, 1)
         yield row
+
+
+def acoustic_maps(scale: Scale) -> Iterator[dict[str, Any]]:
+    """Yield one row per method, with the times of maps on the GPU and on the processor, and their largest difference.
+
+    The maps have third octaves, and the sound is float32 signals of three noise sources.
+    """
+    for method in scale.methods:
+        settings = listening(**dict(scale.listening), passive__method=method)
+        heard = noise(settings, SOURCES, own_rms=OWN_RMS, seed=1)
+        with AcousticCamera(settings, "cuda") as camera, AcousticCamera(settings, "cpu") as host:
+            cameras = {"ours": camera, "cpu": host}
+            times_ms = timing.round_robin(
+                {name: functools.partial(each.process, heard) for name, each in cameras.items()}, count=_N_MAPS
+            )
+            found, wanted = (each.process(heard).power.astype(np.float64) for each in cameras.values())
+        difference = float(np.max(np.abs(found - wanted)) / np.max(wanted))
+        yield {
+            "method": method,
+            "directions": len(camera.grid),
+            "bands": len(camera.band_hz),
+            "bins": len(camera.frequency_hz),
+            **{f"{name}_ms": timing.summary(times)["median_ms"] for name, times in times_ms.items()},
+            "off_cpu_db": round(10 * float(np.log10(max(difference, 1e-30))), 1),
+        }
 
 
 def side_by_side(scale: Scale) -> Iterator[dict[str, Any]]:
@@ -206,6 +240,7 @@ def ceilings_of(scale: Scale) -> Iterator[dict[str, Any]]:
 PARTS: dict[str, Callable[[Scale], Iterator[dict[str, Any]]]] = {
     "machine": machine,
     "paper": paper,
+    "acoustic maps": acoustic_maps,
     "side by side": side_by_side,
     "ceilings": ceilings_of,
 }
@@ -224,7 +259,7 @@ def _checked(plain: Pipeline, recorded: Pipeline, measurement: Measurement) -> d
         recorded.process(measurement) for _ in range(3)
     ]  # The first call launches kernels, the second records a graph, and the third plays it.
     if any(not np.array_equal(other.amplitude, image.amplitude) for other in again):
-        raise DataError("image of a CUDA graph differs from that of launched kernels; do not use graphs=True")
+        raise DataError("image of a CUDA graph differs from that of launched kernels; use graphs=False")
     error_db = checks.require_exact(image, measurement)
     same = Pipeline(plain.settings, device="cpu").process(measurement)
     difference_db = verification.error_db(image.amplitude, same.amplitude)

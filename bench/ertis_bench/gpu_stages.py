@@ -52,7 +52,7 @@ def stages(settings: Settings, words: NDArray[Any], *, count: int) -> dict[str, 
         all launches were queued while the GPU was still busy.
     """
     watch = _LaunchStopwatch()
-    chain = FastChain(settings, _watched(kernels.load("cuda"), watch), threads=1)
+    chain = FastChain(settings, _watched(kernels.load("cuda"), watch), threads=1, graphs=False)
     image = chain.new_image()
     times_ms: list[dict[str, float]] = []
     queued = True
@@ -120,7 +120,7 @@ def _run(kernel: Callable[..., None], watch: _LaunchStopwatch, before: str | Non
 class _TimedMemory:
     """Memory of the device whose lanes set marks."""
 
-    def __init__(self, make: Callable[..., Memory], watch: _LaunchStopwatch, *, graphs: bool = False) -> None:
+    def __init__(self, make: Callable[..., Memory], watch: _LaunchStopwatch, *, graphs: bool | None = None) -> None:
         self._memory, self._watch = make(graphs=graphs), watch
 
     def __getattr__(self, name: str) -> Any:

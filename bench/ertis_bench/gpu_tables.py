@@ -10,8 +10,13 @@ __all__ = ["gpu", "gpu_short"]
 
 _UNMEASURED = "not measured"
 _PUBLISHED = "GPU GTX 1080 Ti"
-_STREAMS = ("to the host, plain", "to the host, graphs", "stay on the GPU, plain", "stay on the GPU, graphs")
-_ONE_AT_A_TIME, _STREAMED = "one at a time, words to image", f"streamed, images {_STREAMS[0]}"
+_WITHOUT = ", without CUDA graphs"
+_SINGLE = {"one at a time, words to image": "graphs", f"one at a time, words to image{_WITHOUT}": "plain"}
+_STREAMS = {
+    f"streamed, images {where}{without}": f"{where}, {how}"
+    for where in ("to the host", "stay on the GPU")
+    for without, how in (("", "graphs"), (_WITHOUT, "plain"))
+}
 _PAPER = f"the paper's {_PUBLISHED.removeprefix('GPU ')}"
 
 
@@ -19,7 +24,7 @@ def gpu(report: dict[str, Any]) -> str:
     """Return all measurements on a GPU, or a note that there are none if the report is empty."""
     if not report:
         return f"{_times(_lines({}))}\n\n{_NO_RESULTS}"
-    parts = [_stages(report), _rivals(report), _reached(report), _verdicts(report), _machine(report)]
+    parts = [_stages(report), _maps(report), _rivals(report), _reached(report), _verdicts(report), _machine(report)]
     return "\n\n".join([_times(_lines(report)), *(part for part in parts if part), _CONDITIONS.format(**report)])
 
 
@@ -28,7 +33,7 @@ def gpu_short(report: dict[str, Any]) -> str:
     if not report:
         return "No GPU has run the kernels yet. They are simulated and compiled, but not measured."
     lines = _lines(report)
-    times = _times({name: lines[name] for name in (_ONE_AT_A_TIME, _STREAMED, _PAPER)})
+    times = _times({name: lines[name] for name in (next(iter(_SINGLE)), next(iter(_STREAMS)), _PAPER)})
     about = f"Medians on {report['gpu']['name']}, {report['date'][:10]}; docs/explanation/gpu.md has the rest."
     return f"{times}\n\n{about}"
 
@@ -42,10 +47,9 @@ def _lines(report: dict[str, Any]) -> dict[str, list[str]]:
     """Return the times per measurement by direction grid. Grids without a measurement are marked."""
     rows = {row["directions"]: row for row in _rows(report, "paper")}
     lines: dict[str, list[str]] = {
-        _ONE_AT_A_TIME: [],
-        "the same as a CUDA graph": [],
+        **{name: [] for name in _SINGLE},
         "on the GPU alone, without transfers": [],
-        **{f"streamed, images {name}": [] for name in _STREAMS},
+        **{name: [] for name in _STREAMS},
         _PAPER: [],
         "paper's time / shortest single time": [],
     }
@@ -64,10 +68,10 @@ def _times(lines: dict[str, list[str]]) -> str:
 
 
 def _cells(row: dict[str, Any]) -> Iterator[str]:
-    for name in ("plain", "graphs"):
+    for name in _SINGLE.values():
         yield f"{row['one_at_a_time'][name]['median_ms']:.3f}"
     yield f"{row['without_transfers_ms']:.3f}"
-    for name in _STREAMS:
+    for name in _STREAMS.values():
         yield f"{row['streamed_ms'][name]:.3f}"
 
 
@@ -85,6 +89,21 @@ def _stages(report: dict[str, Any]) -> str:
     )
     head = ["ms on the GPU's clock", *(f"{row['directions']} directions" for row in rows)]
     return f"{table(head, lines)}\n\n{plans}."
+
+
+def _maps(report: dict[str, Any]) -> str:
+    rows = _rows(report, "acoustic maps")
+    if not rows:
+        return ""
+    cells = [
+        [f"`{row['method']}`", f"{row['ours_ms']:.1f}", f"{row['cpu_ms']:.1f}", f"{row['off_cpu_db']:.0f}"]
+        for row in rows
+    ]
+    text = table(["acoustic map", "GPU, ms", "`cpu`, ms", "largest difference, dB relative to the loudest"], cells)
+    return (
+        f"{text}\n\nMaps of {rows[0]['directions']} directions and {rows[0]['bands']} bands, of {rows[0]['bins']} "
+        "frequencies, from the signals of one measurement to the map on the host."
+    )
 
 
 def _rivals(report: dict[str, Any]) -> str:
@@ -176,5 +195,6 @@ with the images of other libraries. One at a time: from the words in memory to t
 separate launches and with a CUDA graph, in turns. On the GPU alone: with the GPU's own clock, while all launches
 wait behind a kernel that keeps the GPU busy. Streamed: 64 measurements in three lanes. The same measurement is
 processed repeatedly, so that the GPU's caches may hold more of the tables than they would beside other work. Other
-libraries run the same algorithm with the same tables and without a beam grid, in turns with this package. mach
-computes its delays itself."""
+libraries run the same algorithm with the same tables and without a beam grid, in turns with this package. This package
+replays a CUDA graph in these comparisons, and the other libraries launch their kernels. mach computes its delays
+itself."""

@@ -22,6 +22,7 @@ class CufftTransforms:
     ----------
     signals : (mic, n) float32
     analytic : (mic, phase, n_out) complex64
+        With phase shifts, the beams: (direction, 1, n_out).
     zeros : callable
         Returns a new array of zeros of a given shape and type on the device.
     stream : numba.cuda.Stream
@@ -42,7 +43,7 @@ class CufftTransforms:
         stream: Any,
     ) -> None:
         n_mics, n = signals.shape
-        _, n_phases, n_out = analytic.shape
+        n_rows, n_out = analytic.shape[0] * analytic.shape[1], analytic.shape[2]
         self._spectra = zeros((n_mics, n // 2 + 1), np.complex64)
         self._stream = cupy.cuda.Stream.from_external(stream)
         # CuPy's views keep Numba's arrays alive, and cuFFT's plans accept no other arrays.
@@ -51,10 +52,10 @@ class CufftTransforms:
             # CuPy's memory pool is bypassed, because it would keep the work areas after the plans are deleted.
             with self._stream, cupy.cuda.using_allocator(None):
                 self._forward = cufft.Plan1d(n, cufft.CUFFT_R2C, n_mics)
-                self._inverse = cufft.Plan1d(n_out, cufft.CUFFT_C2C, n_mics * n_phases)
+                self._inverse = cufft.Plan1d(n_out, cufft.CUFFT_C2C, n_rows)
         except (cupy.cuda.memory.OutOfMemoryError, cupy.cuda.runtime.CUDARuntimeError, cufft.CuFFTError) as error:
             raise DeviceError(
-                f"device 'cuda' has too little memory for transforms of {n_mics * n_phases} rows of {n_out} samples "
+                f"device 'cuda' has too little memory for transforms of {n_rows} rows of {n_out} samples "
                 f"({error}); give a shorter processing.range_m or a lower accuracy.oversampling, or use device 'cpu'"
             ) from error
 

@@ -86,7 +86,9 @@ class Memory(Protocol):
 
 
 class NewMemory(Protocol):
-    """Creates the memory of a pipeline; with ``graphs``, its lanes record and replay their kernels.
+    """Creates the memory of a pipeline.
+
+    With ``graphs``, `Lane.run` records its steps as a CUDA graph and replays it; by default wherever the device can.
 
     Raises
     ------
@@ -94,7 +96,7 @@ class NewMemory(Protocol):
         ``graphs`` is True, but the device does not support graphs.
     """
 
-    def __call__(self, *, graphs: bool = False) -> Memory: ...
+    def __call__(self, *, graphs: bool | None = None) -> Memory: ...
 
 
 class Threads(Protocol):

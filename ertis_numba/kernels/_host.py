@@ -50,7 +50,7 @@ class HostMemory:
 
     n_lanes = 1
 
-    def __init__(self, *, graphs: bool = False) -> None:
+    def __init__(self, *, graphs: bool | None = None) -> None:
         if graphs:
             raise ArgumentError("graphs is True, but only device 'cuda' has CUDA graphs; leave it out or give 'cuda'")
         self._images = ImagePool(lambda shape: np.empty(shape, np.float32))

@@ -35,7 +35,7 @@ class KernelSet(AdaptiveKernels):
     simulated : bool
         True if the CPU simulates the device, which is fast enough only for tests.
     memory : callable
-        Returns a `Memory`. With ``graphs=True``, its lanes record and replay their kernels.
+        Returns a `Memory`. See `NewMemory`.
     threads : callable
         Context manager that limits the number of threads, see `Threads`.
     """

@@ -282,8 +282,8 @@ class AcousticCamera:
         """Return the sources of matrices with given maps: (bin, direction) float32."""
         out, hollow = np.empty_like(powers), self.settings.passive.diagonal_removal
         with self._kernels.threads(self._threads), self._lane.entered():
-            here = self._lane.send(np.ascontiguousarray(matrices))
-            self._kernels.clean_sources(here, self._steps, self._bins, self._lane.send(powers), hollow, self._powers)
+            here = self._lane.send(np.ascontiguousarray(matrices)), self._steps, self._bins, self._lane.send(powers)
+            self._lane.run(lambda: self._kernels.clean_sources(*here, hollow, self._powers))
             self._lane.fetch(self._powers, out)
             self._lane.wait()
         return out

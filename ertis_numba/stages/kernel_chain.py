@@ -52,8 +52,8 @@ class KernelChain(ABC):
     kernels : KernelSet
     threads : int
         Default number of threads.
-    graphs : bool
-        True to record the chain as a CUDA graph on a GPU and replay it; False by default.
+    graphs : bool, optional
+        True to record the chain as a CUDA graph and replay it; by default on every GPU.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class KernelChain(ABC):
     _matched_filter: Compress
     _beamform: Beamform | PhaseShifts
 
-    def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, graphs: bool = False) -> None:
+    def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, graphs: bool | None = None) -> None:
         self._memory = kernels.memory(graphs=graphs)
         self._pool = BufferPool()
         self._kernels, self._threads = kernels, threads

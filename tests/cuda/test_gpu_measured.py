@@ -56,6 +56,20 @@ def test_gpu_ceiling_kernels_compute_correct_values():
     assert SIMULATED or min(rates.values()) > 0
 
 
+def test_gpu_benchmark_compares_acoustic_maps_with_those_of_the_cpu():
+    small = {
+        "processing__directions": "2d:3",
+        "recording__n_samples": 256,
+        "passive__bands_hz": [[25e3, 40e3]],
+        "passive__resolution_hz": 8e3,
+        "array": TINY.array,
+    }
+    scale = dataclasses.replace(SCALE, listening=tuple(small.items()), methods=("delay_and_sum", "clean_sc"))
+    rows = list(gpu_parts.acoustic_maps(scale))
+    assert [row["method"] for row in rows] == ["delay_and_sum", "clean_sc"]
+    assert all(row["directions"] == 3 and row["ours_ms"] > 0 and row["off_cpu_db"] < -50 for row in rows)
+
+
 def test_stopwatch_adds_parts_of_the_same_name():
     watch, lane = Stopwatch(), kernels.load("cuda").memory().lane()
     with lane.entered():

@@ -195,7 +195,7 @@ class _Lane(Lane):
 
 
 class _Memory(HostMemory):
-    def __init__(self, launches: list[Launch], *, graphs: bool = False) -> None:
+    def __init__(self, launches: list[Launch], *, graphs: bool | None = None) -> None:
         super().__init__(graphs=graphs)
         self._launches = launches
 
