@@ -32,7 +32,9 @@ class Images:
         self.offered.append((data.sequence, words.copy(), arrived_ns))
 
     def counts(self, _):
-        return SimpleNamespace(published=2, dropped=Counter(late=1), in_flight=1, queue=1, latency=Percentiles())
+        return SimpleNamespace(
+            published=2, passive=1, dropped=Counter(late=1), in_flight=1, queue=1, latency=Percentiles()
+        )
 
     def status(self):
         return ProcessingStatus()

@@ -37,6 +37,7 @@ def test_metrics_report_the_present_status():
     assert values["ertis_received_total", front] == 41
     assert values["ertis_stored_total", front] == 40
     assert values["ertis_published_total", front] == 37
+    assert values["ertis_passive_total", front] == 8
     assert values["ertis_connected", front] == 1
     assert values["ertis_connected", ("sensor", "left")] == 0
     assert values["ertis_dropped_total", ("reason", "superseded"), front] == 4

@@ -1,6 +1,8 @@
 """Processing in an event loop: each measurement is published, in progress, or dropped with a reason."""
 
 import dataclasses
+import os
+import signal
 import time
 
 import msgspec
@@ -10,9 +12,10 @@ import pytest
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.errors import ArgumentError, NetworkError
 from ertis_numba.geometry import self_contained
-from ertis_numba.network.messages import Points
+from ertis_numba.network.messages import Points, Raw
 from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
 from ertis_numba.network.processing._predictions import Predictions
+from ertis_numba.network.processing.shared_slots import SlotPool
 from ertis_numba.network.status import Status
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air
@@ -58,6 +61,89 @@ def test_published_products_equal_those_of_the_pipeline(cpu_loop):
     description, settings, axes = application.descriptions[raw.description]
     assert (settings, axes) == (SHORT, [b"", b"", b""])
     assert image.received_ns < image.published_ns < time.monotonic_ns()
+
+
+def test_measurements_without_a_call_are_published_without_images(loop):
+    with Application(loop.processing.address) as application:
+        application.subscribe("energyscape", "raw", sensors=("mixed",), credit=16)
+        loop.until(lambda: application.read() or application.others)
+        loop.processing.register(hello("mixed"), SHORT)
+        loop.offer("mixed", behaviour="active")
+        loop.settle()  # A pipeline is ready.
+        for behaviour in ("active", "passive", "active"):
+            loop.offer("mixed", behaviour=behaviour)
+            loop.settle()
+        loop.until(lambda: application.read() or len(application.got) == 7)
+    assert application.kinds() == ["Image", "Raw", "Image", "Raw", "Raw", "Image", "Raw"]
+    assert [header.behaviour for header, _ in application.got].count("passive") == 1
+    assert [header.number for header, _ in application.got] == list(range(7))  # Nothing is missing.
+    assert all(words == MEASUREMENT.data.tobytes() for header, words in application.got if isinstance(header, Raw))
+    counts = loop.processing.counts("mixed")
+    assert (counts.received, counts.published, counts.passive, counts.dropped.total()) == (4, 4, 1, 0)
+
+
+def test_measurements_without_a_call_wait_for_earlier_images(loop):
+    with Application(loop.processing.address) as application:
+        application.subscribe("raw", sensors=("behind",), credit=16)
+        loop.until(lambda: application.read() or application.others)
+        loop.processing.register(hello("behind"), SHORT)
+        loop.offer("behind", behaviour="active")
+        loop.settle()
+        loop.offer("behind", behaviour="active")  # A worker begins with it.
+        loop.offer("behind", behaviour="passive")
+        loop.settle()
+        loop.until(lambda: application.read() or len(application.got) == 3)
+    sequences = [raw.sequence for raw, _ in application.got]
+    assert sequences == sorted(sequences)
+
+
+def test_sensors_without_calls_need_no_worker():
+    """They are logged once, also if no pipeline could be made for their settings."""
+    long = SHORT.replace(processing=SHORT.processing.replace(range_m=(0.3, 500.0)))
+    maps = SHORT.replace(processing=SHORT.processing.replace(mode="passive"))
+    with driven() as loop, Application(loop.processing.address) as application:
+        application.subscribe("raw", credit=64)
+        loop.until(lambda: application.read() or application.others)
+        loop.processing.register(hello("long", long), long)
+        loop.processing.register(hello("maps", maps), maps)
+        loop.until(lambda: any(event == "unusable" for event, _ in loop.lines))
+        for count in range(2, 42, 2):
+            loop.offer("long", settings=long, behaviour="passive")
+            loop.offer("maps", settings=maps, behaviour="active")
+            loop.until(lambda count=count: application.read() or len(application.got) == count)
+        loop.settle()
+        for sensor in ("long", "maps"):
+            counts = loop.processing.counts(sensor)
+            assert (counts.published, counts.passive, counts.dropped.total()) == (20, 20, 0)
+        assert sum(worker.done for worker in loop.processing.status().workers) == 0
+    assert [fields["sensor"] for event, fields in loop.lines if event == "passive"] == ["long", "maps"]
+    assert [fields["sensor"] for event, fields in loop.lines if event == "unusable"] == ["long"]
+
+
+def test_measurements_without_a_call_are_dropped_with_a_dead_publisher():
+    with driven() as loop:
+        loop.processing.register(hello(), SHORT)
+        os.kill(loop.processing.status().publisher_pid, signal.SIGKILL)
+        loop.until(lambda: loop.processing.status().publisher_pid == 0)
+        for _ in range(5):
+            loop.offer(behaviour="passive")
+        assert loop.processing.counts("front").dropped == {"superseded": 3}
+        loop.settle()
+        assert loop.processing.counts("front").published == 2
+
+
+def test_slots_are_used_again_and_are_limited():
+    pool = SlotPool(range(2))
+    first, second = pool.take(100, 0), pool.take(5000, 0)
+    assert pool.take(100, 0) is None
+    pool.release(first)
+    assert pool.take(50, 0) is first
+    pool.release(first)
+    larger = pool.take(9000, 0)
+    assert (larger.number, larger.words_bytes) == (first.number, 9000)
+    pool.release(second)
+    assert pool.take(100, 0) is second
+    pool.close()
 
 
 def test_options_override_settings_of_a_sensor():

@@ -56,9 +56,9 @@ class Served:
 
 
 @contextmanager
-def serving(*options):
-    command = [sys.executable, "-m", "ertis_cli", "serve", "--json", "--quiet", *options]
-    environment = {**os.environ, "PYTHONPATH": str(Path("cli").absolute())}
+def serving(*options, quiet=True):
+    command = [sys.executable, "-m", "ertis_cli", "serve", "--json", *(["--quiet"] if quiet else []), *options]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     ) as process:
@@ -71,8 +71,8 @@ def serving(*options):
 class Sensors:
     """Sensors of one node that measure at the same time."""
 
-    def __init__(self, node, *names):
-        self.node, self.names, self.numbers = node, names, itertools.count()
+    def __init__(self, node, *names, passive=()):
+        self.node, self.names, self.passive, self.numbers = node, names, passive, itertools.count()
         for name in names:
             node.add_sensor(name, SHORT, translation_m=(0.5, 0.0, 0.0))
 
@@ -85,7 +85,7 @@ class Sensors:
                 sync_count=number,
                 session_id=11,
                 timestamp_ns=now_ns,
-                behaviour="passive",
+                behaviour="passive" if name in self.passive else "active",
             )
             for name in self.names
         ]
@@ -161,7 +161,7 @@ def test_serve_publishes_images_and_stores_measurements(tmp_path):
     assert {(image.stamp.sensor, image.stamp.sequence) for image in images} == set(
         itertools.product(("left", "right"), range(4))
     )
-    assert [image.stamp.behaviour for image in [*images, image_of_pcm]] == ["passive"] * 8 + ["unknown"]
+    assert [image.stamp.behaviour for image in [*images, image_of_pcm]] == ["active"] * 8 + ["unknown"]
     assert [(group.sensors, group.flags) for group in groups] == [(("left", "right"), ())] * 4
     (recording,) = reported["recordings"]
     assert Path(recording).name.startswith("tour_")
@@ -171,8 +171,53 @@ def test_serve_publishes_images_and_stores_measurements(tmp_path):
         sensor = reported["sensors"][name]
         assert (sensor["received"], sensor["published"], sensor["stored"], sensor["dropped"]) == (4, 4, 4, {})
         with open_recording(recording, sensor=name) as stored:
-            assert {stamp.behaviour for stamp in stored.stamps()} == {"passive"}
+            assert {stamp.behaviour for stamp in stored.stamps()} == {"active"}
             assert [measurement.stamp.sequence for measurement in stored] == [0, 1, 2, 3]
+
+
+def test_serve_stores_and_forwards_passive_measurements_without_images(tmp_path):
+    count = 5
+    with (
+        serving(*LOOPBACK, "--record", str(tmp_path), "--workers", "1", "--device", "numpy", quiet=False) as served,
+        SensorNode(served.listen) as node,
+        Subscriber(served.publish, products=("energyscape", "raw", "status"), credit=64) as subscriber,
+        Subscriber(served.publish, credit=64) as of_images,
+    ):
+        while len(received(subscriber, Status).processing.subscribers) < 2:
+            pass
+        sensors = Sensors(node, "ear", "eye", passive=("ear",))
+        found = []
+        for number in range(count):
+            sensors.measure()
+            while len(found) < 3 * (number + 1):  # two measurements, one image
+                product = subscriber.receive(TIMEOUT_S)
+                assert product is not None
+                found += [product] * isinstance(product, Energyscape | Measurement)
+        assert node.flush(TIMEOUT_S)
+        while (status := received(subscriber, Status)).sensors["ear"].passive < count:
+            pass
+        assert [received(of_images, Energyscape).stamp.sequence for _ in range(count)] == list(range(count))
+        assert of_images.counts.missed == of_images.counts.dropped == 0
+        assert subscriber.counts.missed == subscriber.counts.dropped == 0
+        reported = served.end()
+        log = served.process.stderr.read().splitlines()
+    images = [each.stamp for each in found if isinstance(each, Energyscape)]
+    raw = [each for each in found if isinstance(each, Measurement) and each.stamp.sensor == "ear"]
+    assert [(stamp.sensor, stamp.sequence) for stamp in images] == [("eye", number) for number in range(count)]
+    assert [each.stamp.sequence for each in raw] == list(range(count))
+    assert all(each.stamp.behaviour == "passive" and np.array_equal(each.data, MEASUREMENT.data) for each in raw)
+    for name, passive in (("ear", count), ("eye", 0)):
+        assert status.sensors[name].dropped == {}
+        sensor = reported["sensors"][name]
+        assert (sensor["received"], sensor["stored"], sensor["published"]) == (count, count, count)
+        assert (sensor["passive"], sensor["dropped"]) == (passive, {})
+    with open_recording(reported["recordings"][0], sensor="ear") as stored:
+        assert [each.stamp.sequence for each in stored] == list(range(count))
+        assert all(np.array_equal(each.data, MEASUREMENT.data) for each in stored)
+    (line,) = (line for line in log if "no images" in line)
+    assert "INFO" in line.upper()
+    assert "ear" in line
+    assert f"{count} published, {count} of them without an image, because no call was emitted" in "\n".join(log)
 
 
 def test_killed_worker_loses_no_measurement_and_no_process_remains():

@@ -48,6 +48,7 @@ BUSY = Status(
             received=41,
             stored=40,
             published=37,
+            passive=8,
             queue=2,
             missing={"the spool was full": 5},
             dropped={"superseded": 4},

@@ -255,7 +255,8 @@ def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
         if archive is not None:
             parts.append(f"{each.stored} stored")
         if status.processing is not None:
-            parts.append(f"{each.published} published")
+            without = f", {each.passive} of them without an image, because no call was emitted" if each.passive else ""
+            parts.append(f"{each.published} published{without}")
         parts += [f"{count} dropped ({reason})" for reason, count in each.dropped.items()]
         parts += [f"{count} missing ({reason})" for reason, count in each.missing.items()]
         options.say(f"{sensor}: {', '.join(parts)}", quiet=quiet)
@@ -278,7 +279,7 @@ def _progress(status: "Status") -> str:
         parts.append(f"ack p99 {status.archive.ack.p99_ms:.0f} ms")
         parts.append(f"{size(status.archive.room_bytes)} left")
     if status.processing is not None:
-        parts.append(f"{sum(each.published for each in sensors)} images")
+        parts.append(f"{sum(each.published - each.passive for each in sensors)} images")
         parts.append(f"{sum(sum(each.dropped.values()) for each in sensors)} dropped")
     if status.state == "fault":
         parts.append(f"FAULT: {status.fault}")

@@ -179,6 +179,9 @@ def _below(now: "Status") -> Iterator[str]:
         )
         if processing.choice:
             yield f"cores: {processing.choice}"
+        passive = {name: each.passive for name, each in now.sensors.items() if each.passive}
+        if passive:
+            yield f"without a call, published without images: {_by_reason(passive)}"
         if processing.groups:
             yield f"groups: {_by_reason(processing.groups)}"
         yield f"published at {processing.address or 'no address'} to {len(processing.subscribers)}"

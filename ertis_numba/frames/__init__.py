@@ -10,7 +10,7 @@ from ertis_numba.frames._occupancy_map import FREE_BELOW, MAX_CELLS, OCCUPIED_AB
 from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._reflectors import Peak, Reflector
 from ertis_numba.frames._sound_event import SoundEvent
-from ertis_numba.frames._stamp import BEHAVIOURS, Behaviour, Stamp
+from ertis_numba.frames._stamp import BEHAVIOURS, Behaviour, Stamp, is_passive
 from ertis_numba.frames._trajectory import Trajectory
 from ertis_numba.frames._true_source import TrueSource
 
@@ -36,4 +36,5 @@ __all__ = [
     "Stamp",
     "Trajectory",
     "TrueSource",
+    "is_passive",
 ]

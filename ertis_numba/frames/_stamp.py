@@ -4,7 +4,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final, Literal, TypeAlias
 
-__all__ = ["BEHAVIOURS", "Behaviour", "Stamp"]
+from ertis_numba.settings import Settings
+
+__all__ = ["BEHAVIOURS", "Behaviour", "Stamp", "is_passive"]
 
 Behaviour: TypeAlias = Literal["active", "passive", "unknown"]
 """Statement whether a measurement has emitted its call."""
@@ -68,3 +70,24 @@ class Stamp:
         """Time as text with milliseconds, such as ``2023-11-14 22:13:20.000 UTC``; None if `is_timed` is False."""
         iso = self.iso
         return iso and f"{iso[:10]} {iso[11:23]} UTC"
+
+
+def is_passive(settings: Settings, stamp: Stamp) -> bool:
+    """Return True if a measurement becomes an acoustic map, and False if it becomes an image of echoes.
+
+    Parameters
+    ----------
+    settings : Settings
+        Their ``processing.mode`` decides.
+    stamp : Stamp
+        Stamp of the measurement; its ``behaviour`` decides in the mode ``auto``.
+
+    Examples
+    --------
+    >>> from ertis_numba import Settings, Stamp
+    >>> from ertis_numba.passive import is_passive
+    >>> is_passive(Settings(), Stamp(behaviour="passive")), is_passive(Settings(), Stamp())
+    (True, False)
+    """
+    mode = settings.processing.mode
+    return mode == "passive" or (mode == "auto" and stamp.behaviour == "passive")

@@ -24,6 +24,7 @@ _OF_SENSOR: Final = {
     "received_bytes": "Bytes of measurements received",
     "stored": "Measurements stored on disk",
     "published": "Measurements published",
+    "passive": "Measurements without a call, published without an image",
     "repeated": "Duplicate measurements received",
     "conflicts": "Duplicates that differ from the stored measurement",
 }

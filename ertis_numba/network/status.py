@@ -73,6 +73,8 @@ class SensorStatus(msgspec.Struct, kw_only=True):
     received_bytes: int = 0
     stored: int = 0
     published: int = 0
+    passive: int = 0
+    """Published measurements without a call, of which no image was made."""
     in_flight: int = 0
     dropped: dict[str, int] = {}
     missing: dict[str, int] = {}

@@ -23,30 +23,9 @@ from ertis_numba.passive.methods import METHODS, Waves
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.settings import Settings
 
-__all__ = ["AcousticCamera", "is_passive"]
+__all__ = ["AcousticCamera"]
 
 _TURN: Final = 2.0**32
-
-
-def is_passive(settings: Settings, stamp: Stamp) -> bool:
-    """Return True if a measurement becomes an acoustic map, and False if it becomes an image of echoes.
-
-    Parameters
-    ----------
-    settings : Settings
-        Their ``processing.mode`` decides.
-    stamp : Stamp
-        Stamp of the measurement; its ``behaviour`` decides in the mode ``auto``.
-
-    Examples
-    --------
-    >>> from ertis_numba import Settings, Stamp
-    >>> from ertis_numba.passive import is_passive
-    >>> is_passive(Settings(), Stamp(behaviour="passive")), is_passive(Settings(), Stamp())
-    (True, False)
-    """
-    mode = settings.processing.mode
-    return mode == "passive" or (mode == "auto" and stamp.behaviour == "passive")
 
 
 class AcousticCamera:

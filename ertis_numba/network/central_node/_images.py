@@ -83,7 +83,8 @@ class Guarded:
         status.processing = self._images.status()
         for name, sensor in status.sensors.items():
             counts = self._images.counts(name)
-            sensor.published, sensor.dropped = counts.published, dict(counts.dropped)
+            sensor.published, sensor.passive = counts.published, counts.passive
+            sensor.dropped = dict(counts.dropped)
             sensor.in_flight, sensor.queue = counts.in_flight, counts.queue
             sensor.image_latency = counts.latency
 

@@ -1,6 +1,7 @@
 """Jobs on the workers of an existing dask cluster, for several machines."""
 
 import asyncio
+import itertools
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -25,7 +26,7 @@ from ertis_numba.network.processing.runner import (
     Lost,
     bytes_of,
 )
-from ertis_numba.network.processing.shared_slots import Slot
+from ertis_numba.network.processing.shared_slots import Slot, SlotPool
 from ertis_numba.network.status import WorkerStatus
 from ertis_numba.network.wakeup_socket import WakeupSocket
 
@@ -98,8 +99,7 @@ class Cluster:
         self._kinds: dict[int, JobKind] = {}
         self._prepared: dict[int, Prepared] = {}
         self._attempts: set[_Attempt] = set()
-        self._free: list[Slot] = []
-        self._n_slots = 0
+        self._slots = SlotPool(itertools.count())
         self.respawned = 0
         self._closing = threading.Event()
         self._looker = threading.Thread(target=self._look, name="cluster", daemon=True)
@@ -193,19 +193,14 @@ class Cluster:
         shape = self._prepared[job.kind.number].shape
         image_bytes = int(np.prod(shape)) * np.dtype(self._options.dtype).itemsize
         words_bytes = job.words.nbytes
-        for slot in self._free:
-            if slot.holds(words_bytes, image_bytes):
-                self._free.remove(slot)
-                break
-        else:
-            slot = Slot(self._n_slots, words_bytes, image_bytes)
-            self._n_slots += 1
+        slot = self._slots.take(words_bytes, image_bytes)
+        assert slot is not None  # noqa: S101  there is no limit
         slot.view.words(words_bytes)[:] = bytes_of(job.words)
         return slot
 
     def release(self, slot: Slot) -> None:
         """Release the slot of a finished job."""
-        self._free.append(slot)
+        self._slots.release(slot)
 
     def fds(self) -> Iterable[int]:
         """Return the descriptors to poll now."""
@@ -231,10 +226,8 @@ class Cluster:
         self._closing.set()
         self._client.close(timeout=2)
         self._looker.join(_CONNECT_S)
-        for slot in [*self._free, *(attempt.slot for attempt in self._attempts)]:
-            slot.close()
-        self._free.clear()
         self._attempts.clear()
+        self._slots.close()
         self._wakeup_socket.close()
 
     def _look(self) -> None:
@@ -317,7 +310,7 @@ class Cluster:
             job.slot, job.n_points = slot, len(result.points)
             member.done += 1
             return FinishedJob(job, result.took_s)
-        self._free.append(slot)
+        self._slots.release(slot)
         if isinstance(result, str):  # The measurement cannot be processed.
             return Lost(job, result, again=False)
         if isinstance(result, RemoteError):

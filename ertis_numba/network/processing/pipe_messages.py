@@ -163,13 +163,16 @@ class Describe(_Note, frozen=True, kw_only=True):
 
 
 class Publish(_Note, frozen=True, kw_only=True):
-    """A measurement and its products are in a slot, until `ProductsQueued` releases it."""
+    """A measurement and its products are in a slot, until `ProductsQueued` releases it.
+
+    ``description`` is None without an image.
+    """
 
     job: int
     slot: int
     data: Data
     received_ns: int
-    description: int
+    description: int | None
     raw_description: int
     shape: tuple[int, int]
     dtype: Literal["float32", "float16"]

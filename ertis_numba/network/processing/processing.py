@@ -18,8 +18,19 @@ from ertis_numba.network.processing.parallelism import Load
 from ertis_numba.network.processing.publisher import Publisher
 from ertis_numba.network.processing.queues import SUPERSEDED, ProcessingCounts, Queues
 from ertis_numba.network.processing.reorder_buffer import ReorderBuffer
-from ertis_numba.network.processing.runner import Event, FinishedJob, Job, JobKind, KindFailed, KindReady, Lost, Runner
+from ertis_numba.network.processing.runner import (
+    Event,
+    FinishedJob,
+    Job,
+    JobKind,
+    KindFailed,
+    KindReady,
+    Lost,
+    Runner,
+    bytes_of,
+)
 from ertis_numba.network.processing.sensors import Sensors
+from ertis_numba.network.processing.shared_slots import SlotPool
 from ertis_numba.network.processing.worker_pool import LocalWorkerPool
 from ertis_numba.network.status import Latencies, ProcessingStatus, Status
 from ertis_numba.network.trace import mark
@@ -29,6 +40,7 @@ from ertis_numba.stages.memory import require_images
 __all__ = ["ImageProcessing"]
 
 _TRIES: Final = 2
+_PASSIVE_SLOTS: Final = range(-16, 0)  # Measurements without an image at the publisher; workers' slots begin at 0.
 _ENDED: Final = "the central node ended"
 _GETTING_READY: Final = "the workers were getting ready"
 _FAILED_TWICE: Final = "failed twice"
@@ -71,6 +83,8 @@ class ImageProcessing:
         self._n_jobs = 0
         self._predicted: dict[str, int] = {}  # Number of the kind whose error was predicted, by sensor.
         self._order = ReorderBuffer()
+        self._passive_slots = SlotPool(_PASSIVE_SLOTS)
+        self._passive: set[str] = set()  # Sensors that have sent measurements without a call.
         self._load = Load()
         self._took = Latencies()
         self._retried = self._quarantined = 0
@@ -119,7 +133,9 @@ class ImageProcessing:
         ArgumentError
             The image would be too large, the ranges lie outside the record, or the last stage yields no image.
         """
-        require_images(self._options.applied(settings))
+        applied = self._options.applied(settings)
+        if applied.processing.mode != "passive":
+            require_images(applied)
 
     def register(self, hello: Hello, settings: Settings) -> None:
         """Register a sensor before its first measurement, and after each change."""
@@ -137,19 +153,34 @@ class ImageProcessing:
         arrived_ns : int
             Time of `time.monotonic_ns`.
         """
-        now_s = time.monotonic()
-        self._load.add(now_s)
         kind = self._sensors.kind_of(data)
         self._emit_event(self._groups.add(data, arrived_ns))
+        if kind is not None and not kind.settings:
+            self._offer(data, words, arrived_ns, kind, SUPERSEDED)
+            self._note_passive(data.sensor)
+            return
+        now_s = time.monotonic()
+        self._load.add(now_s)
         paused = self._circuit_breaker.holds(data.sensor, now_s)
         if kind is None or paused:
             self._queues.take_in(data)
             self._queues.drop(data, _PAUSED if paused else _UNUSABLE)
             return
+        self._offer(data, words, arrived_ns, kind, SUPERSEDED if self._sensors.is_ready(kind) else _GETTING_READY)
+
+    def _offer(
+        self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int, kind: JobKind, reason: str
+    ) -> None:
+        """Queue a measurement; ``reason`` is that of an older one that it replaces."""
         self._n_jobs += 1
-        reason = SUPERSEDED if self._sensors.is_ready(kind) else _GETTING_READY
         self._queues.add(Job(self._n_jobs, data, words, kind, arrived_ns), reason)
         self._dispatch()
+
+    def _note_passive(self, sensor: str) -> None:
+        if sensor not in self._passive:
+            self._passive.add(sensor)
+            text = "it emits no call: applications get its measurements, but no images of them"
+            self._log.info("passive", sensor=sensor, text=text)
 
     def fds(self) -> Iterable[int]:
         """Return the descriptors to poll for reading at present."""
@@ -225,6 +256,7 @@ class ImageProcessing:
             self._runner.close()
             self._runner = None
         self._publisher.close()
+        self._passive_slots.close()
         if self._dead_letter_queue is not None:
             self._dead_letter_queue.close()
             self._dead_letter_queue = None
@@ -248,18 +280,42 @@ class ImageProcessing:
         """Give waiting measurements to workers, as far as they accept them."""
         runner, found = self._runner, True
         while runner is not None and found and not self._queues.is_empty:
-            found = False
-            for job in self._queues.turns():
-                if runner.takes(job.kind):
-                    self._queues.take(job)
-                    job.points = self._publisher.wants_points(job.data.sensor)
-                    sensor, kind = job.data.sensor, job.kind.number
-                    job.predict = self._predicted.get(sensor) != kind
-                    self._predicted[sensor] = kind
-                    self._order.add(job)
-                    runner.submit(job)
-                    found = True
-                    break
+            found = any(self._start(job, runner) for job in self._queues.turns())
+
+    def _start(self, job: Job, runner: Runner) -> bool:
+        """Give a waiting measurement to a worker, or to the publisher without a call; return False if it must wait."""
+        if not job.kind.settings:
+            return self._forward(job)
+        if not runner.takes(job.kind):
+            return False
+        self._queues.take(job)
+        job.points = self._publisher.wants_points(job.data.sensor)
+        sensor, kind = job.data.sensor, job.kind.number
+        job.predict = self._predicted.get(sensor) != kind
+        self._predicted[sensor] = kind
+        self._order.add(job)
+        runner.submit(job)
+        return True
+
+    def _forward(self, job: Job) -> bool:
+        """Pass a measurement without a call to the publisher, after the images before it; return False without room."""
+        slot = self._passive_slots.take(job.words.nbytes, 0) if self._publisher.serves else None
+        if slot is None:
+            return False
+        slot.view.words(job.words.nbytes)[:] = bytes_of(job.words)
+        job.slot = slot
+        self._queues.take(job)
+        self._order.add(job)
+        self._order.done(job)
+        self._publish_of(job.data.sensor)
+        return True
+
+    def _release(self, job: Job) -> None:
+        """Release the slot of a job that was published or dropped."""
+        if job.slot is not None and not job.kind.settings:
+            self._passive_slots.release(job.slot)
+        elif job.slot is not None and self._runner is not None:
+            self._runner.release(job.slot)
 
     def _handle(self, events: Sequence[Event]) -> None:
         for event in events:
@@ -329,25 +385,26 @@ class ImageProcessing:
         sensor, slot = self._sensors[job.data.sensor], job.slot
         if slot is None or self._runner is None:
             return
-        if not self._publisher.serves or sensor.kind is not job.kind:
-            self._runner.release(slot)
-            reason = _PUBLISHER_DIED if sensor.kind is job.kind else _CHANGED
-            self._queues.drop(job.data, reason)
+        is_current = job.kind is sensor.kind or job.kind is sensor.passive
+        if not self._publisher.serves or not is_current:
+            self._release(job)
+            self._queues.drop(job.data, _PUBLISHER_DIED if is_current else _CHANGED)
             return
+        is_image = job.kind is not sensor.passive
         note = pipe_messages.Publish(
             job=job.number,
             slot=slot.number,
             data=job.data,
             received_ns=job.arrived_ns,
-            description=sensor.image,
+            description=sensor.image if is_image else None,
             raw_description=sensor.raw,
-            shape=self._sensors.shape_of(job.kind),
+            shape=self._sensors.shape_of(job.kind) if is_image else (0, 0),
             dtype=self._options.dtype,
             n_points=job.n_points if job.points else -1,
             words_bytes=job.words.nbytes,
         )
         if not self._publisher.publish(job, note):
-            self._runner.release(slot)
+            self._release(job)
             self._queues.drop(job.data, _UNDESCRIBED)
 
     def _confirm(self, taken: Sequence[tuple[Job, int]], lost: Sequence[Job] = ()) -> None:
@@ -356,12 +413,14 @@ class ImageProcessing:
             counts = self._queues.counts_of(job.data.sensor)
             counts.published += 1
             counts.in_flight -= 1
-            counts.times.add((published_ns - job.arrived_ns) / 1e6)
+            if job.kind.settings:
+                counts.times.add((published_ns - job.arrived_ns) / 1e6)
+            else:
+                counts.passive += 1
         for job in lost:
             self._queues.drop(job.data, _PUBLISHER_DIED)
         for job in (*(job for job, _ in taken), *lost):
-            if job.slot is not None and self._runner is not None:
-                self._runner.release(job.slot)
+            self._release(job)
 
     def _emit_event(self, groups: Iterable[Group]) -> None:
         for group in groups:

@@ -120,7 +120,8 @@ class Publisher:
         if child is None or slot is None:
             raise AssertionError("nothing can be published now; check serves first")
         described = self._descriptions.get(job.data.sensor, {})
-        if not {publish.description, publish.raw_description} <= described.keys():
+        needed = [each for each in (publish.description, publish.raw_description) if each is not None]
+        if not described.keys() >= set(needed):
             return False
         if self._slots.get(slot.number) is not slot:
             self._slots[slot.number] = slot
@@ -128,7 +129,7 @@ class Publisher:
                 slot=slot.number, words_bytes=slot.words_bytes, image_bytes=slot.image_bytes
             )
             child.pipe.send(note, files=(slot.descriptor,))
-        for number in (publish.description, publish.raw_description):
+        for number in needed:
             if number not in self._reported:
                 self._reported.add(number)
                 description, payloads = described[number]

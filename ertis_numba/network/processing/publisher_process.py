@@ -161,16 +161,16 @@ class _Publisher:
             )
         } | {"sensor": sensor, "number": 0, "dropped": 0}
         times: dict[str, Any] = {"received_ns": note.received_ns, "published_ns": 0}
-        about = self._subscribers.description(sensor, note.description)
+        about = None if note.description is None else self._subscribers.description(sensor, note.description)
         raw_about = self._subscribers.description(sensor, note.raw_description)
         items = []
         if about is not None and self._subscribers.wanted("energyscape", sensor):
             rows, columns = note.shape
             payloads = _pieces(view.image(rows * columns * (4 if note.dtype == "float32" else 2)))
-            image = Image(description=note.description, shape=note.shape, dtype=note.dtype, **common, **times)
+            image = Image(description=about[0], shape=note.shape, dtype=note.dtype, **common, **times)
             items.append(QueuedProduct("energyscape", sensor, image, payloads, about))
         if about is not None and note.n_points >= 0 and self._subscribers.wanted("points", sensor):
-            cloud = Points(description=note.description, n_points=note.n_points, **common, **times)
+            cloud = Points(description=about[0], n_points=note.n_points, **common, **times)
             points = view.points(16 * note.n_points)
             items.append(QueuedProduct("points", sensor, cloud, [points], about))
         if raw_about is not None and self._subscribers.wanted("raw", sensor):

@@ -25,6 +25,8 @@ class ProcessingCounts:
     Attributes
     ----------
     received, published : int
+    passive : int
+        Published measurements without a call, of which no image was made.
     dropped : Counter of str
         By reason.
     in_flight : int
@@ -37,6 +39,7 @@ class ProcessingCounts:
 
     received: int = 0
     published: int = 0
+    passive: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
     in_flight: int = 0
     queue: int = 0

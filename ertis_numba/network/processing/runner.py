@@ -18,13 +18,13 @@ __all__ = ["Event", "FinishedJob", "Job", "JobKind", "KindFailed", "KindReady", 
 
 @dataclass(frozen=True, slots=True)
 class JobKind:
-    """Measurements that one pipeline can process.
+    """Measurements that one pipeline can process, or measurements of which no image is made.
 
     Attributes
     ----------
     number : int
     settings : str
-        Settings as TOML.
+        Settings of the pipeline as TOML; empty without one.
     words_bytes : int
         Size of a measurement.
     """

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from ertis_numba.errors import ArgumentError
+from ertis_numba.frames import is_passive
 from ertis_numba.geometry import self_contained
 from ertis_numba.network.log import EventLog
 from ertis_numba.network.messages import Data, Description, Hello
@@ -21,6 +22,7 @@ __all__ = ["RegisteredSensor", "Sensors"]
 _AIR_STEPS: Final = {"temperature_c": 0.5, "humidity_percent": 5.0, "pressure_pa": 1000.0}
 _AGAIN_S: Final = 60.0  # Delay before a pipeline that failed is tried again …
 _GREETED_S: Final = 10.0  # … and after a Hello of its sensor.
+_PASSIVE: Final = 0  # Number of the kind of measurements without a call; kinds of images begin at 1.
 
 
 @dataclass(slots=True)
@@ -36,6 +38,10 @@ class RegisteredSensor:
         The same, with air close to that of its latest measurement.
     kind : JobKind or None
         None if no pipeline can use its settings.
+    passive : JobKind
+        Kind of its measurements without a call, of which no image is made.
+    applied : Settings or None
+        The settings with the options of this node; None if the options do not suit them.
     raw, image : int
         Numbers of the descriptions of its products.
     air : (float, float, float), optional
@@ -46,6 +52,8 @@ class RegisteredSensor:
     stated: Settings
     settings: Settings
     kind: JobKind | None
+    passive: JobKind
+    applied: Settings | None
     raw: int = -1
     image: int = -1
     air: tuple[float, float, float] | None = None
@@ -94,22 +102,27 @@ class Sensors:
 
     def expect(self, settings: Settings) -> None:
         """Prepare for a sensor that has not connected yet."""
-        self._kind_of("expected", settings)
+        self._kind_of("expected", self._applied("expected", settings))
 
     def _take(self, hello: Hello, stated: Settings, settings: Settings) -> None:
-        known = RegisteredSensor(hello, stated, settings, self._kind_of(hello.sensor, settings))
+        passive = JobKind(_PASSIVE, "", sample_format(settings).n_bytes)
+        applied = self._applied(hello.sensor, settings)
+        known = RegisteredSensor(hello, stated, settings, self._kind_of(hello.sensor, applied), passive, applied)
         self._known[hello.sensor] = known
         known.raw = self._described(hello, settings.to_toml(), b"", b"", b"")
         self._describe_images(known)
 
     def kind_of(self, data: Data) -> JobKind | None:
-        """Return the kind of a measurement, None if no image can be made of it.
+        """Return the kind of a measurement, None if it cannot be processed.
 
+        Measurements without a call become no images, unless ``processing.mode`` requests them.
         Air determines ranges, and therefore the kind. A new kind needs a difference of 0.5 °C, 5 % or 1 kPa, because a
         pipeline cannot be made for each measurement of a warming day. The resulting error of ranges at 20 °C is at most
         0.09 % for temperature, 0.02 % for humidity and 0.003 % for pressure: 6 mm at 5 m for all together.
         """
         known = self._known[data.sensor]
+        if is_passive(known.applied or known.settings, data.stamp):
+            return known.passive
         came = data.temperature_c, data.humidity_percent, data.pressure_pa
         if came != known.air:
             try:
@@ -165,11 +178,20 @@ class Sensors:
             self._unusable.pop(kind.number, None)
         return found
 
-    def _kind_of(self, sensor: str, settings: Settings) -> JobKind | None:
+    def _applied(self, sensor: str, settings: Settings) -> Settings | None:
         try:
-            applied = self_contained(self._options.applied(settings)).to_toml()
+            return self._options.applied(settings)
+        except ArgumentError as error:
+            self._log.warning("unusable", sensor=sensor, text=str(error))
+            return None
+
+    def _kind_of(self, sensor: str, settings: Settings | None) -> JobKind | None:
+        if settings is None or settings.processing.mode == "passive":
+            return None
+        try:
+            applied = self_contained(settings).to_toml()
             n_bytes = sample_format(settings).n_bytes
-            require_image_size(self._options.applied(settings))
+            require_image_size(settings)
         except ArgumentError as error:
             self._log.warning("unusable", sensor=sensor, text=str(error))
             return None

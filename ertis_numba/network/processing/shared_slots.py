@@ -3,6 +3,7 @@
 import math
 import mmap
 import os
+from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.processes import anonymous_memory
 
-__all__ = ["POINTS_BYTES", "Slot", "SlotView"]
+__all__ = ["POINTS_BYTES", "Slot", "SlotPool", "SlotView"]
 
 POINTS_BYTES: Final = 65_536
 """Room for the points of an image."""
@@ -89,3 +90,44 @@ class Slot:
     def close(self) -> None:
         """Release it; other processes keep their access."""
         os.close(self.descriptor)
+
+
+class SlotPool:
+    """Slots that are used again once they are free.
+
+    Parameters
+    ----------
+    numbers : iterable of int
+        Numbers of the slots; as many slots are in use at the same time.
+    """
+
+    def __init__(self, numbers: Iterable[int]) -> None:
+        self._numbers = iter(numbers)
+        self._all: dict[int, Slot] = {}
+        self._free: list[Slot] = []
+
+    def take(self, words_bytes: int, image_bytes: int) -> Slot | None:
+        """Return a slot in which a measurement and an image of these sizes fit; None if all are in use."""
+        for slot in self._free:
+            if slot.holds(words_bytes, image_bytes):
+                self._free.remove(slot)
+                return slot
+        number = next(self._numbers, None)
+        if number is None and self._free:
+            number = self._free.pop(0).number
+            self._all.pop(number).close()
+        if number is None:
+            return None
+        self._all[number] = slot = Slot(number, words_bytes, image_bytes)
+        return slot
+
+    def release(self, slot: Slot) -> None:
+        """Accept a slot that is no longer in use."""
+        self._free.append(slot)
+
+    def close(self) -> None:
+        """Release the memory of all slots."""
+        for slot in self._all.values():
+            slot.close()
+        self._all.clear()
+        self._free.clear()
