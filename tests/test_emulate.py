@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import serial
 from click.testing import CliRunner
-from ertis_cli.emulate import _get_ready
+from ertis_cli._emulation import SceneRenderer
+from ertis_cli.emulate import _get_ready, _render_all
 from ertis_cli.main import cli
 
 from ertis_numba.devices.driver import SonarDriver
@@ -274,7 +275,7 @@ def test_emulate_reports_a_point_on_a_sensor(emulate, tmp_path):
     process.stdout.readline()
     _, _, errors = ended(process, signal.SIGTERM)
     assert "note: points[1] is 0 mm from an emitter or a microphone of only" in errors
-    assert "rendering 2 measurements ..." in errors
+    assert "rendering 2 measurements with a call, and as many without ..." in errors
     assert not any("rehears" in line or "Traceback" in line for line in errors.splitlines())
 
 
@@ -310,6 +311,35 @@ def test_capture_waits_for_a_port(emulate, recording, tmp_path, monkeypatch):
     assert done.exit_code == 0, done.stderr
     with open_recording(tmp_path / "new.h5") as made:
         assert made.translation_m.tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_rendering_in_advance_leaves_nothing_to_render(silent, monkeypatch):
+    """A device that renders a measurement while it records loses it on a busy machine."""
+    scene = Scene.from_toml(SCENE)
+    scene = scene.replace(sensors=tuple(each.replace("emitter.silent", silent) for each in scene.sensors))
+    renderer, rendered = SceneRenderer(scene), []
+    render = Engine.render
+    monkeypatch.setattr(Engine, "render", lambda *given: rendered.append(given[1:]) or render(*given))
+    _render_all(renderer, ["only"], quiet=True)
+    assert len(rendered) == scene.count * (1 if silent else 2)
+    words = {active: renderer.of("only", active=active) for active in (True, False)}
+    assert [np.array_equal(words[True][index], words[False][index]) for index in range(scene.count)] == [silent] * 2
+    assert len(rendered) == scene.count * (1 if silent else 2)
+
+
+def test_passive_capture_of_a_scene_loses_no_measurement(emulate, tmp_path, monkeypatch):
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "links"))
+    (tmp_path / "scene.toml").write_text(SCENE)
+    (tmp_path / "settings.toml").write_text(SHORT.to_toml())
+    emulate(tmp_path / "scene.toml", "--quiet").stdout.readline()
+    command = ["capture", "--port", "only", "--passive", "-n", "10", "--rate", "10", "--quiet"]
+    command += ["--settings", str(tmp_path / "settings.toml"), "-o", str(tmp_path / "new.h5")]
+    done = CliRunner().invoke(cli, command)
+    assert done.exit_code == 0, done.stderr
+    with open_recording(tmp_path / "new.h5") as made:
+        assert (len(made), made.gaps) == (10, ())
+        assert {stamp.behaviour for stamp in made.stamps()} == {"passive"}
 
 
 class Unrenderable(list):

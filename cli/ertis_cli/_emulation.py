@@ -67,11 +67,17 @@ class SceneRenderer:
 
     def words(self, name: str, index: int, *, active: bool) -> "NDArray[np.uint32]":
         """Return the samples of a measurement as words."""
+        active = active and self.emits
         key = name, active, index % self._scene.count
         with self._turn:
             if key not in self._words:
                 self._words[key] = self._engine(name, active=active).render(key[2]).data
             return self._words[key]
+
+    @property
+    def emits(self) -> bool:
+        """True if a sensor of the scene emits its call; otherwise active measurements are those without emission."""
+        return not all(sensor.emitter.silent for sensor in self._scene.sensors)
 
     @property
     def count(self) -> int:

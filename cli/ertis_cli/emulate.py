@@ -108,9 +108,9 @@ def emulate(
     until Ctrl-C ends the command.
     For measurements without emission, the scene is simulated with all sensors silent.
 
-    A scene is rendered for the call that was uploaded. Without --sync-rate, all measurements with the scene's call are
-    rendered in advance. With --sync-rate, each is rendered at its pulse, and the first pulses are slower. A recording
-    supports only its own call; with any other call, the sensor does not measure.
+    A scene is rendered for the call that was uploaded. Without --sync-rate, all measurements with the scene's call, and
+    all without emission, are rendered in advance. With --sync-rate, each is rendered at its pulse, and the first pulses
+    are slower. A recording supports only its own call; with any other call, the sensor does not measure.
 
     'ertis capture' can read the mounting of the sensors from the same file: --mounting SCENE.toml|REC.h5.
     """
@@ -212,12 +212,15 @@ def _renderer(
 
 
 def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: bool) -> None:
-    """Render the measurements for the scene's call in advance, so that none is late."""
-    options.say(f"rendering {options.counted(renderer.count * len(names), 'measurement')} ...", quiet=quiet)
-    todo = ((name, index) for index in range(renderer.count) for name in names)
-    with options.progress(todo, length=renderer.count * len(names), label="rendering", quiet=quiet) as shown:
-        for name, index in shown:
-            renderer.words(name, index, active=True)
+    """Render the measurements for the scene's call, and those without emission, in advance, so that none is late."""
+    behaviours = (True, False) if renderer.emits else (False,)
+    todo = [(name, index, active) for active in behaviours for index in range(renderer.count) for name in names]
+    measurements = options.counted(renderer.count * len(names), "measurement")
+    with_call = "with a call, and as many without" if renderer.emits else "without a call"
+    options.say(f"rendering {measurements} {with_call} ...", quiet=quiet)
+    with options.progress(todo, length=len(todo), label="rendering", quiet=quiet) as shown:
+        for name, index, active in shown:
+            renderer.words(name, index, active=active)
 
 
 def _rendered(renderer: "SceneRenderer", names: "Sequence[str]") -> "Given":
