@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import click
+import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -11,8 +13,10 @@ from ertis_cli import process
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
+from ertis_numba.campaign import Campaign, CampaignOptions, RecordingStarted, find_recordings
 from ertis_numba.frames import Stamp
 from ertis_numba.settings import MAP_METHODS
+from tests.campaigns import InlinePool, names_in
 from tests.pages import commands_in, page, python_in, run_code_here, run_here
 from tests.test_acoustic_camera import settings_of, sound
 
@@ -54,6 +58,12 @@ def folder(recorded, tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture
+def in_test_process(monkeypatch):
+    """Process recordings in the test's own process, because worker processes start slowly."""
+    monkeypatch.setattr(Campaign, "_pool", lambda _: InlinePool())
+
+
 def run(line, *, code=0):
     done = CliRunner().invoke(cli, line.split())
     assert done.exit_code == code, done.output
@@ -77,7 +87,7 @@ def test_passive_recording_becomes_acoustic_maps():
             expected = list(camera.process_many(recording))
         for one, other in zip(found, expected, strict=True):
             assert np.array_equal(one.power, other.power)
-        mean = sum(each.power for each in found) / 2
+        mean = sum(each.n_measurements * each.power for each in found) / 3
     assert [row["level_dbfs"] for row in report["loudest"]] == pytest.approx(10 * np.log10(mean.max(axis=0)), abs=1e-3)
     assert azimuths_deg(report["loudest"]) == pytest.approx([21, 21], abs=3.1)  # directions are 3 degrees apart
     assert report["sensors"][0]["loudest"] == report["loudest"]
@@ -97,7 +107,7 @@ def test_options_of_maps_override_the_settings(folder):
 
 def test_emission_is_masked_and_reported():
     done = run("process mixed.h5 -o maps.h5 --mode passive --device cpu")
-    assert "note: sensor sensor emitted its call in 2 of 4 measurements; the first " in done.stderr
+    assert "warning: mixed.h5: sensor sensor emitted its call in 2 of 4 measurements; the first " in done.stderr
     assert "ms of each are left out, but maps contain its echoes" in done.stderr
     with ertis.open_acoustic_maps("maps.h5") as found:
         assert [each.masked_s > found.settings.call.duration_s for each in found] == [True, True]
@@ -124,15 +134,65 @@ def test_sensor_without_calls_is_left_out_of_images():
         assert (maps.sensors, maps.translation_m.tolist()) == (("right",), [0.1, 0.0, 0.0])
 
 
-def test_several_recordings_become_images_only(folder):
+@pytest.mark.usefixtures("in_test_process")
+def test_several_recordings_become_images_or_maps(folder):
     (folder / "both.h5").unlink()
-    done = run("process active.h5 mixed.h5 passive.h5 -o images/ --device cpu --workers 1", code=1)
-    assert "passive.h5: all measurements are passive, and become acoustic maps only if" in done.stderr
+    done = run("process active.h5 mixed.h5 passive.h5 -o out/ --device cpu --average 3 --workers 1 --json")
     assert "mixed.h5: 2 of 4 measurements of sensor sensor are passive" in done.stderr
-    assert sorted(path.name for path in (folder / "images").glob("*.h5")) == ["active.energy.h5", "mixed.energy.h5"]
-    run("process passive.h5 -o images/passive.energy.h5 --device cpu")
-    run("process images -o more/ --device cpu", code=0)  # results of processing are skipped
+    assert "out/passive.acoustic.h5: 1 acoustic map of 3 measurements, 61 directions × 2 bands on cpu" in done.stderr
+    assert "3 recordings: 3 made; 7 measurements in " in done.stderr
+    assert names_in(folder / "out") == ["active.energy.h5", "mixed.energy.h5", "passive.acoustic.h5"]
+    (made,) = [row for row in map(json.loads, done.stdout.splitlines()) if row.get("kind") == "acoustic_map"]
+    alone = json.loads(run("process passive.h5 -o alone.h5 --device cpu --average 3 --json").stdout)
+    assert (made["output"], made["outcome"], made["maps"]) == ("out/passive.acoustic.h5", "made", 1)
+    assert made["loudest"] == alone["loudest"]
+    with ertis.open_acoustic_maps("out/passive.acoustic.h5") as one, ertis.open_acoustic_maps("alone.h5") as other:
+        assert one.uuid == other.uuid
+    run("process out -o more/ --device cpu")  # results of processing are skipped
     assert not list((folder / "more").glob("*.h5"))
+
+
+@pytest.mark.usefixtures("in_test_process")
+def test_finished_maps_are_kept(folder):
+    line = "process passive.h5 silent.h5 -o maps/ --device cpu --workers 1"
+    run(line)
+    assert "2 recordings: 2 kept; 0 measurements in " in run(line).stderr
+    assert "2 kept" in run(f"{line} --strict").stderr
+    done = run(f"{line} --average 1", code=1)
+    assert "exists and was made with other settings (passive.averages of sensor sensor)" in done.stderr
+    with h5py.File(folder / "maps" / "passive.acoustic.h5", "r+") as file:
+        file["sensors/sensor/power"][0, 0, 0] += 1.0
+    assert "passive.acoustic.h5 exists and is damaged; give another folder" in run(line, code=1).stderr
+    done = run(f"{line} --force")
+    assert "maps/silent.acoustic.h5: exists already, kept" in done.stderr
+    assert "2 recordings: 1 made, 1 kept; 3 measurements in " in done.stderr
+    (folder / "maps" / "passive.acoustic.h5").write_bytes((folder / "active.h5").read_bytes())
+    assert "passive.acoustic.h5 exists and is a recording" in run(f"{line} --force", code=1).stderr
+
+
+@pytest.mark.usefixtures("in_test_process")
+def test_failed_recordings_do_not_stop_maps_of_others(folder):
+    (folder / "torn.h5").write_bytes((folder / "passive.h5").read_bytes()[:90_000])
+    done = run("process passive.h5 torn.h5 active.h5 -o maps --mode passive --device cpu", code=1)
+    assert "ertis: failed: torn.h5 is cut short or damaged" in done.stderr
+    assert "active.h5: sensor sensor emitted its call in 2 of 2 measurements; the first" in done.stderr
+    assert names_in(folder / "maps") == ["active.acoustic.h5", "passive.acoustic.h5"]
+    done = run("process passive.h5 active.h5 -o images --verify --device cpu", code=1)
+    assert (
+        "passive.h5: all measurements are passive and become acoustic maps, which have no error budget; leave"
+        in done.stderr
+    )
+    assert names_in(folder / "images") == ["active.energy.h5"]
+    done = run("process passive.h5 silent.h5 -o more --bands 80000:100000 --device cpu", code=1)
+    assert done.stderr.count("passive.bands_hz[0] ends at 100000 Hz, but the record reaches only 90000 Hz") == 2
+
+
+@pytest.mark.usefixtures("in_test_process")
+def test_progress_of_maps_counts_measurements():
+    started, *progress, ended = Campaign(find_recordings(["passive.h5"]), "maps", CampaignOptions(device="cpu")).run()
+    assert started == RecordingStarted(Path("passive.h5"), 3)
+    assert [each.done for each in progress] == [1, 2, 3]
+    assert (ended.outcome, ended.output) == ("made", Path("maps/passive.acoustic.h5"))
 
 
 def test_images_of_silent_sensors_are_fused_only_if_asked(folder):
@@ -155,7 +215,8 @@ def test_check_names_the_kind_of_a_file_of_maps():
         ("passive.h5 --verify", "--verify is for images, but all measurements are passive"),
         ("passive.h5 --bands wide", "'wide' is not a list of bands; give third_octaves, octaves, or edges in Hz"),
         ("passive.h5 --bands 20000:30000:40000", "is not a list of bands"),
-        ("passive.h5 active.h5 -o out/ --focus 2", "--focus is for acoustic maps, but several recordings become"),
+        ("passive.h5 active.h5 -o out/ --focus 2 --mode active", "--focus is for acoustic maps, but --mode active"),
+        ("passive.h5 active.h5 -o out/ --range 1:2 --mode passive", "--range is for images, but all measurements"),
         ("passive.h5 -o s.npz --last-stage demodulation --bands octaves", "--bands is for acoustic maps, but s.npz"),
         ("both.h5 --fuse --map-method capon", "--map-method is for acoustic maps, but --fuse makes images"),
     ],

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _plans, _progress, _tables, options
+from ertis_cli import _acoustic_maps, _plans, _progress, _tables, options
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -204,7 +204,8 @@ def _lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
     match event.outcome:
         case "made":
             yield from _plan_lines(event, reported=reported)
-            yield from summary(event.output, event.made["sensors"], event.made["device"])
+            lines = _acoustic_maps.summary if event.made.get("kind") == "acoustic_map" else summary
+            yield from lines(event.output, event.made["sensors"], event.made["device"])
         case "kept":
             yield from _plan_lines(event, reported=reported)
             yield f"{event.output}: exists already, kept"

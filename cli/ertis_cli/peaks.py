@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _acoustic_maps, _tables, options
+from ertis_cli import _tables, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -169,7 +169,7 @@ def _list_loudest(path: Path, sensors: tuple[str, ...], measurement: int | None,
             for index in options.places(measurement, len(maps)):
                 found = maps[index]
                 place = {"sensor": name, "measurement": index}
-                rows += [place | row for row in _acoustic_maps.loudest_rows(found)]
+                rows += [place | each.as_dict() for each in found.loudest()]
     if as_json:
         options.print_json({"loudest": rows})
         return

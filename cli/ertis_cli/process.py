@@ -234,7 +234,7 @@ def process(
         verify=verify,
     )
     if _process_many.are_meant(paths, target):
-        _acoustic_maps.require_none("several recordings become images; give one recording")
+        _acoustic_maps.require_options_of(other["mode"])
         _process_many.process_many(
             paths, target, wanted, workers=workers, scheduler=scheduler, quiet=quiet, as_json=as_json
         )
@@ -261,15 +261,10 @@ def process(
         _acoustic_maps.write_maps(
             path,
             Path(target) if target else path.with_suffix(".acoustic.h5"),
-            changed,
+            wanted,
             sensors=sensors,
-            mounting=wanted.mounting,
-            strict=strict,
-            force=force,
             quiet=quiet,
             as_json=as_json,
-            device=device,
-            threads=threads,
         )
         return
     _acoustic_maps.require_none("measurements with a call become images; give --mode passive")

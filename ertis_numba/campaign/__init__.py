@@ -1,4 +1,4 @@
-"""Campaigns: processing of many recordings to energyscapes, on all cores or on a cluster.
+"""Campaigns: processing of many recordings to energyscapes or acoustic maps, on all cores or on a cluster.
 
 Each recording becomes one output file, complete or not at all. An interrupted campaign therefore continues at the next
 recording. Workers are independent processes: a crash affects only the recording in progress.

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba import checks
-from ertis_numba.campaign.echo_measurements import count_images, passive_note, require_images
+from ertis_numba.campaign.echo_measurements import count_images, passive_note
 from ertis_numba.campaign.events import Event, Outcome, RecordingEnded, RecordingProgress, RecordingStarted
 from ertis_numba.campaign.existing_output import difference
 from ertis_numba.campaign.folder import clear_parts, exclusive_folder
 from ertis_numba.campaign.plans import Plans
-from ertis_numba.campaign.recordings import RecordingFile, output_paths
+from ertis_numba.campaign.recordings import RecordingFile, ResultKind, map_path, output_paths
 from ertis_numba.campaign.tasks import (
     MAX_WAITING_BYTES,
     TASK_OPTIONS,
@@ -40,6 +40,7 @@ class _RecordingState:
 
     found: RecordingFile
     target: Path
+    kind: ResultKind = "energyscape"
     measurements: int = 0
     wanted: dict[str, Settings] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -50,7 +51,9 @@ class _RecordingState:
 
 
 class Campaign:
-    """Processing of many recordings to energyscape files in a folder.
+    """Processing of many recordings to energyscape files, or files of acoustic maps, in a folder.
+
+    A recording whose measurements are all passive becomes acoustic maps. If only some are, they are left out.
 
     The files do not depend on the number of workers or threads: only the date in them differs. A plan is chosen once
     for all recordings with the same settings. An existing file is kept if it was made from the same recording with the
@@ -95,7 +98,8 @@ class Campaign:
                 )
         self.folder, self._options = Path(folder), options or CampaignOptions()
         targets = output_paths(recordings, self.folder)
-        self._names = {target.name for target in targets}
+        self._names = {name for target in targets for name in (target.name, map_path(target).name)}
+        self._n_recordings = len(recordings)
         self._waiting = deque(_RecordingState(*pair) for pair in zip(recordings, targets, strict=True))
         self._workers, self._scheduler = workers, scheduler
         self._plans = Plans()
@@ -109,7 +113,7 @@ class Campaign:
         """Number of processes on this machine: at most one per recording."""
         cores = usable_cores()
         chosen = self._workers or (1 if self._options.device == "cuda" else cores // (self._options.threads or 1))
-        return max(1, min(chosen, len(self._names)))
+        return max(1, min(chosen, self._n_recordings))
 
     def run(self) -> Generator[Event]:
         """Process the recordings, and yield events; close the iterator to cancel all work.
@@ -159,16 +163,21 @@ class Campaign:
         in_hand = len(self._submitted) + len(self._unplanned)
         if self._waiting and in_hand < pool.size + _N_INSPECTED_AHEAD:
             case = self._waiting.popleft()
-            return self._new_task("look", self._paths(case) | {"sensor": self._options.sensor}), case
+            return self._new_task("look", self._inspection(case)), case
         return None
 
     def _to_plan(self, n_workers: int) -> tuple[Task, _RecordingState] | None:
         """Return a planning task, unless all planning has to wait."""
         for case in self._unplanned:
-            settings = next(each for each in case.wanted.values() if self._plans.get(each) is None)
-            if (kind := self._plans.begin(settings)) is not None:
+            settings = next(each for each in case.wanted.values() if self._plans.get(case.kind, each) is None)
+            if (kernels := self._plans.begin(case.kind, settings)) is not None:
                 self._unplanned.remove(case)
-                arguments = {"settings": settings.to_toml(), "warm": kind == "new", **self._shares(n_workers)}
+                arguments = {
+                    "kind": case.kind,
+                    "settings": settings.to_toml(),
+                    "warm": kernels == "new",
+                    **self._shares(n_workers),
+                }
                 return self._new_task("plan", arguments), case
         return None
 
@@ -176,10 +185,19 @@ class Campaign:
         self._n_tasks += 1
         return Task(self._n_tasks, action, arguments)
 
-    def _paths(self, case: _RecordingState) -> dict[str, Any]:
-        far = self._scheduler is not None  # Its workers may have another current folder.
-        path, target = (each.absolute() if far else each for each in (case.found.path, case.target))
-        return {"path": str(path), "target": str(target), "named": case.found.named, "dtype": self._options.dtype}
+    def _inspection(self, case: _RecordingState) -> dict[str, Any]:
+        targets = {"energyscape": case.target, "acoustic_map": map_path(case.target)}
+        return {
+            "path": self._path(case.found.path),
+            "targets": {kind: self._path(target) for kind, target in targets.items()},
+            "named": case.found.named,
+            "dtype": self._options.dtype,
+            "sensor": self._options.sensor,
+        }
+
+    def _path(self, path: Path) -> str:
+        """Return a path for workers; those of a scheduler may have another current folder."""
+        return str(path if self._scheduler is None else path.absolute())
 
     def _shares(self, n_workers: int) -> dict[str, Any]:
         share = 1 if self._scheduler is not None else n_workers
@@ -190,11 +208,13 @@ class Campaign:
         options = self._options
         planned = {}
         for name, settings in case.wanted.items():
-            plan = self._plans.get(settings)
+            plan = self._plans.get(case.kind, settings)
             if isinstance(plan, Accuracy):
                 planned[name] = settings.replace(accuracy=plan).to_toml()
         return {
-            **self._paths(case),
+            "kind": case.kind,
+            "path": self._path(case.found.path),
+            "target": self._path(case.target),
             **self._shares(n_workers),
             **{name: getattr(options, name) for name in TASK_OPTIONS},
             "sensors": planned,
@@ -213,7 +233,8 @@ class Campaign:
             return
         del self._submitted[news.number]
         if task.action == "plan":
-            self._plans.finish(Settings.from_toml(task.arguments["settings"], "settings"), news.result)
+            settings = Settings.from_toml(task.arguments["settings"], "settings")
+            self._plans.finish(task.arguments["kind"], settings, news.result)
             if "by_chance" not in news.result:
                 yield from self._planned(pool, case, news.result)
                 return
@@ -232,8 +253,8 @@ class Campaign:
             yield case.ended("skipped")
             return
         try:
-            self._choose_images(case, reported)
-            made = reported["made"]
+            self._choose_results(case, reported)
+            made = reported["made"][case.kind]
             differs = "" if made is None else difference(made, case.wanted, self._options.mounting)
         except (ErtisError, OSError) as error:
             yield case.ended("failed", error=" ".join(str(error).split()))
@@ -246,19 +267,25 @@ class Campaign:
         else:
             yield from self._advance(case)
 
-    def _choose_images(self, case: _RecordingState, reported: dict[str, Any]) -> None:
-        """Set the settings of each sensor that has images, and the number of images."""
-        for name, text in reported["sensors"].items():
-            recorded = Settings.from_toml(text, f"{case.found.path}: settings")
-            settings = self_contained(_absolute(self._options.settings(recorded)))
-            behaviours = reported["behaviours"][name]
-            n_images = count_images(settings, behaviours)
-            case.measurements += n_images
-            if n_images:  # Otherwise, the sensor has no measurement that a worker could report.
+    def _choose_results(self, case: _RecordingState, reported: dict[str, Any]) -> None:
+        """Set the kind of result, the settings of each sensor that has results, and the number of measurements."""
+        path, behaviours = case.found.path, reported["behaviours"]
+        wanted = {
+            name: self_contained(_absolute(self._options.settings(Settings.from_toml(text, f"{path}: settings"))))
+            for name, text in reported["sensors"].items()
+        }
+        n_images = {name: count_images(settings, behaviours[name]) for name, settings in wanted.items()}
+        case.measurements = sum(n_images.values())
+        if not case.measurements:
+            self._options.require_maps(path)
+            case.kind, case.target, case.wanted = "acoustic_map", map_path(case.target), wanted
+            case.measurements = sum(sum(counts.values()) for counts in behaviours.values())
+            return
+        for name, settings in wanted.items():
+            if n_images[name]:  # Otherwise, the sensor has no measurement that a worker could report.
                 case.wanted[name] = settings
             else:
-                case.notes.append(passive_note(case.found.path, name, 0, sum(behaviours.values())))
-        require_images(case.found.path, case.measurements)
+                case.notes.append(passive_note(path, name, 0, sum(behaviours[name].values())))
 
     def _handle_existing(self, case: _RecordingState, sensors: dict[str, Any]) -> Iterator[Event]:
         """Report an existing output, or examine its processing first if the options request that."""
@@ -279,7 +306,7 @@ class Campaign:
 
     def _advance(self, case: _RecordingState) -> Iterator[Event]:
         """Queue a recording for processing if its plans are known, otherwise for planning."""
-        plans = [self._plans.get(settings) for settings in case.wanted.values()]
+        plans = [self._plans.get(case.kind, settings) for settings in case.wanted.values()]
         failed = [plan for plan in plans if isinstance(plan, str)]
         if failed:
             yield case.ended("failed", error=f"{case.found.path}: {failed[0]}")

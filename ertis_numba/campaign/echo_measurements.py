@@ -84,6 +84,6 @@ def require_images(path: Path, n_images: int) -> None:
     """
     if not n_images:
         raise DataError(
-            f"{path}: all measurements are passive, and become acoustic maps only if a recording is processed alone; "
-            "do that, or give --mode active for images"
+            f"{path}: all measurements are passive and have no images; make acoustic maps, or give --mode active for "
+            "images"
         )

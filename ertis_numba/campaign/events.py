@@ -32,10 +32,10 @@ class RecordingEnded:
     Attributes
     ----------
     recording, output : Path
-        Recording, and its energyscape file.
+        Recording, and its energyscape file or file of acoustic maps.
     outcome : {"made", "kept", "skipped", "failed"}
-        ``kept`` means that the output exists, made with the same settings and versions. ``skipped`` means an
-        energyscape file that was not given by name.
+        ``kept`` means that the output exists, made with the same settings and versions. ``skipped`` means a
+        result of processing that was not given by name.
     error : str
         Reason of a failure in one line; empty otherwise.
     made : dict

@@ -1,14 +1,23 @@
-"""Comparison of an existing energyscape file with the output to be made."""
+"""Comparison of an existing output with the one to be made."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+from ertis_numba.campaign.recordings import ResultKind
 from ertis_numba.errors import DamagedError, ErtisError
 from ertis_numba.geometry import direction_grid, grid_count, self_contained
 from ertis_numba.settings import Accuracy, Settings
-from ertis_numba.storage import EnergyscapeReader, RecordingReader, file_kind, sensor_names
+from ertis_numba.storage import (
+    AcousticMapReader,
+    EnergyscapeReader,
+    RecordingReader,
+    file_kind,
+    open_acoustic_maps,
+    open_energyscapes,
+    sensor_names,
+)
 from ertis_numba.storage.recording import Mounting
 from ertis_numba.storage.schema import software_versions
 
@@ -18,37 +27,30 @@ _AUTOMATIC = (None, "auto")  # Values that let the planner choose.
 _UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)  # Errors of h5py.
 
 
-class _ExistingOutput(EnergyscapeReader):
-    """Reader of an existing output and its provenance."""
+_Reader = EnergyscapeReader | AcousticMapReader
 
-    @property
-    def dtype(self) -> str:
-        """Type of its amplitudes."""
-        return str(self._group["amplitude"].dtype.name)
+_OPENERS: Final[dict[ResultKind, Callable[..., _Reader]]] = {
+    "energyscape": open_energyscapes,
+    "acoustic_map": open_acoustic_maps,
+}
 
-    @property
-    def axes(self) -> str:
-        return _digest(self.azimuth_rad.tobytes(), self.elevation_rad.tobytes())
 
-    @property
-    def mounting(self) -> list[list[float]] | None:
-        """Translation and rotation of the sensor; None if its mounting is unknown."""
-        if self.translation_m is None or self.rotation_xyzw is None:
-            return None
-        return [self.translation_m.tolist(), self.rotation_xyzw.tolist()]
+def _axes(made: _Reader) -> str:
+    return _digest(made.azimuth_rad.tobytes(), made.elevation_rad.tobytes())
 
-    def require_whole(self) -> None:
-        """Refuse images that do not match their checksums."""
-        with self._reading():
-            for index in range(len(self)):
-                self._rows.row(index)
+
+def _mounting(made: _Reader) -> list[list[float]] | None:
+    """Return translation and rotation of the sensor; None if its mounting is unknown."""
+    if made.translation_m is None or made.rotation_xyzw is None:
+        return None
+    return [made.translation_m.tolist(), made.rotation_xyzw.tolist()]
 
 
 def _digest(*parts: bytes) -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
-def inspect_output(target: Path, recording: RecordingReader, dtype: str) -> dict[str, Any] | None:
+def inspect_output(target: Path, recording: RecordingReader, kind: ResultKind, dtype: str) -> dict[str, Any] | None:
     """Return the description of an existing output of a recording: settings and axes of its sensors.
 
     Return None if the file does not exist. ``differs`` is the reason why the file is not this output, or that it is
@@ -57,39 +59,41 @@ def inspect_output(target: Path, recording: RecordingReader, dtype: str) -> dict
     if not target.exists():
         return None
     try:
-        found, made_of = _read(target, recording, dtype)
+        found, made_of = _read(target, recording, kind, "float32" if kind == "acoustic_map" else dtype)
     except DamagedError:
         return {"differs": "is damaged"}
     except (ErtisError, *_UNREADABLE):
-        return {"differs": "is not a readable energyscape file"}
+        return {
+            "differs": f"is not a readable {'energyscape file' if kind == 'energyscape' else 'file of acoustic maps'}"
+        }
     if not found["differs"] and made_of != recording.sha256():  # Hashing reads the whole file, so it comes last.
         return {"differs": "was made from another file of the same recording"}
     return found
 
 
-def _read(target: Path, recording: RecordingReader, dtype: str) -> tuple[dict[str, Any], object]:
+def _read(target: Path, recording: RecordingReader, kind: ResultKind, dtype: str) -> tuple[dict[str, Any], object]:
     """Return the description of a file, and the SHA-256 of the file that it was made from."""
     if file_kind(target) == "recording":
         return {"differs": "is a recording", "recording": True}, None
     sensors: dict[str, Any] = {}
     made_of: object = None
     for name in sensor_names(target):
-        with _ExistingOutput(target, sensor=name) as made:
+        with _OPENERS[kind](target, sensor=name) as made:
             differs = _differs(made, recording, dtype)
             if differs:
                 return {"differs": differs}, None
-            made.require_whole()
+            made.check_rows()
             made_of = made.attributes.get("recording_sha256")
             sensors[name] = {
                 "settings": made.settings.to_toml(),
-                "axes": made.axes,
+                "axes": _axes(made),
                 "measurements": len(made),
-                "mounting": made.mounting,
+                "mounting": _mounting(made),
             }
     return {"differs": "", "sensors": sensors}, made_of
 
 
-def _differs(made: _ExistingOutput, recording: RecordingReader, dtype: str) -> str:
+def _differs(made: _Reader, recording: RecordingReader, dtype: str) -> str:
     if made.attributes.get("recording_uuid") != recording.uuid:
         return "was made from another recording"
     for name, wanted in software_versions().items():

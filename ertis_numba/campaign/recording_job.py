@@ -22,9 +22,9 @@ from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.wavefronts import plane_wave_error_db
 from ertis_numba.storage import EnergyscapeWriter, open_recording
 
-__all__ = ["RecordingJob", "check_recording", "prepare_recording"]
+__all__ = ["Pipelines", "RecordingJob", "check_recording", "prepare_recording"]
 
-_Pipelines = Callable[[Sequence[Settings]], AbstractContextManager[Sequence[Pipeline]]]
+Pipelines = Callable[[Sequence[Settings]], AbstractContextManager[Sequence[Pipeline]]]
 _Show = Callable[[str, dict[str, Any]], None]
 _Checks = tuple[str, CallMatch | None]
 
@@ -73,7 +73,7 @@ def prepare_recording(
     *,
     sensors: Sequence[str],
     settings: Mapping[str, Settings] | None = None,
-    pipelines: _Pipelines,
+    pipelines: Pipelines,
     max_bytes: float | None = None,
     warn: Callable[[str], None] = lambda _: None,
     show: _Show = lambda *_: None,
@@ -102,7 +102,7 @@ def prepare_recording(
 
     Yields
     ------
-    Making
+    RecordingJob
         Recording that is ready to be processed.
 
     Raises
@@ -150,7 +150,7 @@ def check_recording(
     options: CampaignOptions,
     *,
     settings: Mapping[str, Settings],
-    pipelines: _Pipelines,
+    pipelines: Pipelines,
     warn: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Check every sensor of a recording as `prepare_recording` does, and return the results about plans; write nothing.

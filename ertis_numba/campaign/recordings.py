@@ -5,14 +5,17 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final, Literal
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.storage import is_map
 
-__all__ = ["SUFFIX", "RecordingFile", "find_recordings", "output_paths"]
+__all__ = ["RecordingFile", "ResultKind", "find_recordings", "map_path", "output_paths"]
 
-SUFFIX = ".energy.h5"
-"""Suffix of a recording's energyscape file."""
+ResultKind = Literal["energyscape", "acoustic_map"]
+
+_SUFFIX: Final = ".energy.h5"
+_MAP_SUFFIX: Final = ".acoustic.h5"
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +26,8 @@ class RecordingFile:
     ----------
     path : Path
     named : bool
-        True for a file given by name, by default True. Files found by a pattern or in a folder may be energyscape
-        files, which are skipped.
+        True for a file given by name, by default True. Files found by a pattern or in a folder may be results of
+        processing, which are skipped.
     """
 
     path: Path
@@ -81,7 +84,9 @@ def _is_candidate(path: Path) -> bool:
 
 
 def output_paths(recordings: Sequence[RecordingFile], folder: Path) -> list[Path]:
-    """Return the output file in ``folder`` for each recording.
+    """Return the energyscape file in ``folder`` for each recording.
+
+    Recordings without images have files of acoustic maps instead; see `map_path`.
 
     Raises
     ------
@@ -93,21 +98,27 @@ def output_paths(recordings: Sequence[RecordingFile], folder: Path) -> list[Path
         raise ArgumentError(f"output {folder} is a file, but several recordings need a folder; give another name")
     if not folder.parent.is_dir():
         raise ArgumentError(f"output {folder}: folder {folder.parent} does not exist; create it or give another")
-    # Files found by patterns may be energyscape files.
+    # Files found by patterns may be results of processing.
     named = {os.path.realpath(found.path) for found in recordings if found.named}
     taken: dict[str, Path] = {}
     targets = []
     for found in recordings:
-        target = folder / found.path.with_suffix(SUFFIX).name
+        target = folder / found.path.with_suffix(_SUFFIX).name
         name = os.path.normcase(target)
         if name in taken:
             raise ArgumentError(
                 f"{taken[name]} and {found.path} would both become {target}; process them into separate folders"
             )
-        if os.path.realpath(target) in named:
-            raise ArgumentError(
-                f"{found.path} would become {target}, which is itself to be processed; give another folder"
-            )
+        for output in (target, map_path(target)):
+            if os.path.realpath(output) in named:
+                raise ArgumentError(
+                    f"{found.path} would become {output}, which is itself to be processed; give another folder"
+                )
         taken[name] = found.path
         targets.append(target)
     return targets
+
+
+def map_path(target: Path) -> Path:
+    """Return the file of acoustic maps that replaces an energyscape file of `output_paths`."""
+    return target.with_name(f"{target.name.removesuffix(_SUFFIX)}{_MAP_SUFFIX}")

@@ -1,4 +1,4 @@
-"""Actions of workers: inspect a recording, plan its processing, process it, or check existing energyscapes.
+"""Actions of workers: inspect a recording, plan its processing, process it, or check an existing output.
 
 Arguments and results can be represented in JSON, so that an action runs in any process with access to the files.
 """
@@ -8,18 +8,24 @@ import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
 
 from ertis_numba import kernels
 from ertis_numba.atomic_files import remedy
 from ertis_numba.campaign.existing_output import inspect_output
 from ertis_numba.campaign.folder import final_name
-from ertis_numba.campaign.recording_job import check_recording, prepare_recording
+from ertis_numba.campaign.map_job import MapJob, check_maps, prepare_maps
+from ertis_numba.campaign.recording_job import Pipelines, RecordingJob, check_recording, prepare_recording
 from ertis_numba.campaign.tasks import TASK_OPTIONS, CampaignOptions
 from ertis_numba.errors import ErtisError
+from ertis_numba.frames import Measurement
+from ertis_numba.passive import AcousticCamera
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.costs import PlanCosts
@@ -64,7 +70,8 @@ def _one_line(error: OSError | MemoryError) -> str:
 def _inspect(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Return sensors, settings and measurements of a recording, and a description of its existing output.
 
-    ``behaviours`` has the number of measurements of each sensor by their behaviour.
+    ``behaviours`` has the number of measurements of each sensor by their behaviour. ``made`` has the description by
+    kind of result.
     """
     path = Path(arguments["path"])
     if not arguments["named"] and file_kind(path) != "recording":
@@ -77,7 +84,10 @@ def _inspect(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
             "behaviours": {
                 recording.sensor: Counter(stamp.behaviour for stamp in recording.stamps()) for recording in recordings
             },
-            "made": inspect_output(Path(arguments["target"]), recordings[0], arguments["dtype"]),
+            "made": {
+                kind: inspect_output(Path(target), recordings[0], kind, arguments["dtype"])
+                for kind, target in arguments["targets"].items()
+            },
         }
 
 
@@ -85,6 +95,8 @@ def _plan(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Complete open settings; ``warm`` also compiles the kernels for later use."""
     settings = Settings.from_toml(arguments["settings"], "settings")
     threads = _threads(arguments, settings)
+    if arguments["kind"] == "acoustic_map":
+        return _plan_maps(settings, arguments["device"], threads, warm=arguments["warm"])
     if not arguments["warm"]:
         loaded = kernels.load(arguments["device"])
         planned = planner.complete(settings, loaded, threads=loaded.max_threads, plan=arguments["plan"])
@@ -98,19 +110,27 @@ def _plan(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     return {"settings": planned.to_toml(), "device": device}
 
 
+def _plan_maps(settings: Settings, device: str, threads: int | None, *, warm: bool) -> dict[str, Any]:
+    """Return the settings of acoustic maps as they are; ``warm`` compiles the kernels with a map of silence."""
+    with AcousticCamera(settings, device, threads) as camera:
+        if warm:
+            words = sample_format(settings)
+            camera.process(Measurement(np.zeros(words.shape, words.dtype), camera.settings))
+        return {"settings": settings.to_toml(), "device": camera.device}
+
+
 def _make(arguments: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any]:
-    """Write the energyscape file of a recording."""
-    options, how = _processing_arguments(arguments)
+    """Write the energyscape file, or the file of acoustic maps, of a recording."""
+    options, settings, pipelines = _processing_arguments(arguments)
     warnings: list[str] = []
-    with prepare_recording(
-        Path(arguments["path"]),
-        Path(arguments["target"]),
-        options,
-        sensors=list(how["settings"]),
-        max_bytes=arguments["max_bytes"],
-        warn=warnings.append,
-        **how,
-    ) as work:
+    paths = Path(arguments["path"]), Path(arguments["target"])
+    shared: dict[str, Any] = {"sensors": list(settings), "settings": settings, "warn": warnings.append}
+    prepared: AbstractContextManager[MapJob | RecordingJob]
+    if arguments["kind"] == "acoustic_map":
+        prepared = prepare_maps(*paths, options, **shared)
+    else:
+        prepared = prepare_recording(*paths, options, **shared, pipelines=pipelines, max_bytes=arguments["max_bytes"])
+    with prepared as work:
         with closing(work.run()) as steps:
             for done in steps:
                 notify(done)
@@ -119,18 +139,23 @@ def _make(arguments: Mapping[str, Any], notify: ReportProgress) -> dict[str, Any
 
 def _check(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Return the warnings and results that processing would give, for a recording with an existing output."""
-    options, how = _processing_arguments(arguments)
+    options, settings, pipelines = _processing_arguments(arguments)
     warnings: list[str] = []
-    return {**check_recording(Path(arguments["path"]), options, warn=warnings.append, **how), "warnings": warnings}
+    path, found = Path(arguments["path"]), {}
+    if arguments["kind"] == "acoustic_map":
+        check_maps(path, options, settings=settings, warn=warnings.append)
+    else:
+        found = check_recording(path, options, settings=settings, pipelines=pipelines, warn=warnings.append)
+    return {**found, "warnings": warnings}
 
 
-def _processing_arguments(arguments: Mapping[str, Any]) -> tuple[CampaignOptions, dict[str, Any]]:
+def _processing_arguments(arguments: Mapping[str, Any]) -> tuple[CampaignOptions, dict[str, Settings], Pipelines]:
     """Return the options, the settings of each sensor and the source of pipelines."""
     settings = {name: Settings.from_toml(text, f"settings of {name}") for name, text in arguments["sensors"].items()}
     threads = _threads(arguments, next(iter(settings.values())))
-    options = CampaignOptions(**{name: arguments[name] for name in TASK_OPTIONS}, threads=threads)
-    pipelines = functools.partial(_pipelines, device=arguments["device"], threads=threads)
-    return options, {"settings": settings, "pipelines": pipelines}
+    shared = {name: arguments[name] for name in (*TASK_OPTIONS, "device")}
+    options = CampaignOptions(**shared, threads=threads)
+    return options, settings, functools.partial(_pipelines, device=arguments["device"], threads=threads)
 
 
 def _threads(arguments: Mapping[str, Any], settings: Settings) -> int | None:

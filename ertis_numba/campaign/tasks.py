@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Literal, Protocol, TypeAlias
 
 import msgspec
 
 from ertis_numba import checks
+from ertis_numba.errors import DataError
 from ertis_numba.settings import Settings
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.storage.recording import Mounting
@@ -40,19 +42,19 @@ class CampaignOptions:
     sensor : str, optional
         Name of the only sensor to process; all sensors by default.
     dtype : {"float32", "float16"}
-        Type of the stored amplitudes, by default float32.
+        Type of the stored amplitudes of images, by default float32.
     device : {"auto", "cpu", "cuda", "numpy"}
-        Device of the pipelines, by default ``auto``.
+        Compute device, by default ``auto``.
     plan : {"nominal", "measured"}
         Costs by which plans are chosen, as for `Pipeline`.
     threads : int, optional
         Number of threads per worker; by default, the workers share the cores.
     batch : int
-        Number of measurements per batch, by default 8.
+        Number of measurements per batch of images, by default 8.
     strict : bool
         Refuse recordings with faulty microphones instead of warning.
     overwrite : bool
-        Replace existing energyscape files that are damaged, or that come from another recording, other settings or
+        Replace existing outputs that are damaged, or that come from another recording, other settings or
         other versions. A complete file from the same recording, settings and versions is always kept.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Mountings by name of the sensor, instead of those in the recording.
@@ -81,6 +83,21 @@ class CampaignOptions:
         checks.choice("plan", self.plan, PLAN_COSTS)
         checks.choice("device", self.device, ("auto", "cpu", "cuda", "numpy"))
         checks.integer("batch", self.batch, 1)
+
+    def require_maps(self, path: Path) -> None:
+        """Refuse options that need images, for a recording that becomes acoustic maps.
+
+        Raises
+        ------
+        DataError
+            ``explain`` or ``verify`` is set.
+        """
+        for name in ("explain", "verify"):
+            if getattr(self, name):
+                raise DataError(
+                    f"{path}: all measurements are passive and become acoustic maps, which have no error budget; leave "
+                    f"out --{name}, or give --mode active for images"
+                )
 
     @property
     def examines_existing(self) -> bool:

@@ -27,14 +27,30 @@ class Loudest(NamedTuple):
         Edges of the band in hertz.
     azimuth_rad, elevation_rad : float
         Direction in the sensor frame.
-    level_dbfs : float
-        Level at the array in dBFS.
+    level_dbfs : float or None
+        Level at the array in dBFS; None for the method ``music``.
+    level_db : float or None
+        Sound pressure level at the array in dB re 20 µPa; None if the sensitivity of the microphones is unknown.
     """
 
     band_hz: tuple[float, float]
     azimuth_rad: float
     elevation_rad: float
-    level_dbfs: float
+    level_dbfs: float | None
+    level_db: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the direction in degrees and the levels for JSON; levels are null if they are unknown or infinite."""
+        return {
+            "band_hz": [round(edge_hz, 3) for edge_hz in self.band_hz],
+            "azimuth_deg": round(math.degrees(self.azimuth_rad), 4),
+            "elevation_deg": round(math.degrees(self.elevation_rad), 4),
+            **{name: _rounded(getattr(self, name)) for name in ("level_dbfs", "level_db")},
+        }
+
+
+def _rounded(level_db: float | None) -> float | None:
+    return None if level_db is None or not math.isfinite(level_db) else round(level_db, 4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,16 +169,17 @@ class AcousticMap(DegreesFromRadians):
         -------
         list of Loudest
         """
-        level_dbfs = self.level_dbfs
-        places = np.argmax(self.power, axis=0)
+        levels = (self.level_dbfs, self.level_db) if self.has_level else (None, None)
         return [
             Loudest(
                 (float(low_hz), float(high_hz)),
                 float(self.azimuth_rad[place]),
                 float(self.elevation_rad[place]),
-                float(level_dbfs[place, band]),
+                *(None if each is None else float(each[place, band]) for each in levels),
             )
-            for band, (place, (low_hz, high_hz)) in enumerate(zip(places, self.band_hz, strict=True))
+            for band, (place, (low_hz, high_hz)) in enumerate(
+                zip(np.argmax(self.power, axis=0), self.band_hz, strict=True)
+            )
         ]
 
     def replace(self, **changes: Any) -> Self:

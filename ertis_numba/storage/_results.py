@@ -147,6 +147,23 @@ class ResultReader(ResultFile, FileReader[Result], DegreesFromRadians):
     rotation_xyzw: NDArray[np.float64] | None
     trajectory: Trajectory | None
 
+    @property
+    def dtype(self) -> str:
+        """Name of the type in which the file stores rows."""
+        return str(self._group[self._data].dtype.name)
+
+    def check_rows(self) -> None:
+        """Read all rows.
+
+        Raises
+        ------
+        DamagedError
+            A row does not match its CRC-32.
+        """
+        with self._reading():
+            for index in range(len(self)):
+                self._rows.row(index)
+
     def _load(self) -> None:
         for name, field in self._axes.items():
             setattr(self, field, np.asarray(self._group[name][:]))

@@ -1,0 +1,221 @@
+"""Processing of one recording to its file of acoustic maps, the same in any process."""
+
+import statistics
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ertis_numba.campaign.sensor_processing import describe_faults, require_same_air
+from ertis_numba.campaign.tasks import CampaignOptions
+from ertis_numba.errors import DataError
+from ertis_numba.frames import AcousticMap
+from ertis_numba.passive import AcousticCamera
+from ertis_numba.settings import Settings
+from ertis_numba.storage import AcousticMapWriter, RecordingReader, open_recording
+
+__all__ = ["MapJob", "check_maps", "prepare_maps"]
+
+_Warn = Callable[[str], None]
+
+
+class MapJob:
+    """A recording whose acoustic maps are ready to be computed; nothing is written yet."""
+
+    def __init__(
+        self,
+        recordings: Sequence[RecordingReader],
+        cameras: Sequence[AcousticCamera],
+        writer: AcousticMapWriter,
+        warn: _Warn,
+    ) -> None:
+        self._writer, self._device = writer, cameras[0].device
+        self._runs = [_MapsOfSensor(*pair, warn) for pair in zip(recordings, cameras, strict=True)]
+        self.measurements = sum(map(len, recordings))
+        """Number of measurements."""
+
+    def run(self) -> Generator[int]:
+        """Write the file, and yield the number of processed measurements; closed early, it leaves no file."""
+        done = 0
+        with self._writer:
+            for run in self._runs:
+                for _ in run.write(self._writer):
+                    done += 1
+                    yield done
+
+    def report(self) -> dict[str, Any]:
+        """Return the report of ``--json``; entries of a single sensor are repeated at the top level."""
+        rows = [run.report() for run in self._runs]
+        outside = ("directions", "bands", "loudest") if len(rows) == 1 else ()
+        return {
+            "kind": "acoustic_map",
+            "measurements": self.measurements,
+            "maps": sum(row["maps"] for row in rows),
+            **{name: rows[0][name] for name in outside},
+            "device": self._device,
+            "median_ms": round(statistics.median(time_ms for run in self._runs for time_ms in run.times_ms), 3),
+            "sensors": rows,
+        }
+
+
+class _MapsOfSensor:
+    """Acoustic maps of one sensor, and the mean of their powers."""
+
+    def __init__(self, recording: RecordingReader, camera: AcousticCamera, warn: _Warn) -> None:
+        self._recording, self._camera, self._warn = recording, camera, warn
+        self.times_ms: list[float] = []
+        self._n_maps, self._masked_s = 0, 0.0
+        self._sum: Any = 0.0  # of powers, weighted by the measurements of their maps
+        self._last: AcousticMap | None = None
+
+    def write(self, writer: AcousticMapWriter) -> Generator[None]:
+        """Process the recording and write its maps; yield after each measurement.
+
+        Raises
+        ------
+        DataError
+            The air of a measurement differs from that of the recording, and no settings replace it.
+        """
+        recording, camera = self._recording, self._camera
+        settings, n_left, elapsed_s = camera.settings, len(recording), 0.0
+        as_recorded = settings.air == recording.settings.air
+        for measurement in recording:
+            if as_recorded:
+                require_same_air(measurement, settings)
+            start_s = time.perf_counter()
+            camera.add(replace(measurement, settings=settings))
+            n_left -= 1
+            is_complete = not n_left or camera.n_measurements == settings.passive.averages
+            found = camera.map() if is_complete else None
+            elapsed_s += time.perf_counter() - start_s
+            if found is not None:
+                writer.write(found)
+                self._add(found, elapsed_s)
+                camera.reset()
+                elapsed_s = 0.0
+            yield
+        if self._masked_s:
+            n_emitted = sum(stamp.behaviour == "active" for stamp in recording.stamps())
+            self._warn(
+                f"{recording.path}: sensor {recording.sensor} emitted its call in {n_emitted} of {len(recording)} "
+                f"measurements; the first {1e3 * self._masked_s:.1f} ms of each are left out, but maps contain its "
+                "echoes"
+            )
+
+    def _add(self, found: AcousticMap, elapsed_s: float) -> None:
+        """Add a map to the mean, and the time that its measurements took."""
+        self._last = found
+        self.times_ms += [1000 * elapsed_s / found.n_measurements] * found.n_measurements
+        self._n_maps += 1
+        self._masked_s = max(self._masked_s, found.masked_s)
+        self._sum = self._sum + found.n_measurements * found.power.astype(np.float64)
+
+    def report(self) -> dict[str, Any]:
+        """Return the report of ``--json``; ``loudest`` is that of the mean over all measurements."""
+        assert self._last is not None  # noqa: S101  a recording has at least one measurement
+        mean = self._last.replace(power=np.asarray(self._sum / len(self._recording), np.float32))
+        return {
+            "sensor": self._recording.sensor,
+            "measurements": len(self._recording),
+            "maps": self._n_maps,
+            "directions": len(mean.azimuth_rad),
+            "bands": len(mean.band_hz),
+            "median_ms": round(statistics.median(self.times_ms), 3),
+            "loudest": [each.as_dict() for each in mean.loudest()],
+        }
+
+
+@contextmanager
+def prepare_maps(
+    path: Path,
+    target: Path,
+    options: CampaignOptions,
+    *,
+    sensors: Sequence[str],
+    settings: Mapping[str, Settings] | None = None,
+    warn: _Warn = lambda _: None,
+) -> Generator[MapJob]:
+    """Open a recording and check every sensor, so that errors are reported before any processing.
+
+    Parameters
+    ----------
+    path, target : Path
+        Recording, and its file of acoustic maps.
+    options : CampaignOptions
+        Options for processing; those of images have no effect.
+    sensors : sequence of str
+        Names of the sensors to process.
+    settings : mapping of str to Settings, optional
+        Settings for each sensor. By default, ``options.settings`` derives them from the recorded settings.
+    warn : callable
+        Called with a line for each sensor that has faulty microphones, and after the processing of a sensor that
+        emitted its call.
+
+    Yields
+    ------
+    MapJob
+        Recording that is ready to be processed.
+
+    Raises
+    ------
+    DataError
+        Microphones are faulty and ``options.strict`` is set.
+    ErtisError
+        The recording, its settings or the target is invalid.
+    """
+    with ExitStack() as stack:
+        recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in sensors]
+        mounting = {name: place for name, place in (options.mounting or {}).items() if name in sensors}
+        writer = AcousticMapWriter(target, recording=recordings, mounting=mounting, overwrite=options.overwrite)
+        cameras = [
+            stack.enter_context(
+                AcousticCamera(
+                    options.settings(recording.settings) if settings is None else settings[recording.sensor],
+                    options.device,
+                    options.threads,
+                )
+            )
+            for recording in recordings
+        ]
+        for recording, camera in zip(recordings, cameras, strict=True):
+            _check_sensor(recording, camera.settings, options, warn)
+        yield MapJob(recordings, cameras, writer, warn)
+
+
+def check_maps(
+    path: Path, options: CampaignOptions, *, settings: Mapping[str, Settings], warn: _Warn = lambda _: None
+) -> None:
+    """Check every sensor of a recording as `prepare_maps` does; write nothing.
+
+    Parameters
+    ----------
+    path : Path
+        Recording.
+    options : CampaignOptions
+    settings : mapping of str to Settings
+        Settings with which its maps were made, by sensor.
+    warn : callable
+        As for `prepare_maps`.
+
+    Raises
+    ------
+    DataError
+        As for `prepare_maps`.
+    """
+    for name, each in settings.items():
+        with open_recording(path, sensor=name) as recording:
+            _check_sensor(recording, each, options, warn)
+
+
+def _check_sensor(recording: RecordingReader, settings: Settings, options: CampaignOptions, warn: _Warn) -> None:
+    """Report faulty microphones, or refuse them."""
+    name = f"{recording.path}: sensor {recording.sensor}"
+    faults = describe_faults(name, replace(recording[0], settings=settings))
+    if faults and options.strict:
+        raise DataError(faults)
+    if faults:
+        warn(faults)
