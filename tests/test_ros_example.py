@@ -1,8 +1,9 @@
-"""The ROS 2 example stops a simulated robot in front of a simulated wall."""
+"""The ROS 2 examples stop a simulated robot in front of a simulated wall, and store its odometry."""
 
 import importlib.util
 import itertools
 import os
+import queue
 import signal
 import struct
 import subprocess
@@ -11,20 +12,25 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import ertis_numba as ertis
+from ertis_numba.network.central_node import Archive
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.ros import Participant, PublishingSettings, RosPublisher
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.simulation import Scene, Sensor, Wall
 from ertis_numba.simulation.render import render
-from tests.journals import ENVIRONMENT
+from tests.central import Node as CentralTestNode, running
+from tests.journals import ENVIRONMENT, entries
 from tests.ros_topics import await_subscribers, subscribed
 
 pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
 pytest.importorskip("cyclonedds")
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "6_stop_in_ros.py"
+POSES = EXAMPLE.with_name("7_poses_from_ros.py")
 DOMAIN = 1 + (os.getpid() + 100) % 200
 START_M, STOP_M, STEP_S = 2.0, 0.8, 0.4
 MAX_STEPS = 40
@@ -77,6 +83,67 @@ def test_robot_stops_in_front_of_a_wall():
     assert near[-1] == 0
     assert free[-1] > 0
     assert silent[-1] == 0
+
+
+def test_odometry_of_a_robot_is_stored_with_the_measurements(tmp_path):
+    """Poses of ROS 2 reach the recording of a central node, with their covariances."""
+    measured = entries(3)
+    times_ns = [entry.measurement.stamp.timestamp_ns for entry in measured]
+    poses = ertis.Trajectory(
+        [times_ns[0] - 10**8, times_ns[-1] + 10**8],
+        [[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]],
+        [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.6, 0.8]],
+        [np.eye(6), 2 * np.eye(6)],
+        "odometry",
+    )
+    environment = ENVIRONMENT | {"ROS_DOMAIN_ID": str(DOMAIN), "ROS_LOG_DIR": tempfile.gettempdir()}
+    arrived = queue.SimpleQueue()
+    archive = Archive(tmp_path)
+    archive.offer_pose = lambda pose: (Archive.offer_pose(archive, pose), arrived.put(pose))
+    with (
+        running(archive=archive) as central,
+        Participant(domain=DOMAIN) as participant,
+        subprocess.Popen([sys.executable, POSES, "/odom", central.address, "left"], env=environment) as node,
+    ):
+        try:
+            topic = participant.topic("/odom", "nav_msgs/msg/Odometry")
+            await_subscribers([topic])
+            for time_ns, place, turn, covariance in zip(
+                poses.time_ns.tolist(), poses.position_m, poses.rotation_xyzw, poses.covariance, strict=True
+            ):
+                topic.publish(odometry_of(time_ns, place.tolist(), turn.tolist(), covariance.ravel().tolist()))
+            for _ in poses.time_ns:
+                arrived.get(timeout=30.0)
+            node.send_signal(signal.SIGINT)
+            assert node.wait(30) == 0
+        finally:
+            node.kill()
+        with CentralTestNode(central.address) as sensor:
+            sensor.hello()
+            sensor.measure(*measured)
+            sensor.hear_settled(12)
+    (path,) = tmp_path.glob("*.h5")
+    with ertis.open_recording(path) as recording:
+        found, wanted = recording.trajectory, poses.at(times_ns)
+    assert found.source == "odometry"
+    for part in ("time_ns", "position_m", "rotation_xyzw", "covariance"):
+        np.testing.assert_allclose(getattr(found, part), getattr(wanted, part), rtol=1e-12)
+
+
+def odometry_of(time_ns, place, turn, covariance):
+    """Message of the odometry of a robot, as a dict."""
+    stamp = {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
+    pose = {
+        "position": dict(zip("xyz", place, strict=True)),
+        "orientation": dict(zip("xyzw", turn, strict=True)),
+    }
+    none = {"linear": dict.fromkeys("xyz", 0.0), "angular": dict.fromkeys("xyz", 0.0)}
+    return {
+        "header": {"stamp": stamp, "frame_id": "odom"},
+        "child_frame_id": "base_link",
+        "pose": {"pose": pose, "covariance": covariance},
+        "twist": {"twist": none, "covariance": [0.0] * 36},
+    }
 
 
 def velocities(subscriber, *, until_s):

@@ -399,3 +399,51 @@ def test_trajectory_of_a_platform_refuses_recordings_of_different_drives(tmp_pat
     ertis.add_poses(files[1], drive().replace(position_m=drive().position_m + 1), replace=True)
     with pytest.raises(ArgumentError, match=r"front.h5 and .*left.h5 have different poses at \d+ ns; give one traj"):
         platform_trajectory(files)
+
+
+def test_measurements_outside_a_trajectory_with_gaps_have_no_pose(tmp_path):
+    """The poses cover all measurements but the second; files of images, copies and both sensors keep this."""
+    measured = sensors("left", "right")
+    early = drive(end_ns=TIMES_NS[0] + 1)
+    late = drive(begin_ns=TIMES_NS[1] + SECOND_NS, end_ns=TIMES_NS[1] + 9 * SECOND_NS)
+    measured = [
+        restamped(each, timestamp_ns=each.stamp.timestamp_ns + (2 * SECOND_NS if number % 3 == 2 else 0))
+        for number, each in enumerate(measured)
+    ]
+    columns = {
+        name: np.concatenate([getattr(early, name), getattr(late, name)])
+        for name in ("time_ns", "position_m", "rotation_xyzw", "covariance")
+    }
+    given = ertis.Trajectory(**columns, source="application", max_gap_s=1.0)
+    path = write_recording(tmp_path / "rec.h5", measured, poses=given)
+    covered_ns = [each.stamp.timestamp_ns for each in measured[:3] if given.covers([each.stamp.timestamp_ns])[0]]
+    assert len(covered_ns) == 2
+    with h5py.File(path) as file:
+        for name in ("pose_position", "pose_rotation", "pose_covariance"):
+            column = file["sensors/left"][name][:]
+            assert np.isnan(column[1]).all()
+            assert np.isfinite(column[[0, 2]]).all()
+    for sensor in ("left", "right"):
+        with open_recording(path, sensor=sensor) as recording:
+            same_poses(recording.trajectory, given.at(covered_ns))
+            assert recording.trajectory.max_gap_s == 1.0
+            copy = write_recording(tmp_path / f"{sensor}.h5", recording)
+            with open_recording(copy) as copied:
+                same_poses(copied.trajectory, recording.trajectory)
+    assert recorded_trajectory(path).max_gap_s == 1.0
+    assert not recorded_trajectory(path).covers([measured[1].stamp.timestamp_ns])[0]
+    assert all(report.is_intact for report in verify(path))
+
+
+def test_part_of_a_pose_cannot_be_missing(tmp_path):
+    path = write_recording(tmp_path / "rec.h5", noise(), poses=drive())
+    with h5py.File(path, "r+") as file:
+        file["sensors/eRTIS-7/pose_position"][1, 0] = np.nan
+    with pytest.raises(DamagedError, match="poses of sensor eRTIS-7 are damaged"):
+        open_recording(path)
+
+
+def test_poses_that_cover_no_measurement_are_refused(plain):
+    far = drive(begin_ns=TIMES_NS[-1] + 9 * SECOND_NS, end_ns=TIMES_NS[-1] + 19 * SECOND_NS).replace(max_gap_s=1.0)
+    with pytest.raises(ArgumentError, match="no measurement of sensor left is within the poses; give poses for this"):
+        ertis.add_poses(plain, far)

@@ -85,6 +85,9 @@ def test_replace_changes_a_field():
 
 
 REFUSED = {
+    "gap": ({"max_gap_s": 0.0}, "max_gap_s is 0; give a number above 0"),
+    "huge covariance": ({"covariance": np.full((2, 6, 6), 1e17)}, r"covariance reaches 1e\+17; give square metres"),
+    "huge quaternion": ({"rotation_xyzw": [[1e300] * 4] * 2}, r"rotation_xyzw has length inf at \[0\]"),
     "no pose": ({"time_ns": []}, "time_ns has no time"),
     "times": ({"time_ns": [0, 0]}, "time_ns does not increase: 0 at "),
     "seconds": ({"time_ns": [0.5, 1.5]}, "give one dimension of whole nanoseconds"),
@@ -141,3 +144,33 @@ def test_covariances_may_be_singular_and_rounded():
     draws = np.random.default_rng(1).normal(size=(6, 3))
     rounded = (draws @ draws.T).astype(np.float32)
     assert ertis.Trajectory([1], [[0, 0, 0]], [IDENTITY], [rounded]).covariance.shape == (1, 6, 6)
+
+
+def test_long_intervals_between_poses_are_not_interpolated():
+    """Poses every 0.1 s, without those between 0.5 s and 1.5 s, and a single one at 3 s."""
+    whole = steady([1.0, 0.0, 0.0], np.array([0.0, 0.0, 0.5]), n_poses=31)
+    kept = np.r_[0:6, 15:21, 30]
+    columns = {name: getattr(whole, name)[kept] for name in ("time_ns", "position_m", "rotation_xyzw")}
+    holes = ertis.Trajectory(**columns, max_gap_s=0.9)
+    times_ns = START_NS + 1_000_000 * np.arange(0, 3001, 50)
+    wanted = (times_ns <= START_NS + 500_000_000) | (times_ns >= START_NS + 1_500_000_000)
+    wanted &= (times_ns <= START_NS + 2_000_000_000) | (times_ns == START_NS + 3_000_000_000)
+    assert holes.covers(times_ns).tolist() == wanted.tolist()
+    assert holes.replace(max_gap_s=None).covers(times_ns).all()
+    found = holes.at(times_ns[wanted])
+    assert found.max_gap_s == 0.9
+    np.testing.assert_allclose(found.position_m, whole.at(times_ns[wanted]).position_m, rtol=0, atol=1e-12)
+    with pytest.raises(
+        ertis.ArgumentError, match=r"1 of 1 times .* 0\.000 s to .*, except 2 intervals longer than 0\.9 s"
+    ):
+        holes.replace(time_ns=holes.time_ns - START_NS).at([1_000_000_000])
+
+
+def test_velocity_beside_a_long_interval_is_one_sided():
+    """The platform drives at 1 m/s, then jumps by 9 m while there are no poses."""
+    time_ns = START_NS + 100_000_000 * np.array([0, 1, 2, 12, 13, 14])
+    x_m = [0.0, 0.1, 0.2, 9.2, 9.3, 9.4]
+    given = ertis.Trajectory(time_ns, [[x, 0, 0] for x in x_m], [IDENTITY] * 6, max_gap_s=0.5)
+    np.testing.assert_allclose(given.velocity_at(time_ns)[0][:, 0], 1.0, rtol=1e-9)
+    alone = given.replace(max_gap_s=0.01)  # No interval is short enough, so that all count.
+    np.testing.assert_array_equal(alone.velocity_at(time_ns)[0], given.replace(max_gap_s=None).velocity_at(time_ns)[0])

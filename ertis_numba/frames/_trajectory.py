@@ -39,12 +39,15 @@ class Trajectory:
         PoseWithCovariance of ROS. None if it is unknown.
     source : str, default ""
         Origin of the poses, such as "scene", "file", "application" or "odometry".
+    max_gap_s : float or None, default None
+        Longest interval between two poses for an interpolation between them, in seconds. There is no pose in longer
+        intervals. None allows any.
 
     Raises
     ------
     ArgumentError
         The shapes do not match, a number is not finite, the times do not increase, or a quaternion is not of unit
-        length, or a covariance is not symmetric and positive semidefinite.
+        length, or a covariance is not symmetric and positive semidefinite, or the longest interval is not above zero.
 
     Examples
     --------
@@ -60,6 +63,7 @@ class Trajectory:
     rotation_xyzw: NDArray[np.float64]
     covariance: NDArray[np.float64] | None = None
     source: str = ""
+    max_gap_s: float | None = None
 
     def __post_init__(self) -> None:
         time_ns = _times("time_ns", self.time_ns)
@@ -74,7 +78,8 @@ class Trajectory:
                 "sort the poses by time, and give one for each time"
             )
         rotation = _numbers("rotation_xyzw", self.rotation_xyzw, (n_poses, 4))
-        norms = np.linalg.norm(rotation, axis=1)
+        with np.errstate(over="ignore"):
+            norms = np.linalg.norm(rotation, axis=1)
         wrong = np.flatnonzero(np.abs(norms - 1) > _MAX_NORM_ERROR)
         if wrong.size:
             raise ArgumentError(
@@ -85,6 +90,8 @@ class Trajectory:
         if covariance is not None:
             covariance = _covariances(covariance, n_poses)
         checks.instance("source", self.source, str, "names the origin of the poses")
+        if self.max_gap_s is not None:
+            checks.positive("max_gap_s", self.max_gap_s)
         position_m = _numbers("position_m", self.position_m, (n_poses, 3))
         farthest_m = float(np.max(np.abs(position_m)))
         if farthest_m > _MAX_POSITION_M:
@@ -151,15 +158,14 @@ class Trajectory:
         self._require_covered(wanted)
         index, fraction = self._brackets(wanted)
         covariance = None if self.covariance is None else _linear(self.covariance, index, fraction)
-        return Trajectory(
-            wanted, _linear(self.position_m, index, fraction), self._rotations(index, fraction), covariance, self.source
-        )
+        position_m, rotation_xyzw = _linear(self.position_m, index, fraction), self._rotations(index, fraction)
+        return Trajectory(wanted, position_m, rotation_xyzw, covariance, self.source, self.max_gap_s)
 
     def velocity_at(self, time_ns: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return linear and angular velocities by central differences between poses.
 
         At a pose, the difference spans the poses before and after it; between poses, velocities are interpolated
-        linearly. At both ends, the difference is one-sided.
+        linearly. At both ends, and beside an interval longer than `max_gap_s`, the difference is one-sided.
 
         Parameters
         ----------
@@ -186,6 +192,12 @@ class Trajectory:
         self._require_covered(wanted)
         poses = np.arange(len(self))
         before, after = np.maximum(poses - 1, 0), np.minimum(poses + 1, len(self) - 1)
+        is_gap = self._gaps()
+        follows, precedes = is_gap[before] & (before < poses), is_gap[poses]
+        before, after = (
+            np.where(follows & ~precedes & (after > poses), poses, before),
+            np.where(precedes & ~follows & (before < poses), poses, after),
+        )
         duration_s = ((self.time_ns[after] - self.time_ns[before]) / _NS_PER_S)[:, None]
         linear_m_s = (self.position_m[after] - self.position_m[before]) / duration_s
         turns = Rotation.from_quat(self.rotation_xyzw[after]) * Rotation.from_quat(self.rotation_xyzw[before]).inv()
@@ -200,7 +212,20 @@ class Trajectory:
         time_ns : (n,) int64
         """
         wanted = _times("time_ns", time_ns)
-        return np.asarray((wanted >= self.time_ns[0] - _MARGIN_NS) & (wanted <= self.time_ns[-1] + _MARGIN_NS))
+        is_within = (wanted >= self.time_ns[0] - _MARGIN_NS) & (wanted <= self.time_ns[-1] + _MARGIN_NS)
+        if self.max_gap_s is None:
+            return np.asarray(is_within)
+        before = np.clip(np.searchsorted(self.time_ns, wanted, side="right") - 1, 0, len(self) - 1)
+        after = np.minimum(before + 1, len(self) - 1)
+        nearest_ns = np.minimum(np.abs(wanted - self.time_ns[before]), np.abs(wanted - self.time_ns[after]))
+        return np.asarray(is_within & (~self._gaps()[before] | (nearest_ns <= _MARGIN_NS)))
+
+    def _gaps(self) -> NDArray[np.bool_]:
+        """Return True for each pose that an interval without poses follows: (pose,) bool."""
+        gaps = np.zeros(len(self), np.bool_)
+        if self.max_gap_s is not None:
+            gaps[:-1] = np.diff(self.time_ns) > self.max_gap_s * _NS_PER_S
+        return gaps
 
     def _require_covered(self, wanted: NDArray[np.int64]) -> None:
         first, last = self.time_ns[0], self.time_ns[-1]
@@ -208,9 +233,14 @@ class Trajectory:
         if outside:
             raise ArgumentError(
                 f"{outside} of {len(wanted)} times from {_seconds(wanted.min())} to {_seconds(wanted.max())} lie "
-                f"outside the trajectory, which covers {_seconds(first)} to {_seconds(last)}; "
-                "give times within it, or correct the clock offset"
+                f"outside the trajectory, which covers {_seconds(first)} to {_seconds(last)}"
+                f"{self._exception}; give times within it, or correct the clock offset"
             )
+
+    @property
+    def _exception(self) -> str:
+        n_gaps = int(np.count_nonzero(self._gaps()))
+        return f", except {n_gaps} intervals longer than {self.max_gap_s:g} s" if n_gaps else ""
 
     def _brackets(self, wanted: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Return the index of the pose before each time, and the fraction of the way to the next one."""
@@ -259,6 +289,9 @@ def _numbers(name: str, values: ArrayLike, wanted: tuple[int, ...]) -> NDArray[n
 def _covariances(values: ArrayLike, n_poses: int) -> NDArray[np.float64]:
     """Return checked covariances: (pose, 6, 6) float64."""
     covariance = _numbers("covariance", values, (n_poses, 6, 6))
+    largest = float(np.max(np.abs(covariance)))
+    if largest > _MAX_POSITION_M**2:
+        raise ArgumentError(f"covariance reaches {largest:g}; give square metres up to {_MAX_POSITION_M**2:g}")
     tolerance = _MAX_ASYMMETRY * np.max(np.abs(covariance), axis=(1, 2))
     uneven = np.max(np.abs(covariance - covariance.transpose(0, 2, 1)), axis=(1, 2)) > tolerance
     if uneven.any():

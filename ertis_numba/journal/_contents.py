@@ -12,6 +12,7 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import JournalEntry, JournalKey, JournalSensor, verified_values
+from ertis_numba.journal._poses import JournalPose, poses_in
 from ertis_numba.journal._tables import COMPLETE_VERSION, select_statement
 
 __all__ = ["SUFFIX", "ReadableJournal"]
@@ -125,6 +126,12 @@ class ReadableJournal:
             for number, session_id, first, last, why in made
             if number not in self._unusable
         )
+
+    @property
+    def poses(self) -> tuple[JournalPose, ...]:
+        """Undamaged poses of platforms, in order of arrival."""
+        with self._lock:
+            return tuple(poses_in(self._database, self.path))
 
     def index(self, sensor: str | None = None) -> list[JournalKey]:
         """Return the keys of measurements of one sensor or of all, in order of arrival, without reading them."""

@@ -14,7 +14,8 @@ from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import JournalEntry, JournalSensor, verified_values
 from ertis_numba.journal._files import keep_damaged_log
 from ertis_numba.journal._log import WriteAheadLog
-from ertis_numba.journal._tables import select_statement
+from ertis_numba.journal._poses import JournalPose, poses_in
+from ertis_numba.journal._tables import POSES, select_statement
 
 if TYPE_CHECKING:
     from ertis_numba.journal._journal import Journal
@@ -41,6 +42,7 @@ class _RecoveredRows:
     sensors: list[JournalSensor] = field(default_factory=list)
     entries: list[JournalEntry] = field(default_factory=list)
     gaps: list[SequenceGap] = field(default_factory=list)
+    poses: list[JournalPose] = field(default_factory=list)
     lost: list[SequenceGap] = field(default_factory=list)
     n_unreadable: int = 0
     is_complete: bool = False
@@ -182,6 +184,10 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Recove
         with suppress(DamagedError, KeyError):
             number, session_id, first, last, reason = verified_values(journal.path, "a gap", row)
             found.gaps.append(SequenceGap(sensors[number].name, first, last, reason, session_id))
+    ((n_tables,),) = database.execute("SELECT count(*) FROM sqlite_schema WHERE name = ?", (POSES,))
+    ((last,),) = database.execute("SELECT ifnull(max(id), 0) FROM poses") if n_tables else ((0,),)
+    with suppress(DamagedError):
+        found.poses += poses_in(repaired, journal.path, after=last)
     found.is_complete = (
         not found.n_unreadable
         and len(found.gaps) == len(gaps)
@@ -212,4 +218,6 @@ def _store_recovered(journal: "Journal", found: _RecoveredRows) -> list[str]:
         with suppress(ArgumentError):  # A log left by an earlier crash may contain stored rows.
             journal.append([entry])
     journal.note_gaps([gap for gap in found.gaps if gap.sensor in journal.sensors])
+    if found.poses:
+        journal.append_poses(found.poses)
     return [f"{found.n_unreadable} measurements whose numbers cannot be read"] if found.n_unreadable else []

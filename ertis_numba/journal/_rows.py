@@ -12,7 +12,8 @@ from ertis_numba.journal._contents import ReadableJournal
 from ertis_numba.journal._database import LOG_BYTES, Database
 from ertis_numba.journal._entries import JournalEntry, JournalSensor, require_same_settings
 from ertis_numba.journal._files import disk_errors
-from ertis_numba.journal._tables import VERSION, insert_statement, row_crc32
+from ertis_numba.journal._poses import JournalPose
+from ertis_numba.journal._tables import POSES, VERSION, create_poses_statement, insert_statement, row_crc32
 from ertis_numba.journal._tally import Tally
 from ertis_numba.settings import Settings
 
@@ -169,6 +170,23 @@ class WritableJournal(ReadableJournal):
                     self._insert("gaps", row)
             for gap in gaps:
                 self.tally.record(gap.sensor, gap.session_id, gap.first, gap.last)
+
+    def append_poses(self, poses: Sequence[JournalPose]) -> None:
+        """Store poses of platforms durably, all or none.
+
+        Raises
+        ------
+        DataError
+            The disk is full or fails.
+        JournalInUseError
+            Another process has removed or replaced the journal.
+        """
+        with self._lock:
+            self._database.require_file()
+            with self._database.transaction():
+                self._database.execute(create_poses_statement())
+                for pose in poses:
+                    self._insert(POSES, pose.row())
 
     def discard(self, sensor: str, session_id: int, up_to: int) -> int:
         """Delete measurements of a sensor's session that another node has stored, and gaps; durably, all or none.

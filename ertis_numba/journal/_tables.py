@@ -9,9 +9,11 @@ from typing import Final
 __all__ = [
     "APPLICATION_ID",
     "COMPLETE_VERSION",
+    "POSES",
     "TABLES",
     "VERSION",
     "Column",
+    "create_poses_statement",
     "create_statements",
     "insert_statement",
     "row_crc32",
@@ -111,19 +113,50 @@ TABLES: Final[Mapping[str, tuple[Column, ...]]] = {
         Column("reason", "TEXT", "reason of the loss"),
         _CHECK,
     ),
+    "poses": (
+        _ID,
+        Column("sensors", "TEXT", "names of the sensors on the platform, separated by commas"),
+        Column("timestamp_ns", "INTEGER", "time of the pose", "nanoseconds since 1970-01-01T00:00:00"),
+        Column("x_m", "REAL", "position of the platform in the world frame", "m"),
+        Column("y_m", "REAL", "position of the platform in the world frame", "m"),
+        Column("z_m", "REAL", "position of the platform in the world frame", "m"),
+        Column("rotation_x", "REAL", "unit quaternion that rotates the platform frame into the world frame"),
+        Column("rotation_y", "REAL", "part of the same quaternion"),
+        Column("rotation_z", "REAL", "part of the same quaternion"),
+        Column("rotation_w", "REAL", "part of the same quaternion"),
+        Column(
+            "covariance",
+            "BLOB",
+            "6 by 6 doubles, little-endian: covariance of x, y, z in m² and of the rotation about the world's x, y, z "
+            "in rad²; empty if unknown",
+        ),
+        Column("source", "TEXT", "origin of the pose"),
+        _CHECK,
+    ),
 }
+
+POSES: Final = "poses"
+"""Table that a journal has only once poses are stored in it."""
 
 
 def create_statements() -> Iterable[str]:
     """Yield the statements that create the tables, and the index of keys."""
-    for table, columns in TABLES.items():
-        kinds = ", ".join(
-            f"{column.name} {column.kind} {'PRIMARY KEY' if column is _ID else 'NOT NULL'}" for column in columns
-        )
-        yield f"CREATE TABLE {table} ({kinds})"
+    yield from (_create_statement(table) for table in TABLES if table != POSES)
     yield "CREATE UNIQUE INDEX key ON measurements (sensor, epoch, sequence)"
     yield f"PRAGMA application_id = {APPLICATION_ID}"
     yield f"PRAGMA user_version = {COMPLETE_VERSION}"
+
+
+def create_poses_statement() -> str:
+    """Return the statement that creates the table of poses if it does not exist."""
+    return _create_statement(POSES).replace("CREATE TABLE", "CREATE TABLE IF NOT EXISTS", 1)
+
+
+def _create_statement(table: str) -> str:
+    kinds = ", ".join(
+        f"{column.name} {column.kind} {'PRIMARY KEY' if column is _ID else 'NOT NULL'}" for column in TABLES[table]
+    )
+    return f"CREATE TABLE {table} ({kinds})"
 
 
 def upgrade_statements(version: int) -> Iterable[str]:

@@ -53,6 +53,8 @@ class SealingResult:
         Losses from a damaged log that no gap of the recording covers; empty if there are none.
     refused : dict of str to str
         Reasons why a recording cannot contain the measurements of some sensors, by sensor.
+    without_pose : int
+        Number of measurements without a pose, of sensors that have poses, by default 0.
     """
 
     journal: Path
@@ -64,6 +66,7 @@ class SealingResult:
     lost: int = 0
     damage: str = ""
     refused: dict[str, str] = field(default_factory=dict)
+    without_pose: int = 0
 
     @property
     def remark(self) -> str:
@@ -80,6 +83,12 @@ class SealingResult:
                 "1 measurement is damaged" if self.damaged == 1 else f"{self.damaged} measurements are damaged"
             )
         reported += [f"no recording can hold sensor {name} ({reason})" for name, reason in self.refused.items()]
+        if self.without_pose:
+            reported.append(
+                "1 measurement has no pose, because poses were missing at its time"
+                if self.without_pose == 1
+                else f"{self.without_pose} measurements have no pose, because poses were missing at their times"
+            )
         if self.set_aside is not None:
             reported.append(f"the journal is kept as {self.set_aside}")
         return "; ".join(reported)

@@ -11,13 +11,16 @@ from operator import or_
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from ertis_numba.errors import DataError, FormatVersionError
+from ertis_numba.frames import Trajectory
 from ertis_numba.network.message_fields import (
     MAX_SEQUENCE,
     AckedThrough,
     Count,
+    Int64,
     Line,
     Message,
     Name,
@@ -64,6 +67,7 @@ __all__ = [
     "Image",
     "Message",
     "Ping",
+    "PlatformPose",
     "Points",
     "Pong",
     "Product",
@@ -202,6 +206,44 @@ class Ack(Message, frozen=True, kw_only=True):
     dropped: Annotated[tuple[tuple[Number, Reason], ...], Meta(max_length=32)] = ()
 
 
+class PlatformPose(Message, frozen=True, kw_only=True):
+    """Pose of a platform at a time, to be stored with the measurements of its sensors.
+
+    Attributes
+    ----------
+    sensors : tuple of str
+        Sensors on the platform. The key must be allowed to send for each of them.
+    timestamp_ns : int
+        Time since 1970-01-01 UTC.
+    position_m, rotation_xyzw
+        As in `ertis_numba.frames.Trajectory`.
+    covariance : tuple of float
+        Rows of the covariance of `Trajectory`; None if it is unknown.
+    source : str
+        Origin of the pose.
+    """
+
+    routes = (("sensor", "central"),)
+
+    sensors: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=32)]
+    timestamp_ns: Int64
+    position_m: Position
+    rotation_xyzw: Quaternion
+    covariance: Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)] | None = None
+    source: Reason = "application"
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Trajectory of this pose alone; raises an `ArgumentError` for impossible numbers."""
+        return Trajectory(
+            np.array([self.timestamp_ns]),
+            np.array([self.position_m]),
+            np.array([self.rotation_xyzw]),
+            None if self.covariance is None else np.reshape(self.covariance, (1, 6, 6)),
+            self.source,
+        )
+
+
 class Ping(Message, frozen=True, kw_only=True):
     """Sign of life of a node, sent each second; answered by a `Pong`, and by an `Ack` of every greeted session."""
 
@@ -295,8 +337,8 @@ class AskStatus(Message, frozen=True, kw_only=True):
 
 
 MESSAGES: Final[tuple[type[Message], ...]] = (
-    Hello, Welcome, Data, Gap, Ack, Ping, Pong, Bye, Refused, Configure, Configured, Subscribe, Description, Image,
-    Points, Raw, Group, AskStatus, Report,
+    Hello, Welcome, Data, Gap, Ack, PlatformPose, Ping, Pong, Bye, Refused, Configure, Configured, Subscribe,
+    Description, Image, Points, Raw, Group, AskStatus, Report,
 )  # fmt: skip
 """All messages of the network."""
 

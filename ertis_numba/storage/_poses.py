@@ -14,6 +14,7 @@ from ertis_numba.storage.schema import POSES, create_variables
 from ertis_numba.storage.structure import MAX_TEXT_BYTES, local_member
 
 __all__ = [
+    "MAX_GAP_S",
     "POSE_SIZES",
     "Poses",
     "checked_poses",
@@ -29,6 +30,9 @@ POSE_SIZES: Final = {"axis": 3, "quaternion": 4, "pose_row": 6, "pose_column": 6
 
 Poses = Trajectory | Mapping[str, Trajectory]
 """Trajectory of the platform, or of the platform of each sensor, by name of the sensor."""
+
+MAX_GAP_S: Final = 1.0
+"""Longest interval between poses over which those of a file with holes are interpolated."""
 
 _AXES_OF_POSES: Final = ("quaternion", "pose_row", "pose_column")
 _MAX_SOURCE_BYTES: Final = MAX_TEXT_BYTES["pose_source"]
@@ -64,14 +68,14 @@ def poses_of(poses: Poses | None, sensor: str) -> Trajectory | None:
 
 
 def require_times(trajectory: Trajectory, time_ns: NDArray[np.int64], sensor: str) -> None:
-    """Refuse measurements outside a trajectory.
+    """Refuse measurements outside a trajectory, unless it may have gaps.
 
     Raises
     ------
     ArgumentError
         The trajectory does not cover all measurements.
     """
-    if not len(time_ns):
+    if not len(time_ns) or trajectory.max_gap_s is not None:
         return
     first_ns, last_ns = int(trajectory.time_ns[0]), int(trajectory.time_ns[-1])
     begin_ns, end_ns = int(time_ns.min()), int(time_ns.max())
@@ -90,7 +94,8 @@ def require_times(trajectory: Trajectory, time_ns: NDArray[np.int64], sensor: st
 def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
     """Store the pose at each measurement of a sensor; the group has its rows, but no poses.
 
-    A sensor without measurements has no poses.
+    A sensor without measurements has no poses. If the trajectory has a longest gap, measurements that it does not cover
+    have NaN.
 
     Raises
     ------
@@ -101,12 +106,13 @@ def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
     """
     time_ns = np.asarray(group["time"][:], np.int64)
     require_times(trajectory, time_ns, group.name.rpartition("/")[2])
-    if not len(time_ns):
+    times, rows = np.unique(time_ns, return_inverse=True)  # Measurements may be out of order, or share a time.
+    is_covered = trajectory.covers(times)
+    if not is_covered.any():
         return
     if "axis" in group:  # That of positions; files of images may have none.
         local_member(group, "axis", h5py.Dataset)
-    times, rows = np.unique(time_ns, return_inverse=True)  # Measurements may be out of order, or share a time.
-    stored = trajectory.at(times)
+    stored = trajectory.at(times[is_covered])
     columns = {"pose_position": stored.position_m, "pose_rotation": stored.rotation_xyzw}
     if stored.covariance is not None:
         columns["pose_covariance"] = stored.covariance
@@ -115,12 +121,16 @@ def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
     for name, values in columns.items():
         variable = group[name]
         variable.resize(len(time_ns), axis=0)
-        variable[:] = values[rows]
+        column = np.full((len(times), *values.shape[1:]), np.nan)
+        column[is_covered] = values
+        variable[:] = column[rows]
         variable.flush()
 
 
 def read_poses(group: h5py.Group, path: Path) -> Trajectory | None:
     """Return the poses at the measurements of a sensor, by increasing time; None if there are none.
+
+    Measurements without a pose are left out. The trajectory then has the longest gap `MAX_GAP_S`.
 
     Raises
     ------
@@ -134,12 +144,16 @@ def read_poses(group: h5py.Group, path: Path) -> Trajectory | None:
     if len(found) < 3:
         raise DamagedError(f"{path} has {found[0]!r} for sensor {sensor}, but not all of its poses; copy it again")
     times, rows = np.unique(group["time"][:].astype(np.int64), return_index=True)
-    if not len(times):
+    columns = [group[name][:][rows] for name in (*found[:2], "pose_covariance") if name in group]
+    is_pose = ~np.all([np.isnan(column.reshape(len(times), -1)).all(axis=1) for column in columns], axis=0)
+    if not is_pose.any():
         return None
-    covariance = group["pose_covariance"][:][rows] if "pose_covariance" in group else None
+    position_m, rotation_xyzw, *covariances = (column[is_pose] for column in columns)
     source = group["pose_source"][()].decode(errors="replace")
+    max_gap_s = None if is_pose.all() else MAX_GAP_S
     try:
-        return Trajectory(times, group["pose_position"][:][rows], group["pose_rotation"][:][rows], covariance, source)
+        covariance = covariances[0] if covariances else None
+        return Trajectory(times[is_pose], position_m, rotation_xyzw, covariance, source, max_gap_s)
     except ArgumentError as error:
         problem = str(error).partition(";")[0]
         raise DamagedError(f"{path}: the poses of sensor {sensor} are damaged ({problem}); copy it again") from error

@@ -150,6 +150,11 @@ def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: 
             require_times(trajectory, time_ns, sensor)
         except ArgumentError as error:
             raise ArgumentError(f"{path}: {error}") from error
+        if len(time_ns) and not trajectory.covers(time_ns).any():
+            raise ArgumentError(
+                f"{path}: no measurement of sensor {sensor} is within the poses; give poses for this time, or correct "
+                "the clock offset"
+            )
     return n_measurements
 
 
@@ -240,7 +245,9 @@ def _merged(found: dict[str, Trajectory], kind: str, advice: str) -> Trajectory 
     covariances = [each.covariance for each in several]
     known = [each for each in covariances if each is not None]
     covariance = np.concatenate(known)[first] if len(known) == len(covariances) else None
-    return Trajectory(time_ns, rows[first, :3], rows[first, 3:], covariance, several[0].source)
+    gaps_s = [each.max_gap_s for each in several if each.max_gap_s is not None]
+    max_gap_s = min(gaps_s, default=None)
+    return Trajectory(time_ns, rows[first, :3], rows[first, 3:], covariance, several[0].source, max_gap_s)
 
 
 def _copy(source: Path, part: Path, n_bytes: int) -> None:

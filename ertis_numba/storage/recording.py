@@ -84,7 +84,7 @@ class RecordingWriter(FileWriter[Measurement]):
         Version of each sensor's firmware, by name.
     poses : Trajectory, or mapping of str to Trajectory, optional
         Trajectory of the platform, or of each sensor's platform, by name of the sensor. The recording stores the pose
-        at each measurement, which the trajectory must cover. Unknown by default.
+        at each measurement, which the trajectory must cover unless it has a `max_gap_s`. Unknown by default.
     """
 
     _kind: ClassVar[str] = "recording"
@@ -292,7 +292,8 @@ class RecordingReader(FileReader[Measurement]):
     rotation_xyzw : (4,) float64, or None
         Unit quaternion that rotates the sensor frame into the platform frame; None if the mounting is unknown.
     trajectory : Trajectory or None
-        Poses of the platform at the times of the measurements; None if they are unknown.
+        Poses of the platform at the times of the measurements; None if they are unknown. If some measurements have no
+        pose, its `max_gap_s` is 1.
     """
 
     _kind: ClassVar[str] = "recording"

@@ -18,11 +18,20 @@ import h5py
 import numpy as np
 
 from ertis_numba.atomic_files import fsync, temporary_path
-from ertis_numba.errors import DataError
-from ertis_numba.frames import Measurement
+from ertis_numba.errors import DamagedError, DataError
+from ertis_numba.frames import Measurement, Trajectory
 from ertis_numba.geometry import mounting as mounted, storable
-from ertis_numba.journal import LOST, SUFFIX, Journal, JournalSensor, SealingResult
+from ertis_numba.journal import (
+    LOST,
+    SUFFIX,
+    Journal,
+    JournalPose,
+    JournalSensor,
+    SealingResult,
+    trajectory_through,
+)
 from ertis_numba.storage._journal_rows import JournalRows
+from ertis_numba.storage._poses import MAX_GAP_S
 from ertis_numba.storage._reader import sensor_names
 from ertis_numba.storage.recording import (
     JOURNAL_DAMAGE,
@@ -202,6 +211,7 @@ def _write(
     journal: Journal, rows: dict[str, JournalRows], refused: dict[str, str], *, overwrite: bool, progress: Progress
 ) -> None:
     sensors = [journal.sensors[name] for name in rows]
+    poses, fault = _poses(journal)
     with _SealingWriter(
         journal.target,
         overwrite=overwrite,
@@ -212,6 +222,7 @@ def _write(
             if sensor.translation_m is not None and sensor.rotation_xyzw is not None
         },
         firmware={sensor.name: sensor.firmware for sensor in sensors},
+        poses={name: trajectory for name, trajectory in poses.items() if name in rows},
     ) as writer:
         n_written = 0
         for name, held in rows.items():
@@ -226,7 +237,29 @@ def _write(
         if damage := _damage(journal, rows):
             writer.report_damage(damage)
         kept = (f"sensor {name} was set aside: {reason}" for name, reason in refused.items())
-        writer.set_history("; ".join([_history_of(journal.path), *_history_of_lost_sensors(rows), *kept])[:MAX_HISTORY])
+        left_out = [f"poses were left out: {fault}"] if fault else []
+        history = [_history_of(journal.path), *_history_of_lost_sensors(rows), *kept, *left_out]
+        writer.set_history("; ".join(history)[:MAX_HISTORY])
+
+
+def _poses(journal: Journal) -> tuple[dict[str, Trajectory], str]:
+    """Return the trajectory of the platform of each sensor that has one, or else why poses cannot be used."""
+    by_platform: dict[tuple[str, ...], list[JournalPose]] = {}
+    made: dict[tuple[tuple[str, ...], ...], Trajectory] = {}
+    trajectories: dict[str, Trajectory] = {}
+    try:
+        for pose in journal.poses:
+            by_platform.setdefault(pose.sensors, []).append(pose)
+        for name in journal.sensors:
+            key = tuple(sensors for sensors in by_platform if name in sensors)
+            if key and key not in made:  # Sensors of a platform share their trajectory.
+                poses = [pose for sensors in key for pose in by_platform[sensors]]
+                made[key] = trajectory_through(poses, max_gap_s=MAX_GAP_S)
+            if key:
+                trajectories[name] = made[key]
+    except (DamagedError, ValueError) as error:  # Measurements are sealed without poses.
+        return {}, " ".join(str(error).split())
+    return trajectories, ""
 
 
 def _history_of_lost_sensors(rows: dict[str, JournalRows]) -> Iterator[str]:
@@ -240,9 +273,9 @@ def _history_of_lost_sensors(rows: dict[str, JournalRows]) -> Iterator[str]:
 def _is_complete_recording(target: Path, journal: Journal, rows: dict[str, JournalRows]) -> bool:
     """Return True if a file is the complete, undamaged recording of a journal."""
     try:
-        names = sensor_names(target)
+        names, (poses, _) = sensor_names(target), _poses(journal)
         return set(names) <= set(rows) and all(
-            _same(journal.sensors[name], held, open_recording(target, sensor=name))
+            _same(journal.sensors[name], held, open_recording(target, sensor=name), poses.get(name))
             if name in names
             else not any(True for _ in held)
             for name, held in rows.items()
@@ -251,7 +284,7 @@ def _is_complete_recording(target: Path, journal: Journal, rows: dict[str, Journ
         return False
 
 
-def _same(sensor: JournalSensor, rows: JournalRows, recording: RecordingReader) -> bool:
+def _same(sensor: JournalSensor, rows: JournalRows, recording: RecordingReader, trajectory: Trajectory | None) -> bool:
     with recording:
         place = (recording.translation_m, recording.rotation_xyzw)
         known = (*(None if part is None else tuple(part.tolist()) for part in place), recording.firmware)
@@ -260,7 +293,20 @@ def _same(sensor: JournalSensor, rows: JournalRows, recording: RecordingReader) 
         for entry, back in zip_longest(rows, recording):
             if entry is None or back is None or not _equal(entry.measurement, back):
                 return False
-        return list(recording.gaps) == rows.missing
+        return list(recording.gaps) == rows.missing and _has_poses(recording, trajectory)
+
+
+def _has_poses(recording: RecordingReader, trajectory: Trajectory | None) -> bool:
+    """Return True if a recording has the poses of a trajectory at its measurements, and no others."""
+    time_ns = np.unique([stamp.timestamp_ns for stamp in recording.stamps()])
+    if trajectory is None or not trajectory.covers(time_ns).any():
+        return recording.trajectory is None
+    covered = time_ns[trajectory.covers(time_ns)]
+    wanted, got = trajectory.at(covered), recording.trajectory
+    return got is not None and all(
+        np.array_equal(getattr(wanted, name), getattr(got, name))
+        for name in ("time_ns", "position_m", "rotation_xyzw", "covariance")
+    )
 
 
 def _equal(one: Measurement, other: Measurement) -> bool:
@@ -276,15 +322,20 @@ def _summary(
     refused: dict[str, str] | None = None,
 ) -> SealingResult:
     """Return the result of sealing."""
-    n_measurements = n_missing = n_lost = 0
+    n_measurements = n_missing = n_lost = n_without_pose = 0
     damage = ""
     for name in sensor_names(recording):
         with open_recording(recording, sensor=name) as reader:
             n_measurements += len(reader)
+            if reader.trajectory is not None:
+                covered = reader.trajectory.covers([stamp.timestamp_ns for stamp in reader.stamps()])
+                n_without_pose += int(np.count_nonzero(~covered))
             n_missing += sum(gap.n_missing for gap in reader.gaps)
             n_lost += sum(gap.n_missing for gap in reader.gaps if gap.reason == LOST)
             damage = str(reader.attributes.get(JOURNAL_DAMAGE, ""))
-    return SealingResult(path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage, refused or {})
+    return SealingResult(
+        path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage, refused or {}, n_without_pose
+    )
 
 
 if __name__ == "__main__":

@@ -17,7 +17,19 @@ from ertis_numba.network.central_node._received_items import SensorSession
 from ertis_numba.network.central_node._streams import PeerConnection, SensorTrack, Stream, source_of
 from ertis_numba.network.central_node._volumes import same
 from ertis_numba.network.message_fields import as_line
-from ertis_numba.network.messages import MESSAGES, AskStatus, Configure, Data, Gap, Hello, Message, Refused, Subscribe
+from ertis_numba.network.messages import (
+    MESSAGES,
+    AskStatus,
+    Configure,
+    Data,
+    Gap,
+    Hello,
+    Message,
+    Ping,
+    PlatformPose,
+    Refused,
+    Subscribe,
+)
 from ertis_numba.settings import Settings
 
 __all__ = [
@@ -36,9 +48,12 @@ __all__ = [
 ACCEPTED: Final = tuple(kind for kind in MESSAGES if kind.senders_to("central"))
 """Messages that the central node accepts, by their declarations."""
 
-_ACTIONS: Final = {AskStatus: "request the status", Configure: "change settings"} | dict.fromkeys(
-    (Hello, Data, Gap), "send measurements"
-)
+_ACTIONS: Final = {
+    AskStatus: "request the status",
+    Configure: "change settings",
+    PlatformPose: "send poses",
+    Ping: "send measurements or poses",
+} | dict.fromkeys((Hello, Data, Gap), "send measurements")
 _STREAMS: Final = 64  # Limit per peer.
 _SENSORS: Final = 1024
 _PEERS: Final = 1024

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from ertis_numba import checks
 from ertis_numba.atomic_files import make_folder
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.journal import SUFFIX, SealingResult
+from ertis_numba.journal import SUFFIX, JournalPose, SealingResult
 from ertis_numba.network.central_node._journal_store import JournalStore
 from ertis_numba.network.central_node._ledger import Ledger, Lock
 from ertis_numba.network.central_node._received_items import (
@@ -34,6 +34,7 @@ __all__ = ["Archive"]
 
 _GROUP: Final = 64
 _GROUP_BYTES: Final = 40_000_000
+_POSES: Final = 20_000  # Takes about 15 MB.
 _POLL_INTERVAL_S: Final = 0.5
 _AGAIN_S: Final = 1.0
 _STUCK_S: Final = 5.0
@@ -76,6 +77,7 @@ class Archive:
         self._rotate_s = checks.between("time of a recording", rotate_s, 1.0, 1e9)
         self._seal = seal
         self._queue: queue.SimpleQueue[ReceivedItem | None] = queue.SimpleQueue()
+        self._poses: collections.deque[JournalPose] = collections.deque(maxlen=_POSES)
         self._events: collections.deque[Event] = collections.deque()
         self._stop = threading.Event()
         self._lock: Lock | None = None
@@ -127,6 +129,10 @@ class Archive:
     def offer(self, item: ReceivedItem) -> None:
         """Queue an item to be stored; never blocks."""
         self._queue.put(item)
+
+    def offer_pose(self, pose: JournalPose) -> None:
+        """Queue a pose to be stored; never blocks. If the disk is too slow, the oldest poses are discarded."""
+        self._poses.append(pose)
 
     def read(self) -> list[Event]:
         """Return new events; never blocks."""
@@ -231,12 +237,15 @@ class Archive:
         return True
 
     def _tend(self, journal_store: JournalStore, *, ends: bool) -> None:
-        """Seal full journals."""
+        """Store poses, and seal full journals."""
+        journal_store.add_poses([self._poses.popleft() for _ in range(len(self._poses))])
+        if ends or journal_store.needs_poses():
+            self._attempt(journal_store.store_poses)
         volume = journal_store.volume
         full = volume is not None and (
             volume.n_bytes >= self._rotate_bytes or time.monotonic() - volume.begun_s >= self._rotate_s
         )
-        if full or ends or journal_store.to_hand_on:
+        if full or ends or journal_store.has_finished:
             self._attempt(lambda: self._hand_on(journal_store, rotate=full or ends, ends=ends))
 
     def _hand_on(self, journal_store: JournalStore, *, rotate: bool, ends: bool) -> None:
@@ -244,6 +253,8 @@ class Archive:
             journal_store.rotate()
             if not ends:  # The next item begins a journal, and the ledger is written then.
                 return
+        if ends:
+            journal_store.hurry()
         for path in journal_store.hand_on():
             if self._sealing is not None:
                 self._sealing.give(path)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from ertis_numba.errors import ArgumentError, DataError, DiskFullError
-from ertis_numba.journal import SUFFIX, Journal, JournalEntry
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalPose
 from ertis_numba.network.central_node._ledger import Ledger, read_acked_through
 from ertis_numba.network.central_node._received_items import (
     Event,
@@ -19,6 +19,7 @@ from ertis_numba.network.central_node._received_items import (
     Stored,
     StoredDuplicate,
 )
+from ertis_numba.network.central_node._recent_poses import RecentPoses
 from ertis_numba.network.central_node._volumes import Checksums, UnrecordedGaps, Volume, journal_name, sessions_in
 
 __all__ = ["JournalStore"]
@@ -72,6 +73,7 @@ class JournalStore:
         self._failed: list[Volume] = []  # Closed, but not yet durably abandoned.
         self._is_saved = False  # True once the ledger contains the content of the journals to hand on.
         self.to_hand_on: list[Path] = []
+        self._poses = RecentPoses()
         self._take_up()
 
     def _take_up(self) -> None:
@@ -258,6 +260,29 @@ class JournalStore:
         self._unsealed.update(also)
         self._is_saved = True
 
+    def needs_poses(self) -> bool:
+        """Return True if it is time to call `store_poses`."""
+        return self.volume is not None and self._poses.is_due(self.volume)
+
+    def add_poses(self, poses: Iterable[JournalPose]) -> None:
+        """Add poses that have arrived; `store_poses` stores them."""
+        self._poses.add(poses, self.volume)
+
+    def store_poses(self) -> None:
+        """Store poses durably in the journal in use.
+
+        Raises
+        ------
+        Exception
+            The disk fails. The poses are stored in the next journal.
+        """
+        if self.volume is not None:
+            try:
+                self._poses.store(self.volume)
+            except Exception:
+                self._fail()
+                raise
+
     def rotate(self) -> None:
         """Begin new recordings with the next item.
 
@@ -274,6 +299,7 @@ class JournalStore:
 
     def _retire_volume(self, volume: Volume) -> None:
         self._retire(volume.path)
+        self._poses.retire(volume)
         with suppress(DataError):  # Committed items are safe, regardless of errors here.
             self._unrecorded.learn(volume.journal)
         with suppress(DataError):
@@ -294,8 +320,20 @@ class JournalStore:
         """
         if not self._is_saved:
             self._save(open_=self._open)
-        found, self.to_hand_on = self.to_hand_on, []
+        found = [path for path in self.to_hand_on if not self._poses.waits(path)]
+        for path in found:
+            self._poses.complete(path)
+        self.to_hand_on = [path for path in self.to_hand_on if path not in found]
         return found
+
+    @property
+    def has_finished(self) -> bool:
+        """Return True if `hand_on` would return a journal."""
+        return any(not self._poses.waits(path) for path in self.to_hand_on)
+
+    def hurry(self) -> None:
+        """Wait for no further poses, because no more will arrive."""
+        self._poses.hurry()
 
     def _free_logs(self) -> None:
         """Free the space of logs, which the next measurements need on a small disk."""

@@ -17,6 +17,7 @@ from ertis_numba.network.central_node._admission import ReceivedMessage, Unwante
 from ertis_numba.network.central_node._archive import Archive
 from ertis_numba.network.central_node._images import Guarded
 from ertis_numba.network.central_node._intake import Intake
+from ertis_numba.network.central_node._poses import PoseIntake
 from ertis_numba.network.central_node._received_items import (
     Forgotten,
     Remark,
@@ -43,6 +44,7 @@ from ertis_numba.network.messages import (
     Hello,
     Message,
     Ping,
+    PlatformPose,
     Pong,
     Refused,
     Report,
@@ -132,6 +134,7 @@ class CentralNode:
             max_bytes=max_bytes,
             require=None if self._images is None else self._images.require_usable,
         )
+        self._poses = PoseIntake(archive)
         self._handlers = handlers_of(self)
         self._greetings = Greetings(self._intake.read)
         self._archive_fd = self._greetings_fd = self._requests_fd = -1
@@ -356,9 +359,13 @@ class CentralNode:
         payload = [frame.bytes for frame in received.payload]
         self._greetings.offer(Greeting(received.frames[:2], hello, payload, key))
 
+    def _on_platformpose(self, pose: PlatformPose, received: ReceivedMessage) -> None:
+        self._poses.add(received.sender, pose, received.who)
+
     def _on_bye(self, _: Bye, received: ReceivedMessage) -> None:
         self._greetings.forget(received.sender)
         self._intake.bye(received.sender)
+        self._poses.bye(received.sender)
 
     def _on_configure(self, request: Configure, received: ReceivedMessage) -> None:
         self._settings_requests.forward(received.sender, request, [frame.bytes for frame in received.payload])

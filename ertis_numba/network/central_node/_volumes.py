@@ -61,6 +61,8 @@ class Volume:
         Data bytes in it.
     begun_s : float
         Time of opening, by `time.monotonic`.
+    next_pose : int
+        First number of `RecentPoses` that it lacks; 0 before any.
     """
 
     def __init__(self, journal: Journal) -> None:
@@ -70,6 +72,7 @@ class Volume:
         self.n_bytes = sum(journal.sensors[key.sensor].n_bytes for key in journal.index())
         self.acked = sessions_in(journal)
         self.begun_s = time.monotonic()
+        self.next_pose = 0
 
     @classmethod
     def create(cls, path: Path) -> Self:

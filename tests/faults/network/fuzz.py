@@ -27,6 +27,8 @@ _VALUES: Final[dict[str, object]] = {
     "last": 3,
     "acked_through": 5,
     "products": ["energyscape", "status"],
+    "sensors": ["fuzz"],
+    "rotation_xyzw": [0.0, 0.0, 0.0, 1.0],
 }
 """Values of fields by name; other fields get a value of their type."""
 

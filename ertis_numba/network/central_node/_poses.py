@@ -1,0 +1,105 @@
+"""Intake of the poses of platforms, which applications send."""
+
+import time
+from dataclasses import dataclass
+from typing import Final
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.journal import JournalPose
+from ertis_numba.network.allow_list import Permission
+from ertis_numba.network.central_node._admission import Unwanted
+from ertis_numba.network.central_node._archive import Archive
+from ertis_numba.network.messages import SILENCE_LIMIT_S, PlatformPose
+
+__all__ = ["MAX_RATE_HZ", "PoseIntake"]
+
+MAX_RATE_HZ: Final = 200
+"""Limit on the poses of a sender per second."""
+
+_SENDERS: Final = 64
+
+
+@dataclass(slots=True)
+class _Sender:
+    """Sender of poses: its sensors, the time of its last message, and the number of poses that it may send now."""
+
+    sensors: tuple[str, ...]
+    heard_s: float
+    allowance: float = MAX_RATE_HZ
+
+
+class PoseIntake:
+    """Receiver of poses. Each sensor has the poses of one sender, until that has been silent for some seconds.
+
+    Parameters
+    ----------
+    store : Archive or None
+    """
+
+    def __init__(self, store: Archive | None) -> None:
+        self._store = store
+        self._senders: dict[bytes, _Sender] = {}
+
+    def add(self, peer_id: bytes, pose: PlatformPose, who: Permission) -> None:
+        """Queue a pose to be stored.
+
+        Raises
+        ------
+        Unwanted
+            The pose cannot be accepted.
+        """
+        if self._store is None:
+            raise Unwanted(
+                "message", "this central node stores no recordings, so it has no use for poses; give --record", "pose"
+            )
+        for sensor in pose.sensors:
+            if not who.may_send(sensor):
+                raise Unwanted(
+                    "serial",
+                    f"key {who.name} may not send for sensor {sensor}; allow it with 'ertis keys allow'",
+                    "serial",
+                )
+        stored = _checked(pose)
+        self._count(peer_id, pose.sensors, time.monotonic())
+        self._store.offer_pose(stored)
+
+    def bye(self, peer_id: bytes) -> None:
+        """Forget a sender, so that another one may send poses of its sensors."""
+        self._senders.pop(peer_id, None)
+
+    def _count(self, peer_id: bytes, sensors: tuple[str, ...], now_s: float) -> None:
+        """Refuse a second sender for a sensor, and a sender whose rate is too high."""
+        for other_id, other in list(self._senders.items()):
+            if now_s - other.heard_s > SILENCE_LIMIT_S:
+                del self._senders[other_id]
+            elif other_id != peer_id and (shared := set(sensors).intersection(other.sensors)):
+                raise Unwanted(
+                    "sensor",
+                    f"another application sends poses of the platform of sensor {min(shared)}; end one of both, or "
+                    f"wait until it has been silent for {SILENCE_LIMIT_S:g} s",
+                    "pose",
+                )
+        if peer_id not in self._senders and len(self._senders) >= _SENDERS:
+            raise Unwanted("size", f"{_SENDERS} applications already send poses; end one of them", "too many")
+        sender = self._senders.setdefault(peer_id, _Sender(sensors, now_s))
+        allowance = min(MAX_RATE_HZ, sender.allowance + MAX_RATE_HZ * (now_s - sender.heard_s))
+        sender.sensors, sender.heard_s = sensors, now_s
+        sender.allowance = allowance - 1 if allowance >= 1 else allowance
+        if allowance < 1:
+            raise Unwanted("size", f"poses exceed {MAX_RATE_HZ} per second; send fewer", "rate")
+
+
+def _checked(pose: PlatformPose) -> JournalPose:
+    """Return a pose for the journal, or refuse one with impossible numbers."""
+    try:
+        made = pose.trajectory
+    except ArgumentError as error:
+        raise Unwanted("message", f"a pose cannot be used: {error}", "pose") from error
+    return JournalPose(
+        pose.sensors,
+        pose.timestamp_ns,
+        tuple(made.position_m[0].tolist()),
+        tuple(made.rotation_xyzw[0].tolist()),
+        b"" if made.covariance is None else made.covariance.astype("<f8").tobytes(),
+        made.source,
+    )
