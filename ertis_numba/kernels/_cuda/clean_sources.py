@@ -22,13 +22,13 @@ from ertis_numba.kernels._scalar import cosine_and_sine, imag_of, real_of, sampl
 __all__ = ["clean_sources"]
 
 _BLOCK = 128
-_SEEKERS = 128  # threads that seek the loudest direction of a bin
 _ZERO, _ONE, _NOTHING = np.float32(0), np.float32(1), np.uint64(0)
+_32, _LAST = np.uint64(32), np.uint64(2**32 - 1)
 _ENDED = np.int32(-1)
 
 
 @cuda.jit(cache=True)
-def _begin(matrices, steps, bins, powers, hollow, rests, lefts, phases, components, shares, out):
+def _begin(matrices, steps, bins, powers, hollow, rests, lefts, phases, components, shares, loudest, out):
     """Set the initial rest, map, waves and sources of each bin, and components of 0."""
     k, thread = cuda.blockIdx.y, cuda.blockIdx.x * _BLOCK + cuda.threadIdx.x
     n_mics, n_directions = steps.shape
@@ -40,51 +40,50 @@ def _begin(matrices, steps, bins, powers, hollow, rests, lefts, phases, componen
         lefts[k, thread] = powers[k, thread]
         out[k, thread] = _ZERO
     if thread < n_mics:
-        components[k, 0, thread] = _NOTHING
+        components[k, 0, thread] = loudest[k] = _NOTHING
         shares[k, 0] = shares[k, 1] = _ZERO
         for j in range(n_mics):
             rests[k, thread, j] = _NOTHING if hollow and thread == j else matrices[k, thread, j]
 
 
 @cuda.jit(cache=True)
-def _subtract_map(phases, components, shares, norm, lefts, values, places):
-    """Subtract the map of a component, and set the largest power of each thread's directions."""
-    k, thread = cuda.blockIdx.x, cuda.threadIdx.x
+def _subtract_map(phases, components, shares, norm, lefts, loudest):
+    """Subtract the map of a component, a thread per direction, and find the largest power of each bin.
+
+    ``loudest`` holds the bits of that power, whose order is that of positive numbers, above the bits of 2³² − 1 minus
+    its direction. Of equal powers, the largest number is therefore that of the first direction.
+    """
+    k, direction = cuda.blockIdx.y, cuda.blockIdx.x * _BLOCK + cuda.threadIdx.x
+    if direction >= lefts.shape[1]:
+        return
     scale, own = shares[k, 0] / norm, shares[k, 1]
-    peak, loudest = -_ONE, np.int32(0)
-    for direction in range(thread, lefts.shape[1], _SEEKERS):
-        x, y = _ZERO, _ZERO
-        for mic in range(phases.shape[1]):
-            phase, value = phases[k, mic, direction], components[k, 0, mic]
-            a, b, c, d = real_of(phase), imag_of(phase), real_of(value), imag_of(value)
-            x += a * c + b * d
-            y += a * d - b * c
-        left = lefts[k, direction] - scale * (x * x + y * y - own)
-        lefts[k, direction] = left
-        if left > peak:
-            peak, loudest = left, np.int32(direction)
-    values[k, thread], places[k, thread] = peak, loudest
+    x, y = _ZERO, _ZERO
+    for mic in range(phases.shape[1]):
+        phase, value = phases[k, mic, direction], components[k, 0, mic]
+        a, b, c, d = real_of(phase), imag_of(phase), real_of(value), imag_of(value)
+        x += a * c + b * d
+        y += a * d - b * c
+    left = np.float32(lefts[k, direction] - scale * (x * x + y * y - own))
+    lefts[k, direction] = left
+    if left > _ZERO:
+        cuda.atomic.max(loudest, k, (np.uint64(left.view(np.uint32)) << _32) | (_LAST - np.uint64(direction)))
 
 
 @cuda.jit(cache=True)
-def _choose(values, places, turn, peaks, chosen, shares, out):
+def _choose(loudest, turn, peaks, chosen, shares, out):
     """Choose the loudest direction of each bin, or end it."""
     k = cuda.blockIdx.x * _BLOCK + cuda.threadIdx.x
     if k >= len(chosen) or (turn > 0 and chosen[k] == _ENDED):
         return
-    peak, loudest = values[k, 0], places[k, 0]
-    for seeker in range(1, _SEEKERS):
-        value, place = values[k, seeker], places[k, seeker]
-        if value > peak or (value == peak and place < loudest):
-            peak, loudest = value, place
-    chosen[k] = _ENDED
-    shares[k, 0] = _ZERO
-    if peak > _ZERO:
+    found, loudest[k] = loudest[k], _NOTHING
+    chosen[k], shares[k, 0] = _ENDED, _ZERO
+    if found != _NOTHING:
+        peak, direction = np.uint32(found >> _32).view(np.float32), np.int32(_LAST - (found & _LAST))
         share = CLEAN_LOOP_GAIN * peak
-        out[k, loudest] += share
+        out[k, direction] += share
         peaks[k, turn] = peak
         if turn <= CLEAN_GROWTH or not peak > peaks[k, turn - CLEAN_GROWTH]:
-            chosen[k], shares[k, 0] = loudest, share
+            chosen[k], shares[k, 0] = direction, share
 
 
 @cuda.jit(cache=True)
@@ -147,8 +146,7 @@ def clean_sources(matrices, steps, bins, powers, hollow, out):
     lefts = workspace("clean_sources lefts", out.shape, np.float32)
     phases = workspace("clean_sources phases", (n_bins, *steps.shape), np.uint64)
     components = workspace("clean_sources components", (n_bins, 2, n_mics), np.uint64)
-    values = workspace("clean_sources values", (n_bins, _SEEKERS), np.float32)
-    places = workspace("clean_sources places", (n_bins, _SEEKERS), np.int32)
+    loudest = workspace("clean_sources loudest", (n_bins,), np.uint64)
     peaks = workspace("clean_sources peaks", (n_bins, n_rounds), np.float32)
     chosen = workspace("clean_sources chosen", (n_bins,), np.int32)
     shares = workspace("clean_sources shares", (n_bins, 2), np.float32)
@@ -157,11 +155,12 @@ def clean_sources(matrices, steps, bins, powers, hollow, out):
         return -(-count // _BLOCK)
 
     block, of_bins = (_BLOCK,), (blocks(n_bins),)
-    arguments = matrices.view(np.uint64), steps, bins, powers, hollow, rests, lefts, phases, components, shares, out
-    launch(_begin, (blocks(max(out.shape[1], n_mics)), n_bins), block, *arguments)
+    arguments = matrices.view(np.uint64), steps, bins, powers, hollow, rests, lefts, phases, components, shares
+    launch(_begin, (blocks(max(out.shape[1], n_mics)), n_bins), block, *arguments, loudest, out)
     for turn in range(n_rounds):
-        launch(_subtract_map, (n_bins,), (_SEEKERS,), phases, components, shares, norm, lefts, values, places)
-        launch(_choose, of_bins, block, values, places, turn, peaks, chosen, shares, out)
+        of_directions = blocks(out.shape[1]), n_bins
+        launch(_subtract_map, of_directions, block, phases, components, shares, norm, lefts, loudest)
+        launch(_choose, of_bins, block, loudest, turn, peaks, chosen, shares, out)
         arguments = rests, phases, chosen, turn, peaks, root, hollow, components
         launch(_find_component, (blocks(n_mics), n_bins), block, *arguments)
         if hollow:

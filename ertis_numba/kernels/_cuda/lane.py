@@ -11,6 +11,7 @@ from numba import cuda
 from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.errors import DeviceError
+from ertis_numba.kernels._cuda.copies import Copies
 from ertis_numba.kernels._cuda.graph import Graph
 
 __all__ = ["SIMULATED", "Lane", "current", "launch", "workspace"]
@@ -54,7 +55,9 @@ class Lane:
         self._rooms: dict[str, Any] = {}
         self._staged: dict[tuple[tuple[int, ...], str], tuple[NDArray[Any], Any]] = {}
         self._targets: dict[tuple[int, ...], Any] = {}
-        self._graph = Graph(stream) if graphs and not SIMULATED else None
+        on_gpu = bool(stream) and not SIMULATED
+        self._graph = Graph(stream) if graphs and on_gpu else None
+        self._copies = Copies(stream) if on_gpu else None
 
     @contextlib.contextmanager
     def entered(self) -> Iterator[None]:
@@ -74,7 +77,10 @@ class Lane:
             self._staged[kind] = self._pin(array.shape, array.dtype), self._allocate(array.shape, array.dtype)
         staged, here = self._staged[kind]
         np.copyto(staged, array)
-        here.copy_to_device(staged, stream=self.stream)
+        if self._copies is None:
+            here.copy_to_device(staged, stream=self.stream)
+        else:
+            self._copies.to_device(staged, here)
         return here
 
     def target(self, out: NDArray[np.float32]) -> Any:
@@ -92,7 +98,10 @@ class Lane:
 
     def fetch(self, array: Any, out: NDArray[Any]) -> None:
         """Start to copy an array of the device, such as the result of `target`, to ``out``."""
-        array.copy_to_host(out, stream=self.stream)
+        if self._copies is None or not (out.flags.c_contiguous and array.is_c_contiguous()):
+            array.copy_to_host(out, stream=self.stream)
+        else:
+            self._copies.to_host(array, out)
 
     def wait(self) -> None:
         """Block until all operations on this lane are complete."""
