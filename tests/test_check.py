@@ -55,13 +55,13 @@ def results(checked, sensor=0):
     return {item.check: item.result for item in checked.sensors[sensor].items}
 
 
+PLANE = SENSOR.replace(array=Array(), recording=Recording(n_samples=65_536), electronics=Electronics(noise_dbfs=-45.0))
+
+
 @functools.cache
 def plane_array():
     """A measurement of an array of 32 microphones, with one echo from the side."""
-    sensor = SENSOR.replace(
-        array=Array(), recording=Recording(n_samples=65_536), electronics=Electronics(noise_dbfs=-45.0)
-    )
-    return rendered(sensor, Point(azimuth_deg=25, elevation_deg=10, range_m=0.9, strength_db=-5))
+    return rendered(PLANE, Point(azimuth_deg=25, elevation_deg=10, range_m=0.9, strength_db=-5))
 
 
 # Verdicts on recordings.
@@ -84,6 +84,59 @@ def test_healthy_recordings_are_fit_for_use(tmp_path):
         "call": "ok",
         "calibration": "not known",
     }
+
+
+def passive(path, *measurements, active=()):
+    """Write measurements without a call, after others with a call."""
+    given = [
+        dataclasses.replace(each, stamp=dataclasses.replace(stamp(number), behaviour=behaviour))
+        for number, (each, behaviour) in enumerate(
+            [*((each, "active") for each in active), *((each, "passive") for each in measurements)]
+        )
+    ]
+    return write_recording(path, given)
+
+
+@functools.cache
+def silence():
+    """A measurement of 32 microphones that hear only their own noise."""
+    return rendered(PLANE.replace(emitter=PLANE.emitter.replace(silent=True)))
+
+
+def test_recording_without_a_call_is_judged_by_what_it_shows(tmp_path):
+    path = passive(tmp_path / "a.h5", silence(), silence(), silence())
+    checked = check_recording(path)
+    assert checked.verdict == f"{path}: fit for use; not known: clock drift, call, calibration"
+    details = {item.check: item.detail for item in checked.sensors[0].items}
+    assert details["call"] == details["calibration"] == "no call was emitted"
+    assert "dead microphones: no sound exceeds the noise" in details["microphones"]
+    assert "not observable: polarity, order and delay of channels" in details["microphones"]
+    assert "with the sound of sources; the dynamic range needs a call" in details["noise floor"]
+    assert checked.sensors[0].calibration is checked.sensors[0].call is None
+    assert "3 measurements, 3 of them without a call, 3 examined" in run(path).stdout
+    assert json.loads(run(path, "--json").stdout)["sensors"][0]["passive"] == 3
+    page = tmp_path / "page.html"
+    run(path, "--report", page)
+    assert "without a call: 3" in page.read_text()
+    assert "Matched-filter output" not in page.read_text()
+    # The same sound with a call is a fault, because an echo is missing.
+    assert not check_recording(stored(tmp_path / "b.h5", silence())).is_fit
+
+
+@pytest.mark.parametrize("name", ["stuck at 1", "saturated", "offset"])
+def test_faulty_channel_is_found_without_a_call(tmp_path, name):
+    checked = check_recording(passive(tmp_path / "a.h5", BY_HAND[name]()))
+    assert [fault.check for fault in checked.faults] == ["microphones"]
+    assert "channel 3" in checked.faults[0].text
+
+
+def test_measurements_with_a_call_are_preferred(tmp_path):
+    path = passive(tmp_path / "a.h5", silence(), silence(), active=[plane_array()] * 2)
+    checked = check_recording(path)
+    assert checked.is_fit
+    assert checked.sensors[0].examined == (0, 1)
+    assert checked.sensors[0].n_passive == 2
+    assert (results(checked)["call"], results(checked)["calibration"]) == ("ok", "ok")
 
 
 @pytest.mark.parametrize(

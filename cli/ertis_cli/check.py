@@ -57,7 +57,8 @@ def check(
     """Check whether sensors are fit for use.
 
     The command examines recordings of new, moved or repaired sensors: microphones, noise, losses, timing, call and
-    calibration. At most 8 measurements of each sensor, evenly spaced, are examined. The last line for each file has the
+    calibration. At most 8 measurements of each sensor, evenly spaced, are examined. Measurements without a call show
+    neither call nor calibration, and are examined only if there are no others. The last line for each file has the
     verdict, all faults and their remedies.
 
     The exit code is 0 if all sensors are fit for use, and 1 if a fault was found or a file cannot be read. The page of
@@ -110,7 +111,9 @@ def _print(checked: "RecordingCheck", *, quiet: bool) -> None:
 def _about(sensor: "SensorCheck") -> str:
     microphones = options.counted(sensor.n_microphones, "microphone")
     measurements = options.counted(sensor.stored.measurements, "measurement")
-    return f"layout {sensor.settings.array.layout}, {microphones}, {measurements}, {len(sensor.examined)} examined"
+    passive = f", {sensor.n_passive} of them without a call" if sensor.n_passive else ""
+    examined = f"{len(sensor.examined)} examined"
+    return f"layout {sensor.settings.array.layout}, {microphones}, {measurements}{passive}, {examined}"
 
 
 def _report(checked: "RecordingCheck") -> dict[str, Any]:
@@ -133,6 +136,7 @@ def _sensor(checked: "SensorCheck") -> dict[str, Any]:
         "microphones": checked.n_microphones,
         "measurements": stored.measurements,
         "examined": checked.examined,
+        "passive": checked.n_passive,
         "missing": stored.missing,
         "damaged": [item.index for item in stored.damaged],
         "implausible_words": checked.words.reasons,

@@ -41,7 +41,9 @@ def check_recording(
     """Check whether the sensors of a recording are fit for use.
 
     At most 8 intact measurements of each sensor, evenly spaced, are examined for faulty microphones, noise, the call
-    and the calibration, and at most 64 for lost words. Checksums, sequence numbers and time stamps are checked of all.
+    and the calibration, and at most 64 for lost words. Measurements without a call are examined only if there are no
+    others; the call and the calibration are then not known. Checksums, sequence numbers and time stamps are checked of
+    all.
 
     Parameters
     ----------
@@ -152,22 +154,25 @@ def _check_sensor(
         used = recording.settings if settings is None else settings(recording.settings)
         damaged = {item.index for item in stored.damaged}
         intact = [index for index in range(len(recording)) if index not in damaged]
-        examined = _spread(intact, _MAX_EXAMINED)
+        stamps = recording.stamps()
+        with_call = [index for index in intact if stamps[index].behaviour != "passive"]
+        has_call = bool(with_call) or not intact
+        examined = _spread(with_call or intact, _MAX_EXAMINED)
         words = find_lost_words(((index, recording[index]) for index in _spread(intact, _MAX_BITS_EXAMINED)), used)
         heard = [_with_settings(recording[index], used) for index in examined]
-        clock = check_clock(recording.stamps(), used.recording.duration_s, nominal_rate_hz)
+        clock = check_clock(stamps, used.recording.duration_s, nominal_rate_hz)
     report = merge([health(measurement) for measurement in heard]) if heard else None
-    match = _best_call_match(heard)
-    residuals, why = _calibration_residuals(heard, report)
+    match = _best_call_match(heard) if has_call else None
+    residuals, why = _calibration_residuals(heard, report) if has_call else (None, items.NO_CALL)
     layout = microphones(used.array)
     found: dict[str, items.CheckResult] = {
-        items.MICROPHONES: items.of_microphones(report),
+        items.MICROPHONES: items.of_microphones(report, has_call=has_call),
         items.NOISE: items.of_noise(report, used),
         items.SAMPLES: items.of_samples(report, words),
         items.MEASUREMENTS: items.of_storage(stored),
         items.TIMING: items.of_timing(clock),
         items.DRIFT: items.of_drift(clock),
-        items.CALL: items.of_call(match),
+        items.CALL: items.of_call(match, has_call=has_call),
         items.CALIBRATION: items.of_calibration(residuals, why, report),
     }
     return SensorCheck(
@@ -177,6 +182,7 @@ def _check_sensor(
         items=tuple(CheckItem(check=name, result=each.result, detail=each.detail) for name, each in found.items()),
         faults=tuple(fault for each in found.values() for fault in each.faults),
         examined=tuple(examined),
+        n_passive=sum(stamp.behaviour == "passive" for stamp in stamps),
         stored=stored,
         health=report,
         words=words,

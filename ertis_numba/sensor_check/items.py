@@ -29,6 +29,7 @@ __all__ = [
     "MEASUREMENTS",
     "MICROPHONES",
     "NOISE",
+    "NO_CALL",
     "SAMPLES",
     "TIMING",
     "CheckResult",
@@ -57,6 +58,7 @@ _BITS: Final = {
 """Faults by the reasons of `BitCheck`."""
 COPY: Final = "copy the file again, or record again"
 """Remedy for damaged files."""
+NO_CALL: Final = "no call was emitted"
 
 _DEVIATIONS: Final = 4.0
 _WORTH_S: Final = 1e-6  # 18 degrees of a period at 50 kHz.
@@ -79,32 +81,41 @@ def _result_of(faults: Sequence[CheckFault], detail: str) -> CheckResult:
     return CheckResult("fault" if faults else "ok", texts or detail, tuple(faults))
 
 
-def of_microphones(report: Health | None) -> CheckResult:
-    """Return the result for the microphones; it is a fault if dead microphones cannot be detected."""
+def of_microphones(report: Health | None, *, has_call: bool) -> CheckResult:
+    """Return the result for the microphones; with a call, it is a fault if dead microphones cannot be detected."""
     if report is None:
         return _NOTHING
     count = len(report.channels)
     faults = microphone_faults(report)
-    if report.unknown and not faults:
+    if report.unknown and not faults and has_call:
         if count == 1:
             return CheckResult("not known", report.unknown[0])
         text = f"faulty microphones cannot be detected ({report.unknown[0]})"
         faults = (CheckFault(check=MICROPHONES, text=text, remedy="record a whole emission and its echoes"),)
     detail = f"{count} of {count} without a fault"
+    if report.unknown:
+        detail += f"; not known: {report.unknown[0]}"
     if report.not_observable:
         detail += f"; not observable: {report.not_observable[0].partition(':')[0]}"
     return _result_of(faults, detail)
 
 
 def of_noise(report: Health | None, used: Settings) -> CheckResult:
-    """Return the noise and the dynamic range; noise as that of random bits is a fault."""
+    """Return the noise and the dynamic range, if any; noise as that of random bits is a fault."""
     if report is None:
         return _NOTHING
-    if report.noise_dbfs is None or report.dynamic_range_db is None:
+    if report.noise_dbfs is None:
         return CheckResult("not known", "no microphone without a fault has a measurable noise")
-    detail = f"{report.noise_dbfs:.1f} dBFS in the call's band, dynamic range {report.dynamic_range_db:.1f} dB"
-    band_hz = used.call.high_frequency_hz - used.call.low_frequency_hz
-    white_dbfs = 10 * math.log10(2 * band_hz / used.recording.sample_rate_hz)
+    low_hz, high_hz = used.call.low_frequency_hz, used.call.high_frequency_hz
+    detail = f"{report.noise_dbfs:.1f} dBFS in the call's band, dynamic range {report.dynamic_range_db or 0.0:.1f} dB"
+    if report.dynamic_range_db is None:
+        low_hz, high_hz = used.passive.extent_hz
+        high_hz = min(high_hz, used.recording.sample_rate_hz / 2)
+        detail = (
+            f"{report.noise_dbfs:.1f} dBFS from {low_hz / 1e3:g} to {high_hz / 1e3:g} kHz, with the sound of sources; "
+            "the dynamic range needs a call"
+        )
+    white_dbfs = 10 * math.log10(2 * (high_hz - low_hz) / used.recording.sample_rate_hz)
     if not used.recording.is_pdm or report.noise_dbfs <= white_dbfs + MAX_WHITE_DB:
         return CheckResult("ok", detail)
     text = f"the noise of {report.noise_dbfs:.1f} dBFS is that of random bits"
@@ -177,8 +188,10 @@ def of_drift(clock: ClockCheck) -> CheckResult:
     return _result_of((), f"{clock.drift_ppm or 0.0:+.0f} ± {clock.rate_sd_ppm or 0.0:.0f} ppm relative to the host")
 
 
-def of_call(match: CallMatch | None) -> CheckResult:
+def of_call(match: CallMatch | None, *, has_call: bool) -> CheckResult:
     """Return the match of the call."""
+    if not has_call:
+        return CheckResult("not known", NO_CALL)
     if match is None:
         return CheckResult("not known", "no sound is above the noise")
     if match.matches:

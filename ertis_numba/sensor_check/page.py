@@ -100,7 +100,7 @@ def _of_recording(checked: RecordingCheck) -> str:
 def _of_sensor(path: Path, checked: SensorCheck) -> str:
     about = (
         f"Layout {checked.settings.array.layout}, microphones: {checked.n_microphones}, measurements: "
-        f"{checked.stored.measurements}, examined: {len(checked.examined)}"
+        f"{checked.stored.measurements}, without a call: {checked.n_passive}, examined: {len(checked.examined)}"
     )
     rows = [
         [(_text(item.check), ""), (_text(item.result), f"result {_CLASSES[item.result]}"), (_text(item.detail), "")]
@@ -151,7 +151,8 @@ def _pictures(path: Path, checked: SensorCheck) -> list[str]:
             measurement = replace(recording[index], settings=checked.settings)
     except (DataError, OSError) as error:  # The file may have changed since the check.
         return [f"<p>No plots: {_text(str(error))}</p>"]
-    return [_picture(name, measurement, index) for name in _PLOTS]
+    names = list(_PLOTS)[measurement.stamp.behaviour == "passive" :]  # The matched filter is that of a call.
+    return [_picture(name, measurement, index) for name in names]
 
 
 def _picture(name: str, measurement: Measurement, index: int) -> str:

@@ -71,6 +71,8 @@ class SensorCheck:
         All faults.
     examined : tuple of int
         Indices of the measurements whose samples were examined.
+    n_passive : int
+        Number of measurements without a call.
     stored : SensorReport
         Missing and damaged measurements.
     health : Health or None
@@ -91,6 +93,7 @@ class SensorCheck:
     items: tuple[CheckItem, ...]
     faults: tuple[CheckFault, ...]
     examined: tuple[int, ...]
+    n_passive: int
     stored: SensorReport
     health: Health | None
     words: LostWords

@@ -76,6 +76,13 @@ class Passive(TomlTable, frozen=True, kw_only=True):
                 f"out, or give {' or '.join(_WITHOUT_DIAGONAL)}"
             )
 
+    @property
+    def extent_hz(self) -> tuple[float, float]:
+        """Lowest and highest frequency of all bands, in hertz."""
+        if isinstance(self.bands_hz, str):
+            return self.limits_hz
+        return min(low_hz for low_hz, _ in self.bands_hz), max(high_hz for _, high_hz in self.bands_hz)
+
     def _check_bands(self) -> None:
         given = self.bands_hz
         if isinstance(given, str):

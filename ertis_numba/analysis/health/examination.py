@@ -29,7 +29,7 @@ from ertis_numba.analysis.health.pcm_samples import by_numbers, scaled, swapped_
 from ertis_numba.analysis.health.repeats import duplicates, hum, repeated_blocks, stuck_at_times
 from ertis_numba.analysis.health.report import ChannelHealth, Finding, Health
 from ertis_numba.analysis.health.spectra import by_spectra
-from ertis_numba.analysis.health.wavefront import by_wavefront
+from ertis_numba.analysis.health.wavefront import DESCRIPTIONS, by_wavefront
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.sample_format import sample_format
@@ -54,6 +54,9 @@ def health(measurement: Measurement) -> Health:
     number of microphones without fault. The duration excludes five eighths of each ramp, because a Hann ramp has three
     eighths of the energy.
 
+    A measurement without a call is compared in the bands of ``settings.passive`` instead. It shows neither the dynamic
+    range, nor the faults that the wavefront of a call reveals.
+
     Parameters
     ----------
     measurement : Measurement
@@ -76,7 +79,8 @@ def health(measurement: Measurement) -> Health:
         print(report.verdict() or "no faults")
     """
     checks.instance("measurement", measurement, Measurement, "a recording holds")
-    settings, enabled = measurement.settings, np.flatnonzero(microphones(measurement.settings.array).enabled)
+    settings, has_call = measurement.settings, measurement.stamp.behaviour != "passive"
+    enabled = np.flatnonzero(microphones(measurement.settings.array).enabled)
     words = sample_format(settings).validated(measurement.data, any_length=True)[:MAX_SAMPLES]
     if len(words) < MIN_SAMPLES:
         too_short = f"the state of any microphone: the record has {len(words)} samples, fewer than {MIN_SAMPLES}"
@@ -97,14 +101,17 @@ def health(measurement: Measurement) -> Health:
         columns, half_scale = functools.partial(_column, words), full
     found = {item.channel: item for item in reported}
     moving = [item for item in reported if not any(name.startswith("stuck") for name in item.faults)]
-    reported, tones_hz, unknown, findings = by_spectra(signal_of, len(words), moving, settings)
+    band_hz = (
+        (settings.call.low_frequency_hz, settings.call.high_frequency_hz) if has_call else settings.passive.extent_hz
+    )
+    reported, tones_hz, unknown, findings = by_spectra(signal_of, len(words), moving, settings, band_hz)
     found |= {item.channel: item for item in reported}
     moved = [(item.channel, columns(item.channel)) for item in moving]
     findings += _by_words(words, moved, found, settings, half_scale)
     deaf = {finding.channels[0] for finding in findings if finding.fault in _DEAF}
     heard = [item.channel for item in reported if not set(item.faults) & _DEAF and item.channel not in deaf]
-    not_observable: tuple[str, ...] = ()
-    if heard and not any("resolve" in text for text in unknown):
+    not_observable: tuple[str, ...] = () if has_call else (f"{DESCRIPTIONS}: no call was emitted",)
+    if has_call and heard and not any("resolve" in text for text in unknown):
         shown, not_observable = by_wavefront(signal_of, heard, settings, n_samples=len(words))
         findings += shown
     findings = [*_of_channels(found.values()), *findings]
@@ -122,6 +129,8 @@ def health(measurement: Measurement) -> Health:
         return report
     call = settings.call
     noise_dbfs = 10 * math.log10(math.fsum(noise) / len(noise))
+    if not has_call:
+        return replace(report, noise_dbfs=noise_dbfs)
     duration_s = call.duration_s * (1 - 5 / 4 * call.ramp_fraction)
     gain = (call.high_frequency_hz - call.low_frequency_hz) * duration_s * len(noise)
     dynamic_range_db = 10 * math.log10(gain / 2) - noise_dbfs

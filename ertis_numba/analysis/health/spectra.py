@@ -32,6 +32,7 @@ def by_spectra(
     n_samples: int,
     found: Sequence[ChannelHealth],
     settings: Settings,
+    band_hz: tuple[float, float],
 ) -> tuple[list[ChannelHealth], tuple[float, ...], tuple[str, ...], list[Finding]]:
     """Return the channels with spectral statistics, common tones, impossible checks, and findings of level and noise.
 
@@ -43,16 +44,17 @@ def by_spectra(
     found : sequence of ChannelHealth
         Channels that are not stuck.
     settings : Settings
+    band_hz : (float, float)
+        Band of the sound.
     """
-    call = settings.call
     size = min(_LONGEST_SEGMENT, 2 ** int(math.log2(n_samples / _SEGMENTS)))
     line_hz = settings.recording.sample_rate_hz / size
-    low = round(call.low_frequency_hz / line_hz)
-    high = min(round(call.high_frequency_hz / line_hz) + 1, size // 2)
+    low = round(band_hz[0] / line_hz)
+    high = min(round(band_hz[1] / line_hz) + 1, size // 2)
     if not found:
         return [], (), (), []
     if high - low < _MIN_LINES or low < _FIRST_LINE:
-        why = f"{n_samples} samples are too few to resolve the call's band"
+        why = f"{n_samples} samples are too few to resolve the band of {band_hz[0] / 1e3:g} to {band_hz[1] / 1e3:g} kHz"
         return list(found), (), (f"dead microphones, tones and noise: {why}",), []
     spectra = [_bits.spectrogram(signal_of(item.channel), size=size, n_lines=high) for item in found]
     power = np.stack([lines[:, low:].sum(axis=1, dtype=np.float64) for lines in spectra])

@@ -15,9 +15,9 @@ from ertis_numba.analysis.health.report import Finding
 from ertis_numba.geometry import Layout, layout_names, load_layout, microphones
 from ertis_numba.settings import Settings
 
-__all__ = ["by_wavefront"]
+__all__ = ["DESCRIPTIONS", "by_wavefront"]
 
-_DESCRIPTIONS = "polarity, order and delay of channels, and a shift of the record"
+DESCRIPTIONS = "polarity, order and delay of channels, and a shift of the record"
 _COMPACT_SHARE = 0.75  # Minimum share of the microphones that a wavefront must fit.
 _PERMUTED_SHARE = 0.9  # Minimum share of the microphones that it must fit in another order.
 _MIN_INCOMPATIBLE = 0.25  # Minimum additional share that the other order must fit.
@@ -67,14 +67,14 @@ def by_wavefront(
     width_s = float(2 * np.linalg.norm(positions_m, axis=1).max(initial=0.0)) / speed_m_s
     arrived = strongest(found, width_s)
     if arrived is None:
-        return [], (f"{_DESCRIPTIONS}: no arrival exceeds the background",)
+        return [], (f"{DESCRIPTIONS}: no arrival exceeds the background",)
     times_s, middle_s = arrived
     times_s = times_s - layout.delay_s[list(channels)]
     path_m = max(middle_s * speed_m_s, _MIN_PATH_M)
     curvatures = (0.0, 1 / path_m, 2 / path_m)
     echo = fit_delays(times_s, positions_m, curvatures, speed_m_s)
     if echo is None:
-        return [], (f"{_DESCRIPTIONS}: {len(channels)} microphones are too few to fit a wavefront",)
+        return [], (f"{DESCRIPTIONS}: {len(channels)} microphones are too few to fit a wavefront",)
     direct = fit_emitter(times_s, positions_m, speed_m_s)
     from_centre_m = np.linalg.norm(positions_m, axis=1)
     is_direct = (
@@ -83,12 +83,12 @@ def by_wavefront(
         and float(np.ptp(from_centre_m)) > _MIN_DEPTH_M
     )
     if not is_direct and middle_s * speed_m_s < _MIN_PATH_M:
-        return [], (f"{_DESCRIPTIONS}: the strongest arrival is too near to fit a wavefront",)
+        return [], (f"{DESCRIPTIONS}: the strongest arrival is too near to fit a wavefront",)
     fit = direct if is_direct else echo
     if fit.share < _COMPACT_SHARE:
         enough = len(channels) >= _MIN_RECORD_CHANNELS
         ordered = _other_order(times_s, channels, layout, fit, curvatures, speed_m_s) if enough else []
-        return (ordered, ()) if ordered else ([], (f"{_DESCRIPTIONS}: no single wavefront fits the strongest arrival",))
+        return (ordered, ()) if ordered else ([], (f"{DESCRIPTIONS}: no single wavefront fits the strongest arrival",))
     findings = []
     if is_direct and len(channels) >= _MIN_RECORD_CHANNELS and abs(direct.emission_s) > MAX_SHIFT_S:
         findings.append(
