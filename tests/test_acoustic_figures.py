@@ -1,6 +1,7 @@
 """Plots of acoustic maps, spectra and spectrograms show levels where they are, and in the right unit."""
 
 import dataclasses
+import json
 import math
 
 import numpy as np
@@ -61,6 +62,21 @@ def test_map_shows_the_level_of_a_band_in_each_direction(band_hz, place_deg, lev
     assert bar.get_ylabel() == "dBFS"
     assert "eRTIS-7" in texts(figure)
     assert ("25–31.5 kHz" if band_hz else "20–31.5 kHz") in texts(figure)
+
+
+def test_labels_of_maps_keep_clear_of_the_edges():
+    figure = figures.acoustic_map(acoustic_map())
+    around = figure.axes[0].get_tightbbox(figure.canvas.get_renderer())
+    margin = 0.008 * figure.bbox.width
+    assert around.x0 > margin
+    assert around.y0 > margin
+
+
+def test_maps_of_several_measurements_name_the_last():
+    assert "eRTIS-7 · measurement 3" in texts(figures.acoustic_map(acoustic_map()))
+    averaged = texts(figures.acoustic_map(acoustic_map().replace(n_measurements=3)))
+    assert "eRTIS-7 · up to measurement 3" in averaged
+    assert "mean of 3 measurements" in averaged
 
 
 def test_levels_are_sound_pressures_if_the_sensitivity_is_known():
@@ -238,7 +254,10 @@ def folder(tmp_path, monkeypatch, photo):
 )
 def test_kinds_of_sound_are_plotted(line, kind):
     done = run(f"plot {line} -o plot.png --json")
-    assert f'"kind": "{kind}"' in done.stdout
+    report = json.loads(done.stdout)
+    counted = "map" if line.startswith("maps.h5") else "measurement"
+    assert (report["kind"], report[counted]) == (kind, int("-m 1" in line))
+    assert f"plot.png: {counted} " in done.stderr
     with Image.open("plot.png") as picture:
         assert len(picture.convert("RGB").resize((200, 200)).getcolors(40_000)) > 20
 

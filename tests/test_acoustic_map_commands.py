@@ -261,13 +261,13 @@ def test_peaks_are_the_loudest_directions():
     rows = json.loads(run("peaks maps.h5 --json").stdout)["loudest"]
     with ertis.open_acoustic_maps("maps.h5") as maps:
         expected = [each for found in maps for each in found.loudest()]
-    assert [(row["measurement"], *row["band_hz"]) for row in rows] == [
+    assert [(row["map"], *row["band_hz"]) for row in rows] == [
         (number, *band) for number in (0, 1) for band in ((20e3, 25e3), (30e3, 40e3))
     ]
     assert azimuths_deg(rows) == pytest.approx([np.degrees(each.azimuth_rad) for each in expected], abs=1e-3)
     assert [row["level_dbfs"] for row in rows] == pytest.approx([each.level_dbfs for each in expected], abs=1e-3)
     shown = run("peaks maps.h5 -m 1").stdout.splitlines()
-    assert shown[0].split() == ["sensor", "measurement", "band_khz", "azimuth_deg", "elevation_deg", "level_dbfs"]
+    assert shown[0].split() == ["sensor", "map", "band_khz", "azimuth_deg", "elevation_deg", "level_dbfs"]
     assert [line.split()[:3] for line in shown[1:]] == [["sensor", "1", "20.0–25.0"], ["sensor", "1", "30.0–40.0"]]
 
 

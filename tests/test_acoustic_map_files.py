@@ -210,6 +210,11 @@ def test_spoiled_map_file_is_refused(path, spoil, error, message):
         ertis.open_acoustic_maps(path)
 
 
+def test_map_outside_the_file_is_refused(path):
+    with ertis.open_acoustic_maps(path) as reader, pytest.raises(IndexError, match="has no acoustic map 3; it has 3"):
+        reader[3]
+
+
 def test_missing_map_file_is_reported(tmp_path):
     with pytest.raises(DataError, match="No such file or directory; give a file of acoustic maps"):
         ertis.open_acoustic_maps(tmp_path / "maps.h5")
@@ -220,7 +225,7 @@ def test_flipped_bit_in_the_powers_is_found(path):
         file[f"{GROUP}/power"][1, 2, 1] *= 1.5
     with ertis.open_acoustic_maps(path) as reader:
         assert reader[0].n_measurements == 1
-        with pytest.raises(DamagedError, match="measurement 1 has CRC-32"):
+        with pytest.raises(DamagedError, match="acoustic map 1 has CRC-32"):
             reader[1]
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from ertis_numba.frames import AcousticMap, Measurement
 
-__all__ = ["FIELD_OF_VIEW", "KINDS", "draw", "is_acoustic", "plot_options"]
+__all__ = ["FIELD_OF_VIEW", "KINDS", "draw", "is_acoustic", "plot_options", "row_name"]
 
 KINDS = {
     "acoustic_map": "sound power from each direction, chosen for passive measurements and files of acoustic maps",
@@ -77,6 +77,13 @@ def is_acoustic(path: Path, sensor: str | None, index: int) -> bool:
                 return 0 <= index < len(stamps) and is_passive(recording.settings, stamps[index])
         return kind == "acoustic_map"
     return False
+
+
+def row_name(path: Path) -> str:
+    """Return what --measurement counts in a file: ``map`` or ``measurement``."""
+    from ertis_numba.storage import file_kind
+
+    return "map" if file_kind(path) == "acoustic_map" else "measurement"
 
 
 def draw(

@@ -31,7 +31,7 @@ _ERROR_COLUMNS: dict[str, _tables.Side] = {
 }
 _LOUDEST_COLUMNS: dict[str, _tables.Side] = {
     "sensor": "left",
-    **dict.fromkeys(("measurement", "band_khz", "azimuth_deg", "elevation_deg"), "right"),
+    **dict.fromkeys(("map", "band_khz", "azimuth_deg", "elevation_deg"), "right"),
 }
 _OF_IMAGES = ("top", "min_level", "detector", "false_alarm", "everything", "truth")
 _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "level_db": 4, "level_dbfs": 4}
@@ -49,7 +49,7 @@ _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "
     metavar="DB",
     help=f"Lowest level relative to the strongest peak; {_MIN_LEVEL_DB:g} by default, no limit with cfar.",
 )
-@options.measurement("One measurement only, counted from 0.")
+@options.measurement("One measurement, or map of a file of acoustic maps, counted from 0; all by default.")
 @click.option(
     "--detector",
     type=click.Choice(["peaks", "cfar"]),
@@ -98,7 +98,8 @@ def peaks(
 
     For a file of acoustic maps, there is one entry per map and band: the loudest direction. level_dbfs is its
     mean square, where a full-scale tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones.
-    Maps of the method music have no levels. Only --sensor, --measurement and --json apply to them.
+    Maps of the method music have no levels. Maps are counted from 0, whatever number of measurements they average.
+    Only --sensor, --measurement, which chooses a map, and --json apply to them.
     """
     from ertis_numba.storage import file_kind
 
@@ -168,7 +169,7 @@ def _list_loudest(path: Path, sensors: tuple[str, ...], measurement: int | None,
         with open_acoustic_maps(path, sensor=name) as maps:
             for index in options.places(measurement, len(maps)):
                 found = maps[index]
-                place = {"sensor": name, "measurement": index}
+                place = {"sensor": name, "map": index}
                 rows += [place | each.as_dict() for each in found.loudest()]
     if as_json:
         options.print_json({"loudest": rows})
@@ -183,7 +184,7 @@ def _loudest_cells(row: dict[str, Any], levels: tuple[str, ...]) -> tuple[str, .
     band = "–".join(f"{edge_hz / 1e3:.1f}" for edge_hz in row["band_hz"])
     angles = (f"{row[name]:+.2f}" for name in ("azimuth_deg", "elevation_deg"))
     shown = ("-" if row[name] is None else f"{row[name]:.1f}" for name in levels)
-    return (row["sensor"], str(row["measurement"]), band, *angles, *shown)
+    return (row["sensor"], str(row["map"]), band, *angles, *shown)
 
 
 def _finder(

@@ -65,7 +65,7 @@ _ONLY = {
 )
 @options.output("Picture to write: .png, .svg or .pdf; a .png beside the file by default.")
 @options.sensor("Sensor to plot; required if the file contains several sensors.")
-@options.measurement("Measurement to plot, counted from 0; the first by default.")
+@options.measurement("Measurement, or map of a file of acoustic maps, to plot, counted from 0; the first by default.")
 @click.option(
     "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Range of the colours."
 )
@@ -198,7 +198,7 @@ def plot(
         del look["dynamic_range_db"]
         figure, reported = figures.occupancy(read_map(path), **look), f"map of {path}"
     else:
-        index = measurement or 0
+        row, index = _acoustic_plots.row_name(path), measurement or 0
         if kind in _OF_RECORDINGS:
             heard = _measurement(path, sensor, index)
             draw = figures.signals if kind == "signals" else figures.matched_filter
@@ -221,8 +221,8 @@ def plot(
             places = {"height_m": height, "left_m": left, "side_lobes": side_lobes}
             look |= {name: value for name, value in places.items() if value is not None}
             figure, name = _drawn(kind, image, _reflectors(image, 5 if top is None else top), look), image.stamp.sensor
-        report |= {"sensor": name, "measurement": index}
-        reported = f"measurement {index} of {path}"
+        report |= {"sensor": name, row: index}
+        reported = f"{row} {index} of {path}"
     with atomic_write(target, overwrite=force) as part:
         figures.save(figure, part, format=target.suffix.lower().lstrip("."))
     options.say(f"{target}: {reported}", quiet=quiet)

@@ -89,7 +89,7 @@ def of_acoustic_map(title: str, found: AcousticMap, *parts: str) -> Heading:
     settings = found.settings
     passive, count = settings.passive, found.n_measurements
     return Heading(
-        (title, found.stamp.sensor, f"measurement {found.stamp.sequence}"),
+        (title, found.stamp.sensor, f"{'up to ' if count > 1 else ''}measurement {found.stamp.sequence}"),
         (
             settings.array.layout,
             *parts,

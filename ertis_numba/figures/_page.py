@@ -23,6 +23,7 @@ _ACROSS_EMS, _UP_EMS = 6.5, 6.0  # what ticks and names take around a picture
 _MAX_ROWS = 24  # of the list below a picture
 _MIN_ROWS = 12  # beside one, whatever its height
 _LABEL_EMS = 13.0  # length of what is written along the colour bar
+_LAYOUT_ROUNDS = 2  # The first measures labels beside axes that do not have their proportions yet.
 _SHARE_ALONE = 0.8  # of its box that a colour bar takes which no list is under
 
 
@@ -135,7 +136,8 @@ def _place(
     engine: Any = figure.get_layout_engine()
     rect = (left_pt / width_pt, bottom_pt / height_pt, (right_pt - 2 * left_pt) / width_pt, tall_pt / height_pt)
     engine.set(rect=rect, w_pad=0.02, h_pad=0.02, wspace=0.03, hspace=0.03)
-    engine.execute(figure)
+    for _ in range(_LAYOUT_ROUNDS):
+        engine.execute(figure)
     figure.set_layout_engine("none")
 
 

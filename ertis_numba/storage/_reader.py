@@ -89,6 +89,7 @@ class FileReader(Sequence[Item]):
 
     _kind: ClassVar[str]
     _wanted: ClassVar[str] = _WANTED
+    _row_name: ClassVar[str] = "measurement"
     _data: str
     _table: tuple[Variable, ...]
 
@@ -103,7 +104,7 @@ class FileReader(Sequence[Item]):
                 self._group = SensorGroup(local_member(self._file["sensors"], self.sensor, h5py.Group))
                 self._select_table()
                 self._require_variables()
-                self._rows = RowReader(self._group, self._data)
+                self._rows = RowReader(self._group, self._data, self._row_name)
                 self.attributes = {name: to_python(value) for name, value in self._file.attrs.items()}
                 self.settings = received_settings(
                     self._group["settings"][()], f"{self.path}: settings", are_applied=self._kind != "recording"
@@ -160,7 +161,7 @@ class FileReader(Sequence[Item]):
             return [self[each] for each in range(*index.indices(len(self)))]
         index = operator.index(index)
         if not -len(self) <= index < len(self):
-            raise IndexError(f"{self.path} has no measurement {index}; it has {len(self)}, counted from 0")
+            raise IndexError(f"{self.path} has no {self._row_name} {index}; it has {len(self)}, counted from 0")
         with self._reading():
             return self._item(index % len(self))
 

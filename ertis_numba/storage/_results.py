@@ -182,6 +182,5 @@ class ResultReader(ResultFile, FileReader[Result], DegreesFromRadians):
         try:
             made: Result = self._type(**fields, settings=self.settings, stamp=self._rows.stamp(index, self.sensor))
         except ArgumentError as error:
-            name = self._name.partition(" ")[2]
-            raise DamagedError(f"{self.path}: {name} {index}: {error}") from error
+            raise DamagedError(f"{self.path}: {self._row_name} {index}: {error}") from error
         return made

@@ -106,9 +106,20 @@ class RowWriter:
 
 
 class RowReader:
-    """Reader of measurements, which checks each against its CRC-32."""
+    """Reader of measurements, which checks each against its CRC-32.
 
-    def __init__(self, group: h5py.Group, data: str) -> None:
+    Parameters
+    ----------
+    group : h5py.Group
+        Group of the sensor.
+    data : str
+        Name of the variable with one array per row.
+    name : str
+        Name of a row in errors.
+    """
+
+    def __init__(self, group: h5py.Group, data: str, name: str = "measurement") -> None:
+        self._name = name
         self._group = group
         self._data = group[data]
         self._columns: dict[str, h5py.Dataset] = {}  # Opening a column takes longer than reading a number of it.
@@ -128,7 +139,7 @@ class RowReader:
         wanted, got = int(self.column("crc32", index)), zlib.crc32(row.data)
         if got != wanted:
             raise DamagedError(
-                f"measurement {index} has CRC-32 {got:08x}, but the file states {wanted:08x}: the file is "
+                f"{self._name} {index} has CRC-32 {got:08x}, but the file states {wanted:08x}: the file is "
                 "damaged; copy it again"
             )
         return row

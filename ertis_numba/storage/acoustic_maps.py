@@ -87,6 +87,7 @@ class AcousticMapReader(_AcousticMapFile, ResultReader[AcousticMap]):
     """
 
     _wanted: ClassVar[str] = "a file of acoustic maps"
+    _row_name: ClassVar[str] = "acoustic map"
 
     band_hz: NDArray[np.float64]
     n_measurements: NDArray[np.int64]
