@@ -80,7 +80,7 @@ def is_acoustic(path: Path, sensor: str | None, index: int) -> bool:
 
 
 def row_name(path: Path) -> str:
-    """Return what --measurement counts in a file: ``map`` or ``measurement``."""
+    """Return the name of a row in a file, which --measurement counts: ``map`` or ``measurement``."""
     from ertis_numba.storage import file_kind
 
     return "map" if file_kind(path) == "acoustic_map" else "measurement"
