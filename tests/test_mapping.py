@@ -16,7 +16,9 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.fusion.rig import sensor_poses
 from ertis_numba.mapping import sensor_model
 from ertis_numba.mapping.cell_grid import CellGrid
-from ertis_numba.mapping.sensor_model import Coverage, add_evidence, echoes_of
+from ertis_numba.mapping.coverage import Coverage, directions_around
+from ertis_numba.mapping.echoes import UsualAmplitude, View, echoes_of
+from ertis_numba.mapping.sensor_model import add_evidence
 from ertis_numba.simulation import Box, Point
 
 UNTURNED = (0.0, 0.0, 0.0, 1.0)
@@ -168,54 +170,79 @@ def test_passive_measurements_are_refused():
         ertis.Mapper(mountings()).add(passive, pose)
 
 
-def test_evidence_of_a_point_is_that_of_its_ellipse(monkeypatch):
+ORIGIN = View(np.zeros(3), np.eye(3), np.zeros((6, 6)))
+
+
+def everywhere(n_dimensions=2, reach_m=3.0, step_m=0.05):
+    """Coverage of sensors that hear everything."""
+    grid = directions_around(n_dimensions, reach_m, step_m)
+    return Coverage(grid, np.ones((grid.n_directions, grid.n_ranges)))
+
+
+def axes_m(window):
+    """Centres of the cells along x, y and z, which broadcast against the log-odds."""
+    layers, rows, columns = (np.arange(size) for size in window.log_odds.shape)
+    z_m, y_m, x_m = (
+        (np.arange(size) + first + 0.5) * window.cell_m
+        for size, first in zip(window.log_odds.shape, window.first[::-1], strict=True)
+    )
+    return x_m[None, None, :], y_m[None, :, None], z_m[:, None, None]
+
+
+@pytest.mark.parametrize("n_dimensions", [2, 3])
+def test_evidence_of_a_point_is_that_of_its_ellipse(monkeypatch, n_dimensions):
     """The sum over all cells is that of one echo, and its spread that of the point's uncertainty."""
     monkeypatch.setattr(sensor_model, "_FREE", 0.0)
-    grid = CellGrid(0.02)
-    place_m = np.zeros(2)
-    echoes = echoes_of(np.array([[2.0, 0.0]]), np.array([[0.05, 0.2]]), np.ones(1))
-    coverage = Coverage(np.ones((360, 300)), 0.01)
-    window = grid.window(place_m, 3.0)
-    add_evidence(window, place_m, 0.0, echoes, coverage, near_m=0.0)
+    monkeypatch.setattr(sensor_model, "_MOST", math.inf)
+    monkeypatch.setattr(sensor_model, "MAX_LOG_ODDS", math.inf)
+    echoes = echoes_of(np.array([[1.0, 0.0, 0.0]]), np.array([[0.05, 0.1]]), np.ones(1))
+    window = CellGrid(0.02, n_dimensions).window(np.zeros(3), 1.5)
+    add_evidence(window, ORIGIN, echoes, everywhere(n_dimensions), near_m=0.0)
     total = float(window.log_odds.sum())
     assert total == pytest.approx(5.0, rel=0.02)
     spread = [
-        math.sqrt(float((window.log_odds * offset**2).sum()) / total)
-        for offset in ((window.x_m - 2.0)[None, :], window.y_m[:, None])
+        math.sqrt(float((window.log_odds * (offset_m - middle_m) ** 2).sum()) / total)
+        for offset_m, middle_m in zip(axes_m(window)[:n_dimensions], (1.0, 0.0, 0.0)[:n_dimensions], strict=True)
     ]
-    assert spread == pytest.approx(echoes.sd_m[0].tolist(), rel=0.05)
+    along_m, across_m = echoes.sd_m[0].tolist()
+    assert spread == pytest.approx([along_m, across_m, across_m][:n_dimensions], rel=0.05)
 
 
-def test_two_pulses_make_a_cell_occupied_but_not_one():
-    grid, place_m = CellGrid(0.05), np.zeros(2)
-    echoes = echoes_of(np.array([[2.0, 0.0]]), np.zeros((1, 2)), np.ones(1))
+@pytest.mark.parametrize("n_dimensions", [2, 3])
+def test_two_pulses_make_a_cell_occupied_but_not_one(n_dimensions):
+    grid = CellGrid(0.05, n_dimensions)
+    echoes = echoes_of(np.array([[2.0, 0.0, 0.0]]), np.zeros((1, 2)), np.ones(1))
     found = []
     for _ in range(2):
-        window = grid.window(place_m, 3.0)
-        add_evidence(window, place_m, 0.0, echoes, Coverage(np.ones((360, 60)), 0.05), near_m=0.0)
-        found.append(ertis.OccupancyMap(window.log_odds, (0.0, 0.0), 0.05).is_occupied.any())
+        window = grid.window(np.zeros(3), 3.0)
+        add_evidence(window, ORIGIN, echoes, everywhere(n_dimensions), near_m=0.0)
+        found.append(ertis.OccupancyMap(window.log_odds, (0.0, 0.0, 0.0), 0.05).is_occupied.any())
     assert found == [False, True]
 
 
-def share_behind(monkeypatch, obstacle_m, known):
+def share_behind(monkeypatch, obstacle_m, known, n_dimensions=2):
     """Evidence for an echo at 2 m, in a map and with an echo of an obstacle, relative to that without them."""
     monkeypatch.setattr(sensor_model, "_FREE", 0.0)
     monkeypatch.setattr(sensor_model, "_MOST", math.inf)
+    monkeypatch.setattr(sensor_model, "MAX_LOG_ODDS", math.inf)
     found = []
     for places_m in ([obstacle_m, (2.0, 0.0)], [(2.0, 0.0)]):
-        window = CellGrid(0.05).window(np.zeros(2), 3.0)
-        window.log_odds[:] = known(*np.meshgrid(window.x_m, window.y_m)) if len(places_m) == 2 else 0.0
+        window = CellGrid(0.05, n_dimensions).window(np.zeros(3), 3.0)
+        x_m, y_m, z_m = axes_m(window)
+        window.log_odds[:] = known(x_m, y_m + 0 * z_m) if len(places_m) == 2 else 0.0
         before = window.log_odds.copy()
-        echoes = echoes_of(np.array(places_m), np.full((len(places_m), 2), 0.01), np.ones(len(places_m)))
-        add_evidence(window, np.zeros(2), 0.0, echoes, Coverage(np.ones((360, 60)), 0.05), near_m=0.0)
-        change = window._replace(log_odds=window.log_odds - before)
-        found.append(float(change.around(np.array([2.0, 0.0]), 0.3).log_odds.sum()))
+        offset_m = np.column_stack([places_m, np.zeros(len(places_m))])
+        echoes = echoes_of(offset_m, np.full((len(places_m), 2), 0.01), np.ones(len(places_m)))
+        add_evidence(window, ORIGIN, echoes, everywhere(n_dimensions), near_m=0.0)
+        is_near = (np.abs(x_m - 2.0) < 0.3) & (np.abs(y_m) < 0.3)
+        found.append(float(((window.log_odds - before) * is_near).sum()))
     return found[0] / found[1]
 
 
-def test_clear_echo_in_unknown_space_hides_echoes_behind_it(monkeypatch):
+@pytest.mark.parametrize("n_dimensions", [2, 3])
+def test_clear_echo_in_unknown_space_hides_echoes_behind_it(monkeypatch, n_dimensions):
     """It may be part of a wall that fills the beam."""
-    assert share_behind(monkeypatch, (1.0, 0.0), lambda x_m, _: np.zeros_like(x_m)) == 0
+    assert share_behind(monkeypatch, (1.0, 0.0), lambda x_m, y_m: 0 * x_m + 0 * y_m, n_dimensions) == 0
 
 
 def test_post_in_free_space_hides_the_directions_that_it_covers(monkeypatch):
@@ -238,30 +265,32 @@ def test_mapped_wall_hides_echoes_behind_it_but_not_its_own(monkeypatch):
 
 
 def test_strength_of_points_grows_with_their_amplitude_relative_to_the_usual_one():
-    strength = sensor_model.UsualAmplitude().strength(np.array([0.0, 0.2, 1.0, 1.0, 1.0], np.float32))
+    strength = UsualAmplitude().strength(np.array([0.0, 0.2, 1.0, 1.0, 1.0], np.float32))
     assert strength[:2] == pytest.approx([0.0, 0.5], abs=1e-6)
     assert strength[2] > 0.95
 
 
 def test_coverage_is_that_of_the_emitters_beam_and_of_the_ranges():
     coverage = Coverage.of(sensor_poses(AHEAD), [(0.4, 4.0)], ertis.Settings(), 0.012, 0.05)
-    ahead, beside, behind = (coverage.weight[azimuth_deg] for azimuth_deg in (0, 80, 180))
+    ahead, beside, behind = (coverage.weight[180 + azimuth_deg] for azimuth_deg in (0, 80, -180))
     assert ahead[4] == 0  # at 0.2 m, before the first range
     assert ahead[12] > 0.8 > ahead[40] > ahead[70] > 0
     assert beside.max() < 0.3
     assert behind.max() == 0
 
 
-def test_grid_keeps_values_as_it_grows_in_all_directions():
-    grid = CellGrid(0.1)
-    grid.window(np.array([0.05, 0.05]), 0.04).log_odds[:] = 3.0
-    for centre_m in ((20.0, 0.0), (-20.0, 5.0), (0.0, 30.0), (0.0, -30.0)):
+@pytest.mark.parametrize("n_dimensions", [2, 3])
+def test_grid_keeps_values_as_it_grows_in_all_directions(n_dimensions):
+    grid = CellGrid(0.1, n_dimensions)
+    grid.window(np.full(3, 0.05), 0.04).log_odds[:] = 3.0
+    for centre_m in ((10.0, 0.0, 0.0), (-10.0, 5.0, 0.0), (0.0, 10.0, 4.0), (0.0, -10.0, -4.0)):
         grid.window(np.array(centre_m), 1.0)
     log_odds, origin_m = grid.used()
-    assert log_odds.tolist() == [[3.0]]
-    assert origin_m == pytest.approx((0.0, 0.0))
+    assert log_odds.shape == (1,) * n_dimensions
+    assert log_odds.item() == 3.0
+    assert origin_m == pytest.approx((0.0,) * n_dimensions)
     with pytest.raises(ArgumentError, match="give a larger cell_m"):
-        grid.window(np.array([1e5, 0.0]), 1.0)
+        grid.window(np.array([1e5, 0.0, 0.0]), 1.0)
 
 
 def test_map_without_evidence_has_one_unknown_cell():

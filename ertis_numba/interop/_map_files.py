@@ -11,7 +11,7 @@ import numpy as np
 
 from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target, remedy
-from ertis_numba.errors import DataError, ErtisError
+from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import FREE_BELOW, OCCUPIED_ABOVE, OccupancyMap
 from ertis_numba.interop._mcap import map_mcap
 from ertis_numba.storage import write_map_file
@@ -20,20 +20,25 @@ __all__ = ["MAP_SUFFIXES", "map_files", "write_map"]
 
 MAP_SUFFIXES: Final = (".h5", ".mcap", ".pgm", ".ply")
 """Suffixes of the formats of occupancy maps."""
+_PLANAR_SUFFIXES: Final = (".mcap", ".pgm")
 # Grey levels of map_saver of ROS. The probability of a level is (255 - level) / 255.
 _FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0
 
 
-def map_files(path: str | Path) -> tuple[Path, ...]:
+def map_files(path: str | Path, *, n_dimensions: int = 2) -> tuple[Path, ...]:
     """Return the files of a map: for ``.pgm`` also that of its description, with the suffix ``.yaml``.
 
     Raises
     ------
     ArgumentError
-        The suffix is unknown.
+        The suffix is unknown, or does not hold maps of so many dimensions.
     """
     path = Path(path)
     checks.choice("suffix of the map", path.suffix.lower(), MAP_SUFFIXES)
+    if n_dimensions == 3 and path.suffix.lower() in _PLANAR_SUFFIXES:
+        raise ArgumentError(
+            f"{path} would hold a map of two dimensions, but the map has three; give a name that ends in .h5 or .ply"
+        )
     return (path, path.with_suffix(".yaml")) if path.suffix.lower() == ".pgm" else (path,)
 
 
@@ -42,7 +47,8 @@ def write_map(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = Fa
 
     ``.h5`` stores the log-odds, and `read_map` reads them. ``.pgm`` is a picture for map_server of ROS, with a
     ``.yaml`` beside it. ``.mcap`` holds the map as a message of ROS 2, nav_msgs/OccupancyGrid. ``.ply`` contains the
-    centres of the occupied cells, at height 0, with their probability.
+    centres of the occupied cells with their probability; those of a map of two dimensions are at height 0. Maps of
+    three dimensions are written as ``.h5`` and ``.ply`` only.
 
     Parameters
     ----------
@@ -59,7 +65,7 @@ def write_map(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = Fa
     Raises
     ------
     ArgumentError
-        The suffix is unknown, a file exists, or the packages for MCAP are not installed.
+        The suffix is unknown or does not hold the dimensions of the map, a file exists, or the packages for MCAP are not installed.
     DataError
         The disk is full or cannot be written.
 
@@ -72,7 +78,7 @@ def write_map(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = Fa
     ['place.pgm', 'place.yaml']
     """
     checks.instance("occupancy", occupancy, OccupancyMap, "Mapper.map returns")
-    paths = map_files(path)
+    paths = map_files(path, n_dimensions=occupancy.n_dimensions)
     for each in paths:
         check_target(each, overwrite=overwrite)
     if paths[0].suffix.lower() == ".h5":
@@ -123,7 +129,8 @@ def _yaml(picture: str, occupancy: OccupancyMap) -> bytes:
 def _ply(occupancy: OccupancyMap) -> bytes:
     place_m = occupancy.occupied_m
     points = np.zeros(len(place_m), np.dtype([(name, "<f4") for name in ("x", "y", "z", "probability")]))
-    points["x"], points["y"] = place_m[:, 0], place_m[:, 1]
+    for name, coordinate_m in zip(("x", "y", "z"), place_m.T, strict=False):  # A plane has no z.
+        points[name] = coordinate_m
     points["probability"] = occupancy.probability[occupancy.is_occupied]
     head = [
         "ply",

@@ -6,8 +6,9 @@
 
 from ertis_numba.kernels._compile_notice import on_compiling
 from ertis_numba.kernels._contract.fusion import FusionKernels
+from ertis_numba.kernels._contract.mapping import MappingKernels
 from ertis_numba.kernels._device_protocols import Lane, Memory
-from ertis_numba.kernels._dispatch import DEVICES, load, load_fusion, usable
+from ertis_numba.kernels._dispatch import DEVICES, load, load_fusion, load_mapping, usable
 from ertis_numba.kernels._kernel_set import KernelSet
 
 __all__ = [
@@ -15,9 +16,11 @@ __all__ = [
     "FusionKernels",
     "KernelSet",
     "Lane",
+    "MappingKernels",
     "Memory",
     "load",
     "load_fusion",
+    "load_mapping",
     "on_compiling",
     "usable",
 ]

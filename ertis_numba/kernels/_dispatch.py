@@ -4,14 +4,15 @@ import functools
 import importlib
 import importlib.util
 import logging
-from typing import Final
+from typing import Any, Final
 
 from ertis_numba import checks
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._contract.fusion import FusionKernels
+from ertis_numba.kernels._contract.mapping import MappingKernels
 from ertis_numba.kernels._kernel_set import KernelSet
 
-__all__ = ["DEVICES", "load", "load_fusion", "usable"]
+__all__ = ["DEVICES", "load", "load_fusion", "load_mapping", "usable"]
 
 _LOG = logging.getLogger("ertis_numba")
 
@@ -87,14 +88,37 @@ def load_fusion() -> FusionKernels:
     >>> kernels.load_fusion().spread_cells.__name__
     'spread_cells'
     """
+    kernels: FusionKernels = _compiled("fusion")
+    return kernels
+
+
+@functools.cache
+def load_mapping() -> MappingKernels:
+    """Return the kernels of occupancy maps: compiled ones, or those of NumPy if none can be compiled on this machine.
+
+    Returns
+    -------
+    MappingKernels
+
+    Examples
+    --------
+    >>> from ertis_numba import kernels
+    >>> kernels.load_mapping().find_walls.__name__
+    'find_walls'
+    """
+    kernels: MappingKernels = _compiled("mapping")
+    return kernels
+
+
+def _compiled(name: str) -> Any:
+    """Return the compiled kernels of a module, or their twins of NumPy."""
     try:
         load("cpu")
-        name = "ertis_numba.kernels._cpu.fusion"
+        module = f"ertis_numba.kernels._cpu.{name}"
     except DeviceError as error:
-        _LOG.info("fusion uses NumPy: %s", error)
-        name = "ertis_numba.kernels._numpy_fusion"
-    kernels: FusionKernels = importlib.import_module(name).KERNELS
-    return kernels
+        _LOG.info("%s uses NumPy: %s", name, error)
+        module = f"ertis_numba.kernels._numpy_{name}"
+    return importlib.import_module(module).KERNELS
 
 
 def usable() -> tuple[str, ...]:

@@ -1,6 +1,6 @@
-"""Grid of cells that grows with the explored area."""
+"""Grid of cells that grows with the explored space."""
 
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +10,11 @@ from ertis_numba.frames import MAX_CELLS
 
 __all__ = ["CellGrid", "Window"]
 
+Counts = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-_BLOCK: Final = 64  # The grid grows by whole blocks of cells, so that it is copied rarely.
+_BLOCK: Final = np.array([64, 64, 16])  # The grid grows by whole blocks of cells, so that it is copied rarely.
 
 
 class Window(NamedTuple):
@@ -21,84 +22,108 @@ class Window(NamedTuple):
 
     Attributes
     ----------
-    log_odds : (row, column) float32
+    log_odds : (layer, row, column) float32
         View of the grid.
-    x_m, y_m : (column,) and (row,) float64
-        Centres of the cells.
+    first : (axis,) int64
+        Column, row and layer of the first cell, counted from the world's origin.
+    cell_m : float
+        Side of the cells.
+    is_planar : bool
+        True for a plane, which has one layer. All places are in its middle.
     """
 
     log_odds: Singles
-    x_m: Floats
-    y_m: Floats
+    first: Counts
+    cell_m: float
+    is_planar: bool
 
-    def around(self, place_m: Floats, radius_m: float) -> Self:
-        """Return the part of the window within a distance along both axes; it may be empty."""
-        columns, rows = (
-            slice(*np.searchsorted(centre_m, [place - radius_m, place + radius_m]).tolist())
-            for centre_m, place in zip((self.x_m, self.y_m), place_m.tolist(), strict=True)
-        )
-        return self._replace(log_odds=self.log_odds[rows, columns], x_m=self.x_m[columns], y_m=self.y_m[rows])
+    def cells_of(self, place_m: Floats) -> Floats:
+        """Return places in cells from the centre of the first cell: (..., axis) float64."""
+        cells = place_m / self.cell_m - self.first - 0.5
+        if self.is_planar:
+            cells[..., 2] = 0.0
+        return np.asarray(cells)
 
 
 class CellGrid:
-    """Log-odds of square cells, whose corners are multiples of their side from the world's origin.
+    """Log-odds of square or cubic cells, whose corners are multiples of their side from the world's origin.
 
     Parameters
     ----------
     cell_m : float
         Side of the cells.
+    n_dimensions : int
+        2 for a plane, which has one layer; 3 for a space.
+    height_m : (float, float)
+        Lowest and highest height of cells in space.
     """
 
-    def __init__(self, cell_m: float) -> None:
-        self._cell_m = cell_m
-        self._first = np.zeros(2, np.int64)  # Column and row of the first cell, counted from the world's origin.
-        self.log_odds: Singles = np.zeros((0, 0), np.float32)
-
-    @property
-    def origin_m(self) -> tuple[float, float]:
-        """Outer corner of the first cell."""
-        x_m, y_m = (self._first * self._cell_m).tolist()
-        return x_m, y_m
+    def __init__(
+        self, cell_m: float, n_dimensions: int = 2, height_m: tuple[float, float] = (-np.inf, np.inf)
+    ) -> None:
+        self._cell_m, self._n_dimensions, self._height_m = cell_m, n_dimensions, height_m
+        self._first = np.zeros(3, np.int64)  # Column, row and layer of the first cell, from the world's origin.
+        self.log_odds: Singles = np.zeros((0, 0, 0), np.float32)
 
     def window(self, centre_m: Floats, radius_m: float) -> Window:
-        """Return the square around a place, for which the grid grows if necessary.
+        """Return the square or cube around a place, for which the grid grows if necessary.
+
+        Parameters
+        ----------
+        centre_m : (3,) float64
+        radius_m : float
 
         Raises
         ------
         ArgumentError
             The grid would have too many cells.
         """
-        low = np.floor((centre_m - radius_m) / self._cell_m).astype(np.int64)
-        high = np.ceil((centre_m + radius_m) / self._cell_m).astype(np.int64)
+        low_m, high_m = centre_m - radius_m, centre_m + radius_m
+        low_m[2], high_m[2] = np.clip([low_m[2], high_m[2]], *self._height_m)
+        low, high = np.floor(low_m / self._cell_m).astype(np.int64), np.ceil(high_m / self._cell_m).astype(np.int64)
+        high[2] = max(high[2], low[2] + 1)
+        if self._n_dimensions == 2:
+            low[2], high[2] = 0, 1
         self._grow(low, high)
-        columns, rows = (slice(a, b) for a, b in zip(low - self._first, high - self._first, strict=True))
-        x_m, y_m = ((np.arange(a, b) + 0.5) * self._cell_m for a, b in zip(low.tolist(), high.tolist(), strict=True))
-        return Window(self.log_odds[rows, columns], x_m, y_m)
+        layers, rows, columns = (
+            slice(a, b) for a, b in zip((low - self._first)[::-1], (high - self._first)[::-1], strict=True)
+        )
+        return Window(self.log_odds[layers, rows, columns], low, self._cell_m, self._n_dimensions == 2)
 
-    def _grow(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+    def _grow(self, low: Counts, high: Counts) -> None:
         size = np.array(self.log_odds.shape[::-1])
         if size.all() and (low >= self._first).all() and (high <= self._first + size).all():
             return
         if size.all():
             low, high = np.minimum(low, self._first), np.maximum(high, self._first + size)
-        first, end = low // _BLOCK * _BLOCK, -(-high // _BLOCK) * _BLOCK
-        n_columns, n_rows = (end - first).tolist()
-        if n_rows * n_columns > MAX_CELLS:
+        block = _BLOCK if self._n_dimensions == 3 else np.append(_BLOCK[:2], 1)
+        first, end = low // block * block, -(-high // block) * block
+        sizes = (end - first).tolist()
+        n_cells = int(np.prod(sizes))
+        if n_cells > MAX_CELLS:
+            sides = " by ".join(f"{count * self._cell_m:.0f}" for count in sizes[: self._n_dimensions])
             raise ArgumentError(
-                f"the map would have {n_rows * n_columns} cells, {n_columns * self._cell_m:.0f} by "
-                f"{n_rows * self._cell_m:.0f} m; give a larger cell_m, or poses closer together, for at most "
-                f"{MAX_CELLS} cells"
+                f"the map would have {n_cells} cells, {sides} m; give a larger cell_m, or poses closer together, for "
+                f"at most {MAX_CELLS} cells"
             )
-        grown = np.zeros((n_rows, n_columns), np.float32)
-        column, row = (self._first - first).tolist()
-        grown[row : row + size[1], column : column + size[0]] = self.log_odds
+        grown = np.zeros(sizes[::-1], np.float32)
+        column, row, layer = (self._first - first).tolist()
+        grown[layer : layer + size[2], row : row + size[1], column : column + size[0]] = self.log_odds
         self._first, self.log_odds = first, grown
 
-    def used(self) -> tuple[Singles, tuple[float, float]]:
-        """Return a copy of the smallest part with all known cells, and its outer corner."""
-        rows, columns = (np.flatnonzero(self.log_odds.any(axis=axis)) for axis in (1, 0))
-        if not len(rows):
-            return np.zeros((1, 1), np.float32), self.origin_m
-        first = self._first + np.array([columns[0], rows[0]])
-        x_m, y_m = (first * self._cell_m).tolist()
-        return self.log_odds[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].copy(), (x_m, y_m)
+    def used(self) -> tuple[Singles, tuple[float, ...]]:
+        """Return a copy of the smallest part with all known cells, and its outer corner.
+
+        Returns
+        -------
+        log_odds : (row, column) or (layer, row, column) float32
+        origin_m : (x, y) or (x, y, z)
+        """
+        known = [np.flatnonzero(self.log_odds.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
+        if not len(known[0]):
+            known = [np.zeros(1, np.int64)] * 3
+        parts = tuple(slice(places[0], places[-1] + 1) for places in known)
+        found = self.log_odds[parts] if self.log_odds.size else np.zeros((1, 1, 1), np.float32)
+        first = self._first + [part.start for part in parts[::-1]]
+        origin_m = (first * self._cell_m).tolist()[: self._n_dimensions]
+        return (found[0] if self._n_dimensions == 2 else found).copy(), tuple(origin_m)

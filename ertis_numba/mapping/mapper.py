@@ -16,7 +16,9 @@ from ertis_numba.fusion.fuser import EMITTER_DIAMETER_M
 from ertis_numba.fusion.rig import Mountings, sensor_poses
 from ertis_numba.geometry import mounting
 from ertis_numba.mapping.cell_grid import CellGrid
-from ertis_numba.mapping.sensor_model import Coverage, LocatedEchoes, UsualAmplitude, add_evidence, echoes_of
+from ertis_numba.mapping.coverage import Coverage
+from ertis_numba.mapping.echoes import LocatedEchoes, UsualAmplitude, View, echoes_of
+from ertis_numba.mapping.sensor_model import add_evidence
 from ertis_numba.motion import compensate_motion
 
 __all__ = ["Mapper", "Pose"]
@@ -25,28 +27,33 @@ Floats = NDArray[np.float64]
 Pose = tuple[Sequence[float], Sequence[float]] | Trajectory
 """Position x, y, z in m and unit quaternion x, y, z, w from the platform frame to the world frame, or a trajectory."""
 
-_MAX_LOG_ODDS: Final = 4.0  # A clamp keeps the map able to change (K. M. Wurm et al., OctoMap, 2010).
 _NS_PER_S: Final = 1e9
+_PLANAR: Final = np.ix_([0, 1, 5], [0, 1, 5])
+"""Elements of a covariance for x, y and the heading."""
 
 
 class Mapper:
     """Occupancy map that grows with the images of a platform at known poses.
 
-    Echoes are fused (`Fuser`) and located. Each point adds evidence to the cells of its uncertainty ellipse. Cells in
-    front of the first clear echo of a direction become free, the less the farther away they are. A smooth wall that
-    the sound meets obliquely returns no echo, so silence alone shows free space near the platform only.
+    Echoes are fused (`Fuser`) and located. Each point adds evidence to the cells of its uncertainty ellipse, or in a
+    map of three dimensions, of its ellipsoid. Cells in front of the first clear echo of a direction become free, the
+    less the farther away they are. A smooth wall that the sound meets obliquely returns no echo, so silence alone shows
+    free space near the platform only. Uncertain poses spread the evidence of echoes, and shorten free space.
 
     Parameters
     ----------
     mountings : mapping of str to (translation_m, rotation_xyzw)
         Mountings of all sensors, as for `Fuser`.
+    dimensions : {2, 3}, default 2
+        3 for a map of cubic cells, which needs images with directions over elevation; 2 for one of square cells in the
+        horizontal plane.
     cell_m : float, default 0.05
-        Side of the square cells in metres.
+        Side of the cells in metres.
     half_life_s : float, optional
         Time in which log-odds decay to one half, for places where things move; None keeps them.
     height_m : (float, float), optional
         Lowest and highest height of points in the world frame, in metres, to leave out floor and ceiling; all by
-        default.
+        default. A map of three dimensions has cells at these heights only, which saves memory and time.
     emitter_diameter_m : float, default 0.012
         Diameter of the emitters as pistons; 0 for omnidirectional ones.
 
@@ -70,13 +77,15 @@ class Mapper:
         self,
         mountings: Mountings,
         *,
+        dimensions: int = 2,
         cell_m: float = 0.05,
         half_life_s: float | None = None,
         height_m: tuple[float, float] | None = None,
         emitter_diameter_m: float = EMITTER_DIAMETER_M,
     ) -> None:
         self._fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
-        self._poses = {pose.name: pose for pose in sensor_poses(mountings)}
+        self._mountings = {sensor.name: sensor for sensor in sensor_poses(mountings)}
+        self._dimensions = checks.integer("dimensions", dimensions, 2, 3)
         self._diameter_m = emitter_diameter_m
         self._cell_m = checks.between("cell_m", cell_m, 0.005, 1.0)
         self._half_life_s = None if half_life_s is None else checks.positive("half_life_s", half_life_s)
@@ -84,8 +93,10 @@ class Mapper:
         if height_m is not None:
             checks.interval("height_m", height_m, -1e4, 1e4)
             self._height_m = height_m
-        self._near_m = max(float(np.hypot(*pose.translation_m[:2])) for pose in self._poses.values())
-        self._grid = CellGrid(self._cell_m)
+        places_m = np.array([sensor.translation_m for sensor in self._mountings.values()])
+        self._near_m = float(np.hypot(*places_m.T[:2]).max())
+        self._centre_m = np.array([0.0, 0.0, places_m[:, 2].mean()])  # of directions in space
+        self._grid = CellGrid(self._cell_m, self._dimensions, self._height_m)
         self._usual = UsualAmplitude()
         self._coverages: dict[tuple[tuple[str, float, float], ...], Coverage] = {}
         self._n_groups, self._time_ns = 0, 0
@@ -106,35 +117,48 @@ class Mapper:
         pose : (translation_m, rotation_xyzw) or Trajectory
             Pose of the platform in the world frame: position x, y, z in metres, and the unit quaternion x, y, z, w that
             rotates the platform frame into the world frame. A trajectory is interpolated at the time of the pulse, and
-            its velocity compensates the motion during the measurement (`compensate_motion`).
+            its velocity compensates the motion during the measurement (`compensate_motion`). If it has covariances,
+            points are uncertain by those of the pose as well.
         fused : Fused, optional
             Result of a `Fuser` with the same mountings for these images, if it is available; computed by default.
 
         Raises
         ------
         ArgumentError
-            The pose is invalid, the trajectory does not cover the time of the pulse, the images do not fit together, or
-            the map would have too many cells.
+            The pose is invalid, the trajectory does not cover the time of the pulse, the images do not fit together or
+            have too few dimensions, or the map would have too many cells.
         DataError
             The images are not from the same pulse, no sensor emitted, or with a half-life, their time is before that of
             earlier ones.
         """
         group = tuple(checks.items("images", images, Energyscape, "Pipeline.process returns"))
+        if self._dimensions == 3 and any(image.is_planar for image in group):
+            raise ArgumentError(
+                "images has a planar image, but a map of three dimensions needs directions over elevation; process with "
+                "directions such as 3d:1000, or leave out dimensions"
+            )
         fused = self._fuser(group) if fused is None else fused
         time_ns = fused.image.stamp.timestamp_ns
-        translation_m, rotation = _pose(pose, time_ns)
+        translation_m, rotation, covariance = _pose(pose, time_ns)
         coverage = self._coverage(group)
-        reach_m = coverage.weight.shape[1] * coverage.step_m
-        place_m = translation_m[:2]
-        window = self._grid.window(place_m, reach_m)
+        view = self._view(translation_m, rotation, covariance)
+        window = self._grid.window(view.place_m, coverage.reach_m)
         self._decay(time_ns)
-        heading_rad = math.atan2(rotation[1, 0], rotation[0, 0])
         points = _at_rest(fused.points, pose, rotation) if isinstance(pose, Trajectory) else fused.points
-        echoes = self._echoes(points, translation_m, rotation, heading_rad)
-        add_evidence(window, place_m, heading_rad, echoes, coverage, near_m=self._near_m)
-        np.clip(window.log_odds, -_MAX_LOG_ODDS, _MAX_LOG_ODDS, out=window.log_odds)
+        echoes = self._echoes(points, translation_m, rotation, view)
+        add_evidence(window, view, echoes, coverage, near_m=self._near_m)
         self._n_groups += 1
         self._time_ns = max(time_ns, self._time_ns)
+
+    def _view(self, translation_m: Floats, rotation: Floats, covariance: Floats) -> View:
+        """Return the view from the sensors in space, or from the platform with its heading in a plane."""
+        if self._dimensions == 3:
+            return View(translation_m + rotation @ self._centre_m, rotation, covariance)
+        heading_rad = math.atan2(rotation[1, 0], rotation[0, 0])
+        c, s = math.cos(heading_rad), math.sin(heading_rad)
+        planar = np.zeros((6, 6))
+        planar[_PLANAR] = covariance[_PLANAR]
+        return View(translation_m, np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), planar)
 
     def _decay(self, time_ns: int) -> None:
         """Let the log-odds decay since the last group."""
@@ -157,20 +181,26 @@ class Mapper:
         names = [image.stamp.sensor for image in emitted]
         key = tuple((name, *limits) for name, limits in zip(names, limits_m, strict=True))
         if key not in self._coverages:
-            poses = [self._poses[name] for name in names]
-            self._coverages[key] = Coverage.of(poses, limits_m, emitted[0].settings, self._diameter_m, self._cell_m / 2)
+            self._coverages[key] = Coverage.of(
+                [self._mountings[name] for name in names],
+                limits_m,
+                emitted[0].settings,
+                self._diameter_m,
+                self._cell_m / 2,
+                height_m=float(self._centre_m[2]) if self._dimensions == 3 else None,
+            )
         return self._coverages[key]
 
-    def _echoes(self, points: PointCloud, translation_m: Floats, rotation: Floats, heading_rad: float) -> LocatedEchoes:
-        """Return the points within the limits of height, in the frame of the heading."""
-        offset_m = points.position_m.astype(np.float64) @ rotation.T
-        height_m = offset_m[:, 2] + translation_m[2]
-        kept = (height_m >= self._height_m[0]) & (height_m <= self._height_m[1])
-        c, s = math.cos(heading_rad), math.sin(heading_rad)
-        level_m = offset_m[kept, :2] @ np.array([[c, -s], [s, c]])
+    def _echoes(self, points: PointCloud, translation_m: Floats, rotation: Floats, view: View) -> LocatedEchoes:
+        """Return the points within the limits of height, in the frame of a view."""
+        place_m = points.position_m.astype(np.float64) @ rotation.T + translation_m
+        kept = (place_m[:, 2] >= self._height_m[0]) & (place_m[:, 2] <= self._height_m[1])
+        offset_m = (place_m[kept] - view.place_m) @ view.rotation
+        if self._dimensions == 2:
+            offset_m[:, 2] = 0.0
         uncertainty_m = np.zeros((len(points), 2)) if points.uncertainty_m is None else points.uncertainty_m
         strength = self._usual.strength(points.amplitude[kept])
-        return echoes_of(level_m, np.asarray(uncertainty_m, np.float64)[kept], strength)
+        return echoes_of(offset_m, np.asarray(uncertainty_m, np.float64)[kept], strength)
 
 
 def _at_rest(points: PointCloud, trajectory: Trajectory, rotation: Floats) -> PointCloud:
@@ -181,14 +211,15 @@ def _at_rest(points: PointCloud, trajectory: Trajectory, rotation: Floats) -> Po
     return compensate_motion(points, linear_m_s.tolist(), float(angular_rad_s[2]))
 
 
-def _pose(pose: Pose, time_ns: int) -> tuple[Floats, Floats]:
-    """Return position and rotation matrix of a pose at a time: (3,) and (3, 3) float64."""
+def _pose(pose: Pose, time_ns: int) -> tuple[Floats, Floats, Floats]:
+    """Return position, rotation matrix and covariance of a pose at a time: (3,), (3, 3) and (6, 6) float64."""
     if isinstance(pose, Trajectory):
         now = pose.at([time_ns])
-        return now.position_m[0], Rotation.from_quat(now.rotation_xyzw[0]).as_matrix()
+        covariance = np.zeros((6, 6)) if now.covariance is None else now.covariance[0]
+        return now.position_m[0], Rotation.from_quat(now.rotation_xyzw[0]).as_matrix(), covariance
     try:
         translation_m, rotation_xyzw = pose
     except (TypeError, ValueError) as error:
         raise ArgumentError(f"pose is {pose!r}; give a position and a unit quaternion, or a Trajectory") from error
     found = mounting("platform", translation_m, rotation_xyzw)
-    return found["translation_m"], Rotation.from_quat(found["rotation_xyzw"]).as_matrix()
+    return found["translation_m"], Rotation.from_quat(found["rotation_xyzw"]).as_matrix(), np.zeros((6, 6))

@@ -1,23 +1,27 @@
-"""Inverse sensor model of a sonar: evidence for free and for occupied space from the points of one pulse."""
+"""Inverse sensor model of a sonar: evidence for free and for occupied space from the points of one pulse.
+
+The same code serves planes and spaces: a plane has one layer of cells and one row of directions.
+"""
 
 import math
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.fusion.rig import Emitters, MountedSensor
+from ertis_numba import kernels
 from ertis_numba.mapping.cell_grid import Window
-from ertis_numba.settings import Settings
+from ertis_numba.mapping.coverage import Coverage
+from ertis_numba.mapping.echoes import LocatedEchoes, View
 
-__all__ = ["Coverage", "LocatedEchoes", "UsualAmplitude", "add_evidence", "echoes_of"]
+__all__ = ["MAX_LOG_ODDS", "add_evidence"]
 
 Floats = NDArray[np.float64]
+Places = NDArray[np.int64]
 Singles = NDArray[np.float32]
 
-N_AZIMUTHS: Final = 360
-"""Directions for free space, of 1°."""
+MAX_LOG_ODDS: Final = 4.0
+"""Limit of log-odds, which keeps the map able to change (K. M. Wurm et al., OctoMap, 2010)."""
 _OCCUPIED: Final = 5.0  # Log-odds of a clear echo, shared among the cells that may contain it.
 _MOST: Final = 0.6  # Log-odds of a cell from one pulse; ghosts seldom repeat, so that a single one is not enough.
 _FREE: Final = 0.6  # Log-odds of a cell in front of the first clear echo, near the platform.
@@ -28,183 +32,90 @@ _DEPTH_M: Final = 0.1  # The same for a wall of the map in the direction of the 
 _WALL: Final = 1.5  # Log-odds from which a cell hides those behind it.
 _OPEN: Final = -0.5  # Log-odds below which a cell lets sound pass.
 _CLEAR: Final = 0.6  # Weight of a clear echo.
-_HALF_BEAM: Final = 5  # Directions beside an echo in which it may hide others.
-_HALF_RAY: Final = 1  # The same for a wall of the map, whose directions are known.
-_USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that is the usual one.
-# Amplitude, relative to the usual one, at which one half of the points are ghosts, as measured in simulated places.
-_GHOST: Final = 0.2
+# Angles between the middles of directions; the quarters of a degree make room for rounding.
+_HALF_BEAM_RAD: Final = math.radians(5.25)  # Directions beside an echo in which it may hide others.
+_HALF_RAY_RAD: Final = math.radians(1.25)  # The same for a wall of the map, whose directions are known.
 _DISTRUST: Final = 0.25  # Exponent of the coverage in the weight of echoes, of which more are ghosts at the edges.
-_SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.
-# Errors of positions that noise does not explain: overlapping echoes of rough walls, mountings and poses.
-_RANGE_SD_M: Final = 0.01
-_ANGLE_SD_RAD: Final = math.radians(0.3)
 _REACH_SD: Final = 3.0  # Standard deviations within which an echo counts.
+_POSE_SD: Final = 2.0  # Standard deviations of the pose by which free space keeps away from echoes.
 _TOUCHED: Final = 0.02  # Probability of an echo in a cell from which the cell is not free.
-_WEAKEST_DB: Final = -15.0  # Emitted power, relative to ahead, below which silence shows nothing.
 
 
-class LocatedEchoes(NamedTuple):
-    """Points of one pulse around the platform.
-
-    Attributes
-    ----------
-    azimuth_rad, range_m : (point,) float64
-        In the plane, in the frame of the platform's heading.
-    sd_m : (point, 2) float64
-        Standard deviations along and across the direction.
-    strength : (point,) float64
-        Weight, at most 1: probability that the point is a reflector.
-    """
-
-    azimuth_rad: Floats
-    range_m: Floats
-    sd_m: Floats
-    strength: Floats
-
-
-class UsualAmplitude:
-    """Running amplitude of a clear echo, which depends on the walls of a place."""
-
-    def __init__(self) -> None:
-        self._usual: float | None = None
-
-    def strength(self, amplitude: Singles) -> Floats:
-        """Return the probability that the points of a pulse are reflectors: (point,) float64.
-
-        It is a² / (a² + g²) for the amplitude a, where g is that of ghosts.
-        """
-        if not len(amplitude):
-            return np.zeros(0)
-        now = float(np.percentile(amplitude, _USUAL))
-        self._usual = now if self._usual is None else (1 - _SMOOTHING) * self._usual + _SMOOTHING * now
-        power = (amplitude.astype(np.float64) / max(self._usual, 1e-30)) ** 2
-        return np.asarray(power / (power + _GHOST**2))
-
-
-def echoes_of(offset_m: Floats, uncertainty_m: Floats, strength: Floats) -> LocatedEchoes:
-    """Return points as echoes.
-
-    Parameters
-    ----------
-    offset_m : (point, 2) float64
-        Positions in the frame of the platform's heading.
-    uncertainty_m : (point, 2) float64
-        Standard deviations along and across the direction.
-    strength : (point,) float64
-    """
-    range_m = np.hypot(offset_m[:, 0], offset_m[:, 1])
-    sd_m = np.hypot(uncertainty_m, np.stack([np.full(len(range_m), _RANGE_SD_M), _ANGLE_SD_RAD * range_m], axis=1))
-    return LocatedEchoes(np.arctan2(offset_m[:, 1], offset_m[:, 0]), range_m, sd_m, strength)
-
-
-class Coverage(NamedTuple):
-    """Part of the surroundings in which a clear echo would be heard.
-
-    Attributes
-    ----------
-    weight : (azimuth, range) float64
-        0 where no sensor emits or listens, up to 1 ahead of a sensor.
-    step_m : float
-        Spacing of the ranges, which begin at 0.
-    """
-
-    weight: Floats
-    step_m: float
-
-    def at(self, azimuth_rad: Floats, range_m: Floats) -> Floats:
-        """Return the weights of directions and ranges, 0 beyond the last range: (point,) float64."""
-        step = (range_m / self.step_m).astype(np.int64)
-        n_ranges = self.weight.shape[1]
-        found = self.weight[_direction(azimuth_rad), np.minimum(step, n_ranges - 1)]
-        return np.where(step < n_ranges, found, 0.0)
-
-    @classmethod
-    def of(
-        cls,
-        poses: Sequence[MountedSensor],
-        limits_m: Sequence[tuple[float, float]],
-        settings: Settings,
-        diameter_m: float,
-        step_m: float,
-    ) -> "Coverage":
-        """Return the coverage of sensors that emit.
-
-        Parameters
-        ----------
-        poses : sequence of MountedSensor
-        limits_m : sequence of (first, last)
-            Ranges of their images.
-        settings : Settings
-            Settings with the call and the air.
-        diameter_m : float
-            Diameter of the emitters.
-        step_m : float
-        """
-        emitters = Emitters(settings, diameter_m)
-        reach_m = max(
-            float(np.hypot(*pose.translation_m[:2])) + last for pose, (_, last) in zip(poses, limits_m, strict=True)
-        )
-        range_m = (np.arange(math.ceil(reach_m / step_m)) + 0.5) * step_m
-        azimuth_rad = (np.arange(N_AZIMUTHS) + 0.5) * (2 * math.pi / N_AZIMUTHS)
-        unit = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad), np.zeros(N_AZIMUTHS)], axis=1)
-        weight = np.zeros((N_AZIMUTHS, len(range_m)))
-        for pose, (first_m, last_m) in zip(poses, limits_m, strict=True):
-            place_m = unit[:, None] * range_m[:, None] + [0.0, 0.0, pose.translation_m[2]]
-            local_m = pose.local_m(place_m)
-            distance_m = np.linalg.norm(local_m, axis=-1)
-            power_db = 10 * np.log10(emitters.power(local_m[..., 0] / np.maximum(distance_m, 1e-6)))
-            heard = np.clip(1 - power_db / _WEAKEST_DB, 0.0, 1.0) * (local_m[..., 0] > 0)
-            # Silence means less at long ranges, because spreading and oblique walls make echoes weak.
-            heard *= (distance_m >= first_m) * np.clip(1 - distance_m / last_m, 0.0, 1.0)
-            np.maximum(weight, heard, out=weight)
-        return cls(weight, step_m)
-
-
-def add_evidence(
-    window: Window, place_m: Floats, heading_rad: float, echoes: LocatedEchoes, coverage: Coverage, *, near_m: float
-) -> None:
+def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Coverage, *, near_m: float) -> None:
     """Add the evidence of one pulse to a map.
 
     Parameters
     ----------
     window : Window
         Part of the map around the platform, which changes.
-    place_m : (2,) float64
-        Position of the platform in the world.
-    heading_rad : float
-        Heading of the platform in the world.
+    view : View
     echoes : LocatedEchoes
     coverage : Coverage
     near_m : float
         Radius of the platform, whose own place is free.
     """
-    first_m, wall_m = _first_clear_m(echoes), _wall_m(window, place_m, heading_rad, coverage)
-    end_m: Floats = np.where(np.isfinite(first_m), first_m - _IN_FRONT_M, _FREE_M)
-    is_open = _log_odds(window, place_m, heading_rad, end_m[:, None] + _IN_FRONT_M)[:, 0] < _OPEN
+    grid, kernel = coverage.grid, kernels.load_mapping()
+    ahead = np.asarray(grid.directions @ view.rotation.T)
+    # Cosines between the direction of each echo and all directions.
+    cosine = grid.directions[_direction(coverage, echoes)] @ grid.directions.T
+    first_m = _first_clear_m(echoes, cosine)
+    wall_m = _wall_m(window, view, coverage, ahead)
+    seen_m = np.where(np.isfinite(first_m), first_m, _FREE_M + _IN_FRONT_M)
+    is_open = _log_odds(window, view, ahead * seen_m[:, None]) < _OPEN
     hiding_m = np.minimum(np.where(is_open, np.inf, first_m), wall_m)
-    trusted = echoes.strength * coverage.at(echoes.azimuth_rad, echoes.range_m) ** _DISTRUST
-    trusted *= _visible(echoes, hiding_m, wall_m)
-    occupied = _occupied(window, place_m, heading_rad, echoes._replace(strength=trusted))
-    free = _free(window, place_m, heading_rad, np.minimum(end_m, wall_m), coverage, near_m=near_m)
-    free[occupied > _TOUCHED] = 0.0
-    window.log_odds[:] += np.minimum(_OCCUPIED * occupied, _MOST) - _FREE * free
+    trusted = echoes.strength * coverage.at(echoes.offset_m) ** _DISTRUST
+    trusted *= _visible(echoes, cosine, np.cos(grid.elevations_rad), hiding_m, wall_m)
+    position_sd_m, rotation_sd_rad = view.sd
+    end_m = np.minimum(_end_m(echoes, cosine, first_m, position_sd_m, rotation_sd_rad), wall_m)
+    free = np.where(grid.range_m < end_m[:, None], _FREE * coverage.weight, 0.0).astype(np.float32)
+    kernel.add_evidence(
+        _occupied(window, view, echoes._replace(strength=trusted)),
+        np.float32(_OCCUPIED * _TOUCHED),
+        np.float32(_MOST),
+        free.reshape(-1, grid.n_azimuths, grid.n_ranges),
+        window.cells_of(view.place_m),
+        np.ascontiguousarray(view.rotation),
+        grid.step_m / window.cell_m,
+        max(0.0, near_m - _POSE_SD * position_sd_m) / window.cell_m,
+        np.float32(_FREE),
+        np.float32(MAX_LOG_ODDS),
+        window.log_odds,
+    )
 
 
-def _direction(azimuth_rad: Floats) -> NDArray[np.int64]:
-    """Return the direction of azimuths, counted from that of the heading."""
-    return np.floor(azimuth_rad * (N_AZIMUTHS / (2 * math.pi))).astype(np.int64) % N_AZIMUTHS
+def _direction(coverage: Coverage, echoes: LocatedEchoes) -> Places:
+    """Return the direction of each echo: (point,) int64."""
+    unit = echoes.offset_m / np.maximum(echoes.range_m, 1e-9)[:, None]
+    return np.asarray(coverage.grid.cell_of(unit * coverage.grid.step_m / 2) // coverage.grid.n_ranges)
 
 
-def _first_clear_m(echoes: LocatedEchoes) -> Floats:
-    """Return the range of the first clear echo in each direction, infinite without one: (azimuth,) float64."""
-    first_m = np.full(N_AZIMUTHS, np.inf)
+def _first_clear_m(echoes: LocatedEchoes, cosine: Floats) -> Floats:
+    """Return the range of the first clear echo in each direction, infinite without one: (direction,) float64."""
     is_clear = echoes.strength > _CLEAR
-    around = _beside(echoes.azimuth_rad[is_clear], _HALF_BEAM)
-    np.minimum.at(first_m, around, echoes.range_m[is_clear][:, None])
-    return first_m
+    is_near = cosine[is_clear] > math.cos(_HALF_BEAM_RAD)
+    return np.where(is_near, echoes.range_m[is_clear, None], np.inf).min(axis=0, initial=np.inf)
 
 
-def _visible(echoes: LocatedEchoes, hiding_m: Floats, wall_m: Floats) -> Floats:
+def _end_m(
+    echoes: LocatedEchoes, cosine: Floats, first_m: Floats, position_sd_m: float, rotation_sd_rad: float
+) -> Floats:
+    """Return the end of free space in each direction: (direction,) float64.
+
+    An error of the pose moves an echo along its direction and across it.
+    """
+    end_m = np.where(np.isfinite(first_m), first_m - _IN_FRONT_M, _FREE_M)
+    if not position_sd_m and not rotation_sd_rad:
+        return np.asarray(end_m)
+    end_m -= _POSE_SD * position_sd_m
+    is_clear = echoes.strength > _CLEAR
+    range_m = echoes.range_m[is_clear]
+    across_rad = _POSE_SD * (position_sd_m / np.maximum(range_m, _IN_FRONT_M) + rotation_sd_rad)
+    is_near = cosine[is_clear] > np.cos(np.minimum(_HALF_BEAM_RAD + across_rad, math.pi))[:, None]
+    nearest_m = np.where(is_near, range_m[:, None], np.inf).min(axis=0, initial=np.inf)
+    return np.asarray(np.minimum(end_m, nearest_m - _IN_FRONT_M - _POSE_SD * position_sd_m))
+
+
+def _visible(echoes: LocatedEchoes, cosine: Floats, weight: Floats, hiding_m: Floats, wall_m: Floats) -> Floats:
     """Return the share of the amplitude that passes the obstacles in front of echoes: (point,) float64.
 
     The share of directions that are open passes on the way to the reflector, and again on the way back. Around an echo,
@@ -214,74 +125,64 @@ def _visible(echoes: LocatedEchoes, hiding_m: Floats, wall_m: Floats) -> Floats:
     Parameters
     ----------
     echoes : LocatedEchoes
-    hiding_m : (azimuth,) float64
+    cosine : (point, direction) float64
+        Cosines between echoes and directions.
+    weight : (direction,) float64
+        Solid angle of each direction.
+    hiding_m : (direction,) float64
         Ranges of the first obstacles.
-    wall_m : (azimuth,) float64
+    wall_m : (direction,) float64
         Ranges of the first walls of the map.
     """
-    passed = [
-        np.mean(first_m[_beside(echoes.azimuth_rad, half_width)] + behind_m >= echoes.range_m[:, None], axis=1)
-        for first_m, half_width, behind_m in ((hiding_m, _HALF_BEAM, _BEHIND_M), (wall_m, _HALF_RAY, _DEPTH_M))
-    ]
+    passed = []
+    for first_m, angle_rad, behind_m in ((hiding_m, _HALF_BEAM_RAD, _BEHIND_M), (wall_m, _HALF_RAY_RAD, _DEPTH_M)):
+        is_near = cosine > math.cos(angle_rad)
+        is_open = is_near & (first_m + behind_m >= echoes.range_m[:, None])
+        passed.append((is_open @ weight) / (is_near @ weight))
     return np.asarray(np.minimum(*passed) ** 2)
 
 
-def _beside(azimuth_rad: Floats, half_width: int) -> NDArray[np.int64]:
-    """Return the directions beside azimuths, and their own: (point, direction) int64."""
-    beside = np.arange(-half_width, half_width + 1)
-    return np.asarray((_direction(azimuth_rad)[:, None] + beside) % N_AZIMUTHS)
-
-
-def _wall_m(window: Window, place_m: Floats, heading_rad: float, coverage: Coverage) -> Floats:
-    """Return the range behind the first cell that earlier pulses have found occupied: (azimuth,) float64."""
-    range_m = np.asarray((np.arange(coverage.weight.shape[1]) + 0.5) * coverage.step_m, np.float64)
-    is_wall = _log_odds(window, place_m, heading_rad, range_m) > _WALL
-    first_m = range_m[is_wall.argmax(axis=1)] + float(window.x_m[1] - window.x_m[0])
-    return np.asarray(np.where(is_wall.any(axis=1), first_m, np.inf))
-
-
-def _log_odds(window: Window, place_m: Floats, heading_rad: float, range_m: Floats) -> Singles:
-    """Return the log-odds of a map along all directions, at (range,) or (azimuth, range): (azimuth, range) float32."""
-    cell_m = float(window.x_m[1] - window.x_m[0])
-    azimuth_rad = (np.arange(N_AZIMUTHS) + 0.5) * (2 * math.pi / N_AZIMUTHS) + heading_rad
-    row, column = (
-        np.rint((place_m[axis] - centre_m[0] + unit[:, None] * range_m) / cell_m)
-        .astype(np.int64)
-        .clip(0, len(centre_m) - 1)
-        for axis, centre_m, unit in ((1, window.y_m, np.sin(azimuth_rad)), (0, window.x_m, np.cos(azimuth_rad)))
+def _wall_m(window: Window, view: View, coverage: Coverage, ahead: Floats) -> Floats:
+    """Return the range behind the first cell that earlier pulses have found occupied: (direction,) float64."""
+    grid = coverage.grid
+    n_before = np.empty(grid.n_directions, np.int64)
+    kernels.load_mapping().find_walls(
+        window.log_odds,
+        window.cells_of(view.place_m),
+        ahead,
+        grid.step_m / window.cell_m,
+        np.float32(_WALL),
+        grid.n_ranges,
+        n_before,
     )
-    return np.asarray(window.log_odds[row, column])
+    behind_m = (n_before + 0.5) * grid.step_m + window.cell_m
+    return np.asarray(np.where(n_before < grid.n_ranges, behind_m, np.inf))
 
 
-def _free(
-    window: Window, place_m: Floats, heading_rad: float, end_m: Floats, coverage: Coverage, *, near_m: float
-) -> Singles:
-    """Return the weight of free space in each cell: (row, column) float32, 0 to 1."""
-    n_ranges = coverage.weight.shape[1]
-    range_m = (np.arange(n_ranges) + 0.5) * coverage.step_m
-    polar = np.where(range_m < end_m[:, None], coverage.weight, 0.0).astype(np.float32)
-    dx_m, dy_m = (window.x_m - place_m[0])[None, :], (window.y_m - place_m[1])[:, None]
-    distance_m = np.hypot(dx_m, dy_m)
-    step = np.minimum((distance_m / coverage.step_m).astype(np.int64), n_ranges - 1)
-    free = polar[_direction(np.arctan2(dy_m, dx_m) - heading_rad), step]
-    free[distance_m < near_m] = 1.0
-    return np.asarray(free)
+def _log_odds(window: Window, view: View, offset_m: Floats) -> Singles:
+    """Return the log-odds of a map at places relative to that of a view, in the world: (point,) float32."""
+    cells = np.rint(window.cells_of(view.place_m + offset_m)).astype(np.int64)[:, ::-1]
+    return np.asarray(window.log_odds[tuple(cells.clip(0, np.array(window.log_odds.shape) - 1).T)])
 
 
-def _occupied(window: Window, place_m: Floats, heading_rad: float, echoes: LocatedEchoes) -> Singles:
-    """Return the expected number of echoes in each cell: (row, column) float32."""
-    occupied = window._replace(log_odds=np.zeros_like(window.log_odds))
-    cell_m = float(window.x_m[1] - window.x_m[0])
-    azimuth_rad = echoes.azimuth_rad + heading_rad
-    unit = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad)], axis=1)
-    centre_m = place_m + unit * echoes.range_m[:, None]
-    variance_m2 = echoes.sd_m**2 + cell_m**2 / 12
-    reach_m = _REACH_SD * echoes.sd_m.max(axis=1, initial=0.0) + cell_m
-    peak = echoes.strength * cell_m**2 / (2 * math.pi * np.sqrt(variance_m2.prod(axis=1)))
-    for number, (ahead, left) in enumerate(unit.tolist()):
-        part = occupied.around(centre_m[number], float(reach_m[number]))
-        dx_m, dy_m = (part.x_m - centre_m[number, 0])[None, :], (part.y_m - centre_m[number, 1])[:, None]
-        along, across = (ahead * dx_m + left * dy_m) ** 2, (ahead * dy_m - left * dx_m) ** 2
-        squared = along / variance_m2[number, 0] + across / variance_m2[number, 1]
-        part.log_odds[:] += (peak[number] * np.exp(-squared / 2)).astype(np.float32)
-    return occupied.log_odds
+def _occupied(window: Window, view: View, echoes: LocatedEchoes) -> Singles:
+    """Return the evidence for occupied cells: (layer, row, column) float32.
+
+    Each echo is normally distributed, and a cell is as likely as the density at its middle.
+    """
+    offset_m = echoes.offset_m @ view.rotation.T
+    covariance_m2 = view.rotation @ echoes.covariance_m2 @ view.rotation.T + view.covariance_at_m2(offset_m)
+    covariance = covariance_m2 / window.cell_m**2 + np.eye(3) / 12  # A cell is as wide as a uniform distribution.
+    n_axes = 2 if window.is_planar else 3
+    covariance[:, n_axes:], covariance[:, :, n_axes:] = 0.0, 0.0
+    covariance[:, range(n_axes, 3), range(n_axes, 3)] = 1.0
+    density = (2 * math.pi) ** (-n_axes / 2) / np.sqrt(np.linalg.det(covariance))
+    found = np.zeros_like(window.log_odds)
+    kernels.load_mapping().spread_echoes(
+        window.cells_of(view.place_m + offset_m),
+        np.linalg.inv(covariance),
+        _REACH_SD * np.sqrt(np.einsum("pii->pi", covariance)),
+        _OCCUPIED * echoes.strength * density,
+        found,
+    )
+    return found

@@ -15,6 +15,8 @@ from ertis_numba.storage.schema import (
     CONVENTIONS,
     FORMAT_VERSION,
     OCCUPANCY_MAP,
+    VOXEL_MAP,
+    Variable,
     content_sha256,
     content_uuid,
     create_variables,
@@ -29,7 +31,7 @@ __all__ = ["is_map", "read_map", "write_map_file"]
 
 _KIND: Final = "occupancy_map"
 _NAME: Final = "an occupancy map"
-_NUMBERS: Final = ("cell_m", "origin_x_m", "origin_y_m")
+_AXES: Final = ("x", "y", "z")
 
 
 def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = False) -> Path:
@@ -55,17 +57,18 @@ def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool
         The disk is full or cannot be written.
     """
     checks.instance("occupancy", occupancy, OccupancyMap, "Mapper.map returns")
-    n_rows, n_columns = occupancy.log_odds.shape
+    axes, table = _AXES[: occupancy.n_dimensions], _table(occupancy.n_dimensions)
+    sizes = dict(zip(axes, occupancy.log_odds.shape[::-1], strict=True))
     try:
         with (
             atomic_write(Path(path), overwrite=overwrite) as part,
             h5py.File(part, "w", track_order=True, libver=("v110", "v110")) as file,
         ):
-            create_variables(file, OCCUPANCY_MAP, sizes={"x": n_columns, "y": n_rows})
-            for name, edge_m, count in zip(("x", "y"), occupancy.origin_m, (n_columns, n_rows), strict=True):
-                file[name][:] = edge_m + (np.arange(count) + 0.5) * occupancy.cell_m
+            create_variables(file, table, sizes=sizes)
+            for name, edge_m in zip(axes, occupancy.origin_m, strict=True):
+                file[name][:] = edge_m + (np.arange(sizes[name]) + 0.5) * occupancy.cell_m
             file["log_odds"][:] = occupancy.log_odds
-            content = content_sha256(file, OCCUPANCY_MAP)
+            content = content_sha256(file, table)
             set_attributes(
                 file,
                 {
@@ -76,8 +79,7 @@ def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool
                     "uuid": content_uuid({"": content}),
                     "content_sha256": content,
                     "cell_m": occupancy.cell_m,
-                    "origin_x_m": occupancy.origin_m[0],
-                    "origin_y_m": occupancy.origin_m[1],
+                    **{f"origin_{name}_m": edge_m for name, edge_m in zip(axes, occupancy.origin_m, strict=True)},
                     "n_groups": occupancy.n_groups,
                     "time_ns": occupancy.time_ns,
                     **{f"{name.replace('-', '_')}_version": version for name, version in software_versions().items()},
@@ -131,21 +133,25 @@ def read_map(path: str | Path) -> OccupancyMap:
     with open_file(path, _NAME) as file, reading(file, path):
         require_attributes(file)
         _require_kind(file, path)
-        require_variables(file, OCCUPANCY_MAP)
-        stated = content_sha256(file, OCCUPANCY_MAP)
+        axes = _AXES[: 3 if "z" in file else 2]
+        require_variables(file, _table(len(axes)))
+        stated = content_sha256(file, _table(len(axes)))
         if stated != to_python(file.attrs["content_sha256"]):
             raise DamagedError(f"{path}: the SHA-256 of the content differs from the stated one; copy it again")
-        cell_m, *origin_m = (float(file.attrs[name]) for name in _NUMBERS)
         try:
             return OccupancyMap(
                 np.asarray(file["log_odds"][:]),
-                (origin_m[0], origin_m[1]),
-                cell_m,
+                tuple(float(file.attrs[f"origin_{name}_m"]) for name in axes),
+                float(file.attrs["cell_m"]),
                 int(file.attrs["n_groups"]),
                 int(file.attrs["time_ns"]),
             )
         except ArgumentError as error:
             raise DamagedError(f"{path}: {error}") from error
+
+
+def _table(n_dimensions: int) -> tuple[Variable, ...]:
+    return OCCUPANCY_MAP if n_dimensions == 2 else VOXEL_MAP
 
 
 def _require_kind(file: h5py.File, path: Path) -> None:

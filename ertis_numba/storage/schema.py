@@ -10,7 +10,7 @@ import math
 import os
 import uuid
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
 from typing import Any, Final
@@ -35,6 +35,7 @@ __all__ = [
     "STAMPS",
     "TRUTH",
     "VERSION_WITHOUT_POSES",
+    "VOXEL_MAP",
     "SensorGroup",
     "Variable",
     "content_sha256",
@@ -187,7 +188,14 @@ OCCUPANCY_MAP: Final = (
     Variable("x", ("x",), "<f8", "centres of the cells in the world frame", "m"),
     Variable("y", ("y",), "<f8", "centres of the cells in the world frame", "m"),
 )
-"""Variables of an occupancy map, in the root of its file."""
+"""Variables of an occupancy map of two dimensions, in the root of its file."""
+
+VOXEL_MAP: Final = (
+    replace(OCCUPANCY_MAP[0], dims=("z", "y", "x")),
+    *OCCUPANCY_MAP[1:],
+    Variable("z", ("z",), "<f8", "centres of the cells in the world frame", "m"),
+)
+"""Variables of an occupancy map of three dimensions."""
 
 TRUTH: Final = (
     Variable("scene", (), "str", "scene as TOML"),

@@ -1,0 +1,128 @@
+"""Echoes of one pulse around a platform, with their uncertainties and the probabilities of being reflectors."""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["LocatedEchoes", "UsualAmplitude", "View", "echoes_of"]
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+
+_USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that is the usual one.
+# Amplitude, relative to the usual one, at which one half of the points are ghosts, as measured in simulated places.
+_GHOST: Final = 0.2
+_SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.
+# Errors of positions that noise does not explain: overlapping echoes of rough walls, mountings and poses.
+_RANGE_SD_M: Final = 0.01
+_ANGLE_SD_RAD: Final = math.radians(0.3)
+_NEAREST_M: Final = 0.01  # Range below which directions have no meaning.
+
+
+class View(NamedTuple):
+    """Place from which a platform sees its surroundings.
+
+    Attributes
+    ----------
+    place_m : (axis,) float64
+        Position in the world of the point from which directions are counted.
+    rotation : (axis, axis) float64
+        Rotation from the frame of the directions to the world. In a plane, it is the heading.
+    covariance : (6, 6) float64
+        Covariance of x, y, z and of the rotation about the world's x, y, z.
+    """
+
+    place_m: Floats
+    rotation: Floats
+    covariance: Floats
+
+    def covariance_at_m2(self, offset_m: Floats) -> Floats:
+        """Return the covariance of places, which errors of the pose cause: (point, axis, axis) float64.
+
+        A rotation by the small vector δ moves a place by δ × r, where r is its offset.
+
+        Parameters
+        ----------
+        offset_m : (point, axis) float64
+            Places relative to that of the view, in the world.
+        """
+        x, y, z = offset_m.T
+        slopes = np.zeros((len(offset_m), 3, 6))
+        slopes[:, :, :3] = np.eye(3)
+        slopes[:, 0, 4], slopes[:, 0, 5] = z, -y
+        slopes[:, 1, 3], slopes[:, 1, 5] = -z, x
+        slopes[:, 2, 3], slopes[:, 2, 4] = y, -x
+        return np.asarray(slopes @ self.covariance @ slopes.transpose(0, 2, 1))
+
+    @property
+    def sd(self) -> tuple[float, float]:
+        """Largest standard deviations of the position in metres, and of the rotation in radians."""
+        position, rotation = (np.linalg.eigvalsh(self.covariance[part, part])[-1] for part in (slice(3), slice(3, 6)))
+        return math.sqrt(max(0.0, position)), math.sqrt(max(0.0, rotation))
+
+
+class LocatedEchoes(NamedTuple):
+    """Points of one pulse around the platform.
+
+    Attributes
+    ----------
+    offset_m : (point, axis) float64
+        Positions in the frame of a `View`. In a plane, z is 0.
+    sd_m : (point, 2) float64
+        Standard deviations along and across the direction, without those of the pose.
+    strength : (point,) float64
+        Weight, at most 1: probability that the point is a reflector.
+    """
+
+    offset_m: Floats
+    sd_m: Floats
+    strength: Floats
+
+    @property
+    def range_m(self) -> Floats:
+        """Distances: (point,) float64."""
+        return np.asarray(np.linalg.norm(self.offset_m, axis=1))
+
+    @property
+    def covariance_m2(self) -> Floats:
+        """Covariances without those of the pose: (point, axis, axis) float64."""
+        unit = self.offset_m / np.maximum(self.range_m, _NEAREST_M)[:, None]
+        along, across = (variance[:, None, None] for variance in self.sd_m.T**2)
+        return np.asarray(across * np.eye(3) + (along - across) * (unit[:, :, None] * unit[:, None, :]))
+
+
+class UsualAmplitude:
+    """Running amplitude of a clear echo, which depends on the walls of a place."""
+
+    def __init__(self) -> None:
+        self._usual: float | None = None
+
+    def strength(self, amplitude: Singles) -> Floats:
+        """Return the probability that the points of a pulse are reflectors: (point,) float64.
+
+        It is a² / (a² + g²) for the amplitude a, where g is that of ghosts.
+        """
+        if not len(amplitude):
+            return np.zeros(0)
+        now = float(np.percentile(amplitude, _USUAL))
+        self._usual = now if self._usual is None else (1 - _SMOOTHING) * self._usual + _SMOOTHING * now
+        power = (amplitude.astype(np.float64) / max(self._usual, 1e-30)) ** 2
+        return np.asarray(power / (power + _GHOST**2))
+
+
+def echoes_of(offset_m: Floats, uncertainty_m: Floats, strength: Floats) -> LocatedEchoes:
+    """Return points as echoes, whose uncertainties include errors that noise does not explain.
+
+    Parameters
+    ----------
+    offset_m : (point, axis) float64
+        Positions in the frame of a `View`.
+    uncertainty_m : (point, 2) float64
+        Standard deviations along and across the direction.
+    strength : (point,) float64
+    """
+    range_m = np.linalg.norm(offset_m, axis=1)
+    sd_m = np.hypot(uncertainty_m, np.stack([np.full(len(range_m), _RANGE_SD_M), _ANGLE_SD_RAD * range_m], axis=1))
+    return LocatedEchoes(offset_m, sd_m, strength)
