@@ -9,7 +9,7 @@ from ertis_bench.furnished_rooms import PlatformImager, mountings, random_motion
 
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.fusion.rig import sensor_poses
+from ertis_numba.fusion.rig import mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor
 from ertis_numba.motion.flow import fit_flow
 from ertis_numba.motion.odometry import PlanarPose, _Errors
@@ -231,12 +231,12 @@ def unrelated(seed, pulse, count):
 @pytest.mark.parametrize("count", [40, 75])
 def test_noise_is_not_a_measured_motion(count):
     """The expected number of false alarms exceeds their rate, so that the limit holds for any number of echoes."""
-    poses = sensor_poses(MOUNTINGS)
-    extract = EchoExtractor(poses)
+    sensors = mounted_sensors(MOUNTINGS)
+    extract = EchoExtractor(sensors)
     seeds, found = range(60), []
     for seed in seeds:
         groups = [extract({"sensor": unrelated(seed, pulse, count)}) for pulse in (0, 1)]
-        fit = fit_flow(*groups, poses, 0.1)
+        fit = fit_flow(*groups, sensors, 0.1)
         if fit is not None:
             found.append(fit)
     assert len(found) > 30

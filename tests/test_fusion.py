@@ -14,7 +14,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.fusion.pairs import hypothesis, pair_of
 from ertis_numba.fusion.polar_grid import PolarGrid, close_directions
 from ertis_numba.fusion.receivers import Receiver
-from ertis_numba.fusion.rig import Emitters, sensor_poses
+from ertis_numba.fusion.rig import Emitters, mounted_sensors
 from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.storage import open_energyscapes, write_recording
@@ -307,18 +307,18 @@ def test_images_in_three_dimensions_are_fused():
 @pytest.mark.parametrize("seed", range(3))
 def test_pixels_of_a_reflector_lead_back_to_its_cell(emitter, seed):
     """Positions to pixels, and pixels to positions, are inverse to each other."""
-    poses = sensor_poses(mountings())
+    sensors = mounted_sensors(mountings())
     image = images()["front"]
-    receiver = Receiver(poses[0], image, 0.015)
+    receiver = Receiver(sensors[0], image, 0.015)
     emitters = Emitters(image.settings, 0.0)
     grid = PolarGrid.around(1.0, 0.015, 2.9, is_planar=True, height_m=0.4)
     draws = np.random.default_rng(seed)
     azimuth_rad = draws.uniform(-1.2, 1.2, 50)
     places_m = np.stack([np.cos(azimuth_rad), np.sin(azimuth_rad), np.zeros(50)], axis=1)
-    places_m = places_m * draws.uniform(0.8, 2.0, (50, 1)) + poses[0].translation_m
+    places_m = places_m * draws.uniform(0.8, 2.0, (50, 1)) + sensors[0].translation_m
     deaf = np.zeros(receiver.n_steps, dtype=bool)
-    pair = pair_of(places_m, poses, emitters, receiver, emitter=emitter, number=0, late_m=0.0, deaf=deaf)
-    back = hypothesis(grid, poses, emitters, receiver, emitter=emitter, late_m=0.0, is_mirrored=False)
+    pair = pair_of(places_m, sensors, emitters, receiver, emitter=emitter, number=0, late_m=0.0, deaf=deaf)
+    back = hypothesis(grid, sensors, emitters, receiver, emitter=emitter, late_m=0.0, is_mirrored=False)
     nearest = np.where(pair.share > 0.5, pair.second, pair.first)
     cells_m = grid.positions_m[back.cell[nearest]]
     assert len(pair.cell) == 50

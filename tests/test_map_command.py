@@ -74,6 +74,13 @@ def test_map_of_a_recording_shows_the_post_in_the_world(folder):
     assert found.log_odds_at((10.8, 0.1)) < 0
 
 
+def test_map_of_space_is_refused_for_planar_images_and_files(folder):
+    done = run(folder, "both.h5 --poses poses.tum --dimensions 3 -o space.ply", code=1)
+    assert "has a planar image, but a map of three dimensions needs directions over elevation" in done.output
+    done = run(folder, "both.h5 --poses poses.tum --dimensions 3 -o space.pgm", code=1)
+    assert "give a name that ends in .h5 or .ply" in done.output
+
+
 def test_maps_of_one_or_several_recordings_are_equal(folder):
     run(folder, "both.h5 --poses poses.tum -q -o one.h5")
     run(folder, "left.h5 right.h5 --poses poses.tum -q -o several.h5")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import math
 from pathlib import Path
 
@@ -10,10 +11,12 @@ import pytest
 from ertis_bench import mapping
 from ertis_bench.furnished_rooms import Motion, PlatformImager, mountings
 from plyfile import PlyData
+from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
+from ertis_numba import figures
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
-from ertis_numba.fusion.rig import sensor_poses
+from ertis_numba.fusion.rig import mounted_sensors
 from ertis_numba.mapping import sensor_model
 from ertis_numba.mapping.cell_grid import CellGrid
 from ertis_numba.mapping.coverage import Coverage, directions_around
@@ -147,6 +150,118 @@ def test_evidence_decays_with_the_half_life():
         mapper.add(images, pose)
 
 
+@functools.cache
+def space():
+    """Images with elevations of a post above and of one below the sensors, and the mountings of these."""
+    posts = tuple(Point(position_m=place, strength_db=-6.0) for place in POSTS_IN_SPACE_M)
+    imager = PlatformImager((posts, ()), 4, names=["front", "left"], max_range_m=2.0, directions="3d:1000")
+    images = [imager(Motion(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), number, number / 10) for number in range(2)]
+    imager.close()
+    return images, mountings(["front", "left"])
+
+
+POSTS_IN_SPACE_M = ((1.225, 0.125, 1.025), (0.125, 1.225, -0.125))  # middles of cells
+
+
+def test_map_of_space_shows_the_heights_of_reflectors_and_the_pose_of_the_platform():
+    images, mounted = space()
+    mapper = ertis.Mapper(mounted, dimensions=3)
+    # The platform has turned by 90° and is rolled by 180°, and so are the reflectors around it.
+    place_m, turn = np.array([3.0, -2.0, 1.0]), Rotation.from_euler("zx", [90.0, 180.0], degrees=True)
+    for group in images:
+        mapper.add(group, (place_m, turn.as_quat()))
+    found = mapper.map
+    assert found.n_dimensions == 3
+    wanted_m = turn.apply(POSTS_IN_SPACE_M) + place_m
+    away_m = np.linalg.norm(found.occupied_m[:, None] - wanted_m, axis=2)
+    assert away_m.min(axis=0).max() < 0.05
+    assert away_m.min(axis=1).max() < 0.1
+    assert (found.log_odds_at(place_m + 0.5 * (wanted_m - place_m)) < 0).all()
+    assert found.log_odds_at(place_m + 1.4 * (wanted_m - place_m)).tolist() == [0.0, 0.0]
+
+
+def test_map_of_space_has_cells_within_the_limits_of_height_only():
+    images, mounted = space()
+    mapper = ertis.Mapper(mounted, dimensions=3, height_m=(0.5, 2.0))
+    for group in images:
+        mapper.add(group, ((0.0, 0.0, 0.0), UNTURNED))
+    assert mapper.map.limits_m[2][0] >= 0.5 - 1e-9
+    assert np.linalg.norm(mapper.map.occupied_m - POSTS_IN_SPACE_M[0], axis=1).max() < 0.1
+    assert not ertis.Mapper(mounted, dimensions=3, height_m=(5.0, 6.0)).map.is_occupied.any()
+
+
+def test_map_of_space_refuses_planar_images():
+    images, pose = views()[0]
+    with pytest.raises(ArgumentError, match="planar image, but a map of three dimensions needs directions over elev"):
+        ertis.Mapper(mountings(), dimensions=3).add(images, pose)
+
+
+def with_covariance(pose, images, covariance):
+    """Poses at rest around the time of images."""
+    time_ns = images[0].stamp.timestamp_ns + np.array([-(10**8), 0, 10**8])
+    return ertis.Trajectory(
+        time_ns, [pose[0]] * 3, [pose[1]] * 3, None if covariance is None else np.array([covariance] * 3)
+    )
+
+
+def covariance_of(position_sd_m, yaw_sd_rad):
+    return np.diag([position_sd_m, position_sd_m, position_sd_m, 0.0, 0.0, yaw_sd_rad]) ** 2
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_exact_poses_have_no_influence_on_maps(dimensions):
+    images, mounted = (views()[1][0], mountings()) if dimensions == 2 else (space()[0][0], space()[1])
+    pose = (0.2, -0.1, 0.0), turned(50.0)
+    found = []
+    for covariance in (None, np.zeros((6, 6))):
+        mapper = ertis.Mapper(mounted, dimensions=dimensions)
+        mapper.add(images, with_covariance(pose, images, covariance))
+        found.append(mapper.map.log_odds)
+    assert np.array_equal(*found)
+
+
+def test_uncertain_poses_make_maps_softer():
+    """The more uncertain a pose is, the less sure are free cells, and the surest occupied ones."""
+    found = []
+    for position_sd_m, yaw_sd_rad in ((0.0, 0.0), (0.02, 0.0), (0.02, 0.05), (0.1, 0.05), (0.5, 0.5)):
+        mapper = ertis.Mapper(mountings())
+        for images, pose in views():
+            mapper.add(images, with_covariance(pose, images, covariance_of(position_sd_m, yaw_sd_rad)))
+        grid = mapper.map.log_odds_at(np.stack(np.meshgrid(*[np.arange(-2.5, 2.5, 0.05) + 0.025] * 2), axis=-1))
+        found.append((grid, mapper.map.is_occupied.sum()))
+    for (sharp, _), (soft, _) in itertools.pairwise(found):
+        assert (soft >= np.minimum(sharp, 0.0) - 1e-6).all()
+        assert soft.max() < sharp.max()
+    assert found[0][1] > 0
+    assert found[-1][1] == 0
+    assert found[-1][0].min() >= 0
+
+
+@pytest.mark.parametrize("n_dimensions", [2, 3])
+@pytest.mark.parametrize("strength", [1.0, 0.01])
+def test_uncertain_pose_spreads_the_evidence_of_an_echo(monkeypatch, n_dimensions, strength):
+    """Its sum remains, and its spread is that of position, and of heading times range."""
+    monkeypatch.setattr(sensor_model, "_FREE", 0.0)
+    monkeypatch.setattr(sensor_model, "_REACH_SD", 5.0)
+    echoes = echoes_of(np.array([[0.0, 1.0, 0.0]]), np.array([[0.05, 0.05]]), np.full(1, strength))
+    found = []
+    for covariance in (np.zeros((6, 6)), covariance_of(0.06, 0.1)):
+        window = CellGrid(0.02, n_dimensions).window(np.zeros(3), 1.8)
+        add_evidence(window, ORIGIN._replace(covariance=covariance), echoes, everywhere(n_dimensions), near_m=0.0)
+        evidence = window.log_odds.astype(np.float64)
+        sd_m = [
+            math.sqrt((evidence * (offset_m - middle_m) ** 2).sum() / evidence.sum())
+            for offset_m, middle_m in zip(axes_m(window)[:n_dimensions], (0.0, 1.0, 0.0)[:n_dimensions], strict=True)
+        ]
+        found.append((evidence.sum(), evidence.max(), np.array(sd_m)))
+    (sharp, highest, sharp_m), (soft, lower, soft_m) = found
+    assert soft == pytest.approx(sharp, rel=0.01)
+    own_m = np.full(3, math.hypot(0.05, 0.01, 0.02 / math.sqrt(12)))
+    more_m = np.sqrt(own_m**2 + np.array([math.hypot(0.06, 0.1), 0.06, 0.06]) ** 2)
+    assert lower / highest == pytest.approx((own_m / more_m)[:n_dimensions].prod(), rel=0.02)
+    assert soft_m / sharp_m == pytest.approx((more_m / own_m)[:n_dimensions], rel=0.02)
+
+
 def delayed(images, time_s):
     return [
         image.replace(
@@ -181,7 +296,6 @@ def everywhere(n_dimensions=2, reach_m=3.0, step_m=0.05):
 
 def axes_m(window):
     """Centres of the cells along x, y and z, which broadcast against the log-odds."""
-    layers, rows, columns = (np.arange(size) for size in window.log_odds.shape)
     z_m, y_m, x_m = (
         (np.arange(size) + first + 0.5) * window.cell_m
         for size, first in zip(window.log_odds.shape, window.first[::-1], strict=True)
@@ -271,7 +385,7 @@ def test_strength_of_points_grows_with_their_amplitude_relative_to_the_usual_one
 
 
 def test_coverage_is_that_of_the_emitters_beam_and_of_the_ranges():
-    coverage = Coverage.of(sensor_poses(AHEAD), [(0.4, 4.0)], ertis.Settings(), 0.012, 0.05)
+    coverage = Coverage.of(mounted_sensors(AHEAD), [(0.4, 4.0)], ertis.Settings(), 0.012, 0.05)
     ahead, beside, behind = (coverage.weight[180 + azimuth_deg] for azimuth_deg in (0, 80, -180))
     assert ahead[4] == 0  # at 0.2 m, before the first range
     assert ahead[12] > 0.8 > ahead[40] > ahead[70] > 0
@@ -301,6 +415,7 @@ def test_map_without_evidence_has_one_unknown_cell():
     ("options", "message"),
     [
         ({"cell_m": 0.0}, "cell_m is 0; give a number from 0.005 to 1"),
+        ({"dimensions": 4}, "dimensions is 4; give a whole number from 2 to 3"),
         ({"half_life_s": 0.0}, "half_life_s is 0; give a number above 0"),
         ({"height_m": (2.0, 1.0)}, "height_m runs from 2 to 1"),
         ({"emitter_diameter_m": 1.0}, "emitter_diameter_m is 1"),
@@ -330,6 +445,7 @@ def test_mapper_refuses_invalid_poses(pose, message):
         ({"log_odds": np.zeros(3)}, r"log_odds has shape \(3,\)"),
         ({"log_odds": np.zeros((0, 3))}, r"log_odds has shape \(0, 3\)"),
         ({"log_odds": np.array([[np.nan]])}, "log_odds holds nan"),
+        ({"log_odds": np.zeros((1, 1, 1))}, "origin_m has shape"),
         ({"origin_m": (0.0,)}, "origin_m has shape"),
         ({"origin_m": (0.0, math.inf)}, "origin_m is inf"),
         ({"cell_m": 0.0}, "cell_m is 0"),
@@ -374,6 +490,50 @@ def test_map_file_is_a_netcdf_file_with_axes(tmp_path):
         assert found["log_odds"].dims == ("y", "x")
         assert found["x"].values.tolist() == [-0.75, -0.25, 0.25]
         assert float(found["log_odds"].sel(x=0.25, y=2.75)) == 4.0
+
+
+def voxels():
+    log_odds = np.zeros((2, 3, 4))
+    log_odds[1, 2, 3], log_odds[0, 1, 0] = 3.0, -2.0
+    return ertis.OccupancyMap(log_odds, (-1.0, 2.0, 0.5), 0.1, n_groups=7, time_ns=START_NS)
+
+
+def test_map_of_space_places_its_cells_in_the_world():
+    assert voxels().limits_m == pytest.approx(np.array([(-1.0, -0.6), (2.0, 2.3), (0.5, 0.7)]))
+    assert voxels().occupied_m == pytest.approx(np.array([[-0.65, 2.25, 0.65]]))
+    assert voxels().log_odds_at([[-0.65, 2.25, 0.65], [-0.95, 2.15, 0.55], [-0.65, 2.25, 0.75]]).tolist() == [3, -2, 0]
+    with pytest.raises(ArgumentError, match="give x, y and z along the last axis"):
+        voxels().log_odds_at([1.0, 2.0])
+
+
+def test_map_of_space_is_written_as_hdf5_and_ply(tmp_path):
+    ertis.write_map(tmp_path / "m.h5", voxels())
+    read = ertis.read_map(tmp_path / "m.h5")
+    assert np.array_equal(read.log_odds, voxels().log_odds)
+    assert (read.origin_m, read.n_groups, read.time_ns) == ((-1.0, 2.0, 0.5), 7, START_NS)
+    ertis.write_map(tmp_path / "m.ply", voxels())
+    vertices = PlyData.read(str(tmp_path / "m.ply"))["vertex"]
+    assert [vertices[name][0] for name in "xyz"] == pytest.approx([-0.65, 2.25, 0.65])
+    for suffix in ("pgm", "mcap"):
+        with pytest.raises(ArgumentError, match=r"but the map has three; give a name that ends in .h5 or .ply"):
+            ertis.write_map(tmp_path / f"m.{suffix}", voxels())
+
+
+def test_file_of_a_map_of_space_has_axes(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    ertis.write_map(tmp_path / "m.h5", voxels())
+    with xarray.open_dataset(tmp_path / "m.h5", engine="h5netcdf") as found:
+        assert found["log_odds"].dims == ("z", "y", "x")
+        assert float(found["log_odds"].sel(x=-0.65, y=2.25, z=0.65, method="nearest")) == 3.0
+
+
+def test_figure_of_a_map_of_space_shows_it_from_above_and_from_the_side():
+    above, beside = figures.occupancy(voxels()).axes
+    assert (above.get_ylabel(), beside.get_ylabel()) == ("y (m)", "z (m)")
+    for axes, place in ((above, (2, 3)), (beside, (1, 3))):
+        shown = axes.images[0].get_array()
+        assert np.argwhere(shown > 0.5).tolist() == [list(place)]
+        assert (shown < 0.5).sum() == 1
 
 
 def test_damaged_map_file_is_refused(tmp_path):

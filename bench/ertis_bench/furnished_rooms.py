@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 import ertis_numba as ertis
 from ertis_numba.frames import Energyscape, Stamp
@@ -16,23 +17,29 @@ from ertis_numba.simulation.effects import EFFECTS
 
 __all__ = [
     "HALL_M",
+    "HEIGHT_M",
     "N_PULSES",
     "Motion",
     "PlatformImager",
     "half_size_of_room_m",
+    "half_size_of_space_m",
     "hall",
     "mountings",
     "random_motion",
     "random_room",
+    "random_space",
 ]
 
 HEIGHT_M: Final = 0.4
+"""Height of the sensors."""
 _YAWS_DEG: Final = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
 _OFFSET_M: Final = 0.2
 _MAX_SPEED_M_S: Final = 1.5
 _MAX_YAW_RATE_RAD_S: Final = math.radians(90.0)
 _WALL_SPACING_M: Final = 0.15  # Mean spacing of the scatterers of a rough wall.
 _CLEARANCE_M: Final = 0.8
+_SPACE_CLEARANCE_M: Final = 1.0
+_SURFACE_DB: Final = -20.0  # Strength of the scatterers of a surface, of which more echo at once than of a line.
 HALL_M: Final = 16.0, 10.0
 """Length and width of the hall, whose centre is the origin."""
 N_PULSES: Final = 1268
@@ -128,6 +135,65 @@ def _room(seed: int) -> tuple[np.random.Generator, float, float]:
     return random, random.uniform(2.2, 3.2), random.uniform(1.8, 2.6)
 
 
+def random_space(seed: int, spacing_m: float) -> tuple[tuple[Point, ...], tuple[Box, ...]]:
+    """Return the scatterers and boxes of a furnished room with rough walls, floor and ceiling, around the sensors.
+
+    Parameters
+    ----------
+    seed : int
+    spacing_m : float
+        Mean spacing of scatterers along both axes of a surface.
+    """
+    random, half_x_m, half_y_m, half_z_m = _space(seed)
+    half_m = half_x_m, half_y_m, half_z_m
+    points = []
+    for axis, side in ((axis, side) for axis in range(3) for side in (1, -1)):
+        others = [other for other in range(3) if other != axis]
+        n_points = round(4 * half_m[others[0]] * half_m[others[1]] / spacing_m**2)
+        place_m = np.zeros((n_points, 3))
+        place_m[:, axis] = side * half_m[axis] + random.normal(0.0, 0.01, n_points)
+        for other in others:
+            place_m[:, other] = random.uniform(-half_m[other], half_m[other], n_points)
+        strength_db = _SURFACE_DB + 20 * np.log10(random.rayleigh(0.8, n_points))
+        points += _at_height(place_m, strength_db)
+    posts = [
+        (x, y, random.uniform(-half_z_m, half_z_m))
+        for x, y in _places(random, 6, half_x_m, half_y_m, _SPACE_CLEARANCE_M)
+    ]
+    points += _at_height(np.array(posts), random.uniform(-12.0, -4.0, len(posts)))
+    boxes = []
+    for x, y in _places(random, 2, half_x_m, half_y_m, _SPACE_CLEARANCE_M):
+        length_m, width_m, height_m = random.uniform(0.2, 0.5), random.uniform(0.2, 0.5), random.uniform(0.5, 1.0)
+        z = HEIGHT_M - half_z_m + height_m / 2
+        boxes.append(
+            Box(
+                position_m=(x, y, z),
+                size_m=(length_m, width_m, height_m),
+                yaw_deg=random.uniform(0.0, 90.0),
+                reflection_db=-6.0,
+            )
+        )
+    return tuple(points), tuple(boxes)
+
+
+def half_size_of_space_m(seed: int) -> tuple[float, float, float]:
+    """Return the distances of the surfaces of `random_space` from the middle of the sensors, along x, y and z."""
+    return _space(seed)[1:]
+
+
+def _space(seed: int) -> tuple[np.random.Generator, float, float, float]:
+    random = np.random.default_rng([seed, 27])
+    return random, random.uniform(1.6, 2.2), random.uniform(1.3, 1.7), random.uniform(1.1, 1.3)
+
+
+def _at_height(place_m: NDArray[np.float64], strength_db: NDArray[np.float64]) -> list[Point]:
+    """Return points around the middle of the sensors."""
+    return [
+        Point(position_m=(x, y, z + HEIGHT_M), strength_db=max(-40.0, each))
+        for (x, y, z), each in zip(place_m.tolist(), strength_db.tolist(), strict=True)
+    ]
+
+
 def _walls(random: np.random.Generator, half_x_m: float, half_y_m: float, spacing_m: float) -> list[Point]:
     points = []
     for is_x, side in ((True, 1), (True, -1), (False, 1), (False, -1)):
@@ -141,11 +207,13 @@ def _walls(random: np.random.Generator, half_x_m: float, half_y_m: float, spacin
     return points
 
 
-def _places(random: np.random.Generator, count: int, half_x_m: float, half_y_m: float) -> list[tuple[float, float]]:
+def _places(
+    random: np.random.Generator, count: int, half_x_m: float, half_y_m: float, clearance_m: float = 2 * _CLEARANCE_M
+) -> list[tuple[float, float]]:
     found: list[tuple[float, float]] = []
     while len(found) < count:
         x, y = random.uniform(-half_x_m, half_x_m), random.uniform(-half_y_m, half_y_m)
-        if math.hypot(x, y) > 2 * _CLEARANCE_M:
+        if math.hypot(x, y) > clearance_m:
             found.append((x, y))
     return found
 
@@ -250,6 +318,8 @@ class PlatformImager:
         Sensors on the platform.
     max_range_m : float
         End of the images.
+    directions : str
+        Directions of the images.
     """
 
     def __init__(
@@ -258,8 +328,10 @@ class PlatformImager:
         seed: int,
         names: Sequence[str] = tuple(_YAWS_DEG),
         max_range_m: float = 4.0,
+        directions: str = "90",
     ) -> None:
-        self._things, self._seed, self._names, self._max_range_m = things, seed, tuple(names), max_range_m
+        self._things, self._seed, self._max_range_m = things, seed, max_range_m
+        self._sensors = tuple(_sensor(name, max_range_m, directions) for name in names)
         self._pipelines: dict[str, ertis.Pipeline] = {}
 
     def __call__(self, motion: Motion, number: int, time_s: float) -> list[Energyscape]:
@@ -274,7 +346,7 @@ class PlatformImager:
         scene = Scene(
             seed=self._seed * 1000 + number,
             platform=Platform(waypoints=_way(motion)),
-            sensors=tuple(_sensor(name, self._max_range_m) for name in self._names),
+            sensors=self._sensors,
             points=near,
             boxes=boxes,
         )
@@ -307,7 +379,7 @@ def _way(motion: Motion) -> tuple[tuple[float, float, float, float, float], ...]
     return (0.0, motion.x_m, motion.y_m, 0.0, yaws_deg[0]), (1.0, *later_m, 0.0, yaws_deg[1])
 
 
-def _sensor(name: str, max_range_m: float) -> Sensor:
+def _sensor(name: str, max_range_m: float, directions: str = "90") -> Sensor:
     """Return a sensor of the platform, in its frame."""
     translation_m, _ = mountings([name])[name]
     x, y, z = (round(each, 6) for each in translation_m)
@@ -315,7 +387,7 @@ def _sensor(name: str, max_range_m: float) -> Sensor:
         name=name,
         position_m=(x, y, z),
         yaw_deg=_YAWS_DEG[name],
-        processing=Processing(range_m=(0.4, max_range_m), directions="90"),
+        processing=Processing(range_m=(0.4, max_range_m), directions=directions),
         emitter=Emitter(level_db=-24.0, diameter_m=0.012),
         electronics=Electronics(noise_dbfs=-60.0),
     )

@@ -318,6 +318,12 @@ def motion(**given: Any) -> None:
     metavar="HZ",
     help="Pulses per second, at 1 m/s.",
 )
+@click.option(
+    "--only",
+    multiple=True,
+    type=click.Choice(["space"]),
+    help="Map rooms in three dimensions instead, with rough floors and ceilings and without a hall.",
+)
 @_seed("Seed of the first room, and of the hall.", default=1)
 @_update
 @options.quiet

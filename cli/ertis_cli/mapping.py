@@ -27,7 +27,15 @@ __all__ = ["mapping"]
     metavar="FILE",
     help="Poses of the platform in the world frame, .tum, .csv or .mcap; those of the recordings by default.",
 )
-@options.output("Map to write: .h5, .pgm with a .yaml for ROS, .mcap or .ply; REC.map.h5 by default.")
+@options.output("Map to write: .h5, .ply, .mcap, or .pgm with a .yaml for ROS; REC.map.h5 by default.")
+@click.option(
+    "--dimensions",
+    type=click.IntRange(2, 3),
+    default=2,
+    show_default=True,
+    metavar="2|3",
+    help="3 for cells in space, from images with directions over elevation; 2 for cells in the horizontal plane.",
+)
 @click.option(
     "--cell",
     "cell_m",
@@ -35,7 +43,7 @@ __all__ = ["mapping"]
     default=0.05,
     show_default=True,
     metavar="M",
-    help="Side of the square cells in m.",
+    help="Side of the cells in m.",
 )
 @click.option(
     "--half-life",
@@ -60,6 +68,7 @@ def mapping(
     paths: tuple[Path, ...],
     poses_file: Path | None,
     target: Path | None,
+    dimensions: int,
     cell_m: float,
     half_life_s: float | None,
     height_m: tuple[float, float] | None,
@@ -85,7 +94,7 @@ def mapping(
     from ertis_numba.storage import check_target
 
     target = target or paths[0].with_suffix(".map.h5")
-    for each in map_files(target):
+    for each in map_files(target, n_dimensions=dimensions):
         check_target(each, overwrite=force, sources=paths)
 
     with ExitStack() as stack:
@@ -96,6 +105,7 @@ def mapping(
         )
         mapper = Mapper(
             _pulses.mountings_of(readers, mounting),
+            dimensions=dimensions,
             cell_m=cell_m,
             half_life_s=half_life_s,
             height_m=height_m,

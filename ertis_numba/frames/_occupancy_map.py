@@ -111,9 +111,7 @@ class OccupancyMap:
     def limits_m(self) -> tuple[tuple[float, float], ...]:
         """Limits of the map along x, y, and z if it has layers, in metres."""
         sizes = self.log_odds.shape[::-1]
-        return tuple(
-            (edge_m, edge_m + size * self.cell_m) for edge_m, size in zip(self.origin_m, sizes, strict=True)
-        )
+        return tuple((edge_m, edge_m + size * self.cell_m) for edge_m, size in zip(self.origin_m, sizes, strict=True))
 
     def log_odds_at(self, position_m: ArrayLike) -> NDArray[np.float32]:
         """Return the log-odds of the cells at positions, 0 outside of the map.

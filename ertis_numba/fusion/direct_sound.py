@@ -15,7 +15,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.constants import SYNC_STEP_S
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
-from ertis_numba.fusion.rig import MountedSensor, Mountings, sensor_poses
+from ertis_numba.fusion.rig import MountedSensor, Mountings, mounted_sensors
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
 from ertis_numba.stages.signals import matched, signals_of
@@ -90,7 +90,7 @@ class DirectSoundCheck:
     """
 
     def __init__(self, mountings: Mountings) -> None:
-        self._poses = {pose.name: pose for pose in sensor_poses(mountings)}
+        self._mountings = {sensor.name: sensor for sensor in mounted_sensors(mountings)}
         self._found: dict[tuple[str, str], list[_Arrival]] = {}
         self._sample_s = 0.0
         self._speed_m_s = 0.0
@@ -111,10 +111,10 @@ class DirectSoundCheck:
         """
         group = {}
         for each in checks.items("measurements", measurements, Measurement, "a recording holds"):
-            if each.stamp.sensor not in self._poses:
+            if each.stamp.sensor not in self._mountings:
                 raise ArgumentError(
                     f"measurements has sensor {each.stamp.sensor!r}, but its mounting is unknown; give mountings for "
-                    f"it, or one of {', '.join(self._poses)}"
+                    f"it, or one of {', '.join(self._mountings)}"
                 )
             group[each.stamp.sensor] = each
         for name, each in group.items():
@@ -127,7 +127,7 @@ class DirectSoundCheck:
                 and heard.settings.call.sounds_like(call)
                 and self._distance_m(name, other) > _NEAREST_M
             }
-            for other, arrival in _arrivals(each, self._poses, starts_s).items():
+            for other, arrival in _arrivals(each, self._mountings, starts_s).items():
                 self._found.setdefault((other, name), []).append(arrival)
             self._sample_s = max(self._sample_s, 1 / each.settings.signal_rate_hz)
             self._speed_m_s = sound_speed_m_s(each.settings.air)
@@ -135,7 +135,7 @@ class DirectSoundCheck:
     @property
     def sounds(self) -> tuple[DirectSound, ...]:
         """Direct sound of each pair of emitter and receiver, where it is audible."""
-        chain_s = SYNC_STEP_S * (len(self._poses) - 1)
+        chain_s = SYNC_STEP_S * (len(self._mountings) - 1)
         found = []
         for (emitter, receiver), arrivals in self._found.items():
             difference_s = float(np.median([each.difference_s for each in arrivals]))
@@ -152,7 +152,7 @@ class DirectSoundCheck:
         The limit is three standard deviations and one sample of the signals.
         """
         sounds = {(each.emitter, each.receiver): each for each in self.sounds}
-        clocks_s, distances_s = _both_ways(sounds, SYNC_STEP_S * (len(self._poses) - 1))
+        clocks_s, distances_s = _both_ways(sounds, SYNC_STEP_S * (len(self._mountings) - 1))
         found = [*self._of_clocks(clocks_s)]
         for (one, other), (late_s, sd_s) in distances_s.items():
             if self._is_wrong(late_s, sd_s):
@@ -196,7 +196,7 @@ class DirectSoundCheck:
         return abs(difference_s) > max(_SIGMAS * sd_s, self._sample_s)
 
     def _distance_m(self, one: str, other: str) -> float:
-        return float(np.linalg.norm(self._poses[one].translation_m - self._poses[other].translation_m))
+        return float(np.linalg.norm(self._mountings[one].translation_m - self._mountings[other].translation_m))
 
     def _millimetres(self, late_s: float) -> str:
         return f"{1e3 * abs(late_s) * self._speed_m_s:.1f} mm {'farther apart' if late_s > 0 else 'closer together'}"
@@ -253,21 +253,21 @@ def _lateness_s(names: Sequence[str], pairs: Mapping[tuple[str, str], tuple[floa
 
 
 def _arrivals(
-    measurement: Measurement, poses: Mapping[str, MountedSensor], starts_s: Mapping[str, float]
+    measurement: Measurement, mountings: Mapping[str, MountedSensor], starts_s: Mapping[str, float]
 ) -> dict[str, _Arrival]:
     """Return the arrivals of direct sound at a sensor, by emitter."""
     settings = measurement.settings
     # Without its own delay, the matched filter yields times since the start of the record.
     settings = settings.replace(call=settings.call.replace(delay_s=0.0))
-    layout, pose, speed_m_s = (
+    layout, sensor, speed_m_s = (
         microphones(settings.array),
-        poses[measurement.stamp.sensor],
+        mountings[measurement.stamp.sensor],
         sound_speed_m_s(settings.air),
     )
-    places_m = pose.translation_m + layout.enabled_positions_m @ pose.rotation.T
+    places_m = sensor.translation_m + layout.enabled_positions_m @ sensor.rotation.T
     late_s = {
         name: start_s
-        + np.linalg.norm(places_m - poses[name].translation_m, axis=1) / speed_m_s
+        + np.linalg.norm(places_m - mountings[name].translation_m, axis=1) / speed_m_s
         + layout.delay_s[layout.enabled]
         for name, start_s in starts_s.items()
     }

@@ -12,7 +12,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.pulses import is_same_pulse
-from ertis_numba.fusion.rig import Mountings, sensor_poses
+from ertis_numba.fusion.rig import Mountings, mounted_sensors
 from ertis_numba.fusion.tables import FusionTables
 
 __all__ = ["Fused", "Fuser", "fuse"]
@@ -112,13 +112,13 @@ class Fuser:
         range_step_m: float | None = None,
         silent: Collection[str] = (),
     ) -> None:
-        self._poses = sensor_poses(mountings)
-        self._numbers = {pose.name: number for number, pose in enumerate(self._poses)}
+        self._mountings = mounted_sensors(mountings)
+        self._numbers = {sensor.name: number for number, sensor in enumerate(self._mountings)}
         self._diameter_m = checks.between("emitter_diameter_m", emitter_diameter_m, 0.0, 0.2)
         self._spacing_deg, self._step_m = spacing_deg, range_step_m
         for sensor in silent:
             self._number(sensor, "silent")
-        self._emitting = [number for number, pose in enumerate(self._poses) if pose.name not in silent]
+        self._emitting = [number for number, sensor in enumerate(self._mountings) if sensor.name not in silent]
         self._start_s: dict[int, float] = {}  # of the calls of all sensors so far
         self._tables: FusionTables | None = None
 
@@ -157,9 +157,9 @@ class Fuser:
         image = tables.image(found.reflectivity, group)
         return Fused(
             image=image,
-            sensors=tuple(self._poses[number].name for number in group),
-            missing=tuple(pose.name for number, pose in enumerate(self._poses) if number not in group),
-            unheard=tuple(self._poses[number].name for number in sorted(found.unheard)),
+            sensors=tuple(self._mountings[number].name for number in group),
+            missing=tuple(sensor.name for number, sensor in enumerate(self._mountings) if number not in group),
+            unheard=tuple(self._mountings[number].name for number in sorted(found.unheard)),
             _locate=lambda: tables.points(group, found.shares, image),
         )
 
@@ -227,7 +227,7 @@ class Fuser:
                 f"range_step_m is {step_m:g}, but ranges are {spacing_m:.3g} m apart; give at least that"
             )
         last_m = max(
-            float(np.linalg.norm(self._poses[number].translation_m[:2]) + image.range_m[-1])
+            float(np.linalg.norm(self._mountings[number].translation_m[:2]) + image.range_m[-1])
             for number, image in group.items()
         )
         grid = PolarGrid.around(
@@ -235,11 +235,11 @@ class Fuser:
             step_m,
             last_m,
             is_planar=kind == 0,
-            height_m=float(np.mean([pose.translation_m[2] for pose in self._poses])),
+            height_m=float(np.mean([sensor.translation_m[2] for sensor in self._mountings])),
         )
         first = next(iter(group.values())).settings.call.start_s
-        start_s = [self._start_s.get(number, first) for number in range(len(self._poses))]
-        return FusionTables(grid, self._poses, self._emitting, start_s, self._diameter_m)
+        start_s = [self._start_s.get(number, first) for number in range(len(self._mountings))]
+        return FusionTables(grid, self._mountings, self._emitting, start_s, self._diameter_m)
 
 
 def fuse(

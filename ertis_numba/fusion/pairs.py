@@ -192,15 +192,15 @@ def hypothesis(
     is_mirrored : bool
         Look for reflectors behind the array.
     """
-    pose = receiver.pose
+    mounting = receiver.mounting
     toward = receiver.directions * np.array([-1.0 if is_mirrored else 1.0, 1.0, 1.0])
-    directions = toward @ pose.rotation.T
-    offset_m = sensors[emitter].translation_m - pose.translation_m
+    directions = toward @ mounting.rotation.T
+    offset_m = sensors[emitter].translation_m - mounting.translation_m
     apart_m = float(np.linalg.norm(offset_m))
     path_m = np.arange(2 * receiver.n_steps + 1) * receiver.step_m - late_m
     beyond = path_m**2 - apart_m**2
     to_m = beyond / np.maximum(2 * (path_m - (directions @ offset_m)[:, None]), 1e-6)
-    place_m = pose.translation_m + to_m[..., None] * directions[:, None]
+    place_m = mounting.translation_m + to_m[..., None] * directions[:, None]
     sent_m = (place_m - sensors[emitter].translation_m) @ sensors[emitter].rotation
     from_m = np.linalg.norm(sent_m, axis=-1)
     radiated = emitters.power(sent_m[..., 0] / np.maximum(from_m, _NEAREST_M))

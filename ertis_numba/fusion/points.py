@@ -130,9 +130,9 @@ class PointFuser:
     def _observation(
         self, place_m: Floats, range_m: float, emitter: int, path_m: float, uncertainty_m: Floats, amplitude: float
     ) -> Observation | None:
-        pose = self._sensors[self._number]
-        direction = pose.rotation @ (place_m / range_m)
-        offset_m = self._sensors[emitter].translation_m - pose.translation_m
+        mounting = self._sensors[self._number]
+        direction = mounting.rotation @ (place_m / range_m)
+        offset_m = self._sensors[emitter].translation_m - mounting.translation_m
         beyond = path_m**2 - float(offset_m @ offset_m)
         if beyond <= 0:
             return None
@@ -144,7 +144,7 @@ class PointFuser:
             direction,
             2 * math.hypot(float(uncertainty_m[0]), _RANGE_SD_M),
             math.hypot(float(uncertainty_m[1]) / range_m, _ANGLE_SD_RAD),
-            pose.translation_m + to_m * direction,
+            mounting.translation_m + to_m * direction,
             amplitude,
         )
 

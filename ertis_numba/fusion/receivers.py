@@ -70,15 +70,15 @@ class Receiver:
 
     Parameters
     ----------
-    pose : MountedSensor
+    mounting : MountedSensor
     image : Energyscape
         Any image of the sensor; others must have the same directions and ranges.
     step_m : float
         Spacing of the coarse range axis.
     """
 
-    def __init__(self, pose: MountedSensor, image: Energyscape, step_m: float) -> None:
-        self.pose, self.step_m = pose, step_m
+    def __init__(self, mounting: MountedSensor, image: Energyscape, step_m: float) -> None:
+        self.mounting, self.step_m = mounting, step_m
         self._azimuth_rad, self._elevation_rad, self._range_m = image.azimuth_rad, image.elevation_rad, image.range_m
         self.directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
         positions_m = microphones(image.settings.array).enabled_positions_m

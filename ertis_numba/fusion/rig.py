@@ -14,7 +14,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import mounting
 from ertis_numba.settings import Settings
 
-__all__ = ["Emitters", "MountedSensor", "Mountings", "sensor_poses"]
+__all__ = ["Emitters", "MountedSensor", "Mountings", "mounted_sensors"]
 
 Floats = NDArray[np.float64]
 Mountings = Mapping[str, tuple[Sequence[float], Sequence[float]]]
@@ -46,8 +46,8 @@ class MountedSensor(NamedTuple):
         return np.asarray((position_m - self.translation_m) @ self.rotation)
 
 
-def sensor_poses(mountings: Mountings) -> tuple[MountedSensor, ...]:
-    """Return the poses of sensors, in the order of their mountings.
+def mounted_sensors(mountings: Mountings) -> tuple[MountedSensor, ...]:
+    """Return mounted sensors, in the order of their mountings.
 
     Raises
     ------

@@ -65,7 +65,8 @@ def write_map(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = Fa
     Raises
     ------
     ArgumentError
-        The suffix is unknown or does not hold the dimensions of the map, a file exists, or the packages for MCAP are not installed.
+        The suffix is unknown or does not hold the dimensions of the map, a file exists, or the packages for MCAP are
+        not installed.
     DataError
         The disk is full or cannot be written.
 

@@ -27,9 +27,9 @@ def find_walls(
     out[:] = np.where(is_wall.any(axis=1), is_wall.argmax(axis=1), n_steps)
 
 
-def spread_echoes(place: Doubles, precision: Doubles, reach: Doubles, peak: Doubles, out: Real) -> None:
+def spread_echoes(place: Doubles, precision: Doubles, reach: Doubles, peak: Doubles, most: Doubles, out: Real) -> None:
     """Add the density of normally distributed echoes to the cells around them."""
-    for centre, inverse, far, density in zip(place, precision, reach, peak, strict=True):
+    for centre, inverse, far, density, limit in zip(place, precision, reach, peak, most, strict=True):
         x, y, z = (
             np.arange(max(0, math.ceil(middle - most)), min(size, math.floor(middle + most) + 1))
             for middle, most, size in zip(centre, far, out.shape[::-1], strict=True)
@@ -39,7 +39,7 @@ def spread_echoes(place: Doubles, precision: Doubles, reach: Doubles, peak: Doub
         cells = np.ix_(z, y, x)
         offset = np.stack(np.broadcast_arrays(*(np.ix_(z - centre[2], y - centre[1], x - centre[0])[::-1])), axis=-1)
         squared = np.einsum("lrci,ij,lrcj->lrc", offset, inverse, offset)
-        out[cells] += (density * np.exp(-squared / 2)).astype(out.dtype)
+        out[cells] += np.minimum(density * np.exp(-squared / 2), limit).astype(out.dtype)
 
 
 def add_evidence(

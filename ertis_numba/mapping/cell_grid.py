@@ -58,9 +58,7 @@ class CellGrid:
         Lowest and highest height of cells in space.
     """
 
-    def __init__(
-        self, cell_m: float, n_dimensions: int = 2, height_m: tuple[float, float] = (-np.inf, np.inf)
-    ) -> None:
+    def __init__(self, cell_m: float, n_dimensions: int = 2, height_m: tuple[float, float] = (-np.inf, np.inf)) -> None:
         self._cell_m, self._n_dimensions, self._height_m = cell_m, n_dimensions, height_m
         self._first = np.zeros(3, np.int64)  # Column, row and layer of the first cell, from the world's origin.
         self.log_odds: Singles = np.zeros((0, 0, 0), np.float32)

@@ -13,7 +13,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Trajectory
 from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.fusion.fuser import EMITTER_DIAMETER_M
-from ertis_numba.fusion.rig import Mountings, sensor_poses
+from ertis_numba.fusion.rig import Mountings, mounted_sensors
 from ertis_numba.geometry import mounting
 from ertis_numba.mapping.cell_grid import CellGrid
 from ertis_numba.mapping.coverage import Coverage
@@ -84,7 +84,7 @@ class Mapper:
         emitter_diameter_m: float = EMITTER_DIAMETER_M,
     ) -> None:
         self._fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
-        self._mountings = {sensor.name: sensor for sensor in sensor_poses(mountings)}
+        self._mountings = {sensor.name: sensor for sensor in mounted_sensors(mountings)}
         self._dimensions = checks.integer("dimensions", dimensions, 2, 3)
         self._diameter_m = emitter_diameter_m
         self._cell_m = checks.between("cell_m", cell_m, 0.005, 1.0)
@@ -134,8 +134,8 @@ class Mapper:
         group = tuple(checks.items("images", images, Energyscape, "Pipeline.process returns"))
         if self._dimensions == 3 and any(image.is_planar for image in group):
             raise ArgumentError(
-                "images has a planar image, but a map of three dimensions needs directions over elevation; process with "
-                "directions such as 3d:1000, or leave out dimensions"
+                "images has a planar image, but a map of three dimensions needs directions over elevation; process "
+                "with directions such as 3d:1000, or leave out dimensions"
             )
         fused = self._fuser(group) if fused is None else fused
         time_ns = fused.image.stamp.timestamp_ns

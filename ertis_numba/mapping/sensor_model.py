@@ -93,7 +93,7 @@ def _first_clear_m(echoes: LocatedEchoes, cosine: Floats) -> Floats:
     """Return the range of the first clear echo in each direction, infinite without one: (direction,) float64."""
     is_clear = echoes.strength > _CLEAR
     is_near = cosine[is_clear] > math.cos(_HALF_BEAM_RAD)
-    return np.where(is_near, echoes.range_m[is_clear, None], np.inf).min(axis=0, initial=np.inf)
+    return np.asarray(np.where(is_near, echoes.range_m[is_clear, None], np.inf).min(axis=0, initial=np.inf))
 
 
 def _end_m(
@@ -168,21 +168,25 @@ def _log_odds(window: Window, view: View, offset_m: Floats) -> Singles:
 def _occupied(window: Window, view: View, echoes: LocatedEchoes) -> Singles:
     """Return the evidence for occupied cells: (layer, row, column) float32.
 
-    Each echo is normally distributed, and a cell is as likely as the density at its middle.
+    Each echo is normally distributed, and a cell is as likely as the density at its middle. An uncertain pose stretches
+    the evidence of an echo, as if it moved with the pose: the sum over all cells remains, and the highest value falls.
     """
-    offset_m = echoes.offset_m @ view.rotation.T
-    covariance_m2 = view.rotation @ echoes.covariance_m2 @ view.rotation.T + view.covariance_at_m2(offset_m)
-    covariance = covariance_m2 / window.cell_m**2 + np.eye(3) / 12  # A cell is as wide as a uniform distribution.
     n_axes = 2 if window.is_planar else 3
-    covariance[:, n_axes:], covariance[:, :, n_axes:] = 0.0, 0.0
-    covariance[:, range(n_axes, 3), range(n_axes, 3)] = 1.0
-    density = (2 * math.pi) ** (-n_axes / 2) / np.sqrt(np.linalg.det(covariance))
+    offset_m = echoes.offset_m @ view.rotation.T
+    # A cell is as wide as a uniform distribution.
+    sharp = view.rotation @ echoes.covariance_m2 @ view.rotation.T / window.cell_m**2 + np.eye(3) / 12
+    covariance = sharp + view.covariance_at_m2(offset_m) / window.cell_m**2
+    for each in (sharp, covariance):
+        each[:, n_axes:], each[:, :, n_axes:] = 0.0, 0.0
+        each[:, range(n_axes, 3), range(n_axes, 3)] = 1.0
+    volume = np.sqrt(np.linalg.det(covariance))
     found = np.zeros_like(window.log_odds)
     kernels.load_mapping().spread_echoes(
         window.cells_of(view.place_m + offset_m),
-        np.linalg.inv(covariance),
+        np.asarray(np.linalg.inv(covariance), np.float64),
         _REACH_SD * np.sqrt(np.einsum("pii->pi", covariance)),
-        _OCCUPIED * echoes.strength * density,
+        _OCCUPIED * echoes.strength * (2 * math.pi) ** (-n_axes / 2) / volume,
+        _MOST * np.sqrt(np.linalg.det(sharp)) / volume,
         found,
     )
     return found

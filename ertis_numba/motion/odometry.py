@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Trajectory
-from ertis_numba.fusion.rig import MountedSensor, Mountings, sensor_poses
+from ertis_numba.fusion.rig import MountedSensor, Mountings, mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor, GroupEchoes
 from ertis_numba.motion.flow import FlowFit, fit_flow, twist_of
 from ertis_numba.motion.velocity import MAX_TIME_S, EgoVelocity, Item, grouped, stamp_of, velocity_of
@@ -152,7 +152,7 @@ class Odometry:
     """
 
     def __init__(self, mountings: Mountings) -> None:
-        self._sensors = sensor_poses(mountings)
+        self._sensors = mounted_sensors(mountings)
         self._extract = EchoExtractor(self._sensors)
         self._last: _View | None = None
         self._keyframe: _View | None = None
@@ -217,7 +217,7 @@ class Odometry:
         >>> odometry = ertis.Odometry({"front": front})
         >>> odometry.remount({"front": front, "back": back})
         """
-        sensors = sensor_poses(mountings)
+        sensors = mounted_sensors(mountings)
         if not _begins_with(sensors, self._sensors):
             self._begin(None)
         self._sensors, self._extract = sensors, EchoExtractor(sensors)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.fusion.pulses import is_same_pulse
-from ertis_numba.fusion.rig import Mountings, sensor_poses
+from ertis_numba.fusion.rig import Mountings, mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor
 from ertis_numba.motion.flow import FlowFit, fit_flow, twist_of
 
@@ -110,7 +110,7 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
     >>> ertis.ego_velocity([clouds[0]], [clouds[1]], mountings).velocity_m_s.round(2).tolist()
     [0.5, 0.0]
     """
-    sensors = sensor_poses(mountings)
+    sensors = mounted_sensors(mountings)
     groups = [grouped(before, "before"), grouped(after, "after")]
     first, second = (stamp_of(group) for group in groups)
     time_s = (second.timestamp_ns - first.timestamp_ns) / 1e9

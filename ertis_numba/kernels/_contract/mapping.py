@@ -66,11 +66,15 @@ class SpreadEchoes(Protocol):
         Distances along the axes within which cells change.
     peak : (echo,) float64
         Density at the mean.
+    most : (echo,) float64
+        Limit of the density.
     out : (layer, row, column) float32
         Sum, to which the densities are added.
     """
 
-    def __call__(self, place: Doubles, precision: Doubles, reach: Doubles, peak: Doubles, out: Real) -> None: ...
+    def __call__(
+        self, place: Doubles, precision: Doubles, reach: Doubles, peak: Doubles, most: Doubles, out: Real
+    ) -> None: ...
 
 
 class AddEvidence(Protocol):

@@ -30,7 +30,7 @@ def find_walls(log_odds, place, direction, step, wall, n_steps, out):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def spread_echoes(place, precision, reach, peak, out):
+def spread_echoes(place, precision, reach, peak, most, out):
     """Add the density of normally distributed echoes to the cells around them."""
     for e in range(len(place)):
         first_column, end_column = _within(place[e, 0], reach[e, 0], out.shape[2])
@@ -45,7 +45,7 @@ def spread_echoes(place, precision, reach, peak, out):
                     x = column - place[e, 0]
                     crossed = p[0, 1] * x * y + p[0, 2] * x * z + p[1, 2] * y * z
                     squared = p[0, 0] * x * x + p[1, 1] * y * y + p[2, 2] * z * z + 2 * crossed
-                    out[layer, row, column] += np.float32(peak[e] * math.exp(-squared / 2))
+                    out[layer, row, column] += np.float32(min(peak[e] * math.exp(-squared / 2), most[e]))
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -80,7 +80,9 @@ def add_evidence(occupied, touched, most, free, place, rotation, step, near, nea
                         up = r[0, 2] * x + r[1, 2] * y + r[2, 2] * z
                         s = int(away / step)
                         if s < n_steps:
-                            evidence -= free[_elevation(ahead, left, up, free.shape[0]), _azimuth(ahead, left, free.shape[1]), s]
+                            evidence -= free[
+                                _elevation(ahead, left, up, free.shape[0]), _azimuth(ahead, left, free.shape[1]), s
+                            ]
                 if evidence != _ZERO:
                     out[layer, row, column] = min(max(out[layer, row, column] + evidence, -limit), limit)
 
