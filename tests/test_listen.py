@@ -158,9 +158,39 @@ def test_unanswered_address_is_reported_once(monkeypatch):
     monkeypatch.setattr("ertis_cli._product_printer._SOON_S", 0.1)
     text = "waiting for tcp://127.0.0.1:1: no answer; is 'ertis serve' running?"
     done = listen("tcp://127.0.0.1:1", "--duration", "0.6", "--json")
-    assert done.stderr.splitlines() == [text, "0 received, 0 dropped"]
-    waiting, _ = events(done)
+    assert done.exit_code == 1
+    *lines, error = done.stderr.splitlines()
+    assert lines == [text, "0 received, 0 dropped"]
+    assert error.startswith("ertis: error: tcp://127.0.0.1:1 has not answered in 0.6")
+    waiting, _ = map(json.loads, done.stdout.splitlines())
     assert waiting == {"event": "waiting", "address": "tcp://127.0.0.1:1", "text": text}
+
+
+@pytest.mark.parametrize("output", ["--fuse", "--odometry", "--bearings"])
+def test_computed_output_without_an_answer_fails_as_products_do(output):
+    done = listen("tcp://127.0.0.1:1", output, "--duration", "0.2")
+    assert done.exit_code == 1
+    assert "ertis: error: tcp://127.0.0.1:1 has not answered in 0." in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("product", "text"),
+    [
+        (
+            "energyscape",
+            "no energyscape received from tcp://here yet; is 'ertis capture --to' running without --passive?",
+        ),
+        ("raw", "no raw received from tcp://here yet; is 'ertis capture --to' running?"),
+    ],
+)
+def test_silence_is_reported_at_the_end_without_a_delay(capsys, product, text):
+    heard = MicrophoneTable(as_json=False, quiet=False)
+    heard.subscribed("tcp://here", (), (product,))
+    heard.silent("tcp://here", (product,), 0)
+    assert not capsys.readouterr().err
+    heard.silent("tcp://here", (product,), 0, at_end=True)
+    assert text in capsys.readouterr().err
+    heard.require_answer("tcp://here", 1.0)
 
 
 def test_points_use_the_directions_of_each_image(capsys):
@@ -245,5 +275,6 @@ def test_silence_is_reported_once(monkeypatch, capsys, n_received, lines):
     reported = capsys.readouterr().err.splitlines()
     assert len(reported) == lines
     assert all(
-        "no energyscape received from tcp://here yet; is 'ertis capture --to' running?" in line for line in reported
+        "no energyscape received from tcp://here yet; is 'ertis capture --to' running without --passive?" in line
+        for line in reported
     )

@@ -338,7 +338,7 @@ def test_listen_refuses_options_that_do_not_fit_odometry(arguments, message):
 class _Silent(contextlib.nullcontext):
     """Stand-in for a connected subscriber that receives nothing at first."""
 
-    connected, n_skipped, counts = True, 0, SimpleNamespace(dropped=0)
+    connected, n_skipped, counts = True, 0, SimpleNamespace(dropped=0, received=0)
 
     def __init__(self):
         super().__init__(self)

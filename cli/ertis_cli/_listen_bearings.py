@@ -61,6 +61,7 @@ def listen_bearings(
         show,
         head=_HEAD,
         of=("map", "measurements"),
+        product="raw",
         at_end=report_active,
         n=n,
         duration=duration,

@@ -16,7 +16,6 @@ from ertis_cli._stop_signals import stopped_by_signals
 __all__ = ["Connect", "listen_pulses"]
 
 _POLL_INTERVAL_S = 0.1
-_PRODUCTS = ("energyscape",)
 
 Arrival_co = TypeVar("Arrival_co", covariant=True)
 Arrival = TypeVar("Arrival")
@@ -47,6 +46,7 @@ def listen_pulses(
     *,
     head: str,
     of: tuple[str, str] = ("pulse", "images"),
+    product: str = "energyscape",
     at_end: Callable[[Any], None] = lambda _: None,
     n: int | None,
     duration: float | None,
@@ -67,6 +67,8 @@ def listen_pulses(
         Line above the lines of pulses; omitted with ``as_json``.
     of : (str, str)
         What is shown, in the singular, and what the central node may drop, in the plural.
+    product : str
+        Product that the subscriber receives.
     at_end : callable
         Called with the subscriber at the end, also after an error.
     n : int or None
@@ -74,11 +76,11 @@ def listen_pulses(
     quiet, as_json : bool
     """
     notes: deque[str] = deque()
-    begun_s, received = time.monotonic(), 0
-    end_s = math.inf if duration is None else begun_s + duration
     heard = MicrophoneTable(as_json=as_json, quiet=quiet)
     with stopped_by_signals() as signals, connect(notes.append) as subscriber:
         signals.obey(subscriber.close)
+        begun_s, received = time.monotonic(), 0  # Loading kernels to connect may take longer than the duration.
+        end_s = math.inf if duration is None else begun_s + duration
         if not as_json:
             click.echo(head)
         try:
@@ -86,7 +88,7 @@ def listen_pulses(
                 arrival = subscriber.receive(_POLL_INTERVAL_S)
                 if subscriber.connected:
                     heard.connected(sensors)
-                    heard.silent(address, _PRODUCTS, received)
+                    heard.silent(address, (product,), subscriber.counts.received)
                 else:
                     heard.unanswered(address, time.monotonic() - begun_s)
                 while notes:
@@ -96,11 +98,13 @@ def listen_pulses(
                     show(arrival)
         finally:
             at_end(subscriber)
+        heard.silent(address, (product,), subscriber.counts.received, at_end=True)
         dropped, skipped = subscriber.counts.dropped, subscriber.n_skipped
     if as_json:
         options.print_json({"event": "listened", "received": received, "dropped": dropped, "skipped": skipped})
     options.say(f"{options.counted(received, of[0])}, {dropped} {of[1]} dropped, {skipped} skipped", quiet=quiet)
     if signals.came:
         sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
+    heard.require_answer(address, time.monotonic() - begun_s)
     if n is not None and received < n:
         raise click.ClickException(f"received {received} of {n} {of[0]}s in {duration:g} s; give a longer --duration")

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["PRINTERS", "MicrophoneTable"]
 
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'made in':>8}  {'dropped':>7}  what"
+_MADE = frozenset({"energyscape", "points"})  # Products of measurements with a call.
 _SOON_S = 3.0
 _SILENT_S = 5.0
 _STAMP = (
@@ -66,20 +67,30 @@ class MicrophoneTable:
             self._subscribed_s, self._of_sensors = time.monotonic(), f" of {', '.join(sensors)}" if sensors else ""
         self._reported_names = True
 
-    def silent(self, address: str, products: tuple[str, ...], n_received: int) -> None:
-        """Report once, after a delay, that a connected publisher has sent nothing."""
-        if self._subscribed_s is None or (not n_received and time.monotonic() - self._subscribed_s < _SILENT_S):
+    def silent(self, address: str, products: tuple[str, ...], n_received: int, *, at_end: bool = False) -> None:
+        """Report once, after a delay or at the end, that a connected publisher has sent nothing."""
+        if self._subscribed_s is None:
+            return
+        if not (n_received or at_end) and time.monotonic() - self._subscribed_s < _SILENT_S:
             return
         self._subscribed_s = None
         if n_received:
             return
+        with_call = " without --passive" if _MADE.issuperset(products) else ""
         text = (
             f"no {' and no '.join(products)}{self._of_sensors} received from {address} yet; is 'ertis capture --to' "
-            "running? Check with 'ertis status'"
+            f"running{with_call}? Check with 'ertis status'"
         )
         if self._as_json:
             options.print_json({"event": "waiting", "address": address, "text": text})
         options.say(text, quiet=self._quiet)
+
+    def require_answer(self, address: str, took_s: float) -> None:
+        """Raise a ClickException if no publisher has answered at all."""
+        if not self._reported_names:
+            raise click.ClickException(
+                f"{address} has not answered in {took_s:.3g} s; start 'ertis serve' there, or check the address"
+            )
 
     def unanswered(self, address: str, since_s: float) -> None:
         """Report once, after a delay, that no node answers; `note` then reports the first connection too."""

@@ -160,11 +160,14 @@ def listen(
             if item is not None and subscriber.latest is not None:
                 failure = _saved(save, subscriber.latest)
                 heard.product(subscriber.latest, subscriber.counts)
-    heard.end(subscriber.counts, target, time.monotonic() - begun_s)
+    took_s = time.monotonic() - begun_s
+    heard.silent(address, products, subscriber.counts.received, at_end=True)
+    heard.end(subscriber.counts, target, took_s)
     if failure is not None:
         raise failure
     if signals.came:
         sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
+    heard.require_answer(address, took_s)
     if n is not None and subscriber.counts.received < n:
         raise click.ClickException(
             f"received {subscriber.counts.received} of {n} products in {duration:g} s; give a longer --duration"
