@@ -76,9 +76,11 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 	$(BIN)/ertis bench calibration --update docs/how-to/calibrate.md
 	$(BIN)/ertis bench fusion --update docs/how-to/fusion.md
 	$(BIN)/ertis bench fusion --only calls --count 6 --seed 1000 --update docs/how-to/fusion.md
+	$(BIN)/ertis bench fusion --only clocks --update docs/how-to/fusion.md
 	$(BIN)/ertis bench network --only fusion --update docs/how-to/fusion.md
 	$(BIN)/ertis bench motion --length 90 --seed 2000 --update docs/how-to/motion.md
 	$(BIN)/ertis bench map --update docs/how-to/mapping.md
+	$(BIN)/ertis bench map --only space --update docs/how-to/mapping.md
 	$(BIN)/ertis bench scaling --update docs/reference/benchmarks.md
 	$(BIN)/ertis bench simulation --update docs/reference/benchmarks.md
 	$(BIN)/ertis bench many --update docs/how-to/many.md

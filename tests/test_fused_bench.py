@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import differing_calls
+from ertis_bench import clock_checks, differing_calls
 from ertis_bench.network import fused_receiver, live_fusion
 from ertis_bench.network.fused_receiver import FusedReceiverJob
 from ertis_cli.main import cli
@@ -65,3 +65,31 @@ def test_calls_bench_compares_equal_and_different_calls(tmp_path, monkeypatch):
     low_db, high_db = report["suppression_db"]
     assert 0 < low_db < high_db
     assert "| omnidirectional | different, an image for each pair | 16 |" in target.read_text("utf-8")
+
+
+def test_clocks_bench_counts_accusations_and_finds(tmp_path, monkeypatch):
+    monkeypatch.setattr(clock_checks, "EMITTERS_M", (0.0,))
+    target = tmp_path / "page.md"
+    marker = "ertis bench fusion --only clocks"
+    target.write_text(f"<!-- {marker} -->\nold\n<!-- /{marker} -->\n", "utf-8")
+    options = ["--only", "clocks", "--count", "2", "--seed", "5", "--json", "--quiet", "--update", str(target)]
+    done = CliRunner().invoke(cli, ["bench", "fusion", *options])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    (row,) = json.loads(done.stdout)["clocks"]
+    assert (row["heard"], row["accused"], row["found_clocks"], row["found_mountings"]) == (12, 0, 2, 2)
+    assert row["clock_rms_us"] < 5
+    assert "| omnidirectional | 12.0 of 12 | 0 of 2 | 2 of 2 (" in target.read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("fault", "expected"),
+    [({"clock_us": -50.0}, (1, 0)), ({"moved_m": (0.0, 0.05, 0.0)}, (0, 1)), ({}, (0, 0))],
+)
+def test_clocks_bench_counts_each_fault_as_its_own(monkeypatch, fault, expected):
+    """Every trial has the same fault, so that only the finds of its kind count."""
+    monkeypatch.setattr(clock_checks, "EMITTERS_M", (0.0,))
+    trial = clock_checks.PlatformTrial("left", **fault)
+    monkeypatch.setattr(clock_checks, "_trials", lambda *_: (trial, trial, trial))
+    (row,) = clock_checks.run(count=1, seed=5, say=lambda _: None)["clocks"]
+    assert (row["found_clocks"], row["found_mountings"]) == expected
+    assert row["accused"] == max(expected)

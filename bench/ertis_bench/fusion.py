@@ -6,12 +6,12 @@ Four sensors on a platform face in four directions and emit together. Nothing is
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench import differing_calls, machine
+from ertis_bench import clock_checks, differing_calls, machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
@@ -25,6 +25,8 @@ from ertis_numba.simulation.render import Simulator
 __all__ = ["form", "run"]
 
 Floats = NDArray[np.float64]
+
+_PARTS: Final = {"calls": differing_calls, "clocks": clock_checks}
 
 _LOUD_DB = -25.0  # Level of foreign echoes that count, relative to the strongest own echo.
 _BEAM_RAD, _PULSE_M = math.radians(25.0), 0.12  # Distance of ghosts from all reflectors.
@@ -58,10 +60,14 @@ def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None], only: 
     say : callable
         Function that reports progress.
     only : sequence of str
-        ``calls`` to compare equal calls with different ones instead.
+        ``calls`` to compare equal calls with different ones instead, or ``clocks`` to check clocks and mountings by
+        direct sound.
     """
     if only:
-        return differing_calls.run(count=count, seed=seed, say=say)
+        report: dict[str, Any] = {}
+        for part in only:
+            report |= _PARTS[part].run(count=count, seed=seed, say=say)
+        return report
     rows, times = [], []
     for diameter_m in EMITTERS_M:
         ghosts, positions, lost = [], [], 0
@@ -91,8 +97,9 @@ def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None], only: 
 
 def form(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
-    if "calls" in report:
-        return differing_calls.form(report)
+    parts = [part.form(report) for name, part in _PARTS.items() if name in report]
+    if parts:
+        return "\n\n".join(parts)
     head = [
         "emitters",
         "ghosts, fused / single (median)",

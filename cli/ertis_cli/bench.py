@@ -259,9 +259,10 @@ def calibration(**given: Any) -> None:
 @click.option(
     "--only",
     multiple=True,
-    type=click.Choice(["calls"]),
+    type=click.Choice(["calls", "clocks"]),
     metavar="PART",
-    help="Run only this part: calls compares sensors with equal and with different calls.",
+    help="Run only this part: calls compares sensors with equal and with different calls, and clocks checks clocks and "
+    "mountings by direct sound.",
 )
 @_update
 @options.quiet
