@@ -1,4 +1,4 @@
-"""Benchmarks of fusion, with short measurements, fill their tables."""
+"""Benchmarks of fusion and of live maps, with short measurements, fill their tables."""
 
 import json
 
@@ -6,12 +6,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_bench import clock_checks, differing_calls
-from ertis_bench.network import fused_receiver, live_fusion
+from ertis_bench.network import fused_receiver, live_fusion, live_maps
 from ertis_bench.network.fused_receiver import FusedReceiverJob
+from ertis_bench.network.map_viewer import MapViewerJob, n_wrong
+from ertis_bench.network.sender import SETTINGS
 from ertis_cli.main import cli
 
+from ertis_numba.frames import Measurement
 from ertis_numba.fusion import Fuser
 from ertis_numba.network.fused_subscriber import FusedArrival
+from ertis_numba.passive import AcousticCamera
 from tests.publishing import image
 
 MARKER = "ertis bench network --only fusion"
@@ -93,3 +97,30 @@ def test_clocks_bench_counts_each_fault_as_its_own(monkeypatch, fault, expected)
     (row,) = clock_checks.run(count=1, seed=5, say=lambda _: None)["clocks"]
     assert (row["found_clocks"], row["found_mountings"]) == expected
     assert row["accused"] == max(expected)
+
+
+def test_maps_bench_counts_and_checks_maps_of_a_live_view(tmp_path, monkeypatch):
+    monkeypatch.setattr(live_maps, "_WARM_UP", 5)
+    target = tmp_path / "page.md"
+    marker = "ertis bench network --only maps"
+    target.write_text(f"<!-- {marker} -->\nold\n<!-- /{marker} -->\n", "utf-8")
+    options = ["--duration", "2", "--json", "--quiet", "--folder", str(tmp_path), "--update", str(target)]
+    done = CliRunner().invoke(cli, ["bench", "network", "--only", "maps", *options])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    (row,) = json.loads(done.stdout)["rows"]
+    assert row["sent"] == row["published"] == 80
+    assert not row["dropped"]
+    assert row["maps"] + row["maps_dropped"] <= 80
+    assert 0 < row["checked"] <= row["maps"] + 20
+    assert row["wrong"] == 0
+    assert "80 measurements sent, 80 published" in target.read_text("utf-8")
+
+
+@pytest.mark.parametrize(("gain", "wrong"), [(1.0, 0), (1.001, 1)])
+def test_maps_bench_finds_wrong_maps(tmp_path, gain, wrong):
+    words = np.random.default_rng(1).integers(0, 2**32, (1, SETTINGS.recording.n_samples), dtype=np.uint32)
+    np.save(tmp_path / "words.npy", words)
+    with AcousticCamera(SETTINGS.replace(**{"processing.mode": "passive"})) as camera:
+        found = camera.process(Measurement(words[0], camera.settings))
+    job = MapViewerJob(address="", keys=("", ""), words=str(tmp_path / "words.npy"), stated="")
+    assert n_wrong(job, [found.replace(power=gain * found.power)]) == wrong

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from ertis_bench import machine
-from ertis_bench.network import live_fusion
+from ertis_bench.network import live_fusion, live_maps
 from ertis_bench.network.oracle import judged, read_diaries
 from ertis_bench.network.processes import central, survivors, until
 from ertis_bench.network.processor_time import ProcessorTime
@@ -287,6 +287,7 @@ PARTS: dict[str, tuple[str, Callable[[Path, float, int], Found]]] = {
         ),
     ),
     "fusion": ("fused image of 4 sensors × 10 Hz, 90 directions each", live_fusion.measure),
+    "maps": ("acoustic maps of 4 passive sensors × 10 Hz in a live view", live_maps.measure),
     "overload": ("twice the capacity", _overload),
     "cluster": ("90 directions, 4 sensors × 10 Hz, with own workers and on a dask cluster", _cluster),
 }

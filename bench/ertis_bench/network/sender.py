@@ -75,6 +75,8 @@ class SenderJob:
         Pulse from which the clock is wrong, and its error.
     start_s : float, optional
         Start time on the clock of `time.monotonic`.
+    passive : bool
+        State that the sensors emit no calls.
     """
 
     address: str
@@ -97,6 +99,7 @@ class SenderJob:
     double_pulse: int | None = None
     clock_step: tuple[int, float] | None = None
     start_s: float | None = None
+    passive: bool = False
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed."""
@@ -235,6 +238,7 @@ class Sender:
             session_id=self._session_id,
             timestamp_ns=start_ns + round(1e9 * pulse / job.rate_hz) + step_ns,
             timestamp_uncertainty_ns=100_000,
+            behaviour="passive" if job.passive else "unknown",
         )
 
     def _entries(self, measurements: Sequence[Measurement]) -> list[JournalEntry]:

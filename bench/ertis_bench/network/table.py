@@ -23,6 +23,12 @@ _FUSED: Final = (
     "computation. Times start when the whole measurements are at the sensor node, so they exclude emission, recording "
     "and USB."
 )
+_MAPS: Final = (
+    "The view of acoustic maps runs without a browser, and draws all frames that a browser would show. It makes its "
+    "cameras in the three seconds before. Maps have third octaves from 8.9 to 89.5 kHz. A frame shows the latest map "
+    "of each sensor. The maps of one measurement in ten, as far as they were drawn, were compared with a separate "
+    "computation."
+)
 
 
 def as_list(found: Any) -> str:
@@ -45,8 +51,9 @@ def network(report: dict[str, Any]) -> str:
 
 
 def _conditions(rows: Sequence[dict[str, Any]]) -> list[str]:
-    are_fused = [row["part"] == "fused image" for row in rows]
-    return [text for text, applies in ((_CONDITIONS, not all(are_fused)), (_FUSED, any(are_fused))) if applies]
+    parts = {row["part"] for row in rows}
+    own = {"fused image": _FUSED, "acoustic maps": _MAPS}
+    return [*([_CONDITIONS] if parts - own.keys() else []), *(text for part, text in own.items() if part in parts)]
 
 
 def _figure(row: dict[str, Any]) -> dict[str, str]:
@@ -64,6 +71,8 @@ def _figure(row: dict[str, Any]) -> dict[str, str]:
         )
     elif row["part"] == "fused image":
         what, goal, found = _fused(row), row["goal"], _fused_result(row)
+    elif row["part"] == "acoustic maps":
+        what, goal, found = _maps(row), row["goal"], _maps_result(row)
     else:
         what = (
             f"{row['part']}, {row['directions']} directions, {row['sensors']} × {row['rate_hz']:g} Hz for "
@@ -100,4 +109,21 @@ def _fused_result(row: dict[str, Any]) -> str:
         f"p99 {row['p99_ms']:.1f} ms, slowest {row['slowest_ms']:.0f} ms; to its points p50 "
         f"{row['points_p50_ms']:.1f} ms, p99 {row['points_p99_ms']:.1f} ms. In the first {row['start_s']:g} s, which "
         f"these times exclude, the slowest image took {row['start_slowest_ms']:.0f} ms"
+    )
+
+
+def _maps(row: dict[str, Any]) -> str:
+    return (
+        f"live view of acoustic maps of {row['sensors']} passive sensors × {row['rate_hz']:g} Hz, {row['directions']} "
+        f"directions each, for {row['duration_s']:g} s"
+    )
+
+
+def _maps_result(row: dict[str, Any]) -> str:
+    return (
+        f"{row['sent']:,} measurements sent, {row['published']:,} published, {as_list(row['dropped'])} dropped by the "
+        f"central node; {row['maps']:,} maps made, {row['maps_dropped']} measurements dropped for the view "
+        f"(and {row['start_dropped']} in its first seconds), "
+        f"{row['replaced']} maps replaced by later ones before a frame; {row['frames']:,} frames drawn; "
+        f"{row['checked']} maps checked, {row['wrong']} wrong"
     )

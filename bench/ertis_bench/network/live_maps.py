@@ -1,0 +1,106 @@
+"""Acoustic maps of passive sensors in a live view."""
+
+import signal
+from collections import Counter
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+from ertis_bench.network.map_viewer import MapViewerJob
+from ertis_bench.network.oracle import read_diaries
+from ertis_bench.network.processor_time import ProcessorTime
+from ertis_bench.network.sender import SETTINGS, SenderJob
+from ertis_bench.network.serving import Serve, create_keys, some_words
+
+__all__ = ["measure"]
+
+GOAL: Final = "0 dropped"
+_N_SENSORS: Final = 4
+_RATE_HZ: Final = 10.0
+_WARM_UP: Final = 30  # Measurements of each sensor, for which the view compiles kernels and makes cameras.
+Found = dict[str, Any]
+
+
+def measure(folder: Path, duration_s: float, seed: int) -> Found:
+    """Show the acoustic maps of four sensors that emit no calls, in a view without a browser.
+
+    Parameters
+    ----------
+    folder : Path
+    duration_s : float
+    seed : int
+        Seed of the words, which are noise.
+    """
+    sensors = [f"sensor-{number + 1}" for number in range(_N_SENSORS)]
+    options, given, boss = create_keys(folder, sensors)
+    words = some_words(SETTINGS, folder / "words.npy", seed=seed)
+    diaries = folder / "warm.ndjson", folder / "sender.ndjson"
+    with ExitStack() as stack:
+        serve = stack.enter_context(Serve.running(folder, *options, keys=boss))
+        job = SenderJob(
+            address=serve.listen,
+            diary=str(diaries[0]),
+            sensors=tuple(sensors),
+            rate_hz=_RATE_HZ,
+            count=_WARM_UP,
+            words=str(words),
+            small=False,
+            keys=given,
+            passive=True,
+        )
+        look = MapViewerJob(
+            address=serve.publish,
+            keys=(str(folder / "keys" / "boss.secret.toml"), boss.server),
+            words=str(words),
+            stated=str(folder / "view.txt"),
+        )
+        viewer = stack.enter_context(look.start())
+        viewer.wait_for("subscribed")
+        with job.start() as first:
+            first.wait_for("sent", timeout_s=120.0)
+        n_before = len(read_diaries(diaries[:1]).kept)
+        serve.settle(n_before)
+        published = _published(serve)
+        viewer.signal(signal.SIGUSR1)
+        begun = viewer.wait_for("counts")
+        sender = stack.enter_context(job.replace(diary=str(diaries[1]), count=round(duration_s * _RATE_HZ)).start())
+        sender.wait_for("begun")
+        load = ProcessorTime(serve.processes() | {"sensor nodes": [sender.pid], "view": [viewer.pid]})
+        sender.wait_for("sent", timeout_s=duration_s + 60.0)
+        n_sent = len(read_diaries(diaries).kept)
+        serve.settle(n_sent)
+        dropped = (
+            Counter[str]()
+            if serve.latest is None
+            else sum((Counter(each.dropped) for each in serve.latest.sensors.values()), Counter[str]())
+        )
+        published = _published(serve) - published
+        cpu_percent, cpu_ms = load.percent(), load.rows(max(1, n_sent))
+        viewer.signal(15)
+        end = viewer.wait_for("shown", timeout_s=60.0)
+        serve.node.stop()
+    since = {name: end[name] - begun[name] for name in ("received", "dropped", "replaced", "frames")}
+    return {
+        "part": "acoustic maps",
+        "directions": SETTINGS.processing.directions,
+        "sensors": _N_SENSORS,
+        "rate_hz": _RATE_HZ,
+        "goal": GOAL,
+        "sent": n_sent - n_before,
+        "published": published,
+        "dropped": dict(dropped),
+        "maps": since["received"],
+        "maps_dropped": since["dropped"],
+        "start_dropped": begun["dropped"],
+        "replaced": since["replaced"],
+        "frames": since["frames"],
+        "checked": end["checked"],
+        "wrong": end["wrong"],
+        "cpu_percent": cpu_percent,
+        "cpu_ms": cpu_ms,
+    }
+
+
+def _published(serve: Serve) -> int:
+    """Return the number of published measurements without a call."""
+    return 0 if serve.latest is None else sum(each.passive for each in serve.latest.sensors.values())
