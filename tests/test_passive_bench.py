@@ -60,13 +60,15 @@ def test_report_without_acoular_has_times_of_this_package(monkeypatch):
     monkeypatch.setattr(times, "_OURS", 2)
     report = passive.run(count=1, seeds=2, bearings=0, seed=0, say=lambda _: None)
     assert report["differences"] == []
-    assert [row["name"] for row in report["times"]] == list(agreement.CASES)
+    assert [row["name"] for row in report["times"]] == list(times.TIMED)
     assert all(row["ours"]["processor_ms"] > 0 and "acoular" not in row for row in report["times"])
     text = passive.form(report)
     assert "Acoular is not installed" in text
     assert "| signals to cross-spectral matrices |" in text
-    shares = {(row["name"], row["apart_deg"]): row["shares"] for row in report["separation"]}
-    assert shares["capon", 5.0] == shares["music", 5.0] == shares["clean_sc", 10.0] == [1.0, 1.0]
+    shares = {(row["name"], row["apart_deg"], row["weaker_db"]): row["shares"] for row in report["separation"]}
+    assert all(shares[name, 5.0, 0.0] == [1.0, 1.0] for name in ("capon", "music", "hr_clean_sc"))
+    assert shares["clean_sc", 10.0, 0.0] == [1.0, 1.0]
+    assert "| 5° and 10 dB apart |" in text
     assert "| music | 100% / 100% |" in text
 
 
@@ -76,4 +78,7 @@ def test_sources_are_separated_by_two_maxima_near_them():
     assert separation.are_separated(power, azimuth_deg, (-2.5, 2.5))
     assert not separation.are_separated(power, azimuth_deg, (-5, 5))
     assert not separation.are_separated(power, azimuth_deg, (-3.5, 0.5))
+    near = np.isin(azimuth_deg, (-1.0, 1.0)).astype(float)
+    assert separation.are_separated(near, azimuth_deg, (-1.1, 1.3))
+    assert not separation.are_separated(near, azimuth_deg, (-0.4, 0.4))
     assert not separation.are_separated(np.exp(-(azimuth_deg**2)), azimuth_deg, (-1, 1))

@@ -28,7 +28,7 @@ __all__ = [
 
 _PREFIX = "passive_"
 _MAP_OPTIONS = {"bands_hz": "bands", "method": "map-method", "averages": "average", "focus_m": "focus"}
-_METHODS = ("delay_and_sum", "functional", "capon", "music", "clean_sc")
+_METHODS = ("delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc")
 _OF_IMAGES = (
     *("range_m", "preset", "beamformer", "weighting", "dmas_order", "snapshots", "diagonal_loading", "array_weights"),
     *("clean_within_db", "clean_above_mean_db", "last_stage", "wavefront", "method", "max_error_db", "plan"),

@@ -81,7 +81,7 @@ class BearingFinder:
         self._searches: list[BandSearch] = []
         for shares in bin_shares(camera.band_hz, camera.frequency_hz).astype(np.float64):
             bins = np.flatnonzero(shares)
-            frequency_hz, steer = camera.frequency_hz[bins], functools.partial(camera.waves.steer, first=int(bins[0]))
+            frequency_hz, steer = camera.frequency_hz[bins], functools.partial(camera.waves.steer, bins=bins)
             noise = NoiseModel(
                 microphones(camera.settings.array).enabled_positions_m,
                 frequency_hz,

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +19,12 @@ from ertis_numba.geometry import (
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.block_spectra import BlockSpectra
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
-from ertis_numba.passive.methods import METHODS, Waves
+from ertis_numba.passive.methods import METHODS
 from ertis_numba.passive.wave_delays import WaveDelays
+from ertis_numba.passive.waves import Waves
 from ertis_numba.settings import Settings
 
 __all__ = ["AcousticCamera"]
-
-_TURN: Final = 2.0**32
 
 
 class AcousticCamera:
@@ -97,15 +96,10 @@ class AcousticCamera:
         self.frequency_hz: NDArray[np.float64] = self._blocks.frequency_hz
         self._shares = bin_shares(self.band_hz, self.frequency_hz)
         directions = unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad)
-        delay_s = WaveDelays(settings)(directions).T.copy()
-        steps = np.rint(delay_s * self._blocks.spacing_hz * _TURN).astype(np.int64).astype(np.uint32)
-        self._memory = kernel_set.memory()
-        self._lane = self._memory.lane()
-        self._steps = self._memory.table(np.ascontiguousarray(steps))
-        self._bins = self._memory.table(self._blocks.bins)
-        self._powers = self._memory.zeros((len(self._blocks.bins), len(self.grid)), np.float32)
-        self.waves = Waves(self._steer, self._clean)
+        delay_s = WaveDelays(settings)(directions)
+        self.waves = Waves(delay_s, self._blocks.bins, self._blocks.spacing_hz, kernel_set, threads=self._threads)
         self._masked_s = 0.0
+        self._shape = len(self.frequency_hz), delay_s.shape[1], delay_s.shape[1]
         self.reset()
 
     def add(self, measurement: Measurement) -> None:
@@ -184,8 +178,7 @@ class AcousticCamera:
 
     def reset(self) -> None:
         """Discard all measurements."""
-        n_mics = self._steps.shape[0]
-        self._sums: NDArray[Any] = np.zeros((len(self.frequency_hz), n_mics, n_mics), np.complex128)
+        self._sums: NDArray[Any] = np.zeros(self._shape, np.complex128)
         self._n_blocks = self.n_measurements = 0
         self._masked_s = 0.0
         self._stamp = Stamp()
@@ -238,34 +231,13 @@ class AcousticCamera:
     def close(self) -> None:
         """Free the memory of the device."""
         self._blocks.close()
-        self._memory.close()
+        self.waves.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _steer(self, matrices: NDArray[np.complex64], first: int = 0) -> NDArray[np.float32]:
-        """Return the quadratic form of the matrices of bins for the wave from each direction: (bin, direction)."""
-        stop = first + len(matrices)
-        out = np.empty((len(matrices), len(self.grid)), np.float32)
-        with self._kernels.threads(self._threads), self._lane.entered():
-            here = self._lane.send(np.ascontiguousarray(matrices))
-            self._kernels.steer_power(here, self._steps, self._bins[first:stop], self._powers[first:stop])
-            self._lane.fetch(self._powers[first:stop], out)
-            self._lane.wait()
-        return out
-
-    def _clean(self, matrices: NDArray[np.complex64], powers: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the sources of matrices with given maps: (bin, direction) float32."""
-        out, hollow = np.empty_like(powers), self.settings.passive.diagonal_removal
-        with self._kernels.threads(self._threads), self._lane.entered():
-            here = self._lane.send(np.ascontiguousarray(matrices)), self._steps, self._bins, self._lane.send(powers)
-            self._lane.run(lambda: self._kernels.clean_sources(*here, hollow, self._powers))
-            self._lane.fetch(self._powers, out)
-            self._lane.wait()
-        return out
 
     def _require_microphones(self) -> None:
         """Refuse a single microphone, and as many sources as microphones."""

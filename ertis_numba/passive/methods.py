@@ -1,11 +1,10 @@
 """Methods of acoustic maps: power from each direction, from cross-spectral matrices.
 
 ``v`` is the wave from a direction, whose M elements have a magnitude of 1, and ``C`` the cross-spectral matrix of a
-bin. Each method but CLEAN-SC is the quadratic form of a transformed matrix, followed by a scalar function.
+bin. Each method but those of CLEAN-SC is the quadratic form of a transformed matrix, followed by a scalar function.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -13,31 +12,16 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
+from ertis_numba.passive.high_resolution import HighResolutionClean
+from ertis_numba.passive.waves import Waves
 from ertis_numba.settings import MapMethod, Passive
 
-__all__ = ["METHODS", "Waves", "capon", "clean_sc", "delay_and_sum", "functional", "music"]
+__all__ = ["METHODS", "capon", "clean_sc", "delay_and_sum", "functional", "hr_clean_sc", "music"]
 
 Matrices = NDArray[np.complex64]
 Powers = NDArray[np.float32]
 
 _LEAST: Final = np.float32(1e-30)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Waves:
-    """Waves from each direction at the frequencies of a spectrum.
-
-    Attributes
-    ----------
-    steer : callable
-        Returns the quadratic form of matrices, ``v^H C v``: (bin, direction) float32. The second argument, 0 by
-        default, is the number of the first matrix's bin.
-    clean : callable
-        Returns the sources of CLEAN-SC, (bin, direction) float32, of matrices and their map of delay-and-sum.
-    """
-
-    steer: Callable[..., Powers]
-    clean: Callable[[Matrices, Powers], Powers]
 
 
 Method = Callable[[CrossSpectrum, Waves, Passive], Powers]
@@ -90,7 +74,14 @@ def music(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
 
 def clean_sc(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
     """Return the powers of sources whose coherent sound is subtracted from the map (P. Sijtsma, 2007)."""
-    return waves.clean(spectrum.matrix, _steered(spectrum, waves, passive))
+    return waves.clean(spectrum.matrix, _steered(spectrum, waves, passive), hollow=passive.diagonal_removal)
+
+
+def hr_clean_sc(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
+    """Return the powers of sources with markers beside their peaks, and those of CLEAN-SC in the rest."""
+    found, rest = HighResolutionClean(spectrum.matrix, waves, hollow=passive.diagonal_removal)()
+    left = CrossSpectrum(rest, spectrum.frequency_hz, spectrum.n_blocks)
+    return found + clean_sc(left, waves, passive)
 
 
 def _hollow(matrices: Matrices) -> Matrices:
@@ -118,5 +109,6 @@ METHODS: Final[dict[MapMethod, Method]] = {
     "capon": capon,
     "music": music,
     "clean_sc": clean_sc,
+    "hr_clean_sc": hr_clean_sc,
 }
 """Function of each method of `Passive`."""

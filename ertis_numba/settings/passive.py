@@ -8,14 +8,14 @@ from ertis_numba.errors import ArgumentError
 
 __all__ = ["MAP_METHODS", "MAX_BANDS", "MapMethod", "Passive"]
 
-MapMethod = Literal["delay_and_sum", "functional", "capon", "music", "clean_sc"]
+MapMethod = Literal["delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc"]
 
-MAP_METHODS: Final[tuple[MapMethod, ...]] = ("delay_and_sum", "functional", "capon", "music", "clean_sc")
+MAP_METHODS: Final[tuple[MapMethod, ...]] = ("delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc")
 """Methods of acoustic maps; ``docs/explanation/acoustic-maps.md`` has their equations."""
 
 MAX_BANDS: Final = 100
 
-_WITHOUT_DIAGONAL: Final = ("delay_and_sum", "clean_sc")
+_WITHOUT_DIAGONAL: Final = ("delay_and_sum", "clean_sc", "hr_clean_sc")
 
 
 class Passive(TomlTable, frozen=True, kw_only=True):
@@ -27,11 +27,12 @@ class Passive(TomlTable, frozen=True, kw_only=True):
         Bands in hertz, up to 100: those of IEC 61260-1 within ``limits_hz``, or your own.
     limits_hz : (low, high), default (8900, 89500)
         Limits of third octaves and octaves, in hertz; the default has those from 10 to 80 kHz.
-    method : {"delay_and_sum", "functional", "capon", "music", "clean_sc"}, default "delay_and_sum"
-        Estimate of the power from each direction. ``music`` finds directions, and has no level.
+    method : {"delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc"}, default "delay_and_sum"
+        Estimate of the power from each direction. ``music`` finds directions, and has no level. ``hr_clean_sc`` is
+        CLEAN-SC for sources within one main lobe.
     diagonal_removal : bool, default false
-        Leave out the power of each microphone itself, which contains its noise; for ``delay_and_sum`` and
-        ``clean_sc``.
+        Leave out the power of each microphone itself, which contains its noise; for ``delay_and_sum``, ``clean_sc``
+        and ``hr_clean_sc``.
     functional_order : float, default 8
         Order of ``functional``, 1 to 100; 1 is delay-and-sum, and higher ones have narrower lobes.
     n_sources : int, default 1
@@ -73,7 +74,7 @@ class Passive(TomlTable, frozen=True, kw_only=True):
         if self.diagonal_removal and self.method not in _WITHOUT_DIAGONAL:
             raise ArgumentError(
                 f"passive.diagonal_removal is true, which passive.method {self.method!r} does not support; leave it "
-                f"out, or give {' or '.join(_WITHOUT_DIAGONAL)}"
+                f"out, or give one of {', '.join(_WITHOUT_DIAGONAL)}"
             )
 
     @property

@@ -17,7 +17,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("method", ["delay_and_sum", "capon"])
+@pytest.mark.parametrize("method", ["delay_and_sum", "capon", "hr_clean_sc"])
 def test_gpu_map_equals_cpu_map(method):
     settings = TINY.replace(**CHANGES, **{"passive.method": method})
     measurement = noise(settings)

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +10,26 @@ from numpy.typing import NDArray
 from ertis_bench.passive.signals import NoiseSource, listening, noise
 from ertis_numba.passive import AcousticCamera
 
-__all__ = ["APART_DEG", "AVERAGES", "BAND_HZ", "SNR_DB", "are_separated", "measure"]
+__all__ = ["AVERAGES", "BAND_HZ", "PAIRS", "SNR_DB", "SourcePair", "are_separated", "measure"]
 
-APART_DEG: Final = (5.0, 7.5, 10.0)
-"""Angles between the sources."""
+
+class SourcePair(NamedTuple):
+    """Two sources.
+
+    Attributes
+    ----------
+    apart_deg : float
+        Angle between them.
+    weaker_db : float
+        Level of the first one relative to the second.
+    """
+
+    apart_deg: float
+    weaker_db: float = 0.0
+
+
+PAIRS: Final = (SourcePair(3.0), SourcePair(5.0), SourcePair(7.5), SourcePair(10.0), SourcePair(5.0, 10.0))
+"""Pairs that shall be separated."""
 
 BAND_HZ: Final = (38e3, 42e3)
 """Band of the maps."""
@@ -30,6 +46,7 @@ _METHODS: Final[dict[str, dict[str, Any]]] = {
     "capon": {"method": "capon"},
     "music": {"method": "music", "n_sources": 2},
     "clean_sc": {"method": "clean_sc", "diagonal_removal": True},
+    "hr_clean_sc": {"method": "hr_clean_sc"},
 }
 _DIRECTIONS: Final = "2d:361"  # every half degree
 _MAX_AZIMUTH_DEG: Final = 30.0
@@ -52,16 +69,14 @@ def measure(*, count: int, seed: int, say: Callable[[str], None]) -> list[dict[s
     rows: list[dict[str, Any]] = []
     with contextlib.ExitStack() as stack:
         cameras = {name: stack.enter_context(_camera(changes)) for name, changes in _METHODS.items()}
-        for apart_deg in APART_DEG:
-            say(f"separating sources {apart_deg:g}° apart")
+        for pair in PAIRS:
+            say(f"separating sources {pair.apart_deg:g}° and {pair.weaker_db:g} dB apart")
             found = {name: dict.fromkeys(AVERAGES, 0) for name in cameras}
             for number in range(seed, seed + count):
-                middle_deg = np.random.default_rng((number, 1)).uniform(-_MAX_AZIMUTH_DEG, _MAX_AZIMUTH_DEG)
-                true_deg = middle_deg - apart_deg / 2, middle_deg + apart_deg / 2
-                for name, averages in _separated(cameras, true_deg, number):
+                for name, averages in _separated(cameras, pair, number):
                     found[name][averages] += 1
             rows += [
-                {"name": name, "apart_deg": apart_deg, "shares": [each[n] / count for n in AVERAGES]}
+                {"name": name, **pair._asdict(), "shares": [each[n] / count for n in AVERAGES]}
                 for name, each in found.items()
             ]
     return rows
@@ -75,14 +90,17 @@ def _camera(changes: dict[str, Any]) -> AcousticCamera:
     return AcousticCamera(settings, "cpu")
 
 
-def _separated(cameras: dict[str, AcousticCamera], true_deg: Sequence[float], seed: int) -> Iterator[tuple[str, int]]:
+def _separated(cameras: dict[str, AcousticCamera], pair: SourcePair, seed: int) -> Iterator[tuple[str, int]]:
     """Return an iterator over the methods, and the numbers of measurements, that separate two sources."""
     for camera in cameras.values():
         camera.reset()
+    settings = next(iter(cameras.values())).settings
+    middle_deg = np.random.default_rng((seed, 1)).uniform(-_MAX_AZIMUTH_DEG, _MAX_AZIMUTH_DEG)
+    true_deg = middle_deg - pair.apart_deg / 2, middle_deg + pair.apart_deg / 2
+    weaker, stronger = _RMS * 10 ** (-pair.weaker_db / 20), _RMS
+    sources = [NoiseSource(true_deg[0], 0.0, weaker), NoiseSource(true_deg[1], 0.0, stronger)]
+    own_rms = _RMS * 10 ** (-SNR_DB / 20)
     for n in range(max(AVERAGES)):
-        settings = next(iter(cameras.values())).settings
-        own_rms = _RMS * 10 ** (-SNR_DB / 20)
-        sources = [NoiseSource(each, 0.0, _RMS) for each in true_deg]
         heard = noise(settings, sources, own_rms=own_rms, seed=seed * max(AVERAGES) + n)
         for name, camera in cameras.items():
             camera.add(heard)
@@ -93,9 +111,10 @@ def _separated(cameras: dict[str, AcousticCamera], true_deg: Sequence[float], se
 
 
 def are_separated(power: NDArray[np.float32], azimuth_deg: NDArray[np.float64], true_deg: Sequence[float]) -> bool:
-    """Return True if the two largest local maxima of a map lie within 1.5° of two sources, one beside each.
+    """Return True if the two largest local maxima of a map lie near two sources, one beside each.
 
-    Two local maxima always have a dip between them.
+    Both must lie within 1.5° of their source, and nearer to it than to the middle between both. Two local maxima always
+    have a dip between them.
 
     Parameters
     ----------
@@ -108,4 +127,5 @@ def are_separated(power: NDArray[np.float32], azimuth_deg: NDArray[np.float64], 
     padded = np.concatenate([[-np.inf], power, [-np.inf]])
     places = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]) & (power > 0))
     largest = np.sort(azimuth_deg[places[np.argsort(power[places])[-2:]]])
-    return len(largest) == 2 and bool(np.all(np.abs(largest - np.sort(true_deg)) < _TOLERANCE_DEG))
+    tolerance_deg = min(_TOLERANCE_DEG, abs(true_deg[1] - true_deg[0]) / 2)
+    return len(largest) == 2 and bool(np.all(np.abs(largest - np.sort(true_deg)) < tolerance_deg))

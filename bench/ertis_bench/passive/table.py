@@ -112,23 +112,23 @@ def _parts(report: dict[str, Any]) -> str:
 
 
 def _separation(report: dict[str, Any]) -> str:
-    apart_deg = list(dict.fromkeys(row["apart_deg"] for row in report["separation"]))
-    found = {(row["name"], row["apart_deg"]): row["shares"] for row in report["separation"]}
-    names = list(dict.fromkeys(name for name, _ in found))
+    pairs = list(dict.fromkeys((row["apart_deg"], row["weaker_db"]) for row in report["separation"]))
+    found = {(row["name"], row["apart_deg"], row["weaker_db"]): row["shares"] for row in report["separation"]}
     rows = [
-        [name, *(" / ".join(f"{share:.0%}" for share in found[name, each_deg]) for each_deg in apart_deg)]
-        for name in names
+        [name, *(" / ".join(f"{share:.0%}" for share in found[name, *pair]) for pair in pairs)]
+        for name in dict.fromkeys(row["name"] for row in report["separation"])
     ]
-    head = ["sources separated", *(f"{each_deg:g}° apart" for each_deg in apart_deg)]
+    heads = [f"{apart_deg:g}°" + f" and {weaker_db:g} dB" * bool(weaker_db) for apart_deg, weaker_db in pairs]
+    head = ["sources separated", *(f"{each} apart" for each in heads)]
     low_hz, high_hz = separation.BAND_HZ
     averages = " / ".join(str(n) for n in separation.AVERAGES)
     return (
         f"{table(head, rows)}\n\nShare of {report['seeds']} seeds in which a map separates two incoherent sources, "
-        f"with {averages} averaged measurements of 36.4 ms. The sources have the same level, {separation.SNR_DB:g} dB "
-        f"above the noise of a microphone. The map has one band, {low_hz / 1e3:g}–{high_hz / 1e3:g} kHz, and "
-        "directions every half degree of azimuth. Two sources are separated if the two largest local maxima lie within "
-        "1.5° of them, one beside each, so that there is a dip between them. Settings are the defaults, with 2 sources "
-        "for MUSIC and without the diagonal for CLEAN-SC."
+        f"with {averages} averaged measurements of 36.4 ms. The level of the stronger source, or of both, is "
+        f"{separation.SNR_DB:g} dB above the noise of a microphone. The map has one band, {low_hz / 1e3:g}–"
+        f"{high_hz / 1e3:g} kHz, and directions every half degree of azimuth. Two sources are separated if the two "
+        "largest local maxima lie within 1.5° of them, one on each side of the middle between them, so that there is a "
+        "dip. Settings are the defaults, with 2 sources for MUSIC and without the diagonal for CLEAN-SC."
     )
 
 

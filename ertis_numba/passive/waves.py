@@ -1,0 +1,102 @@
+"""Waves from the directions of a map, and the operations on them that a compute device performs."""
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.kernels import KernelSet
+
+__all__ = ["Waves"]
+
+Matrices = NDArray[np.complex64]
+Powers = NDArray[np.float32]
+
+_TURN: Final = 2.0**32
+
+
+class Waves:
+    """Waves from each direction at the frequencies of a spectrum.
+
+    Parameters
+    ----------
+    delay_s : (direction, mic) float64
+        Delays of the sound from each direction.
+    numbers : (bin,) uint32
+        Frequencies relative to the spacing of bins.
+    spacing_hz : float
+    kernels : KernelSet
+    threads : int
+    """
+
+    def __init__(
+        self,
+        delay_s: NDArray[np.float64],
+        numbers: NDArray[np.uint32],
+        spacing_hz: float,
+        kernels: KernelSet,
+        *,
+        threads: int,
+    ) -> None:
+        self._kernels, self._threads, self._numbers = kernels, threads, numbers
+        turns = np.rint(delay_s.T * spacing_hz * _TURN).astype(np.int64).astype(np.uint32)
+        self._turns = np.ascontiguousarray(turns)
+        self._memory = kernels.memory()
+        self._lane = self._memory.lane()
+        self._steps = self._memory.table(self._turns)
+        self._bins = self._memory.table(numbers)
+        self._powers = self._memory.zeros((len(numbers), turns.shape[1]), np.float32)
+
+    def vectors(self, bins: NDArray[np.intp], directions: NDArray[np.intp]) -> NDArray[np.complex128]:
+        """Return the waves from directions, with an element of magnitude 1 for each microphone: (…, mic) complex128.
+
+        Parameters
+        ----------
+        bins, directions : (…) intp
+            Numbers of the bins and of the directions.
+        """
+        turns = self._numbers[bins][..., None] * self._turns.T[directions]
+        return np.asarray(np.exp(-2j * np.pi / _TURN * turns))
+
+    def steer(self, matrices: Matrices, bins: NDArray[np.intp] | None = None) -> Powers:
+        """Return the quadratic form of matrices for the wave v from each direction, ``v^H C v``: (n, direction).
+
+        Parameters
+        ----------
+        matrices : (n, mic, mic) complex64
+            Hermitian matrices.
+        bins : (n,) intp
+            Numbers of their bins; all bins by default.
+        """
+        out = np.empty((len(matrices), self._turns.shape[1]), np.float32)
+        powers = self._powers[: len(matrices)]
+        with self._kernels.threads(self._threads), self._lane.entered():
+            numbers = self._bins if bins is None else self._lane.send(self._numbers[bins])
+            self._kernels.steer_power(self._lane.send(np.ascontiguousarray(matrices)), self._steps, numbers, powers)
+            self._lane.fetch(powers, out)
+            self._lane.wait()
+        return out
+
+    def clean(self, matrices: Matrices, powers: Powers, *, hollow: bool) -> Powers:
+        """Return the sources of CLEAN-SC: (bin, direction) float32.
+
+        Parameters
+        ----------
+        matrices : (bin, mic, mic) complex64
+            Hermitian matrices of all bins.
+        powers : (bin, direction) float32
+            Their map of delay-and-sum.
+        hollow : bool
+            Leave out the diagonal of the matrices.
+        """
+        out: NDArray[Any] = np.empty_like(powers)
+        with self._kernels.threads(self._threads), self._lane.entered():
+            here = self._lane.send(np.ascontiguousarray(matrices)), self._steps, self._bins, self._lane.send(powers)
+            self._lane.run(lambda: self._kernels.clean_sources(*here, hollow, self._powers))
+            self._lane.fetch(self._powers, out)
+            self._lane.wait()
+        return out
+
+    def close(self) -> None:
+        """Free the memory of the device."""
+        self._memory.close()
