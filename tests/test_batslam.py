@@ -444,6 +444,9 @@ def rig(tmp_path_factory):
     for name, given in by_name.items():
         write_recording(place / f"{name}.h5", given)
     write_recording(place / "both.h5", [*by_name["left"], *by_name["right"]])
+    silent = [replace(each, stamp=replace(each.stamp, behaviour="passive")) for each in by_name["left"]]
+    write_recording(place / "silent.h5", silent)
+    write_recording(place / "mixed.h5", [by_name["left"][0], silent[1], by_name["left"][2]])
     write_recording(place / "img.h5", noise())
     ertis.write_tum(place / "way.tum", straight())
     return place
@@ -459,7 +462,20 @@ def test_one_of_several_sensors_is_chosen(rig):
     assert one.meta["sensor"].tolist() == ["right"]
 
 
+def test_measurements_without_a_call_are_left_out(rig):
+    done = run("mixed.h5", "-o", "mixed.mat", "--poses", "way.tum", "--odometry", "way.tum", folder=rig)
+    assert "note: 1 measurement without a call left out" in done.stderr
+    found = BatslamReader.of(rig / "mixed.mat")
+    np.testing.assert_allclose(found["t"][:, 0], [0, 0.1])
+    assert found["echo_left"].shape[0] == 2
+
+
 REFUSED = {
+    "no call": (
+        "silent.h5 -o x.mat --poses way.tum --odometry way.tum",
+        1,
+        "all chosen measurements of sensor left are passive and have no echoes",
+    ),
     "no poses": ("left.h5 -o x.mat", 1, "left.h5 has no poses; give true ones with --poses TRAJ"),
     "several sensors": (
         "both.h5 -o x.mat --poses way.tum",

@@ -108,7 +108,7 @@ def test_export_leaves_out_measurements_without_a_call(tmp_path):
     with np.load(tmp_path / "a.npz") as data:
         assert data["sequence"].tolist() == [1]
     done = run(tmp_path / "rec.h5", "-o", tmp_path / "b.npz", "--measurement", "2", code=1)
-    assert "all chosen measurements of sensor sensor are passive and have no images" in done.stderr
+    assert "all chosen measurements of sensor sensor are passive and have no echoes" in done.stderr
     assert not (tmp_path / "b.npz").exists()
 
 

@@ -17,7 +17,7 @@ from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, mounted_sensors
 from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
-from ertis_numba.storage import open_energyscapes, write_recording
+from ertis_numba.storage import open_energyscapes, open_recording, write_recording
 from tests.pages import commands_in, page, python_in, run_code_here, run_here
 
 YAWS = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
@@ -436,6 +436,28 @@ def test_process_fuses_several_recordings(recordings):
     assert code == 0, output
     with open_energyscapes(recordings / "several.h5") as stored:
         np.testing.assert_array_equal(stored[0].amplitude, fused().image.amplitude)
+
+
+def test_process_leaves_out_pulses_without_a_call(recordings, tmp_path):
+    given = []
+    for name in YAWS:
+        with open_recording(recordings / f"{name}.h5") as recording:
+            (measurement,) = recording
+        for number, behaviour in enumerate(("passive", "active" if name == "front" else "passive")):
+            stamp = dataclasses.replace(
+                measurement.stamp,
+                sequence=number,
+                sync_count=number,
+                timestamp_ns=measurement.stamp.timestamp_ns + number * 10**9,
+                behaviour=behaviour,
+            )
+            given.append(dataclasses.replace(measurement, stamp=stamp))
+    write_recording(tmp_path / "mixed.h5", given, mounting=mountings())
+    code, output = run("process", tmp_path / "mixed.h5", "--fuse")
+    assert code == 0, output
+    assert "note: 1 of 2 pulses left out, in which no sensor emitted its call" in output
+    with open_energyscapes(tmp_path / "mixed.fused.h5") as stored:
+        assert [stamp.sync_count for stamp in stored.stamps()] == [1]
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,8 @@ def folder(tmp_path_factory):
         write_recording(made / f"{name}.h5", several, mounting={name: mounting[name]})
     passive = [replace(each, stamp=replace(each.stamp, behaviour="passive")) for each in recorded["left"]]
     write_recording(made / "passive.h5", passive, mounting={"left": mounting["left"]})
+    mixed = [recorded["left"][0], passive[1], recorded["left"][2]]
+    write_recording(made / "mixed.h5", mixed, mounting={"left": mounting["left"]})
     ertis.write_tum(made / "poses.tum", poses())
     return made
 
@@ -72,6 +74,12 @@ def test_map_of_a_recording_shows_the_post_in_the_world(folder):
     assert report["occupied"] == found.is_occupied.sum() == len(found.occupied_m) > 0
     assert np.hypot(*(found.occupied_m - [POST_M[0] + 10.0, POST_M[1]]).T).max() < 0.1
     assert found.log_odds_at((10.8, 0.1)) < 0
+
+
+def test_map_leaves_out_pulses_without_a_call(folder):
+    done = run(folder, "mixed.h5 --poses poses.tum --json -o echoes.h5")
+    assert json.loads(done.stdout)["pulses"] == 2
+    assert "note: 1 of 3 pulses left out, in which no sensor emitted its call" in done.stderr
 
 
 def test_map_of_space_is_refused_for_planar_images_and_files(folder):

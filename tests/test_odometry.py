@@ -73,6 +73,11 @@ def folder(tmp_path_factory):
     ]
     passive = [replace(each, stamp=replace(each.stamp, behaviour="passive")) for each in measurements[:COUNT]]
     write_recording(place / "passive.h5", passive, mounting={"front": mountings["front"]})
+    write_recording(
+        place / "mixed.h5", [measurements[0], passive[1], measurements[2]], mounting={"front": mountings["front"]}
+    )
+    silent = [replace(each, stamp=replace(each.stamp, behaviour="passive")) for each in measurements[COUNT:]]
+    write_recording(place / "silent_back.h5", [*measurements[:COUNT], *silent], mounting=mountings)
     write_recording(place / "slow.h5", slow, mounting={"front": mountings["front"]})
     return place
 
@@ -99,6 +104,21 @@ def test_odometry_command_writes_the_trajectory_of_the_platform(folder, tmp_path
     with open_recording(folder / "both.h5", sensor="front") as recording:
         stamps_ns = [stamp.timestamp_ns for stamp in recording.stamps()]
     np.testing.assert_allclose(path.time_ns, stamps_ns, atol=1000)
+
+
+def test_odometry_command_leaves_out_pulses_without_a_call(folder, tmp_path):
+    code, _, stderr = run(folder / "mixed.h5", "-o", tmp_path / "path.tum")
+    assert code == 0, stderr
+    assert "note: 1 of 3 pulses left out, in which no sensor emitted its call" in stderr
+    path = ertis.read_trajectory(tmp_path / "path.tum")
+    np.testing.assert_allclose(path.position_m, PLATFORM.trajectory(np.array([0.0, 0.2])).position_m, atol=4e-3)
+
+
+def test_odometry_command_leaves_out_silent_sensors(folder, tmp_path):
+    for name in ("silent_back", "front"):
+        code, _, stderr = run(folder / f"{name}.h5", "-o", tmp_path / f"{name}.tum")
+        assert code == 0, stderr
+    assert (tmp_path / "silent_back.tum").read_text() == (tmp_path / "front.tum").read_text()
 
 
 def test_odometry_command_names_its_output_after_the_recording(folder, tmp_path):

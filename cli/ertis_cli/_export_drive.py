@@ -88,7 +88,7 @@ def open_ears(
 def drive_of(
     readers: "Sequence[RecordingReader]",
     ears: "RecordingReader",
-    chosen: range,
+    chosen: "Sequence[int]",
     known: "Mapping[str, Mounting]",
     *,
     poses: Path | None,
@@ -105,8 +105,8 @@ def drive_of(
         Recordings of all sensors of the platform.
     ears : RecordingReader
         Recording of the sensor with ears.
-    chosen : range
-        Indices of its measurements.
+    chosen : sequence of int
+        Indices of its measurements with a call.
     known : mapping of str to Mounting
         Mountings of sensors, as far as they are known.
     poses, odometry, scene : Path or None
@@ -144,7 +144,7 @@ def drive_of(
 def _measured(
     readers: "Sequence[RecordingReader]",
     ears: "RecordingReader",
-    chosen: range,
+    chosen: "Sequence[int]",
     known: "Mapping[str, Mounting]",
     *,
     quiet: bool,
@@ -157,9 +157,10 @@ def _measured(
 
     if len(readers) == 1 and ears.sensor not in known:
         known = {ears.sensor: _IDENTITY}
-    groups = list(_pulses.pulse_groups(readers))
+    groups = _pulses.active_groups(readers, _as_recorded, quiet=quiet)
+    kept = set(chosen)
     wanted = [
-        number for number, group in enumerate(groups) if ears.sensor in group and group[ears.sensor].index in chosen
+        number for number, group in enumerate(groups) if ears.sensor in group and group[ears.sensor].index in kept
     ]
     groups = groups[wanted[0] : wanted[-1] + 1]
     with ExitStack() as stack:

@@ -64,9 +64,7 @@ def write_fused(
         mountings = _pulses.mountings_of(readers, mounting)
         fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
         pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, **device)
-        groups = list(_pulses.pulse_groups(readers))
-        if any(changed(reader.settings).processing.mode != "active" for reader in readers):
-            _pulses.active_groups(readers)  # refuses recordings without a call
+        groups = _pulses.active_groups(readers, changed, quiet=quiet)
         by_name = {reader.sensor: reader for reader in readers}
         clocks = _clock_check(mountings, groups, by_name)
         for text in clocks.warnings():

@@ -115,8 +115,21 @@ def pulse_groups(readers: "Sequence[RecordingReader]") -> "Iterator[dict[str, St
         yield rest
 
 
-def active_groups(readers: "Sequence[RecordingReader]") -> "list[dict[str, StampedIndex]]":
-    """Return the measurements of each pulse in which a sensor emitted its call, by sensor; others have no echoes.
+def active_groups(
+    readers: "Sequence[RecordingReader]", changed: "Callable[[Settings], Settings]", *, quiet: bool
+) -> "list[dict[str, StampedIndex]]":
+    """Return the measurements of each pulse in which a sensor emitted its call, by sensor.
+
+    A sensor that was silent in such a pulse hears the echoes of the others, so its measurement belongs to the pulse. A
+    note states the number of other pulses.
+
+    Parameters
+    ----------
+    readers : sequence of RecordingReader
+        Recordings of all sensors of the platform.
+    changed : callable
+        Function that returns the settings to use; with their ``processing.mode``, `is_passive` decides.
+    quiet : bool
 
     Raises
     ------
@@ -124,13 +137,20 @@ def active_groups(readers: "Sequence[RecordingReader]") -> "list[dict[str, Stamp
         No sensor emitted in any pulse.
     """
     from ertis_numba.errors import DataError
+    from ertis_numba.frames import is_passive
 
+    settings = {reader.sensor: changed(reader.settings) for reader in readers}
     groups = list(pulse_groups(readers))
-    active = [group for group in groups if any(place.stamp.behaviour != "passive" for place in group.values())]
+    active = [
+        group for group in groups if not all(is_passive(settings[name], place.stamp) for name, place in group.items())
+    ]
     if groups and not active:
         raise DataError(
             f"{readers[0].path}: all measurements are passive and have no echoes; give recordings of emitted calls"
         )
+    if len(active) < len(groups):
+        left_out = f"{len(groups) - len(active)} of {options.counted(len(groups), 'pulse')}"
+        options.say(f"note: {left_out} left out, in which no sensor emitted its call", quiet=quiet)
     return active
 
 
@@ -153,6 +173,10 @@ class PipelinesBySensor:
     ) -> None:
         self._changed, self._stack, self._quiet, self._device = changed, stack, quiet, device
         self._made: dict[str, tuple[Settings, Pipeline]] = {}
+
+    def settings(self, reader: "RecordingReader") -> "Settings":
+        """Return the settings in use for a sensor."""
+        return self._changed(reader.settings)
 
     def image(self, measurement: "Measurement | Energyscape") -> "Energyscape":
         """Return the image of a measurement, or an image of a file itself.

@@ -145,7 +145,8 @@ def export(
         every, readers = _readers(name, paths, sensor, stack)
         known = _known(every, mounting) if "mounting" in fitting else None
         is_image = name not in {"acoular", "batslam"}
-        items = _Items(readers, places, process=is_image and file_kind(paths[0]) == "recording", quiet=quiet)
+        process = is_image and file_kind(paths[0]) == "recording"
+        items = _Items(readers, places, process=process, echoes=name == "batslam", quiet=quiet)
         if name == "batslam":
             (ears,), (indices,) = readers, items.indices
             chosen["drive"] = _export_drive.drive_of(every, ears, indices, known or {}, **drive, quiet=quiet)
@@ -206,7 +207,10 @@ def _known(
 
 
 class _Items:
-    """Measurements or images to export, one sensor after the other, under a progress bar."""
+    """Measurements or images to export, one sensor after the other, under a progress bar.
+
+    With ``process``, recordings become images. With ``echoes``, measurements with a call are exported.
+    """
 
     def __init__(
         self,
@@ -214,30 +218,31 @@ class _Items:
         places: tuple[int, int] | None,
         *,
         process: bool,
+        echoes: bool,
         quiet: bool,
     ) -> None:
-        self._chosen = [(reader, _between(places, len(reader))) for reader in readers]
-        self._kept = [_echoes(reader, chosen) if process else chosen for reader, chosen in self._chosen]
-        self._process, self._quiet = process, quiet
-        n_passive = sum(map(len, self.indices)) - len(self)
+        self._readers, self._process, self._quiet = readers, process, quiet
+        chosen = [_between(places, len(reader)) for reader in readers]
+        self.indices = [
+            _with_call(reader, each)
+            if echoes or (process and reader.settings.processing.last_stage == "envelope")  # signals need no call
+            else each
+            for reader, each in zip(readers, chosen, strict=True)
+        ]
+        n_passive = sum(map(len, chosen)) - len(self)
         if n_passive:
             left_out = options.counted(n_passive, "measurement")
             options.say(f"note: {left_out} without a call left out; 'ertis process' makes acoustic maps", quiet=quiet)
 
-    @property
-    def indices(self) -> tuple[range, ...]:
-        """Indices of the chosen measurements of each sensor."""
-        return tuple(chosen for _, chosen in self._chosen)
-
     def __len__(self) -> int:
-        return sum(map(len, self._kept))
+        return sum(map(len, self.indices))
 
     def __iter__(self) -> "Iterator[_Exported]":
         with options.progress(self._each(), length=len(self), label="exporting", quiet=self._quiet) as shown:
             yield from shown
 
     def _each(self) -> "Iterator[_Exported]":
-        for (reader, _), chosen in zip(self._chosen, self._kept, strict=True):
+        for reader, chosen in zip(self._readers, self.indices, strict=True):
             read = (reader[index] for index in chosen)
             yield from self._processed(read) if self._process else read
 
@@ -249,8 +254,8 @@ class _Items:
                     yield pipeline.result(measurement)
 
 
-def _echoes(reader: "RecordingReader | EnergyscapeReader", chosen: range) -> "Sequence[int]":
-    """Return the chosen measurements of a recording that become images.
+def _with_call(reader: "RecordingReader | EnergyscapeReader", chosen: range) -> "Sequence[int]":
+    """Return the chosen measurements of a recording that have echoes of a call.
 
     Raises
     ------
@@ -260,13 +265,11 @@ def _echoes(reader: "RecordingReader | EnergyscapeReader", chosen: range) -> "Se
     from ertis_numba.errors import DataError
     from ertis_numba.passive import is_passive
 
-    if reader.settings.processing.last_stage != "envelope":  # signals, which need no call
-        return chosen
     stamps = list(reader.stamps())
     found = [place for place in chosen if not is_passive(reader.settings, stamps[place])]
     if chosen and not found:
         raise DataError(
-            f"{reader.path}: all chosen measurements of sensor {reader.sensor} are passive and have no images; make "
+            f"{reader.path}: all chosen measurements of sensor {reader.sensor} are passive and have no echoes; make "
             "acoustic maps with 'ertis process', or images with its option --mode active, and export these"
         )
     return found

@@ -100,9 +100,8 @@ def mapping(
     with ExitStack() as stack:
         readers = _pulses.open_sensors(paths, stack, images=True)
         trajectory = _trajectory(poses_file, paths)
-        pipelines = _pulses.PipelinesBySensor(
-            _pulses.image_settings(settings_file, preset), stack, quiet=quiet, device=device, threads=threads, plan=plan
-        )
+        changed = _pulses.image_settings(settings_file, preset)
+        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
         mapper = Mapper(
             _pulses.mountings_of(readers, mounting),
             dimensions=dimensions,
@@ -111,7 +110,7 @@ def mapping(
             height_m=height_m,
             emitter_diameter_m=emitter_diameter_m,
         )
-        groups = _pulses.active_groups(readers)
+        groups = _pulses.active_groups(readers, changed, quiet=quiet)
         located = _located(groups, trajectory)
         by_name = {reader.sensor: reader for reader in readers}
         with options.progress(located, length=len(located), label="mapping", quiet=quiet) as shown:

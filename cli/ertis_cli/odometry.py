@@ -65,10 +65,10 @@ def odometry(
     with ExitStack() as stack:
         readers = _pulses.open_sensors(paths, stack)
         mountings = _pulses.mountings_of(readers, mounting)
-        pipelines = _pulses.PipelinesBySensor(
-            _pulses.image_settings(settings_file, preset), stack, quiet=quiet, device=device, threads=threads, plan=plan
-        )
-        found = odometry_of(readers, _pulses.active_groups(readers), pipelines, mountings, quiet=quiet)
+        changed = _pulses.image_settings(settings_file, preset)
+        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
+        groups = _pulses.active_groups(readers, changed, quiet=quiet)
+        found = odometry_of(readers, groups, pipelines, mountings, quiet=quiet)
     write_tum(file, found.trajectory, overwrite=force)
     measured = sum(pose.is_measured for pose in found.poses[1:]) / (len(found.poses) - 1)
     duration_s = (found.poses[-1].timestamp_ns - found.poses[0].timestamp_ns) / _NS_PER_S
@@ -96,6 +96,8 @@ def odometry_of(
 ) -> "Odometry":
     """Return the odometry of pulses, under a progress bar.
 
+    A sensor without a call hears the echoes of others, whose paths begin elsewhere. Its images are left out.
+
     Parameters
     ----------
     readers : sequence of RecordingReader
@@ -113,14 +115,17 @@ def odometry_of(
         Clocks of the recordings cannot be used, or no motion could be measured.
     """
     from ertis_numba.errors import DataError
+    from ertis_numba.frames import is_passive
     from ertis_numba.motion import Odometry
 
     _require_times(readers, groups)
     found = Odometry(mountings)
     by_name = {reader.sensor: reader for reader in readers}
+    settings = {reader.sensor: pipelines.settings(reader) for reader in readers}
     with options.progress(groups, length=len(groups), label="odometry", quiet=quiet) as shown:
         for group in shown:
-            found.add([pipelines.image(by_name[name][place.index]) for name, place in group.items()])
+            emitted = {name: place for name, place in group.items() if not is_passive(settings[name], place.stamp)}
+            found.add([pipelines.image(by_name[name][place.index]) for name, place in emitted.items()])
     unmeasured = sum(not pose.is_measured for pose in found.poses)
     if unmeasured == len(groups) - 1:
         raise DataError(
