@@ -1,4 +1,4 @@
-"""Speed of sound and absorption in air."""
+"""Speed of sound, absorption and transmission loss in air."""
 
 import math
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.settings import Air
 
-__all__ = ["absorption_db_m", "sound_speed_m_s"]
+__all__ = ["absorption_db_m", "sound_speed_m_s", "transmission_loss_db"]
 
 _ZERO_C_K = 273.15
 _TRIPLE_POINT_K = 273.16  # of water; ISO 9613-1, annex B
@@ -72,6 +72,33 @@ def absorption_db_m(air: Air, frequency_hz: NDArray[np.float64]) -> NDArray[np.f
     oxygen = 0.012_75 * math.exp(-2239.1 / kelvin) / (oxygen_hz + frequency_hz**2 / oxygen_hz)
     nitrogen = 0.1068 * math.exp(-3352.0 / kelvin) / (nitrogen_hz + frequency_hz**2 / nitrogen_hz)
     return np.asarray(_DB_PER_NEPER * frequency_hz**2 * (classical + warmth**-2.5 * (oxygen + nitrogen)))
+
+
+def transmission_loss_db(air: Air, distance_m: float, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the transmission loss of a spherical wave in dB at each frequency.
+
+    ``20 log10(r / 1 m) + α r``: the level at the distance r is the source level minus this loss (R. J. Urick,
+    Principles of Underwater Sound, 1983). The source level is that at 1 m without absorption by the air.
+
+    Parameters
+    ----------
+    air : Air
+    distance_m : float
+    frequency_hz : (frequency,) float64
+
+    Returns
+    -------
+    (frequency,) float64
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ertis_numba.air import transmission_loss_db
+    >>> from ertis_numba.settings import Air
+    >>> transmission_loss_db(Air(), 2.0, np.array([40e3])).round(1).tolist()
+    [8.7]
+    """
+    return 20 * math.log10(distance_m) + distance_m * absorption_db_m(air, frequency_hz)
 
 
 def _water_vapour_fraction(air: Air) -> float:

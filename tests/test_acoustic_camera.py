@@ -5,6 +5,7 @@ import pytest
 from scipy.signal import csd
 
 import ertis_numba as ertis
+from ertis_numba.air import transmission_loss_db
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
 from ertis_numba.passive import AcousticCamera, is_passive, octave_bands
@@ -238,6 +239,40 @@ def test_focus_is_that_of_a_near_source():
     assert levels[1].level_dbfs == pytest.approx(-40 - 20 * np.log10(np.hypot(0.25, 0.02)), abs=0.3)
     assert levels[1].level_dbfs > levels[0].level_dbfs + 0.5
     assert np.degrees(levels[1].azimuth_rad) == pytest.approx(np.degrees(np.arctan2(0.02, 0.25)), abs=1.5)
+
+
+@pytest.mark.parametrize("range_m", [0.5, 3.0])
+def test_source_level_is_that_at_1_m_at_any_distance(range_m):
+    scene = ertis.Scene.from_toml(
+        "sensors = [{emitter.silent = true}]\neffects = {absorption = true}\n"
+        f"noises = [{{azimuth_deg = 20.0, range_m = {range_m}, band_hz = [30000, 70000], level_db = -40}}]"
+    )
+    measurement = ertis.render(scene)
+    settings = measurement.settings.replace(
+        **{
+            "passive.focus_m": range_m,
+            "passive.bands_hz": [[35e3, 40e3], [60e3, 65e3]],
+            "array.sensitivity_dbfs": -26.0,
+        }
+    )
+    with AcousticCamera(settings, "cpu") as camera:
+        found = camera.process(ertis.Measurement(measurement.data, settings, measurement.stamp))
+    # The noise is white: each band has an eighth of its power. Few blocks measure it to some tenths of a decibel.
+    wanted_db = 94 + 26 + 3.01 - 40 - 10 * np.log10(8)
+    assert [each.source_level_db for each in found.loudest()] == pytest.approx([wanted_db, wanted_db], abs=0.7)
+    loss_db = transmission_loss_db(settings.air, range_m, found.centre_hz)
+    assert found.source_level_db == pytest.approx(found.level_db + loss_db, abs=1e-3)
+    assert found.reference.unit == "dB re 20 µPa at 1 m"
+
+
+@pytest.mark.parametrize(("focus_m", "sensitivity_dbfs"), [(None, -26.0), (2.0, None)])
+def test_source_level_needs_distance_and_sensitivity(focus_m, sensitivity_dbfs):
+    settings = settings_of(passive__focus_m=focus_m, array__sensitivity_dbfs=sensitivity_dbfs)
+    with AcousticCamera(settings, "numpy") as camera:
+        found = camera.process(sound(settings, [(20, 0.1)]))
+    assert found.source_level_db is None
+    assert {each.source_level_db for each in found.loudest()} == {None}
+    assert found.reference.unit == ("dBFS" if sensitivity_dbfs is None else "dB re 20 µPa")
 
 
 def test_mode_decides_between_images_and_maps():

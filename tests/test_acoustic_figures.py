@@ -13,6 +13,7 @@ from scipy.signal import welch
 
 import ertis_numba as ertis
 from ertis_numba import figures
+from ertis_numba.air import transmission_loss_db
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.figures import _acoustic_signals
 from ertis_numba.frames import Stamp
@@ -83,6 +84,31 @@ def test_levels_are_sound_pressures_if_the_sensitivity_is_known():
     figure = figures.acoustic_map(acoustic_map(sensitivity_dbfs=-26.0))
     assert figure.axes[1].get_ylabel() == "dB re 20 µPa"
     assert figure.axes[0].images[-1].get_clim()[1] == pytest.approx(-40 + 94 + 26 + 3, abs=0.5)
+
+
+def test_source_levels_are_shown_if_the_distance_is_known():
+    found = acoustic_map(sensitivity_dbfs=-26.0)
+    found = found.replace(settings=found.settings.replace("passive.focus_m", 3.0))
+    loss_db = transmission_loss_db(found.settings.air, 3.0, found.centre_hz)
+    figure = figures.acoustic_map(found, band_hz=(25e3, 30e3))
+    assert figure.axes[1].get_ylabel() == "dB re 20 µPa at 1 m"
+    assert figure.axes[0].images[-1].get_clim()[1] == pytest.approx(-50 + 94 + 26 + 3 + loss_db[1], abs=0.5)
+    (axes,) = figures.spectrum(found, direction_deg=LOUD_DEG).axes
+    assert axes.get_ylabel() == "level of a band (dB re 20 µPa at 1 m)"
+    first = axes.patches[0]
+    assert first.get_y() + first.get_height() == pytest.approx(-40 + 94 + 26 + 3 + loss_db[0], abs=0.5)
+
+
+def test_spectra_of_a_direction_have_source_levels():
+    heard = sound(settings_of(array__sensitivity_dbfs=-26.0, passive__focus_m=2.0), [(20, 0.1)])
+    (mean,) = figures.spectrum(heard).axes
+    (beam,) = figures.spectrum(heard, direction_deg=(20.0, 0.0)).axes
+    assert mean.get_ylabel() == "level of a bin (dB re 20 µPa)"
+    assert beam.get_ylabel() == "level of a bin (dB re 20 µPa at 1 m)"
+    frequency_khz, level_db = beam.lines[0].get_data()
+    loudest = level_db.argmax()
+    loss_db = transmission_loss_db(heard.settings.air, 2.0, 1e3 * frequency_khz[[loudest]])[0]
+    assert level_db[loudest] - mean.lines[0].get_ydata()[loudest] == pytest.approx(loss_db, abs=0.5)
 
 
 def test_maps_of_music_are_relative():

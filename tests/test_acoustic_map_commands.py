@@ -13,6 +13,7 @@ from ertis_cli import process
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
+from ertis_numba.air import transmission_loss_db
 from ertis_numba.campaign import Campaign, CampaignOptions, RecordingStarted, find_recordings
 from ertis_numba.frames import Stamp
 from ertis_numba.settings import MAP_METHODS
@@ -282,6 +283,18 @@ def test_levels_are_sound_pressures_if_the_sensitivity_is_known(folder):
         assert float(first.split()[-1]) == pytest.approx(maps[0].level_db[:, 0].max(), abs=0.06)
     run("process passive.h5 -o unknown.h5 --device numpy")
     assert {row["level_db"] for row in json.loads(run("peaks unknown.h5 --json").stdout)["loudest"]} == {None}
+
+
+def test_source_levels_are_listed_if_the_distance_is_known(folder):
+    (folder / "given.toml").write_text("[array]\nsensitivity_dbfs = -26\n")
+    run("process passive.h5 -o maps.h5 --settings given.toml --focus 4 --device numpy")
+    heading, first, *_ = run("peaks maps.h5").stdout.splitlines()
+    assert heading.split()[-3:] == ["level_dbfs", "level_db", "source_level_db"]
+    with ertis.open_acoustic_maps("maps.h5") as maps:
+        assert float(first.split()[-1]) == pytest.approx(maps[0].source_level_db[:, 0].max(), abs=0.06)
+    for row in json.loads(run("peaks maps.h5 --json").stdout)["loudest"]:
+        loss_db = transmission_loss_db(SETTINGS.air, 4.0, np.array([np.sqrt(np.prod(row["band_hz"]))]))
+        assert row["source_level_db"] - row["level_db"] == pytest.approx(loss_db[0], abs=1e-3)
 
 
 def test_maps_of_music_have_no_level():

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
+from ertis_numba.air import transmission_loss_db
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
@@ -120,7 +121,7 @@ def short():
 
 def test_listen_prints_bearings():
     scene = ertis.load_scene(ROOT / "data" / "synthetic" / "scenes" / "leak.toml")
-    changes = {"processing.directions": "3d:1000", "passive.bands_hz": [[40e3, 60e3]]}
+    changes = {"processing.directions": "3d:1000", "passive.bands_hz": [[40e3, 60e3]], "passive.focus_m": 2.5}
     sensor = scene.sensors[0]
     heard = ertis.render(scene.replace(sensors=(sensor.replace(**{"processing.directions": "3d:1000"}),)))
     settings = heard.settings.replace(**changes)
@@ -132,6 +133,9 @@ def test_listen_prints_bearings():
     assert (summary["received"], found["averages"], found["sensor"]) == (1, 1, "inspector")
     (leak,) = found["bearings"]
     assert (leak["azimuth_deg"], leak["elevation_deg"]) == (pytest.approx(28, abs=0.5), pytest.approx(12, abs=0.5))
+    assert leak["level_db"] - leak["level_dbfs"] == pytest.approx(94 + 26 + 3, abs=0.05)
+    loss_db = transmission_loss_db(settings.air, 2.5, np.sqrt([40e3 * 60e3]))[0]
+    assert leak["source_level_db"] - leak["level_db"] == pytest.approx(loss_db, abs=0.01)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import importlib.util
 import io
+import re
 import sys
 import threading
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import ertis_numba as ertis
 from ertis_numba.network.subscriber import Subscriber
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing
@@ -265,3 +267,49 @@ def test_send_your_own_example_stores_measurements(tmp_path, capsys):
     assert key[0] == "mine"
     assert [words for _, words in held.values()] == [each.data.tobytes() for each in given]
     assert [*held] == [0, 1, 2]
+
+
+# Leak of compressed air.
+
+
+@pytest.fixture(scope="module")
+def leak_recording(tmp_path_factory):
+    scene = ertis.load_scene(EXAMPLES.parent / "data" / "synthetic" / "scenes" / "leak.toml")
+    path = tmp_path_factory.mktemp("leak") / "leak.h5"
+    return ertis.write_recording(path, [ertis.render(scene, index) for index in range(2)]), scene.noises[0]
+
+
+def test_leak_example_prints_direction_uncertainty_and_source_level(leak_recording, capsys):
+    path, leak = leak_recording
+    example("find_a_leak").main(str(path), f"{leak.range_m}")
+    azimuth, elevation, level = capsys.readouterr().out.splitlines()
+    for line, name, true_deg in ((azimuth, "azimuth", leak.azimuth_deg), (elevation, "elevation", leak.elevation_deg)):
+        found = re.fullmatch(rf"{name} ([+-][\d.]+)° ± ([\d.]+)°", line)
+        assert 0 < float(found[2]) < 0.1
+        assert float(found[1]) == pytest.approx(true_deg, abs=5 * float(found[2]))
+    found = re.fullmatch(r"([\d.]+) dB re 20 µPa at 1 m from 40 to 80 kHz", level)
+    every_hz = np.linspace(*leak.band_hz, 9001)
+    density = leak.density(every_hz)
+    share = density[(every_hz >= 40e3) & (every_hz <= 80e3)].sum() / density.sum()
+    # The sensitivity of -26 dBFS is the level of a sine of 94 dB, relative to a full-scale sine.
+    wanted_db = 94 + 26 + 3.01 + leak.level_db + 10 * np.log10(share)
+    assert float(found[1]) == pytest.approx(wanted_db, abs=0.7)
+
+
+def test_leak_example_states_the_level_at_the_array_without_a_distance(leak_recording, capsys):
+    path, leak = leak_recording
+    find_a_leak = example("find_a_leak")
+    levels = []
+    for arguments in ([str(path)], [str(path), f"{leak.range_m}"]):
+        find_a_leak.main(*arguments)
+        levels.append(re.fullmatch(r"([\d.]+) (.*) from 40 to 80 kHz", capsys.readouterr().out.splitlines()[-1]))
+    assert [level[2] for level in levels] == ["dB re 20 µPa", "dB re 20 µPa at 1 m"]
+    loss_db = ertis.air.transmission_loss_db(ertis.Settings().air, leak.range_m, np.array([np.sqrt(40e3 * 80e3)]))
+    assert float(levels[1][1]) - float(levels[0][1]) == pytest.approx(loss_db[0], abs=0.2)
+
+
+def test_leak_example_finds_nothing_in_noise(tmp_path, capsys):
+    settings = ertis.Settings().replace(**{"processing.directions": "3d:300", "processing.mode": "passive"})
+    write_recording(tmp_path / "noise.h5", noise(settings, count=1))
+    example("find_a_leak").main(str(tmp_path / "noise.h5"))
+    assert capsys.readouterr().out == "no leak found\n"

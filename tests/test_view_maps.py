@@ -145,6 +145,18 @@ def test_levels_are_sound_pressures_if_all_microphones_are_calibrated():
     assert both.scale.bands[1].level_db == pytest.approx(found.level_dbfs[:, 0].max(), abs=1e-4)
 
 
+def test_levels_are_source_levels_if_all_distances_are_known():
+    settings = SMALL.replace(**{"array.sensitivity_dbfs": -26.0})
+    at_array = sounds((10, 0, 0, -51.3), (20, 0, 1, -42.0)).replace(settings=settings)
+    near = at_array.replace(settings=settings.replace("passive.focus_m", 2.0), stamp=Stamp(sensor="left"))
+    scale = drawn(near).scale
+    assert scale.unit == "dB re 20 µPa at 1 m"
+    assert [each.level_db for each in scale.bands[1:]] == pytest.approx(near.source_level_db.max(axis=0), abs=1e-3)
+    total = (10 ** (near.source_level_db / 10)).sum(axis=1).max()
+    assert scale.bands[0].level_db == pytest.approx(10 * math.log10(total), abs=1e-3)
+    assert drawn(near, at_array, pose=Pose()).unit == "dB re 20 µPa"
+
+
 def test_sphere_surrounds_its_sensor():
     found = sounds((30, 20, 0, -40.0), directions="3d:1000")
     (front,) = drawn(found, pose=TURNED).sensors.values()

@@ -100,7 +100,8 @@ def _show(found: "AcousticMap", bearings: "Sequence[Bearing]", age_ms: float | N
         band = f"{each.band_hz[0] / 1e3:.1f}-{each.band_hz[1] / 1e3:.1f} kHz"
         azimuth = f"{each.azimuth_deg:+.2f} ± {each.sideways_deg:.2f}°"
         elevation = f"{each.elevation_deg:+.2f} ± {each.upwards_deg:.2f}°"
-        click.echo(f"{start}  {band:>15}  {azimuth:>14}  {elevation:>14}  {each.level_dbfs:.1f} dBFS")
+        level, unit = each.level
+        click.echo(f"{start}  {band:>15}  {azimuth:>14}  {elevation:>14}  {level:.1f} {unit}")
 
 
 def _numbers(bearing: "Bearing") -> dict[str, object]:
@@ -110,6 +111,10 @@ def _numbers(bearing: "Bearing") -> dict[str, object]:
         "elevation_deg": round(bearing.elevation_deg, 4),
         "sideways_deg": bearing.sideways_deg,
         "upwards_deg": bearing.upwards_deg,
-        "level_dbfs": round(bearing.level_dbfs, 3),
+        **{name: _rounded(getattr(bearing, name)) for name in ("level_dbfs", "level_db", "source_level_db")},
         "snr_db": round(bearing.snr_db, 3),
     }
+
+
+def _rounded(level_db: float | None) -> float | None:
+    return None if level_db is None else round(level_db, 3)

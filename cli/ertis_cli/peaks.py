@@ -98,6 +98,7 @@ def peaks(
 
     For a file of acoustic maps, there is one entry per map and band: the loudest direction. level_dbfs is its
     mean square, where a full-scale tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones.
+    source_level_db, in dB re 20 µPa at 1 m from the source, also needs the distance of the source (process --focus).
     Maps of the method music have no levels. Maps are counted from 0, whatever number of measurements they average.
     Only --sensor, --measurement, which chooses a map, and --json apply to them.
     """
@@ -174,8 +175,8 @@ def _list_loudest(path: Path, sensors: tuple[str, ...], measurement: int | None,
     if as_json:
         options.print_json({"loudest": rows})
         return
-    is_pressure = any(row["level_db"] is not None for row in rows)
-    levels = ("level_dbfs", "level_db") if is_pressure else ("level_dbfs",)
+    optional = [name for name in ("level_db", "source_level_db") if any(row[name] is not None for row in rows)]
+    levels = ("level_dbfs", *optional)
     columns: dict[str, _tables.Side] = {**_LOUDEST_COLUMNS, **dict.fromkeys(levels, "right")}
     _tables.TextTable(columns, [_loudest_cells(row, levels) for row in rows]).print()
 

@@ -20,10 +20,8 @@ from ertis_numba.figures._sampling import PIXELS, centres, look_raster
 from ertis_numba.figures.style import angle, minus
 from ertis_numba.frames import AcousticMap
 from ertis_numba.geometry import unit_vectors
-from ertis_numba.settings import Settings
-from ertis_numba.units import sound_pressure_level_db
 
-__all__ = ["draw", "draw_bands", "draw_on_photo", "level_offset_db"]
+__all__ = ["draw", "draw_bands", "draw_on_photo"]
 
 _LINE_RATIO, _BAND_RATIO = 0.42, 0.42
 _SPARE_DB = 3.0
@@ -98,6 +96,7 @@ def draw_on_photo(
 
 def draw_bands(canvas: Canvas, found: AcousticMap, *, direction_deg: tuple[float, float] | None) -> Figure:
     """Draw the level of each band in a direction, by default the loudest of all bands together."""
+    found = _referred(found)
     place = _place(found, direction_deg)
     canvas, level_db = _scaled(canvas, found, found.power[place])
     edges_khz = found.band_hz / 1e3
@@ -127,26 +126,24 @@ def draw_bands(canvas: Canvas, found: AcousticMap, *, direction_deg: tuple[float
     return compose(canvas, heading, [Panel(paint, lambda width_pt: _BAND_RATIO * width_pt)])
 
 
-def level_offset_db(settings: Settings) -> tuple[float, str]:
-    """Return the level of a mean square of 1, and its unit: dB re 20 µPa if the sensitivity is known."""
-    sensitivity_dbfs = settings.array.sensitivity_dbfs
-    if sensitivity_dbfs is None:
-        return 0.0, "dBFS"
-    return sound_pressure_level_db(0.0, sensitivity_dbfs), "dB re 20 µPa"
-
-
 def _levels(
     canvas: Canvas, found: AcousticMap, band_hz: tuple[float, float] | None
 ) -> tuple[Canvas, NDArray[np.float32]]:
     """Return the levels of a band in all directions, and a canvas with their scale."""
+    found = _referred(found)
     return _scaled(canvas, found, found.power.sum(axis=1) if band_hz is None else found.in_band(*band_hz))
+
+
+def _referred(found: AcousticMap) -> AcousticMap:
+    """Return a map whose powers are relative to the reference of its levels."""
+    return found.replace(power=np.asarray(found.power * 10 ** (found.reference.offset_db / 10), np.float32))
 
 
 def _scaled(canvas: Canvas, found: AcousticMap, power: NDArray[np.float32]) -> tuple[Canvas, NDArray[np.float32]]:
     """Return levels limited to the dynamic range below the highest, and a canvas with their scale."""
-    offset_db, unit = level_offset_db(found.settings) if found.has_level else (0.0, canvas.unit)
+    unit = found.reference.unit if found.has_level else canvas.unit
     highest = float(power.max(initial=0.0)) or 1.0
-    top_db = 10 * math.log10(highest) + offset_db if found.has_level else 0.0
+    top_db = 10 * math.log10(highest) if found.has_level else 0.0
     lowest = 10 ** (-canvas.dynamic_range_db / 10)
     below_db = 10 * np.log10(np.maximum(power / highest, lowest))
     return replace(canvas, top_db=top_db, unit=unit), np.asarray(top_db + below_db, np.float32)
@@ -162,8 +159,7 @@ def _heading(
     if band_hz is None:
         shown_hz = found.band_hz
     else:
-        centre_hz = np.sqrt(found.band_hz.prod(axis=1))
-        shown_hz = found.band_hz[(centre_hz >= band_hz[0]) & (centre_hz <= band_hz[1])]
+        shown_hz = found.band_hz[(found.centre_hz >= band_hz[0]) & (found.centre_hz <= band_hz[1])]
     place = int(np.argmax(level_db))
     place_deg = np.degrees([found.azimuth_rad[place], found.elevation_rad[place]])
     level = f": {minus(f'{canvas.top_db:.1f}')} {canvas.unit}" if found.has_level else ""

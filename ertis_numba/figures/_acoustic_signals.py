@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.figures import _captions
-from ertis_numba.figures._acoustic import level_offset_db
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures.style import angle
-from ertis_numba.frames import Measurement
+from ertis_numba.frames import LevelReference, Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.passive import HeardSignals, listen_to
 from ertis_numba.settings import Settings
@@ -32,9 +31,9 @@ _CHUNK = 2**20  # samples of spectra at a time, so that memory stays bounded
 
 def draw_spectrum(canvas: Canvas, measurement: Measurement, *, direction_deg: tuple[float, float] | None) -> Figure:
     """Draw the level in each bin, of the mean of the microphones or of a beam."""
-    settings = _calibrated(measurement.settings)
     power, frequency_hz, _ = _spectra(measurement, direction_deg)
-    canvas, level_db = _scaled(canvas, settings, power.mean(axis=1))
+    reference = _reference(measurement.settings, frequency_hz, direction_deg)
+    canvas, level_db = _scaled(canvas, reference, power.mean(axis=1, keepdims=True))
 
     def paint(axes: Axes) -> None:
         axes.plot(frequency_hz / 1e3, level_db, color=canvas.style.mark)
@@ -50,9 +49,8 @@ def draw_spectrum(canvas: Canvas, measurement: Measurement, *, direction_deg: tu
 
 def draw_spectrogram(canvas: Canvas, measurement: Measurement, *, direction_deg: tuple[float, float] | None) -> Figure:
     """Draw the level in each bin over time, of the mean of the microphones or of a beam."""
-    settings = _calibrated(measurement.settings)
     power, frequency_hz, time_s = _spectra(measurement, direction_deg)
-    canvas, level_db = _scaled(canvas, settings, power)
+    canvas, level_db = _scaled(canvas, _reference(measurement.settings, frequency_hz, direction_deg), power)
     half_s = (time_s[-1] - time_s[0]) / max(1, 2 * (len(time_s) - 1)) or 0.5e-3
     half_hz = frequency_hz[1] / 2
     edges = (time_s[0] - half_s, time_s[-1] + half_s, -half_hz, frequency_hz[-1] + half_hz)
@@ -126,18 +124,26 @@ def _spectra(
         return power[:n_bins], frequency_hz[:n_bins], time_s
 
 
-def _calibrated(settings: Settings) -> Settings:
-    """Return settings with the sensitivity of the layout."""
-    return settings.replace("array.sensitivity_dbfs", microphones(settings.array).sensitivity_dbfs)
+def _reference(
+    settings: Settings, frequency_hz: NDArray[np.float64], direction_deg: tuple[float, float] | None
+) -> LevelReference:
+    """Return the reference of levels; only the sound of a direction has a source level."""
+    settings = settings.replace("array.sensitivity_dbfs", microphones(settings.array).sensitivity_dbfs)
+    if direction_deg is None:
+        settings = settings.replace("passive.focus_m", None)
+    return LevelReference.of(settings, frequency_hz)
 
 
-def _scaled(canvas: Canvas, settings: Settings, power: NDArray[np.float32]) -> tuple[Canvas, NDArray[np.float32]]:
-    offset_db, unit = level_offset_db(settings)
+def _scaled(
+    canvas: Canvas, reference: LevelReference, power: NDArray[np.float32]
+) -> tuple[Canvas, NDArray[np.float32]]:
+    """Return levels over frequency and time, and a canvas with their scale."""
+    power = power * np.asarray(10 ** (reference.offset_db / 10), np.float32)[:, None]
     highest = float(power.max(initial=0.0)) or 1.0
-    top_db = 10 * math.log10(highest) + offset_db
+    top_db = 10 * math.log10(highest)
     lowest = 10 ** (-canvas.dynamic_range_db / 10)
     level_db = top_db + 10 * np.log10(np.maximum(power / highest, lowest))
-    return replace(canvas, top_db=top_db, unit=unit), np.asarray(level_db, np.float32)
+    return replace(canvas, top_db=top_db, unit=reference.unit), np.asarray(level_db, np.float32)
 
 
 def _heading(

@@ -5,6 +5,7 @@ from ertis_numba.frames._beams import Beams
 from ertis_numba.frames._bearings import Bearing
 from ertis_numba.frames._energyscape import Energyscape
 from ertis_numba.frames._gap import SequenceGap
+from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelReference, LevelUnit, level_offset_db
 from ertis_numba.frames._measurement import Measurement, MicrophoneSignals
 from ertis_numba.frames._occupancy_map import FREE_BELOW, MAX_CELLS, OCCUPIED_ABOVE, OccupancyMap
 from ertis_numba.frames._point_cloud import PointCloud
@@ -17,6 +18,7 @@ from ertis_numba.frames._true_source import TrueSource
 __all__ = [
     "BEHAVIOURS",
     "FREE_BELOW",
+    "LEVEL_UNITS",
     "MAX_CELLS",
     "OCCUPIED_ABOVE",
     "AcousticMap",
@@ -24,6 +26,8 @@ __all__ = [
     "Bearing",
     "Behaviour",
     "Energyscape",
+    "LevelReference",
+    "LevelUnit",
     "Loudest",
     "Measurement",
     "MicrophoneSignals",
@@ -37,4 +41,5 @@ __all__ = [
     "Trajectory",
     "TrueSource",
     "is_passive",
+    "level_offset_db",
 ]

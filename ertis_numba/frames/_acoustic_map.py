@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.angles import DegreesFromRadians
 from ertis_numba.errors import ArgumentError
+from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelReference, LevelUnit, level_offset_db
 from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames._stamp import Stamp
 from ertis_numba.settings import Settings
-from ertis_numba.units import sound_pressure_level_db
 
 __all__ = ["AcousticMap", "Loudest"]
 
@@ -31,6 +31,8 @@ class Loudest(NamedTuple):
         Level at the array in dBFS; None for the method ``music``.
     level_db : float or None
         Sound pressure level at the array in dB re 20 µPa; None if the sensitivity of the microphones is unknown.
+    source_level_db : float or None
+        Source level in dB re 20 µPa at 1 m; None if the sensitivity or the distance of the sources is unknown.
     """
 
     band_hz: tuple[float, float]
@@ -38,6 +40,7 @@ class Loudest(NamedTuple):
     elevation_rad: float
     level_dbfs: float | None
     level_db: float | None
+    source_level_db: float | None
 
     def as_dict(self) -> dict[str, Any]:
         """Return the direction in degrees and the levels for JSON; levels are null if they are unknown or infinite."""
@@ -45,7 +48,7 @@ class Loudest(NamedTuple):
             "band_hz": [round(edge_hz, 3) for edge_hz in self.band_hz],
             "azimuth_deg": round(math.degrees(self.azimuth_rad), 4),
             "elevation_deg": round(math.degrees(self.elevation_rad), 4),
-            **{name: _rounded(getattr(self, name)) for name in ("level_dbfs", "level_db")},
+            **{name: _rounded(getattr(self, name)) for name in reversed(LEVEL_UNITS)},
         }
 
 
@@ -126,10 +129,31 @@ class AcousticMap(DegreesFromRadians):
 
         None if the settings do not state the sensitivity of the microphones.
         """
-        sensitivity_dbfs = self.settings.array.sensitivity_dbfs
-        if sensitivity_dbfs is None:
-            return None
-        return self.level_dbfs + np.float32(sound_pressure_level_db(0.0, sensitivity_dbfs))
+        return self._in_unit(LEVEL_UNITS["level_db"])
+
+    @property
+    def source_level_db(self) -> NDArray[np.float32] | None:
+        """Source level in dB re 20 µPa at 1 m: (direction, band) float32.
+
+        It is the level of a source at the distance ``passive.focus_m``, at 1 m from it and without absorption by the
+        air: that at the array plus the transmission loss at the centre of the band. None if the settings state no
+        distance, or not the sensitivity of the microphones.
+        """
+        return self._in_unit(LEVEL_UNITS["source_level_db"])
+
+    @property
+    def centre_hz(self) -> NDArray[np.float64]:
+        """Geometric centre of each band in hertz: (band,) float64."""
+        return np.asarray(np.sqrt(self.band_hz.prod(axis=1)))
+
+    @property
+    def reference(self) -> LevelReference:
+        """Reference of the levels in plots: source level, sound pressure level or full scale, as the settings allow."""
+        return LevelReference.of(self.settings, self.centre_hz)
+
+    def _in_unit(self, unit: LevelUnit) -> NDArray[np.float32] | None:
+        offset_db = level_offset_db(self.settings, self.centre_hz, unit)
+        return None if offset_db is None else np.asarray(self.level_dbfs + offset_db, np.float32)
 
     @property
     def has_level(self) -> bool:
@@ -153,7 +177,7 @@ class AcousticMap(DegreesFromRadians):
         ArgumentError
             No band has its centre within the limits.
         """
-        centre_hz = np.sqrt(self.band_hz.prod(axis=1))
+        centre_hz = self.centre_hz
         chosen = (centre_hz >= low_hz) & (centre_hz <= high_hz)
         if not chosen.any():
             raise ArgumentError(
@@ -169,7 +193,7 @@ class AcousticMap(DegreesFromRadians):
         -------
         list of Loudest
         """
-        levels = (self.level_dbfs, self.level_db) if self.has_level else (None, None)
+        levels = [getattr(self, name) if self.has_level else None for name in reversed(LEVEL_UNITS)]
         return [
             Loudest(
                 (float(low_hz), float(high_hz)),

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from ertis_numba.angles import RadiansFromDegrees
+from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelUnit
 
 __all__ = ["Bearing"]
 
@@ -30,6 +31,11 @@ class Bearing(RadiansFromDegrees):
         Level of the source in the band at the array, without noise, in dBFS.
     snr_db : float
         Power of the source relative to the noise of a microphone in the band, in decibels.
+    level_db : float, optional
+        Its sound pressure level at the array in dB re 20 µPa; None, the default, if the sensitivity of the microphones
+        is unknown.
+    source_level_db : float, optional
+        Its source level in dB re 20 µPa at 1 m, as in `AcousticMap`; None, the default, if it is unknown.
 
     Examples
     --------
@@ -48,6 +54,14 @@ class Bearing(RadiansFromDegrees):
     band_hz: tuple[float, float]
     level_dbfs: float
     snr_db: float
+    level_db: float | None = None
+    source_level_db: float | None = None
+
+    @property
+    def level(self) -> tuple[float, LevelUnit]:
+        """Most informative level that is known, and its unit."""
+        levels = ((getattr(self, name), unit) for name, unit in LEVEL_UNITS.items())
+        return next((level, unit) for level, unit in levels if level is not None)
 
     @property
     def center_hz(self) -> float:

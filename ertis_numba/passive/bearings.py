@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.frames import Bearing
+from ertis_numba.frames import LEVEL_UNITS, Bearing, level_offset_db
 from ertis_numba.geometry import microphones, spacing_rad, unit_vectors
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.camera import AcousticCamera
@@ -17,6 +17,7 @@ from ertis_numba.passive.noise_model import NoiseModel
 from ertis_numba.passive.scan_extent import is_level, scan_extent
 from ertis_numba.passive.source_search import BandSearch, FoundSource, Scan
 from ertis_numba.passive.wave_delays import WaveDelays
+from ertis_numba.settings import Settings
 
 __all__ = ["BearingFinder", "find_bearings"]
 
@@ -108,7 +109,7 @@ class BearingFinder:
             matrix = spectrum.matrix[bins].astype(np.complex128)
             sources = search(matrix, spectrum.n_blocks, false_alarm=self._false_alarm, top=self._top, least=self._least)
             sources.sort(key=lambda source: -source.power)
-            out += [_bearing(source, band_hz) for source in sources]
+            out += [_bearing(source, band_hz, self._camera.settings) for source in sources]
         return out
 
 
@@ -146,11 +147,12 @@ def find_bearings(
     return BearingFinder(camera, false_alarm=false_alarm, top=top, min_level_db=min_level_db).find()
 
 
-def _bearing(source: FoundSource, band_hz: NDArray[np.float64]) -> Bearing:
+def _bearing(source: FoundSource, band_hz: NDArray[np.float64], settings: Settings) -> Bearing:
     x, y, z = source.direction
     sideways, upwards = np.sqrt(np.diag(source.covariance_rad2))
     is_known = 0 < sideways < math.inf and 0 < upwards < math.inf
     correlation = source.covariance_rad2[0, 1] / (sideways * upwards) if is_known else 0.0
+    level_dbfs = 10 * math.log10(max(source.power, _LEAST))
     return Bearing(
         azimuth_deg=math.degrees(math.atan2(y, x)),
         elevation_deg=math.degrees(math.asin(max(-1.0, min(1.0, z)))),
@@ -158,6 +160,13 @@ def _bearing(source: FoundSource, band_hz: NDArray[np.float64]) -> Bearing:
         upwards_deg=math.degrees(upwards),
         correlation=float(correlation),
         band_hz=(float(band_hz[0]), float(band_hz[1])),
-        level_dbfs=10 * math.log10(max(source.power, _LEAST)),
+        level_dbfs=level_dbfs,
         snr_db=10 * math.log10(max(source.ratio, _LEAST)),
+        **{name: _level(level_dbfs, settings, band_hz, name) for name in ("level_db", "source_level_db")},
     )
+
+
+def _level(level_dbfs: float, settings: Settings, band_hz: NDArray[np.float64], name: str) -> float | None:
+    """Return the level in the unit of a field of `Bearing`; None if it is unknown."""
+    offset_db = level_offset_db(settings, np.sqrt(band_hz.prod(keepdims=True)), LEVEL_UNITS[name])
+    return None if offset_db is None else level_dbfs + float(offset_db[0])

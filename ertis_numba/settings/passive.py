@@ -44,7 +44,8 @@ class Passive(TomlTable, frozen=True, kw_only=True):
     averages : int, default 1
         Number of measurements in a map, 1 to 100000, over which powers are averaged.
     focus_m : float, optional, default None
-        Distance of the sources in metres, from 0.01. By default, waves are plane.
+        Distance of the sources in metres, from 0.01, which also gives their source levels. By default, waves are
+        plane.
     """
 
     bands_hz: str | tuple[tuple[float, float], ...] = "third_octaves"

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.point_finder import same_directions
-from ertis_numba.frames import AcousticMap, Energyscape, PointCloud
+from ertis_numba.frames import LEVEL_UNITS, AcousticMap, Energyscape, PointCloud, level_offset_db
 from ertis_numba.geometry import unit_vectors
-from ertis_numba.units import sound_pressure_level_db
 from ertis_numba.viewer._choices import Choices, colour_table
 from ertis_numba.viewer._level_plane import LevelPlane
 from ertis_numba.viewer._shapes import (
@@ -134,38 +133,42 @@ def _chosen(bands: list[Edges], band_hz: float | None) -> Edges | None:
     return min(inside, key=lambda each: abs(math.log(each[0] * each[1] / band_hz**2)), default=(band_hz, band_hz))
 
 
-def _power(found: AcousticMap, band: Edges | None) -> NDArray[np.float32] | None:
-    """Return the power in a band, or in all: (direction,) float32. None if the map has no such band."""
+def _power(found: AcousticMap, band: Edges | None, unit: Unit) -> NDArray[np.float64] | None:
+    """Return the power in a band, or in all, relative to the reference of a unit: (direction,) float64.
+
+    None if the map has no such band.
+    """
+    offset_db = level_offset_db(found.settings, found.centre_hz, "dBFS" if unit == "dB" else unit)
+    assert offset_db is not None  # noqa: S101  _unit chooses a unit that all maps have
+    gain = 10 ** (offset_db / 10)
     if band is None:
-        return np.asarray(found.power.sum(axis=1))
+        return np.asarray(found.power @ gain)
     places = np.flatnonzero((found.band_hz == band).all(axis=1))
-    return found.power[:, places[0]] if len(places) else None
+    return np.asarray(found.power[:, places[0]] * gain[places[0]]) if len(places) else None
+
+
+def _decibels(power: NDArray[np.float64]) -> NDArray[np.float32]:
+    with np.errstate(divide="ignore"):
+        return np.asarray(10 * np.log10(power), np.float32)
 
 
 def _unit(maps: Iterable[AcousticMap]) -> Unit:
-    """Return the unit of the levels of several maps: sound pressure levels if all microphones are calibrated."""
+    """Return the unit of the levels of several maps: the most informative one that all of them have."""
     if not all(found.has_level for found in maps):
         return "dB"
-    return "dBFS" if any(found.level_db is None for found in maps) else "dB re 20 µPa"
-
-
-def _level_db(found: AcousticMap, power: NDArray[np.float32], unit: Unit) -> NDArray[np.float32]:
-    """Return the levels of powers: (direction,) float32."""
-    sensitivity_dbfs = found.settings.array.sensitivity_dbfs if unit == "dB re 20 µPa" else None
-    offset_db = 0.0 if sensitivity_dbfs is None else sound_pressure_level_db(0.0, sensitivity_dbfs)
-    with np.errstate(divide="ignore"):
-        return np.asarray(10 * np.log10(power) + offset_db, np.float32)
+    units = {found.reference.unit for found in maps}
+    return next((unit for unit in reversed(LEVEL_UNITS.values()) if unit in units), "dBFS")
 
 
 def _loudest(maps: Iterable[AcousticMap], band: Edges | None, unit: Unit, *, is_shown: bool) -> BandLevel:
     """Return the loudest direction of a band, of the maps that have it."""
     best = BandLevel(band, -math.inf, "", 0.0, 0.0, is_shown)
     for found in maps:
-        power = _power(found, band)
+        power = _power(found, band, unit)
         if power is None:
             continue
         place = int(power.argmax())
-        level_db = float(_level_db(found, power[place : place + 1], unit)[0])
+        level_db = float(_decibels(power[place : place + 1])[0])
         if level_db > best.level_db:
             direction_deg = float(found.azimuth_deg[place]), float(found.elevation_deg[place])
             best = BandLevel(band, level_db, found.stamp.sensor, *direction_deg, is_shown)
@@ -198,14 +201,14 @@ def _prepare(kept: _SensorMaps, choices: Choices, scale: LevelScale, radius_m: f
     if kept.drawn_for == drawn_for:
         return
     kept.drawn_for, kept.shape, kept.loudest = drawn_for, None, None
-    power = _power(found, band)
+    power = _power(found, band, scale.unit)
     if power is None:
         low_hz, high_hz = found.band_hz.min(), found.band_hz.max()
         text = f"no band at {choices.band_hz / 1e3:g} kHz:" if choices.band_hz is not None else ""
         kept.picture = plane.empty(f"{text}\nthe map covers {low_hz / 1e3:.3g} to {high_hz / 1e3:.3g} kHz")
         return
     table = colour_table(choices.colours, dim=overdue)
-    shades = scale.shade(_level_db(found, power, scale.unit))
+    shades = scale.shade(_decibels(power))
     place = int(shades.argmax())
     kept.loudest = (place, int(shades[place])) if shades[place] else None
     kept.picture = plane.picture(shades, table, scale)

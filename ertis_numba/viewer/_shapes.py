@@ -8,7 +8,7 @@ from typing import Final, Generic, Literal, Self, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.frames import AcousticMap, Energyscape, PointCloud, Stamp
+from ertis_numba.frames import AcousticMap, Energyscape, LevelUnit, PointCloud, Stamp
 from ertis_numba.settings import Settings
 
 __all__ = [
@@ -24,7 +24,7 @@ __all__ = [
     "Unit",
 ]
 
-Unit: TypeAlias = Literal["dBFS", "dB re 20 µPa", "dB"]
+Unit: TypeAlias = LevelUnit | Literal["dB"]
 """Unit of the levels of acoustic maps."""
 
 Shown_co = TypeVar("Shown_co", Energyscape, AcousticMap, covariant=True)
@@ -208,7 +208,7 @@ class LevelScale:
     Attributes
     ----------
     low_db, high_db : float
-    unit : {"dBFS", "dB re 20 µPa", "dB"}
+    unit : {"dBFS", "dB re 20 µPa", "dB re 20 µPa at 1 m", "dB"}
         Sound pressure level if the settings of all sensors state the sensitivity of the microphones. ``dB`` for the
         method ``music``, whose numbers have no reference.
     bands : tuple of BandLevel

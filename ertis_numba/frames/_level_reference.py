@@ -1,0 +1,64 @@
+"""Reference of the levels of sound: full scale, a sound pressure, or a sound pressure at 1 m from the source."""
+
+from typing import Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.air import transmission_loss_db
+from ertis_numba.settings import Settings
+from ertis_numba.units import sound_pressure_level_db
+
+__all__ = ["LEVEL_UNITS", "LevelReference", "LevelUnit", "level_offset_db"]
+
+LevelUnit: TypeAlias = Literal["dBFS", "dB re 20 µPa", "dB re 20 µPa at 1 m"]
+
+LEVEL_UNITS: Final[dict[str, LevelUnit]] = {
+    "source_level_db": "dB re 20 µPa at 1 m",
+    "level_db": "dB re 20 µPa",
+    "level_dbfs": "dBFS",
+}
+"""Units of levels by the name of a field, the most informative first."""
+
+
+def level_offset_db(
+    settings: Settings, frequency_hz: NDArray[np.float64], unit: LevelUnit
+) -> NDArray[np.float64] | None:
+    """Return the level of a mean square of 1 at the array in a unit: (frequency,) float64.
+
+    None if ``array.sensitivity_dbfs``, or for the source level ``passive.focus_m``, is unknown.
+
+    Parameters
+    ----------
+    settings : Settings
+    frequency_hz : (frequency,) float64
+    unit : {"dBFS", "dB re 20 µPa", "dB re 20 µPa at 1 m"}
+    """
+    sensitivity_dbfs, focus_m = settings.array.sensitivity_dbfs, settings.passive.focus_m
+    if unit == "dBFS":
+        return np.zeros(len(frequency_hz))
+    if sensitivity_dbfs is None:
+        return None
+    pressure_db = np.full(len(frequency_hz), sound_pressure_level_db(0.0, sensitivity_dbfs))
+    if unit == "dB re 20 µPa":
+        return pressure_db
+    return None if focus_m is None else pressure_db + transmission_loss_db(settings.air, focus_m, frequency_hz)
+
+
+class LevelReference(NamedTuple):
+    """Unit of levels, and the level of a mean square of 1 at the array.
+
+    Attributes
+    ----------
+    unit : {"dBFS", "dB re 20 µPa", "dB re 20 µPa at 1 m"}
+    offset_db : (frequency,) float64
+    """
+
+    unit: LevelUnit
+    offset_db: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, settings: Settings, frequency_hz: NDArray[np.float64]) -> "LevelReference":
+        """Return the most informative reference that the settings allow at frequencies."""
+        found = ((unit, level_offset_db(settings, frequency_hz, unit)) for unit in LEVEL_UNITS.values())
+        return next(cls(unit, offset_db) for unit, offset_db in found if offset_db is not None)
