@@ -1,6 +1,6 @@
-"""Words of the measurements that a pipeline accepts, in the range of single precision."""
+"""Words of the measurements that a pipeline or a camera accepts, in the range of single precision."""
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +9,11 @@ from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.sample_format import sample_format
-from ertis_numba.settings import Array, Settings
+from ertis_numba.settings import Air, Array, Call, Recording, Settings
 
 __all__ = ["AcceptedWords", "rescaled"]
+
+_REMEDY: Final = "process it with its own settings (measurement.settings)"
 
 
 class AcceptedWords:
@@ -54,15 +56,21 @@ class AcceptedWords:
         for name in ("call", "recording", "air"):
             came, wanted = getattr(settings, name), getattr(self._settings, name)
             if came != wanted:
-                raise DataError(
-                    f"measurement has {came}, but the pipeline has {wanted}; create a pipeline from its settings"
-                )
+                raise DataError(f"measurement has {_difference(name, came, wanted)}; {_REMEDY}")
         if settings.array != self._settings.array and not _same_layout(settings.array, self._settings.array):
             raise DataError(
-                f"measurement has array {settings.array.layout!r}, but the pipeline has another, "
-                f"{self._settings.array.layout!r}; create a pipeline from its settings"
+                f"measurement has array {settings.array.layout!r}, but another one, "
+                f"{self._settings.array.layout!r}, is in use; {_REMEDY}"
             )
         self._accepted_settings = settings
+
+
+def _difference(table: str, came: Call | Recording | Air, wanted: Call | Recording | Air) -> str:
+    """Return the keys of a table that differ, with both values."""
+    pairs = ((name, getattr(came, name), getattr(wanted, name)) for name in came.__struct_fields__)
+    return ", ".join(
+        f"{table}.{name} {one!r:.60}, but {other!r:.60} is in use" for name, one, other in pairs if one != other
+    )
 
 
 def _same_layout(array: Array, other: Array) -> bool:

@@ -6,6 +6,7 @@ __all__ = [
     "ERTIS_PDM_RATE_HZ",
     "MAX_MICROPHONES",
     "MAX_NAME_LENGTH",
+    "SHAPED_NOISE_SHARE",
     "STANDARD_HUMIDITY_PERCENT",
     "STANDARD_PRESSURE_PA",
     "STANDARD_TEMPERATURE_C",
@@ -18,6 +19,9 @@ STANDARD_HUMIDITY_PERCENT: Final = 50.0
 STANDARD_PRESSURE_PA: Final = 101_325.0  # ISO 9613-1, reference pressure
 
 ERTIS_PDM_RATE_HZ: Final = 4_500_000.0  # eRTIS in ultrasonic mode
+# Measured on a real sensor at 4.5 MHz: the noise is flat up to 130 kHz, 4 dB higher at 140 kHz, and 25 dB at 250 kHz.
+SHAPED_NOISE_SHARE: Final = 130e3 / 4.5e6
+"""Frequency above which the shaped quantisation noise of one-bit microphones dominates, relative to their clock."""
 SYNC_STEP_S: Final = 400e-9  # delay between neighbours in the SYNC chain; Jansen et al., 2019
 
 MAX_MICROPHONES: Final = 1024

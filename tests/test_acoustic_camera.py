@@ -170,6 +170,17 @@ def test_clean_sc_has_no_power_beside_a_source_in_a_direction_of_the_grid(diagon
     assert 10 * np.log10(beside.sum(axis=0) / found.power[place]).max() < -20
 
 
+def test_measurement_of_other_settings_is_refused_with_the_keys_that_differ():
+    settings = settings_of()
+    warmer = settings.replace(**{"air.temperature_c": 30.0, "air.humidity_percent": 10.0})
+    message = (
+        r"has air.temperature_c 30.0, but 20.0 is in use, air.humidity_percent 10.0, but 50.0 is in use; process it "
+        r"with its own settings \(measurement.settings\)"
+    )
+    with AcousticCamera(settings, "numpy") as camera, pytest.raises(DataError, match=message):
+        camera.add(sound(warmer, [(20, 0.1)]))
+
+
 def test_diagonal_removal_suppresses_the_noise_of_microphones():
     levels = {}
     for removed in (False, True):

@@ -94,6 +94,18 @@ def test_passive_recording_becomes_acoustic_maps():
     assert report["sensors"][0]["loudest"] == report["loudest"]
 
 
+def test_bands_of_quantisation_noise_are_reported():
+    """One-bit microphones at 4.5 MHz shape their noise to frequencies above 130 kHz."""
+    pdm = ertis.Settings().replace(**{"recording.n_samples": 81_920, "processing.range_m": (0.5, 1.0)})
+    noise = np.random.default_rng(5).integers(0, 2**32, 81_920, dtype=np.uint32)
+    ertis.write_recording("pdm.h5", [ertis.Measurement(noise, pdm, Stamp(behaviour="passive"))])
+    quiet = run("process pdm.h5 -o low.h5 --bands 20000:130000")
+    assert "quantisation" not in quiet.stderr
+    noisy = run("process pdm.h5 -o high.h5 --bands 20000:30000,200000:300000")
+    (line,) = (line for line in noisy.stderr.splitlines() if "quantisation noise" in line)
+    assert "dominates above 130 kHz, and so in 200 to 300 kHz; give lower bands" in line
+
+
 def test_options_of_maps_override_the_settings(folder):
     (folder / "given.toml").write_text('[passive]\nmethod = "music"\naverages = 9\nfocus_m = 3\n')
     run(

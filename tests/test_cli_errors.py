@@ -74,7 +74,11 @@ CASES = {
         1,
         "nan.h5: calibration_gain of channel 3 is nan, but the settings",
     ),
-    "info of nothing": ("info folder", 1, "folder is a folder; give a recording or an energyscape file"),
+    "info of nothing": (
+        "info folder",
+        1,
+        "folder is a folder; give a recording, an energyscape file or a file of acoustic maps",
+    ),
     # processing
     "no directions": ("process rec.h5 -o out.h5 --directions 2d:0", 2, "count of directions '2d:0' is 0; give a whole"),
     "empty directions": (
@@ -149,9 +153,17 @@ CASES = {
     "no peaks": ("peaks img.h5 --top 0", 2, "--top is 0; give a whole number of at least 1"),
     "peaks above": ("peaks img.h5 --min-level 3", 2, "--min-level is 3; give a number from -1000 to 0"),
     "nothing at that level": ("compare truth.h5 --min-level 3", 2, "--min-level is 3; give a number from -1000 to 0"),
-    "this folder": ("plot .", 1, ". is a folder; give a recording or an energyscape file"),
-    "root": ("plot / --kind array", 1, "/ is a folder; give a recording or an energyscape file"),
-    "a folder": ("plot folder", 1, "folder is a folder; give a recording or an energyscape file"),
+    "this folder": ("plot .", 1, ". is a folder; give a recording, an energyscape file or a file of acoustic maps"),
+    "root": (
+        "plot / --kind array",
+        1,
+        "/ is a folder; give a recording, an energyscape file or a file of acoustic maps",
+    ),
+    "a folder": (
+        "plot folder",
+        1,
+        "folder is a folder; give a recording, an energyscape file or a file of acoustic maps",
+    ),
     "picture format": ("plot img.h5 -o out.bmp", 1, "picture format '.bmp' is unknown; known are .pdf, .png, .svg"),
     "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 2, "--dynamic-range is -5; give a number above 0"),
     # sensors and ground truth

@@ -263,15 +263,15 @@ def test_tests_package_is_this_project():
     [
         (
             SHORT.replace(air=SHORT.air.replace(temperature_c=-10.0)),
-            r"has Air\(temperature_c=-10.0.*, but the pipeline has Air",
+            r"has air.temperature_c -10.0, but 20.0 is in use; process it with its own settings",
         ),
         (
             SHORT.replace(call=SHORT.call.replace(duration_s=1e-3)),
-            r"has Call\(.*duration_s=0.001.*, but the pipeline has Call",
+            "has call.duration_s 0.001, but 0.0025 is in use",
         ),
         (
             SHORT.replace(array=Array(layout="eRTIS_v2")),
-            "has array 'eRTIS_v2', but the pipeline has another, 'eRTIS_v3D1'",
+            "has array 'eRTIS_v2', but another one, 'eRTIS_v3D1', is in use",
         ),
     ],
 )

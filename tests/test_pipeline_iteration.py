@@ -75,7 +75,7 @@ def test_process_many_yields_the_batches_before_a_measurement_it_refuses(pipelin
     other = replace(MEASUREMENTS[3], settings=SHORT.replace(air=Air(temperature_c=30.0)))
     images = pipeline.process_many([*MEASUREMENTS[:3], other], batch_size=2)
     assert [next(images).stamp.sequence, next(images).stamp.sequence] == [0, 1]
-    with pytest.raises(DataError, match="create a pipeline from its settings"):
+    with pytest.raises(DataError, match="process it with its own settings"):
         next(images)
 
 

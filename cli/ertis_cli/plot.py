@@ -169,7 +169,7 @@ def plot(
     if kind != "array":
         _require_no_array(path)
     if not path.name:  # "." and "/" give no name for the picture
-        raise DataError(f"{path} is a folder; give a recording or an energyscape file")
+        raise DataError(f"{path} is a folder; give a recording, an energyscape file or a file of acoustic maps")
     target = target or path.with_suffix(".png")
     checks.choice("picture format", target.suffix.lower(), _FORMATS)
     check_target(target, overwrite=force)
@@ -294,7 +294,8 @@ def _require_no_array(path: Path) -> None:
 
     if path.suffix.lower() in {".csv", ".toml"} or (str(path) in layout_names() and not path.exists()):
         raise click.UsageError(
-            f"{path} contains no measurement; give --kind array, or a recording or an energyscape file",
+            f"{path} contains no measurement; give --kind array, or a recording, an energyscape file or a file of "
+            "acoustic maps",
             click.get_current_context(),
         )
 

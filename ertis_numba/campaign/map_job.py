@@ -15,6 +15,7 @@ from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.errors import DataError
 from ertis_numba.frames import AcousticMap
 from ertis_numba.passive import AcousticCamera
+from ertis_numba.passive.bands import shaped_noise_warning
 from ertis_numba.settings import Settings
 from ertis_numba.storage import AcousticMapWriter, RecordingReader, open_recording
 
@@ -152,8 +153,8 @@ def prepare_maps(
     settings : mapping of str to Settings, optional
         Settings for each sensor. By default, ``options.settings`` derives them from the recorded settings.
     warn : callable
-        Called with a line for each sensor that has faulty microphones, and after the processing of a sensor that
-        emitted its call.
+        Called with a line for each sensor that has faulty microphones or bands of noise only, and after the processing
+        of a sensor that emitted its call.
 
     Yields
     ------
@@ -183,6 +184,8 @@ def prepare_maps(
         ]
         for recording, camera in zip(recordings, cameras, strict=True):
             _check_sensor(recording, camera.settings, options, warn)
+            if noisy := shaped_noise_warning(camera.settings, camera.band_hz):
+                warn(f"{path}: {noisy}")
         yield MapJob(recordings, cameras, writer, warn)
 
 

@@ -298,10 +298,14 @@ def acoustic_map(
     """
     checks.instance("found", found, AcousticMap, "AcousticCamera.process returns")
     canvas = _canvas(dynamic_range_db, look)
+    if band_hz is not None:
+        checks.interval("band_hz", band_hz, 0.0, 1e9)
     if (photo is None) != (photo_fov_deg is None):
         raise ArgumentError("photo and photo_fov_deg need each other; give both or neither")
     if photo is None or photo_fov_deg is None:
         return _acoustic.draw(canvas, found, band_hz=band_hz)
+    if isinstance(photo_fov_deg, str) or not isinstance(photo_fov_deg, Sequence) or len(photo_fov_deg) != 2:
+        raise ArgumentError(f"photo_fov_deg is {photo_fov_deg!r:.80}; give its width and its height in degrees")
     for number, each_deg in enumerate(photo_fov_deg):
         checks.between(f"photo_fov_deg[{number}]", each_deg, 1.0, 170.0)
     return _acoustic.draw_on_photo(canvas, found, band_hz=band_hz, photo=_picture(photo), fov_deg=photo_fov_deg)

@@ -175,8 +175,10 @@ class AcousticMap(DegreesFromRadians):
         Raises
         ------
         ArgumentError
-            No band has its centre within the limits.
+            A limit is no frequency, or no band has its centre within the limits.
         """
+        checks.between("low_hz", low_hz, 0.0, 1e9)
+        checks.between("high_hz", high_hz, 0.0, 1e9)
         centre_hz = self.centre_hz
         chosen = (centre_hz >= low_hz) & (centre_hz <= high_hz)
         if not chosen.any():

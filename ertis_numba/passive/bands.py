@@ -5,10 +5,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.constants import SHAPED_NOISE_SHARE
 from ertis_numba.errors import ArgumentError
-from ertis_numba.settings import Passive
+from ertis_numba.settings import Passive, Settings
 
-__all__ = ["band_edges", "bin_shares", "octave_bands"]
+__all__ = ["band_edges", "bin_shares", "octave_bands", "shaped_noise_warning"]
 
 _ROUNDING = 1e-6  # relative, so that limits include the bands whose edges they name
 
@@ -79,6 +80,26 @@ def band_edges(passive: Passive, *, highest_hz: float) -> NDArray[np.float64]:
                 "lower the upper edge of this band"
             )
     return np.array(given, np.float64)
+
+
+def shaped_noise_warning(settings: Settings, bands_hz: NDArray[np.float64]) -> str:
+    """Return a line on bands in which the noise of one-bit microphones dominates; empty if there are none.
+
+    Parameters
+    ----------
+    settings : Settings
+    bands_hz : (band, 2) float64
+    """
+    limit_hz = SHAPED_NOISE_SHARE * settings.recording.sample_rate_hz
+    noisy = bands_hz[bands_hz[:, 1] > limit_hz]
+    if not settings.recording.is_pdm or not len(noisy):
+        return ""
+    named = ", ".join(f"{low_hz / 1e3:g} to {high_hz / 1e3:g} kHz" for low_hz, high_hz in noisy[:3])
+    more = f" and {len(noisy) - 3} more" if len(noisy) > 3 else ""
+    return (
+        f"the quantisation noise of one-bit microphones dominates above {limit_hz / 1e3:g} kHz, and so in "
+        f"{named}{more}; give lower bands to hear sources"
+    )
 
 
 def bin_shares(bands_hz: NDArray[np.float64], frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:

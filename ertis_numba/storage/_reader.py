@@ -38,7 +38,7 @@ _KIND_NAMES = {
     "energyscape": "an energyscape file",
     "acoustic_map": "a file of acoustic maps",
 }
-_WANTED = "a recording or an energyscape file"
+_WANTED = "a recording, an energyscape file or a file of acoustic maps"
 
 
 def file_kind(path: str | Path) -> str:
