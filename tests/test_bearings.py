@@ -108,6 +108,22 @@ def test_maximum_is_that_of_a_fine_search():
     assert beside(found[None]) >= beside(around).max()
 
 
+def test_separated_powers_are_those_outside_of_the_other_sources():
+    random = np.random.default_rng(5)
+    positions_m = random.normal(scale=0.02, size=(7, 3))
+    directions = unit_vectors(np.radians([20.0, -15.0, 24.0]), np.radians([10.0, 0.0, 30.0]))
+    heard = random.standard_normal((4, 7, 9, 2)) @ np.array([1, 1j])
+    matrix, whitening = heard @ heard.conj().transpose(0, 2, 1), random.standard_normal((4, 7, 7))
+    omega = 2 * np.pi * np.linspace(20e3, 24e3, 4)
+    likelihood = BandLikelihood(matrix, whitening, omega, np.full(4, 0.25), lambda there: -there @ positions_m.T / 340)
+    found, noise = likelihood.separated(directions)
+    for k, each in enumerate(directions):
+        beside = likelihood.beside(np.delete(directions, k, axis=0))
+        beam, size = beside.beams(each[None])
+        assert noise == pytest.approx((beside.power - beam[:, 0]) / 4)  # 7 microphones without three sources
+        assert found[:, k] == pytest.approx((beam[:, 0] - noise) / size[:, 0])
+
+
 @pytest.mark.parametrize("directions", ["2d:181", "3d:1500"])
 def test_false_alarms_have_the_asked_rate(directions):
     settings, asked, n_seeds = settings_of(**SPACE | {"processing__directions": directions}), 0.1, 200

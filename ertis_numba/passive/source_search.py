@@ -137,8 +137,8 @@ class BandSearch:
         place = rest.maximum(self._loudest(rest, likelihood), reach_rad=self._scan.reach_rad, level=self._scan.level)
         share = float(rest.relative_power(place[None])[0]) / rest.dimensions
         chance = exceedance(share, n_samples=n_samples, n_dimensions=rest.dimensions, extent=self._extent)
-        known = [_powers(likelihood.beside(np.delete(places, k, axis=0)), each)[0] for k, each in enumerate(places)]
-        strongest = max((float(self._weights @ powers) for powers in known), default=0.0)
+        known = self._weights @ likelihood.separated(places)[0] if len(places) else np.zeros(0)
+        strongest = max(0.0, known.max(initial=0.0))
         power = float(self._weights @ _powers(rest, place)[0])
         size, whole = (float(self._weights @ each.beams(place[None])[1][:, 0]) for each in (rest, likelihood))
         is_source = chance <= false_alarm and power >= least * strongest and size >= _BLIND * whole
@@ -146,15 +146,14 @@ class BandSearch:
 
     def _likelihood(self, matrix: Matrices, places: Floats) -> BandLikelihood:
         """Return the likelihood of sources, in noise whose diffuse share is that of the matrix without sources."""
-        n_mics = matrix.shape[1]
-        identity = np.broadcast_to(np.eye(n_mics), matrix.shape)
-        plain = BandLikelihood(matrix, identity, self._omega, self._weights, self._delays)
-        rest = matrix
-        for k, place in enumerate(places):
-            waves = plain.waves(place[None])
-            power = np.maximum(_powers(plain.beside(np.delete(places, k, axis=0)), place)[0], 0)
-            rest = rest - power[:, None, None] * waves @ waves.conj().transpose(0, 2, 1)
-        whitening = self._noise.whitening(self._noise.diffuse_share(rest, self._weights))
+        plain, rest = BandLikelihood(matrix, None, self._omega, self._weights, self._delays), matrix
+        if len(places):
+            waves, powers = plain.waves(places), np.maximum(plain.separated(places)[0], 0)
+            rest = matrix - (waves * powers[:, None]) @ waves.conj().transpose(0, 2, 1)
+        share = self._noise.diffuse_share(rest, self._weights)
+        if not share:
+            return plain
+        whitening = self._noise.whitening(share)
         white = whitening @ matrix @ whitening.transpose(0, 2, 1)
         return BandLikelihood(white, whitening, self._omega, self._weights, self._delays)
 
@@ -169,14 +168,17 @@ class BandSearch:
 
     def _loudest(self, rest: BandLikelihood, whole: BandLikelihood) -> Floats:
         """Return the direction of the scan with the largest mean power relative to the noise."""
-        powers, every = (
-            self._steer(whole.unwhitened(each).astype(np.complex64)) for each in (rest.rest, whole.projection)
-        )
-        sizes = every
-        if rest.dimensions < whole.dimensions:
-            sizes = self._steer(whole.unwhitened(rest.projection).astype(np.complex64))
+        every: Floats | NDArray[np.float32] = np.full((len(self._omega), 1), float(whole.dimensions))
+        if whole.is_whitened:
+            every = self._powers_of(whole, whole.projection)
+        sizes = every if rest.dimensions == whole.dimensions else self._powers_of(whole, rest.projection)
+        powers = self._powers_of(whole, rest.rest)
         ratio = np.where(sizes >= _BLIND * every, powers / np.maximum(sizes, _BLIND * every), 0)
         return np.asarray(self._scan.directions[int(((rest.weights / rest.power) @ ratio).argmax())])
+
+    def _powers_of(self, whole: BandLikelihood, matrices: Matrices) -> NDArray[np.float32]:
+        """Return the powers of matrices for the whitened wave from each direction: (bin, direction)."""
+        return self._steer(whole.unwhitened(matrices).astype(np.complex64))
 
     def _source(
         self, likelihood: BandLikelihood, places: Floats, k: int, level: Floats, n_samples: float
