@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba import checks, kernels
 from ertis_numba.accepted_words import AcceptedWords, rescaled
@@ -15,7 +15,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.range_cleaning import clean_in_place
 from ertis_numba.errors import ArgumentError, DeviceError
 from ertis_numba.frames import Beams, Energyscape, Measurement, MicrophoneSignals
-from ertis_numba.geometry import Grid, microphones
+from ertis_numba.geometry import Grid, levelled_grid, microphones
 from ertis_numba.image_checks import ImageChecks
 from ertis_numba.settings import ERROR_PRESETS_DB, Settings
 from ertis_numba.stages import paper, paper_scipy, planner
@@ -33,6 +33,10 @@ __all__ = ["Pipeline"]
 
 _GPU_BATCH: Final = 16  # measurements; several times as many as a GPU has lanes
 _MAX_BATCH_BYTES: Final = 2**30
+_NO_ATTITUDE: Final = (
+    "no attitude is given; give Pipeline.process the attitude_xyzw of each measurement, or process a recording with "
+    "poses by 'ertis process --level'"
+)
 
 
 class Pipeline:
@@ -154,6 +158,7 @@ class Pipeline:
         *,
         threads: int | None = None,
         stream: WordStream | None = None,
+        attitude_xyzw: ArrayLike | None = None,
         clean: bool = True,
     ) -> Energyscape:
         """Return the energyscape of one measurement.
@@ -168,6 +173,11 @@ class Pipeline:
         stream : WordStream, optional
             Stream to which the words of the measurement were added as they arrived; see `stream`. The image has the
             same bits as without it.
+        attitude_xyzw : (4,) array_like of float, optional
+            Unit quaternion that rotates the sensor frame into the world frame; required if
+            ``processing.level_directions`` is true. The directions of the image then refer to the horizontal plane; see
+            `levelled_grid`. Directions that lie behind a sensor in this attitude, but in front of a level one, have the
+            amplitude 0. The tables of the chain are computed for each measurement.
         clean : bool, default True
             False to omit the cleaning that ``settings.processing`` may request. The settings of the image then request
             none.
@@ -181,7 +191,8 @@ class Pipeline:
         DataError
             The measurement's array, call, record or air, or its data, are not those of the pipeline's settings.
         ArgumentError
-            ``out`` has another shape or type, the device has fewer threads, or the stream is of another pipeline.
+            ``out`` has another shape or type, the device has fewer threads, the stream is of another pipeline, or
+            ``attitude_xyzw`` is invalid, missing or not needed.
 
         Examples
         --------
@@ -193,8 +204,17 @@ class Pipeline:
         """
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         self.settings.processing.require_image()
+        if attitude_xyzw is not None and not self.settings.processing.level_directions:
+            raise ArgumentError(
+                "attitude_xyzw is given, but processing.level_directions is false; leave attitude_xyzw out, or set "
+                "level_directions"
+            )
         words, exponent = self._words_of(measurement)
         amplitude = self._chain.new_image() if out is None else self._checked_out(out)
+        if attitude_xyzw is not None:
+            self._process_levelled(words, amplitude, attitude_xyzw, threads=threads)
+            return self._checked_image(rescaled(amplitude, exponent), measurement, clean=clean)
+        self.settings.processing.require_sensor_frame(_NO_ATTITUDE)
         if stream is not None and isinstance(self._chain, KernelChain):
             self._chain.process_streamed(stream, words, amplitude, threads=threads)
         elif stream is None or stream.is_of(None):
@@ -252,6 +272,7 @@ class Pipeline:
         """
         self._require_open()
         self.settings.processing.require_image()
+        self.settings.processing.require_sensor_frame(_NO_ATTITUDE)
         batch = list(checks.items("measurements", measurements, Measurement, "a recording holds"))
         words = [self._words_of(measurement) for measurement in batch]
         amplitudes = [self._chain.new_image() for _ in batch]
@@ -301,6 +322,7 @@ class Pipeline:
         """
         self._require_open()
         self.settings.processing.require_image()
+        self.settings.processing.require_sensor_frame(_NO_ATTITUDE)
         size = self._batch_size() if batch_size is None else checks.integer("batch_size", batch_size, 1)
         return self._batches(checks.items("measurements", measurements, Measurement, "a recording holds"), size)
 
@@ -392,6 +414,7 @@ class Pipeline:
         'complex64'
         """
         self.settings.processing.require_beams("beams are needed")
+        self.settings.processing.require_sensor_frame("beams are computed in the frame of the sensor")
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         words, exponent = self._words_of(measurement)
         settings, chain = self._beam_chain
@@ -473,6 +496,19 @@ class Pipeline:
         # Raised here, because a pending exception would keep the memory allocated, and a smaller pipeline would fail.
         raise DeviceError(failed)
 
+    def _process_levelled(
+        self, words: NDArray[Any], out: NDArray[np.float32], attitude_xyzw: ArrayLike, *, threads: int | None
+    ) -> None:
+        """Compute the image of one measurement in directions relative to the horizontal plane."""
+        grid, is_behind = levelled_grid(self.grid, attitude_xyzw)
+        kernel_set = kernels.load(self.device)
+        chain = _chain(self.settings, kernel_set, self._threads, graphs=False, grid=grid)
+        try:
+            chain.process(words, out, threads=threads)
+        finally:
+            chain.close()
+        out[is_behind] = 0.0
+
     def _require_open(self) -> None:
         if self._closed:
             raise ArgumentError("the pipeline is closed; create another one")
@@ -514,9 +550,11 @@ def _without_cleaning(settings: Settings) -> Settings:
     return settings.replace(**{"processing.clean_within_db": None, "processing.clean_above_mean_db": None})
 
 
-def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool | None) -> Chain:
+def _chain(
+    settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool | None, grid: Grid | None = None
+) -> Chain:
     if settings.processing.method == "fast":
-        return FastChain(settings, kernel_set, threads=threads, graphs=graphs)
+        return FastChain(settings, kernel_set, threads=threads, graphs=graphs, grid=grid)
     if kernel_set.device == "numpy":
-        return paper_scipy.ScipyPaperChain(settings)
-    return paper.PaperChain(settings, kernel_set, threads=threads, graphs=graphs)
+        return paper_scipy.ScipyPaperChain(settings, grid=grid)
+    return paper.PaperChain(settings, kernel_set, threads=threads, graphs=graphs, grid=grid)

@@ -296,6 +296,7 @@ def comparisons(
 
     with open_energyscapes(path, sensor=sensor) as images:
         if images.truth is None:
+            images.settings.processing.require_sensor_frame("the ground truth is in the frame of the sensor")
             raise DataError(
                 f"{path}: sensor {sensor} holds no ground truth; simulate a scene and process that recording"
             )

@@ -43,6 +43,12 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N, 3d:N, or a CSV of azimuth, elevation in °.")
 @click.option("--azimuth", type=options.INTERVAL, help="Azimuth limits of 2d:N and 3d:N in °.")
 @click.option("--elevation", type=options.ELEVATION, help="Elevation limits A:B of 3d:N, or elevation E of 2d:N, in °.")
+@click.option(
+    "--level/--no-level",
+    default=None,
+    help="Turn directions by roll and pitch of the poses, so that they refer to the horizontal plane; the recording's "
+    "own by default.",
+)
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
 @click.option(
     "--method", type=click.Choice(["fast", "paper"]), help="Processing method; the recording's own by default."
@@ -130,6 +136,7 @@ def process(
     directions: str | None,
     azimuth: tuple[float, float] | None,
     elevation: tuple[float, float] | float | None,
+    level: bool | None,
     range_m: tuple[float, float] | None,
     method: str | None,
     array_weights: str | None,
@@ -187,6 +194,7 @@ def process(
             directions=directions,
             azimuth_limits_deg=azimuth,
             elevation=elevation,
+            level_directions=level,
             range_m=range_m,
             method=method,
             **other,
@@ -280,7 +288,7 @@ def process(
 def _require_options_of(*, fuse: bool, target: str | None) -> None:
     """Refuse options that apply only with or only without --fuse."""
     context = click.get_current_context()
-    for name in ("sensor", "dtype", "verify", "explain", "workers", "scheduler") if fuse else ():
+    for name in ("sensor", "level", "dtype", "verify", "explain", "workers", "scheduler") if fuse else ():
         if typed(name):
             raise click.UsageError(f"--{name} does not apply to --fuse; leave it out", context)
     if not fuse and typed("emitter_diameter_m"):

@@ -123,7 +123,7 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     Raises
     ------
     ArgumentError
-        ``min_level_db`` is above 0.
+        ``min_level_db`` is above 0, or the directions of the image are levelled.
 
     Examples
     --------
@@ -141,6 +141,7 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     reflectors = list(checks.items("reflectors", reflectors, Reflector, "RecordingReader.reflectors returns"))
     checks.between("min_level_db", min_level_db, _MIN_DB, 0.0)
+    image.settings.processing.require_sensor_frame("the ground truth is in the frame of the sensor")
     lobe = _Lobe(image.settings)
     in_view = _in_view(image, reflectors, lobe)
     in_range = _in_range(image, reflectors)

@@ -4,11 +4,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import overload
 
+from ertis_numba.campaign.attitudes import Attitudes
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Behaviour, Measurement, Stamp
 from ertis_numba.passive import is_passive
 from ertis_numba.settings import Settings
 from ertis_numba.storage import RecordingReader
+from ertis_numba.storage.recording import Mounting
 
 __all__ = ["EchoMeasurements", "count_images", "passive_note", "require_images"]
 
@@ -51,6 +53,18 @@ class EchoMeasurements(Sequence[Measurement]):
 
     def __iter__(self) -> Iterator[Measurement]:
         return (self.recording[place] for place in self._places)
+
+    def attitudes(self, mountings: Mapping[str, Mounting] | None = None) -> Attitudes:
+        """Return the attitudes of the sensor at its measurements; raises the errors of `Attitudes`.
+
+        Parameters
+        ----------
+        mountings : mapping of str to (translation_m, rotation_xyzw), optional
+            Mountings by sensor, in place of those of the recording.
+        """
+        stamps = self.recording.stamps()
+        _, rotation_xyzw = (mountings or {}).get(self.sensor, (None, None))
+        return Attitudes(self.recording, [stamps[place] for place in self._places], rotation_xyzw)
 
     @property
     def note(self) -> str:

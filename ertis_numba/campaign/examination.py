@@ -5,6 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from ertis_numba import kernels, verification
+from ertis_numba.campaign.attitudes import unlevelled_image
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
@@ -66,7 +67,7 @@ def examine(
     planners = {
         # Measured costs give the times on this machine.
         "safe": Planner(settings, kernel_set, threads=n_threads, plan="measured"),
-        "signal_model": heard or planner_of(pipeline.process(first, clean=False), first, kernel_set, threads=n_threads),
+        "signal_model": heard or planner_of(unlevelled_image(pipeline, first), first, kernel_set, threads=n_threads),
     }
     if explain:
         yield "plan", _plan(planners, settings)
@@ -120,7 +121,7 @@ def _plane_waves(model: ErrorModel, settings: Settings) -> list[dict[str, float]
 def _verified(pipeline: Pipeline, first: Measurement, planners: dict[str, Planner]) -> dict[str, Any]:
     """Return the true error of a measurement, with the predicted errors."""
     accuracy = pipeline.settings.accuracy
-    measured = verification.measure(pipeline.process(first, clean=False), first)
+    measured = verification.measure(unlevelled_image(pipeline, first), first)
     return {
         "sequence": first.stamp.sequence,
         "directions": measured.n_directions,

@@ -11,6 +11,7 @@ from typing import Any
 
 from ertis_numba import kernels
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
+from ertis_numba.campaign.attitudes import unlevelled_image
 from ertis_numba.campaign.echo_measurements import EchoMeasurements, require_images
 from ertis_numba.campaign.sensor_processing import SensorProcessing, describe_faults
 from ertis_numba.campaign.tasks import CampaignOptions
@@ -131,10 +132,14 @@ def prepare_recording(
             dtype=options.dtype,
             overwrite=options.overwrite,
         )
+        levelled = [
+            recording.attitudes(options.mounting) if each.processing.level_directions else None
+            for recording, each in zip(recordings, chosen, strict=True)
+        ]
         checks = _begin_checks(stack, recordings, chosen)
         runs = [
-            SensorProcessing(pipeline, batch=options.batch, max_bytes=max_bytes)
-            for pipeline in stack.enter_context(pipelines(chosen))
+            SensorProcessing(pipeline, batch=options.batch, max_bytes=max_bytes, attitudes=attitudes)
+            for pipeline, attitudes in zip(stack.enter_context(pipelines(chosen)), levelled, strict=True)
         ]
         for run, recording, check in zip(runs, recordings, checks, strict=True):
             _check_sensor(run, recording, check.result(), options, warn, show)
@@ -252,7 +257,7 @@ def _check_sensor(
     if run.pipeline.settings.processing.method != "paper":
         kernel_set = kernels.load(run.pipeline.device)
         threads = kernel_set.max_threads if options.threads is None else options.threads
-        heard = planner_of(run.pipeline.process(first, clean=False), first, kernel_set, threads=threads)
+        heard = planner_of(unlevelled_image(run.pipeline, first), first, kernel_set, threads=threads)
         run.prediction = predict(heard)
         run.reported |= _wavefront(heard, recording, show)
         if run.prediction.warning:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ertis_numba.analysis.health import health
 from ertis_numba.analysis.health.kinds import DISABLE
+from ertis_numba.campaign.attitudes import Attitudes
 from ertis_numba.campaign.echo_measurements import EchoMeasurements
 from ertis_numba.campaign.tasks import MAX_WAITING_BYTES
 from ertis_numba.errors import DataError
@@ -52,6 +53,8 @@ class SensorProcessing:
         Number of measurements per batch; fewer if the images exceed ``max_bytes``.
     max_bytes : float, optional
         Limit on images that wait to be written, in bytes; `MAX_WAITING_BYTES` by default.
+    attitudes : Attitudes, optional
+        Attitudes of the sensor; required if ``processing.level_directions`` is true.
 
     Attributes
     ----------
@@ -67,8 +70,16 @@ class SensorProcessing:
         Warning that echoes do not match the call; empty if they do.
     """
 
-    def __init__(self, pipeline: Pipeline, *, batch: int, max_bytes: float | None = None) -> None:
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        *,
+        batch: int,
+        max_bytes: float | None = None,
+        attitudes: Attitudes | None = None,
+    ) -> None:
         self.pipeline = pipeline
+        self._attitudes = attitudes
         self.times_ms: list[float] = []
         self.reported: dict[str, Any] = {}
         self.prediction: Prediction | None = None
@@ -103,7 +114,13 @@ class SensorProcessing:
 
     def _processed(self, measurements: Sequence[Measurement]) -> list[Energyscape]:
         start_s = time.perf_counter()
-        if len(measurements) == 1:
+        if self._attitudes is not None:
+            attitudes = map(self._attitudes, measurements)
+            images = [
+                self.pipeline.process(each, attitude_xyzw=attitude)
+                for each, attitude in zip(measurements, attitudes, strict=True)
+            ]
+        elif len(measurements) == 1:
             images = [self.pipeline.process(measurements[0])]
         else:
             images = self.pipeline.process_batch(measurements)

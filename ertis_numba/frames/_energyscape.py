@@ -36,7 +36,9 @@ class Energyscape(DegreesFromRadians):
     amplitude : (direction, range) float32
         Envelope amplitude; a full-scale echo of the whole call in every microphone has 1.
     azimuth_rad, elevation_rad : (direction,) float64
-        Directions in the sensor frame: x is forward, azimuth counts towards y, elevation towards z.
+        Directions in the sensor frame: x is forward, azimuth counts towards y, elevation towards z. If
+        ``settings.processing.level_directions`` is true, they refer to the horizontal plane instead: z is up, and x has
+        the heading of the sensor.
     range_m : (range,) float64
         Half of the sound's path, at the speed of sound in the air of the settings.
     settings : Settings

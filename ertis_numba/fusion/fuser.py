@@ -188,6 +188,7 @@ class Fuser:
         found: dict[int, Energyscape] = {}
         for image in checks.items("images", images, Energyscape, "Pipeline.process returns"):
             number = self._number(image.stamp.sensor, "images")
+            image.settings.processing.require_sensor_frame("fusion needs directions of each sensor")
             if number in found:
                 raise ArgumentError(f"images has two of sensor {image.stamp.sensor!r}; give one image of each sensor")
             found[number] = image

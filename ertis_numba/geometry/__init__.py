@@ -19,6 +19,7 @@ from ertis_numba.geometry.layouts import (
     storable,
     written_out,
 )
+from ertis_numba.geometry.levelling import levelled_grid
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
 from ertis_numba.geometry.sector import Fan, plan_m, round_step
@@ -44,6 +45,7 @@ __all__ = [
     "layout_file",
     "layout_names",
     "layout_text",
+    "levelled_grid",
     "load_layout",
     "microphones",
     "mounting",

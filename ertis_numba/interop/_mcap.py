@@ -53,7 +53,7 @@ def write_mcap(
     ------
     ArgumentError
         The packages for MCAP are not installed, two sensors would share a topic, the name of a sensor is invalid, or a
-        time is outside the range of ROS 2.
+        time is outside the range of ROS 2, or directions are levelled.
     """
     with path.open("wb") as file, _started(file) as writer:
         _McapWriter(writer, find, mountings, topics).write(images)
@@ -142,6 +142,7 @@ class _McapWriter:
             if earliest is None or stamp.timestamp_ns < earliest.timestamp_ns:
                 earliest = stamp
             if sensor not in metadata:
+                image.settings.processing.require_sensor_frame("messages of ROS are in the frame of the sensor")
                 metadata[sensor] = {"sensor": sensor, "settings": self_contained(image.settings).to_toml()}
                 behaviours[sensor] = Counter()
             behaviours[sensor][stamp.behaviour] += 1

@@ -160,6 +160,7 @@ def grouped(items: Iterable[Item], name: str) -> Mapping[str, Item]:
         if not isinstance(item, Energyscape | PointCloud):
             raise ArgumentError(f"{name} has a {type(item).__name__}; give images of Pipeline.process, or point clouds")
         sensor = item.stamp.sensor
+        item.settings.processing.require_sensor_frame("odometry needs directions of each sensor")
         if sensor in group:
             raise ArgumentError(f"{name} has two items of sensor {sensor!r}; give one of each sensor")
         group[sensor] = item

@@ -82,6 +82,7 @@ class AcousticCamera:
         if isinstance(settings, str | Path):
             settings = Settings.load(settings)
         checks.instance("settings", settings, Settings, "a recording holds, or Settings.from_preset returns")
+        settings.processing.require_sensor_frame("acoustic maps are means over measurements at several poses")
         kernel_set = kernels.load(device)
         self._threads = kernel_set.max_threads if threads is None else threads
         with kernel_set.threads(self._threads):  # refuses an impossible number

@@ -179,8 +179,9 @@ class RosPublisher:
         Raises
         ------
         ArgumentError
-            Two sensors would share topics, or the time is outside the range of ROS 2.
+            Two sensors would share topics, the time is outside the range of ROS 2, or directions are levelled.
         """
+        item.settings.processing.require_sensor_frame("messages of ROS are in the frame of the sensor")
         if not item.stamp.is_timed:
             item = item.replace(stamp=replace(item.stamp, timestamp_ns=time.time_ns()))
         stamp = item.stamp

@@ -44,6 +44,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         Limits of grids with a count (``2d:N`` and ``3d:N``) in degrees.
     elevation_deg : float, default 0
         Elevation of all directions of ``2d:N``, -90 to 90 degrees.
+    level_directions : bool, default False
+        Turn the directions by the roll and pitch of each measurement's pose, so that azimuth and elevation refer to the
+        horizontal plane; see ``docs/how-to/motion.md``.
     range_m : (first, last), default (0.5, 5)
         First and last range in metres.
     range_decimation : int, default 100
@@ -110,6 +113,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     azimuth_limits_deg: tuple[float, float] = (-90.0, 90.0)
     elevation_limits_deg: tuple[float, float] = (-90.0, 90.0)
     elevation_deg: float = 0.0
+    level_directions: bool = False
     range_m: tuple[float, float] = (0.5, 5.0)
     range_decimation: int = 100
     band_edges_hz: tuple[float, float] | None = None
@@ -309,6 +313,11 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         given = self.delay_matrix
         if not given:
             return
+        if self.level_directions:
+            raise ArgumentError(
+                "processing.level_directions is true, but the delays of processing.delay_matrix cannot be turned; "
+                "leave one out"
+            )
         if not isinstance(given, str):
             check_delays(given)
         if self.is_adaptive or self.wavefront != "plane":
@@ -368,6 +377,22 @@ class Processing(TomlTable, frozen=True, kw_only=True):
                 f"processing.last_stage is {self.last_stage!r}, which yields no image; give 'envelope', or call "
                 "Pipeline.result for the result of that stage"
             )
+
+    def require_sensor_frame(self, reason: str) -> None:
+        """Refuse directions that refer to the horizontal plane, where those of the sensor are needed.
+
+        Parameters
+        ----------
+        reason : str
+            Reason in the error.
+
+        Raises
+        ------
+        ArgumentError
+            ``level_directions`` is true.
+        """
+        if self.level_directions:
+            raise ArgumentError(f"processing.level_directions is true, but {reason}; set it to false")
 
     def require_beams(self, wanted: str) -> None:
         """Refuse a method or beamformer without beams.

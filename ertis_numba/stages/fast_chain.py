@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import Grid, array_weights, delay_matrix, direction_grid, microphones, unit_vectors
+from ertis_numba.geometry import Grid, array_weights, delay_matrix, microphones, unit_vectors
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
 from ertis_numba.stages.adaptive import AdaptiveBeamform
@@ -49,11 +49,11 @@ class FastChain(KernelChain):
     The settings have a complete plan: see `planner.complete`.
     """
 
-    def _make(self, settings: Settings) -> None:
+    def _make(self, settings: Settings, grid: Grid) -> None:
         memory, kernels, threads = self._memory, self._kernels, self._threads
         plan = settings.accuracy
         layout = microphones(settings.array)
-        self.grid: Grid = direction_grid(settings.processing)
+        self.grid = grid
         speed_m_s = sound_speed_m_s(settings.air)
         aperture = Aperture.of(layout.enabled_positions_m, unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad))
         spectrum = spectrum_of(settings)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import fft
-from ertis_numba.geometry import Grid
+from ertis_numba.geometry import Grid, direction_grid
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beamform import Beamform
@@ -54,6 +54,8 @@ class KernelChain(ABC):
         Default number of threads.
     graphs : bool, optional
         True to record the chain as a CUDA graph and replay it; by default on every GPU.
+    grid : Grid, optional
+        Directions of the image in the sensor frame; those of the settings by default.
 
     Attributes
     ----------
@@ -74,15 +76,23 @@ class KernelChain(ABC):
     _matched_filter: Compress
     _beamform: Beamform | PhaseShifts
 
-    def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int, graphs: bool | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        kernels: KernelSet,
+        *,
+        threads: int,
+        graphs: bool | None = None,
+        grid: Grid | None = None,
+    ) -> None:
         self._memory = kernels.memory(graphs=graphs)
         self._pool = BufferPool()
         self._kernels, self._threads = kernels, threads
         with one_thread():
-            self._make(settings)
+            self._make(settings, direction_grid(settings.processing) if grid is None else grid)
 
     @abstractmethod
-    def _make(self, settings: Settings) -> None:
+    def _make(self, settings: Settings, grid: Grid) -> None:
         """Create the axes and the stages."""
 
     def process(

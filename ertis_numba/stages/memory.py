@@ -118,9 +118,10 @@ def require_images(settings: Settings) -> None:
     Raises
     ------
     ArgumentError
-        An image or its pipeline would be too large, the ranges lie outside the record, the array cannot be used, or the
-        last stage yields no image.
+        An image or its pipeline would be too large, the ranges lie outside the record, the array cannot be used, the
+        last stage yields no image, or directions depend on poses.
     """
     settings.processing.require_image()
+    settings.processing.require_sensor_frame("a central node does not know the poses of measurements in time")
     require_image_size(settings)
     require_memory(settings, MAX_BYTES)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import fft
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import array_weights, direction_grid, microphones, plane_delays
+from ertis_numba.geometry import Grid, array_weights, microphones, plane_delays
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beamform import Buffers
@@ -42,9 +42,9 @@ class PaperChain(KernelChain):
         The device has too little memory.
     """
 
-    def _make(self, settings: Settings) -> None:
+    def _make(self, settings: Settings, grid: Grid) -> None:
         layout, memory, kernels = microphones(settings.array), self._memory, self._kernels
-        self.grid = direction_grid(settings.processing)
+        self.grid = grid
         n_samples = -(-settings.recording.n_samples // settings.decimation)
         self.range_m, outputs = range_axis(settings, n_samples)
         waves_s = plane_delays(settings, self.grid, sound_speed_m_s=sound_speed_m_s(settings.air))

@@ -34,6 +34,8 @@ class ScipyPaperChain:
     Parameters
     ----------
     settings : Settings
+    grid : Grid, optional
+        Directions of the image; those of the settings by default.
 
     Attributes
     ----------
@@ -49,9 +51,9 @@ class ScipyPaperChain:
         The range window extends beyond the record or contains no sample.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, *, grid: Grid | None = None) -> None:
         layout = microphones(settings.array)
-        self.grid: Grid = direction_grid(settings.processing)
+        self.grid: Grid = direction_grid(settings.processing) if grid is None else grid
         self._n_samples = -(-settings.recording.n_samples // settings.decimation)
         self.range_m, self._window = range_axis(settings, self._n_samples)
         waves_s = plane_delays(settings, self.grid, sound_speed_m_s=sound_speed_m_s(settings.air))

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 import h5py
 import numpy as np
@@ -24,6 +24,10 @@ from ertis_numba.storage.schema import FORMAT_VERSION, POSES, Variable, create_v
 from ertis_numba.storage.truth import GroundTruth
 
 __all__ = ["ResultFile", "ResultReader", "ResultWriter"]
+
+_LEVEL_COMMENT: Final = (
+    "relative to the horizontal plane and to the heading of the sensor (processing.level_directions)"
+)
 
 Result = TypeVar("Result", Energyscape, AcousticMap)
 
@@ -115,6 +119,9 @@ class ResultWriter(ResultFile, FileWriter[Result]):
         for name, values in axes.items():
             group[name][:] = values
         set_attributes(group[self._data], {"coordinates": "azimuth elevation"})
+        if first.settings.processing.level_directions:
+            for name in ("azimuth", "elevation"):
+                set_attributes(group[name], {"comment": _LEVEL_COMMENT})
 
     def _row(self, item: Result) -> tuple[NDArray[Any], dict[str, float]]:
         first = self._first[item.stamp.sensor]

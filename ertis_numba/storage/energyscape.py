@@ -47,7 +47,8 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         Path of the file.
     recording : RecordingReader or sequence of RecordingReader, optional
         Recording of the images: one reader, or one for each sensor of the same recording. The file stores its UUID and
-        SHA-256, and the poses and the ground truth of the measurements.
+        SHA-256, and the poses and the ground truth of the measurements. Images in level directions have no ground
+        truth, because it is in the frame of the sensor.
     truth : mapping of str to GroundTruth, optional
         Ground truth by name of the sensor, instead of that of the recording.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
@@ -130,6 +131,8 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         given = super()._sensor_truth(sensor, group)
         if given is not None or sensor not in self._recorded:
             return given
+        if self._first[sensor].settings.processing.level_directions:
+            return None  # The ground truth is in the frame of the sensor.
         truth, recorded = self._recorded[sensor]
         written = RowReader(group, self._data).stamps(sensor)
         if written == recorded:

@@ -45,6 +45,7 @@ class SharedPipeline:
     def __init__(self, settings: str, device: str, plan: PlanCosts = "nominal") -> None:
         stated = Settings.from_toml(settings, "settings of a sensor", find_line=False)
         stated.processing.require_image()
+        stated.processing.require_sensor_frame("a central node does not know the poses of measurements in time")
         self.pipeline = Pipeline(stated, device=device, max_bytes=memory.MAX_BYTES, predict=False, plan=plan)
         self.shape = (len(self.pipeline.grid), len(self.pipeline.range_m))
         self.format = sample_format(self.pipeline.settings)

@@ -1,0 +1,72 @@
+"""Directions relative to the horizontal plane, for a sensor that is tilted."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry.delays import unit_vectors
+from ertis_numba.geometry.grids import Grid
+from ertis_numba.geometry.mountings import mounting
+
+__all__ = ["levelled_grid"]
+
+_MIN_HORIZONTAL = 1e-3  # of the unit vector forward, so that the sensor has a heading
+_ROUNDING = 1e-9
+
+
+def levelled_grid(grid: Grid, attitude_xyzw: ArrayLike) -> tuple[Grid, NDArray[np.bool_]]:
+    """Return directions of the sensor frame for given directions relative to the horizontal plane.
+
+    The level frame has the origin and the heading of the sensor, and its z axis points up. With the rotation matrix R
+    of the sensor in the world and the heading ψ of its x axis, a direction d of the level frame is ``Rᵀ Rz(ψ) d`` in
+    the sensor frame. Jansen, Laurijssen and Steckel (arXiv 2406.06255) thus compensate the pitch of a vehicle; this
+    function also compensates roll.
+
+    Parameters
+    ----------
+    grid : Grid
+        Directions in the level frame.
+    attitude_xyzw : (4,) array_like of float
+        Unit quaternion that rotates the sensor frame into the world frame.
+
+    Returns
+    -------
+    turned : Grid
+        The same directions in the sensor frame.
+    is_behind : (direction,) bool
+        True for directions in front of the sensor (x ≥ 0) that are behind it when they are turned. A planar array
+        cannot distinguish them from directions in front.
+
+    Raises
+    ------
+    ArgumentError
+        The quaternion is invalid, or the sensor looks straight up or down, so that it has no heading.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ertis_numba.geometry import Grid, levelled_grid
+    >>> from scipy.spatial.transform import Rotation
+    >>> ahead = Grid(np.array([0.0]), np.array([0.0]))
+    >>> nose_down = Rotation.from_euler("y", 10, degrees=True).as_quat()
+    >>> turned, _ = levelled_grid(ahead, nose_down)
+    >>> turned.elevation_deg.round(6).tolist()
+    [10.0]
+    """
+    given_xyzw: Any = np.asarray(attitude_xyzw)
+    rotation = Rotation.from_quat(mounting("attitude", None, given_xyzw)["rotation_xyzw"]).as_matrix()
+    forward = rotation[:, 0]
+    if np.hypot(*forward[:2]) < _MIN_HORIZONTAL:
+        raise ArgumentError(
+            "the sensor looks straight up or down, so that its images have no level directions; leave out "
+            "processing.level_directions"
+        )
+    heading_rad = np.arctan2(forward[1], forward[0])
+    given = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+    turned = given @ Rotation.from_euler("z", heading_rad).as_matrix().T @ rotation
+    is_behind = (given[:, 0] >= -_ROUNDING) & (turned[:, 0] < -_ROUNDING)
+    azimuth_rad = np.arctan2(turned[:, 1], turned[:, 0])
+    return Grid(azimuth_rad, np.arcsin(np.clip(turned[:, 2], -1.0, 1.0))), is_behind
