@@ -17,7 +17,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, NetworkError, RefusedError
+from ertis_numba.errors import ArgumentError, DataError, NetworkError, RefusedError
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalPose
 from ertis_numba.journal._tables import row_crc32
 from ertis_numba.network import messages
@@ -31,7 +31,7 @@ from ertis_numba.network.pose_publisher import PosePublisher
 from ertis_numba.network.zap_authenticator import EVERYBODY
 from ertis_numba.settings import Processing
 from ertis_numba.simulation import Electronics, Point, Scene, Sensor
-from tests.central import Node, running
+from tests.central import Node, running, stored, wanted
 from tests.journals import ENVIRONMENT, entries
 from tests.pages import ROOT
 from tests.test_record import Recording
@@ -399,3 +399,35 @@ with PosePublisher(sys.argv[1], ["left"]) as publisher:
         publisher.send(time_ns, (10.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     publisher.flush(60.0)
 """
+
+
+def test_disk_that_fails_while_poses_are_stored_loses_nothing(tmp_path, monkeypatch):
+    """After the error, measurements and poses go into another journal; those acknowledged before stay in the first."""
+    measured = entries(6)
+    times_ns = times_of(measured)
+    append, fails = Journal.append_poses, threading.Event()
+
+    def append_or_fail(journal, poses):
+        if not fails.is_set():
+            fails.set()
+            raise DataError("the disk has failed")
+        append(journal, poses)
+
+    monkeypatch.setattr(Journal, "append_poses", append_or_fail)
+    with (
+        running(archive=Archive(tmp_path)) as central,
+        PosePublisher(central.address, ["left"]) as publisher,
+        Node(central.address) as node,
+    ):
+        publisher.flush()
+        send(publisher, drive(times_ns[0], times_ns[-1]))
+        node.hello()
+        node.measure(*measured[:3])
+        node.hear_settled(12)
+        assert fails.wait(60.0)
+        node.measure(*measured[3:])
+        node.hear_settled(15)
+    found = [trajectory_of(path) for path in sorted(tmp_path.glob("*.h5"))]
+    assert np.concatenate([each.time_ns for each in found if each is not None]).tolist()[-3:] == times_ns[3:]
+    assert stored(tmp_path)[0] == wanted(measured)
+    assert [event["event"] for event in central.events].count("fault") == 1
