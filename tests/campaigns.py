@@ -1,5 +1,6 @@
 """Small recordings, and a worker pool in this process, for the tests of campaigns."""
 
+import json
 from collections import deque
 
 from ertis_numba.campaign import Campaign, RecordingEnded, find_recordings
@@ -42,8 +43,9 @@ class InlinePool:
     def wait(self, _):
         task = self.tasks.popleft()
         advanced = []
-        result = run_task(task.action, task.arguments, lambda done: advanced.append(TaskUpdate(task.number, done)))
-        return [*advanced, TaskUpdate(task.number, result=result)]
+        arguments = json.loads(json.dumps(task.arguments))  # as for a worker process
+        result = run_task(task.action, arguments, lambda done: advanced.append(TaskUpdate(task.number, done)))
+        return [*advanced, TaskUpdate(task.number, result=json.loads(json.dumps(result)))]
 
     def close(self):
         self.tasks.clear()
