@@ -16,6 +16,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.geometry import microphones
 from ertis_numba.interop import PcmReader
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.sensor_check import check_recording
 from ertis_numba.settings import Array, Call, Processing, Recording, Settings
 from ertis_numba.storage import open_recording, write_recording
 from ertis_numba.verification import error_db
@@ -146,6 +147,32 @@ def test_given_settings_are_kept(tmp_path):
     path = write_wav(tmp_path / "a.wav", numbers())
     asked = PCM.processing.replace(range_decimation=2, range_m=(0.2, 1.0))
     assert ertis.open_pcm(path, PCM.replace(processing=asked)).settings.processing == asked
+
+
+def test_recording_without_a_call_needs_no_fitting_call(tmp_path):
+    """The default call of 25 to 50 kHz does not fit 44.1 kHz, but nothing was emitted."""
+    path = write_wav(tmp_path / "a.wav", numbers(9_000), 44_100)
+    (tmp_path / "ring.toml").write_text(PCM.replace(**{"passive.bands_hz": ((2e3, 4e3),)}).to_toml())
+    command = ["import", str(path), "--settings", str(tmp_path / "ring.toml"), "--length", "0.1"]
+    refused = CliRunner().invoke(cli, [*command, "-o", str(tmp_path / "refused.h5")])
+    assert refused.exit_code == 1
+    assert "or give --passive (passive=True) if no call was emitted" in refused.stderr
+    done = CliRunner().invoke(cli, [*command, "--passive", "-o", str(tmp_path / "rec.h5")])
+    assert done.exit_code == 0, done.stderr
+    assert "cannot be processed" not in done.stderr
+    with open_recording(tmp_path / "rec.h5") as recording:
+        assert [stamp.behaviour for stamp in recording.stamps()] == ["passive"] * 2
+        with ertis.AcousticCamera(recording.settings, "numpy") as camera:
+            found = camera.process(recording[1])
+    assert found.band_hz.tolist() == [[2000.0, 4000.0]]
+    assert check_recording(tmp_path / "rec.h5").is_fit
+    for line in ("process rec.h5 -o maps.h5", "plot rec.h5 -o a.png", "info rec.h5 --health", "check rec.h5"):
+        arguments = [str(tmp_path / each) if "." in each else each for each in line.split()]
+        done = CliRunner().invoke(cli, arguments)
+        assert done.exit_code == 0, (line, done.stderr, done.exception)
+    images = CliRunner().invoke(cli, ["process", str(tmp_path / "rec.h5"), "--mode", "active"])
+    assert images.exit_code != 0
+    assert "give one that leaves more than twice the call's 50000 Hz" in images.stderr
 
 
 REFUSED = {

@@ -57,6 +57,7 @@ _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
     type=click.DateTime([f"%Y-%m-%dT%H:%M{rest}{zone}" for rest in ("", ":%S", ":%S.%f") for zone in ("", "%z")]),
     help="PCM: time of the first emission, as 2026-05-04T12:30 or 12:30:00.5, in UTC unless it has an offset.",
 )
+@click.option("--passive", is_flag=True, help="PCM: no call was emitted, so the settings need no call.")
 @click.option("--sensor", metavar="NAME", default="sensor", show_default=True, help="Name of the sensor.")
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
 @click.option("--humidity", type=float, metavar="PCT", help="Relative humidity in percent; 50 by default.")
@@ -73,6 +74,7 @@ def import_raw(
     skip_s: float | None,
     length_s: float | None,
     start: datetime | None,
+    passive: bool,
     sensor: str,
     temperature: float | None,
     humidity: float | None,
@@ -90,12 +92,14 @@ def import_raw(
     for each measurement, and the settings of recording and processing as JSON.
 
     Files that end in .wav contain multichannel PCM, as do .h5 files with the time_data of Acoular. Their channels are
-    the rows of the layout, and their sample rate becomes that of the recording.
+    the rows of the layout, and their sample rate becomes that of the recording. With --passive, they are recordings
+    of other sound than that of a call, for acoustic maps.
     """
     from ertis_numba.storage import check_target, write_recording
 
     is_pcm = all(path.suffix.lower() in _PCM for path in raw)
-    for name, parameter in (("--skip", "skip_s"), ("--length", "length_s"), ("--start", "start")):
+    of_pcm = (("--skip", "skip_s"), ("--length", "length_s"), ("--start", "start"), ("--passive", "passive"))
+    for name, parameter in of_pcm:
         if typed(parameter) and not is_pcm:
             raise click.UsageError(f"{name} is for PCM (.wav, .h5); remove it", click.get_current_context())
     if not is_pcm and any(path.suffix.lower() in _PCM for path in raw):
@@ -111,8 +115,13 @@ def import_raw(
     air = {name: value for name, value in given.items() if value is not None}
     measurements: PcmReader | RawReader
     if is_pcm:
-        times = {"skip_s": skip_s or 0.0, "length_s": length_s, "start_ns": _since_1970_ns(start)}
-        measurements = _opened_pcm(raw, layout, preset, settings_file, sensor, times)
+        given_pcm = {
+            "skip_s": skip_s or 0.0,
+            "length_s": length_s,
+            "start_ns": _since_1970_ns(start),
+            "passive": passive,
+        }
+        measurements = _opened_pcm(raw, layout, preset, settings_file, sensor, given_pcm)
     else:
         measurements = _opened_raw(raw, folder, layout, preset, settings_file, sensor)
     settings = measurements.settings
@@ -167,18 +176,18 @@ def _opened_pcm(
     preset: str | None,
     settings_file: Path | None,
     sensor: str,
-    times: dict[str, Any],
+    given: dict[str, Any],
 ) -> "PcmReader":
     from ertis_numba.interop import open_pcm
 
     settings = None
     if any(part is not None for part in (layout, preset, settings_file)):
-        if settings_file is None and (layout is None or preset is None):
+        if settings_file is None and (layout is None or (preset is None and not given["passive"])):
             _require("--layout" if layout is None else "--preset")
         settings = _settings(layout, preset, settings_file)
     elif raw[0].suffix.lower() == ".wav":
         _require("--settings")
-    return open_pcm(raw, settings, sensor=sensor, **times)
+    return open_pcm(raw, settings, sensor=sensor, **given)
 
 
 def _since_1970_ns(start: datetime | None) -> int:
@@ -198,11 +207,15 @@ def _report_obstacle(settings: "Settings", *, quiet: bool) -> None:
     """Print a note if the recording cannot be processed with its own settings."""
     from ertis_numba.errors import ArgumentError
     from ertis_numba.geometry import direction_grid
+    from ertis_numba.passive.heard_signals import heard_bands
     from ertis_numba.stages.time_window import time_window
 
     try:
         direction_grid(settings.processing)
-        time_window(settings, largest_delay_s=0.0, n_taps=1)
+        if settings.processing.mode == "passive":
+            heard_bands(settings)
+        else:
+            time_window(settings, largest_delay_s=0.0, n_taps=1)
     except ArgumentError as error:
         options.say(f"note: this recording cannot be processed with its own settings: {error}", quiet=quiet)
 

@@ -293,8 +293,11 @@ def _health_lines(section: dict[str, Any]) -> Iterator[str]:
     """Yield the properties of an array."""
     yield f"sensor         {section['sensor']}"
     yield f"measurements   {section['measurements']}, of which {section['examined']} examined"
-    yield f"noise          {_cell(section['noise_dbfs'], 1)} dBFS in the call's band"
-    yield f"dynamic range  {_cell(section['dynamic_range_db'], 1)} dB"
+    without_call = any("no call" in text for text in section["not_observable"])
+    band = "bands of acoustic maps" if without_call else "call's band"
+    yield f"noise          {_cell(section['noise_dbfs'], 1)} dBFS in the {band}"
+    if not without_call:
+        yield f"dynamic range  {_cell(section['dynamic_range_db'], 1)} dB"
     if section["tones_hz"]:
         yield f"common tones   {', '.join(f'{tone_hz / 1000:.1f}' for tone_hz in section['tones_hz'])} kHz"
     for text in section["unknown"]:

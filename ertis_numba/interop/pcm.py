@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.frames import Behaviour, Measurement, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.interop._acoular import read_acoular
 from ertis_numba.settings import Recording, Settings, fit_ranges
@@ -48,7 +48,7 @@ class PcmReader:
     paths : sequence of Path
         Files with the same sample rate and number of channels. Each contains one measurement, or several of
         ``length_s``.
-    settings, sensor, skip_s, length_s, start_ns
+    settings, sensor, skip_s, length_s, start_ns, passive
         See `open_pcm`.
 
     Attributes
@@ -68,6 +68,7 @@ class PcmReader:
         skip_s: float,
         length_s: float | None,
         start_ns: int,
+        passive: bool,
     ) -> None:
         if not paths:
             raise ArgumentError("no PCM file is given; give at least one")
@@ -90,6 +91,9 @@ class PcmReader:
         left = sum(file.n_samples - end for file, end in zip(self._files, ends, strict=True))
         self.rest_s = left / first.rate_hz
         recording = Recording(sample_rate_hz=first.rate_hz, n_samples=self._n_samples, encoding=first.encoding)
+        self._behaviour: Behaviour = "passive" if passive else "unknown"
+        if passive:
+            known = known.replace("processing.mode", "passive")
         self.settings = _fitted(known, recording, first)
         self._enabled = microphones(self.settings.array).enabled
         self._sensor = checks.sensor_name(sensor)
@@ -109,6 +113,7 @@ class PcmReader:
                     sequence=sequence,
                     sync_count=sequence,
                     timestamp_ns=self._start_ns + round(sequence * period_ns),
+                    behaviour=self._behaviour,
                 )
                 words = _samples(file, numbers, slice(start, start + self._n_samples), self._enabled)
                 yield Measurement(words, self.settings, stamp)
@@ -160,6 +165,7 @@ def open_pcm(
     skip_s: float = 0.0,
     length_s: float | None = None,
     start_ns: int = 0,
+    passive: bool = False,
 ) -> PcmReader:
     """Open files of multichannel PCM: WAV, or Acoular's HDF5 (``time_data`` and its ``sample_freq``).
 
@@ -184,6 +190,9 @@ def open_pcm(
     start_ns : int
         Time of the first emission, in nanoseconds since 1970-01-01 UTC; 0 if unknown. The times of the others follow
         from the length of a measurement.
+    passive : bool
+        No call was emitted: ``processing.mode`` becomes ``passive``, and the sample rate may be too low for the call of
+        the settings, which has no meaning.
 
     Returns
     -------
@@ -195,7 +204,7 @@ def open_pcm(
     DataError
         A file is missing, has another format, is shorter than a measurement, or differs from the first in sample rate,
         encoding or channels. The number of channels differs from that of the array, or the sample rate is too low for
-        the call.
+        the call that was emitted.
     ArgumentError
         No file is given, a value is invalid, or neither the argument nor the file contains settings.
 
@@ -215,6 +224,7 @@ def open_pcm(
         skip_s=skip_s,
         length_s=length_s,
         start_ns=start_ns,
+        passive=passive,
     )
 
 
@@ -241,10 +251,13 @@ def _require_channels(first: _PcmFile, settings: Settings) -> None:
 def _fitted(settings: Settings, recording: Recording, first: _PcmFile) -> Settings:
     """Return settings for another recording, with matching ranges."""
     call = settings.call
+    if settings.processing.mode == "passive":
+        return settings.replace(recording=recording)
     if recording.sample_rate_hz <= 2 * call.high_frequency_hz:
         raise DataError(
             f"{first.path} has a sample rate of {recording.sample_rate_hz:g} Hz, too low for a call up to "
-            f"{call.high_frequency_hz:g} Hz; give the emitted call, or record at more than twice its frequency"
+            f"{call.high_frequency_hz:g} Hz; give the emitted call, record at more than twice its frequency, or give "
+            "--passive (passive=True) if no call was emitted"
         )
     if recording.duration_s <= call.end_s:
         raise DataError(

@@ -33,7 +33,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     ----------
     mode : {"auto", "active", "passive"}, default "auto"
         ``active`` makes images of echoes, and ``passive`` acoustic maps of other sound. ``auto`` makes acoustic maps of
-        measurements without a call only.
+        measurements without a call only. With ``passive``, the call does not have to fit the record.
     method : {"fast", "paper"}, default "fast"
         ``fast`` uses analytic signals and computes beams at the output ranges only. ``paper`` is the algorithm of the
         2019 paper, for comparison.

@@ -85,13 +85,15 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.processing.mode == "passive":
+            return  # No image will be made, so the call does not have to fit the record.
         if isinstance(self.call.waveform, str):
             return  # The file is checked when it is read.
         if self.signal_rate_hz <= 2 * self.call.high_frequency_hz:
             raise ArgumentError(
                 f"processing.decimation {self.decimation} leaves signals at "
                 f"{self.signal_rate_hz:g} Hz; give one that leaves more than twice the call's "
-                f"{self.call.high_frequency_hz:g} Hz"
+                f"{self.call.high_frequency_hz:g} Hz, or without a call, processing.mode 'passive'"
             )
         swept_hz = self.call.high_frequency_hz - self.call.low_frequency_hz
         if self.processing.method == "paper" and swept_hz < _MIN_BANDWIDTH_HZ:
