@@ -89,6 +89,7 @@ def test_recording_has_the_sent_poses_at_its_measurements(tmp_path):
             node.hello(name)
             node.measure(*measured)
             node.hear_settled(14)
+    assert central.latest.archive.poses == len(given)
     wanted = given.at(times_ns)
     for name in both:
         with ertis.open_recording(the_recording(tmp_path), sensor=name) as recording:

@@ -163,9 +163,10 @@ def _below(now: "Status") -> Iterator[str]:
     if archive is not None:
         failed = f", {archive.sealing_failed} not sealed" if archive.sealing_failed else ""
         failed += f", {archive.set_aside} set aside" if archive.set_aside else ""
+        poses = f", {options.counted(archive.poses, 'pose')} received" if archive.poses else ""
         yield (
             f"archive {archive.folder}: {_writing(archive, fault=bool(now.fault))}, {archive.sealed} sealed, "
-            f"{archive.sealing} to seal{failed}"
+            f"{archive.sealing} to seal{failed}{poses}"
         )
         yield (
             f"disk: {size(archive.free_bytes)} free, room for {size(archive.room_bytes)}; "

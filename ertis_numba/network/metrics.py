@@ -168,6 +168,7 @@ class Metrics:
         if archive is not None:
             for field in ("journal_bytes", "free_bytes", "room_bytes", "sealing"):
                 yield gauge(f"archive_{field}", f"Archive: {field}", {(): getattr(archive, field)})
+            yield counter("archive_poses", "Poses received", {(): archive.poses})
             for field in ("sealed", "sealing_failed", "set_aside"):
                 yield counter(f"archive_{field}", f"Recordings: {field}", {(): getattr(archive, field)})
             for field in ("commit", "ack"):

@@ -102,6 +102,8 @@ class ArchiveStatus(msgspec.Struct, kw_only=True):
     sealed: int = 0
     sealing: int = 0
     sealing_failed: int = 0
+    poses: int = 0
+    """Accepted poses of platforms."""
     set_aside: int = 0
     """Journals kept under another name, because they are damaged or a recording cannot hold some of their sensors."""
     commit: Percentiles = Percentiles()

@@ -78,6 +78,7 @@ class Archive:
         self._seal = seal
         self._queue: queue.SimpleQueue[ReceivedItem | None] = queue.SimpleQueue()
         self._poses: collections.deque[JournalPose] = collections.deque(maxlen=_POSES)
+        self._n_poses = 0
         self._events: collections.deque[Event] = collections.deque()
         self._stop = threading.Event()
         self._lock: Lock | None = None
@@ -133,6 +134,7 @@ class Archive:
     def offer_pose(self, pose: JournalPose) -> None:
         """Queue a pose to be stored; never blocks. If the disk is too slow, the oldest poses are discarded."""
         self._poses.append(pose)
+        self._n_poses += 1
 
     def read(self) -> list[Event]:
         """Return new events; never blocks."""
@@ -157,9 +159,10 @@ class Archive:
         """Return the status without blocking, with numbers up to half a second old."""
         sealing = self._sealing
         if sealing is None:
-            return replace(self._snapshot)
+            return replace(self._snapshot, poses=self._n_poses)
         return replace(
             self._snapshot,
+            poses=self._n_poses,
             sealed=sealing.sealed,
             sealing=sealing.left,
             sealing_failed=sealing.failed,
