@@ -27,6 +27,21 @@ TURNED = (0.0, 0.0, 0.0, 1.0)
 pytestmark = pytest.mark.usefixtures("folder")
 
 
+SILENT_SCENE = """
+seed = 1
+[[sensors]]
+emitter.silent = true
+recording = {sample_rate_hz = 48000.0, n_samples = 4800, encoding = "float32"}
+processing.mode = "passive"
+passive.bands_hz = [[2000.0, 4000.0]]
+[[noises]]
+azimuth_deg = 40.0
+range_m = 2.0
+level_db = -40.0
+band_hz = [1000.0, 10000.0]
+"""
+
+
 def heard(behaviours, sensor="sensor", settings=SETTINGS):
     """Return a measurement of a source at 20 degrees for each behaviour."""
     return [
@@ -104,6 +119,17 @@ def test_bands_of_quantisation_noise_are_reported():
     noisy = run("process pdm.h5 -o high.h5 --bands 20000:30000,200000:300000")
     (line,) = (line for line in noisy.stderr.splitlines() if "quantisation noise" in line)
     assert "dominates above 130 kHz, and so in 200 to 300 kHz; give lower bands" in line
+
+
+def test_silent_sensor_of_a_scene_needs_no_fitting_call(folder):
+    """The default call reaches 50 kHz, above half of the sample rate."""
+    (folder / "ear.toml").write_text(SILENT_SCENE)
+    run("simulate ear.toml -o ear.h5")
+    run("process ear.h5 -o ear.acoustic.h5")
+    with ertis.open_acoustic_maps("ear.acoustic.h5") as maps:
+        assert maps.band_hz.tolist() == [[2000.0, 4000.0]]
+        (loudest,) = maps[0].loudest()
+    assert abs(np.degrees(loudest.azimuth_rad) - 40) < 15  # The array is smaller than a wavelength.
 
 
 def test_options_of_maps_override_the_settings(folder):

@@ -238,7 +238,12 @@ class Sensor(Settings, frozen=True, kw_only=True):
     def settings(self) -> Settings:
         """Return the settings with which its recordings are processed."""
         return Settings(
-            array=self.array, call=self.call, recording=self.recording, air=self.air, processing=self.processing
+            array=self.array,
+            call=self.call,
+            recording=self.recording,
+            air=self.air,
+            processing=self.processing,
+            passive=self.passive,
         )
 
     def rotation(self) -> NDArray[np.float64]:
