@@ -87,6 +87,16 @@ def test_reflector_appears_in_its_level_direction(tilt_deg, device):
     assert np.array_equal(image.azimuth_rad, untouched.azimuth_rad)
 
 
+@pytest.mark.parametrize("device", ["cpu", "numpy"])
+def test_method_of_the_paper_is_levelled_as_well(device):
+    measurement = heard(*TILTS_DEG[2], directions="3d:500")
+    settings = levelled(measurement).replace("processing.method", "paper")
+    with ertis.Pipeline(settings, device, predict=False) as pipeline:
+        image = pipeline.process(measurement, attitude_xyzw=attitude(*TILTS_DEG[2]).as_quat())
+        tilted = pipeline.process(measurement, attitude_xyzw=UNTURNED)
+        assert angle_off_deg(image) < cell_deg(pipeline.grid) < angle_off_deg(tilted)
+
+
 def test_plane_of_a_tilted_sensor_becomes_horizontal():
     """A planar image of a sensor that looks down 15° misses an echo at its own height, unless it is levelled."""
     level = unit_vectors(np.radians([AZIMUTH_DEG]), np.zeros(1))[0] * RANGE_M
