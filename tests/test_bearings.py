@@ -7,12 +7,12 @@ from ertis_bench import passive_bearings
 
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.passive import AcousticCamera, BearingFinder, find_bearings
 from ertis_numba.passive.detection_law import exceedance, independent_samples
 from ertis_numba.passive.likelihood import BandLikelihood, moved
 from ertis_numba.passive.noise_model import NoiseModel
-from ertis_numba.passive.scan_extent import ScanExtent, scan_extent
+from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
 from tests.test_acoustic_camera import settings_of, sound
 
 SPACE = {"processing__directions": "3d:400", "passive__bands_hz": [[30e3, 45e3]]}
@@ -57,20 +57,53 @@ def test_extent_of_a_plane_is_that_of_direction_cosines():
     processing = ertis.Settings().replace("processing.directions", "3d:3000").processing
     grid = ertis.geometry.direction_grid(processing)
     directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
-    found = scan_extent(directions, -directions @ positions_m.T / 340)
+    found = ScanMesh(directions, -directions @ positions_m.T / 340).extent(1.0)
     covariance = np.cov(positions_m[:, 1:].T, bias=True) / 340**2
-    assert found.area_s2 == pytest.approx(np.pi * np.sqrt(np.linalg.det(covariance)), rel=0.03)
+    assert found.area == pytest.approx(np.pi * np.sqrt(np.linalg.det(covariance)), rel=0.03)
     turn = np.linspace(0, 2 * np.pi, 1000)
     slopes = np.stack([-np.sin(turn), np.cos(turn)])
     around = np.sqrt(np.einsum("it,ij,jt->t", slopes, covariance, slopes)).mean() * 2 * np.pi
-    assert found.length_s == pytest.approx(around / 2, rel=0.05)
+    assert found.length == pytest.approx(around / 2, rel=0.05)
 
 
 def test_extent_of_a_line_is_its_length():
     directions = unit_vectors(np.radians(np.arange(-90, 91.0)), np.zeros(181))
-    found = scan_extent(directions, directions[:, 1:2] * np.array([[-1.0, 1.0]]))
+    found = ScanMesh(directions, directions[:, 1:2] * np.array([[-1.0, 1.0]])).extent(1.0)
     assert found == pytest.approx((1.0, 2.0, 0.0), rel=1e-3)
-    assert scan_extent(directions[:2], directions[:2, 1:2] * np.ones(3)) == (2.0, 0.0, 0.0)
+    assert ScanMesh(directions[:2], directions[:2, 1:2] * np.ones(3)).extent(1.0) == (2.0, 0.0, 0.0)
+
+
+def test_extent_of_whitened_waves_is_that_of_their_angles():
+    """The angle between two waves is the arc cosine of the magnitude of their normalised product."""
+    random = np.random.default_rng(7)
+    directions = unit_vectors(np.radians(np.linspace(-60, 60, 4000)), np.zeros(4000))
+    delay_s, omega = -directions @ random.normal(scale=0.02, size=(3, 6)) / 340, 2 * np.pi * 30e3
+    whitening = random.standard_normal((6, 6))
+    waves = np.exp(-1j * omega * delay_s) @ whitening.T
+    waves /= np.linalg.norm(waves, axis=1, keepdims=True)
+    angles = np.arccos(np.minimum(np.abs((waves[1:].conj() * waves[:-1]).sum(axis=1)), 1))
+    found = ScanMesh(directions, delay_s).extent(omega, whitening)
+    assert found == pytest.approx((1.0, angles.sum(), 0.0), rel=1e-3)
+    assert found.length != pytest.approx(ScanMesh(directions, delay_s).extent(omega).length, rel=0.01)
+
+
+def test_coherence_of_diffuse_noise_is_that_of_blocks():
+    """Sum plane waves from many directions, and compare the blocks of two microphones with the model."""
+    n_block, rate_hz, number, n_waves = 64, 200e3, 3, 200
+    spacing_hz = rate_hz / n_block
+    apart_s = np.array([0.0, 7.7, -3.3]) / (2 * np.pi * number * spacing_hz)
+    random, cosines = np.random.default_rng(8), (np.arange(n_waves) + 0.5) / n_waves * 2 - 1
+    frequency_hz, window = np.fft.rfftfreq(1 << 15, 1 / rate_hz), scipy.signal.get_window("hann", n_block)
+    products = np.zeros((3, 3))
+    for cosine in cosines:
+        spectrum = np.fft.rfft(random.standard_normal(1 << 15))
+        heard = np.fft.irfft(spectrum * np.exp(-2j * np.pi * frequency_hz * cosine * apart_s[:, None]))
+        bins = np.fft.rfft(heard.reshape(3, -1, n_block) * window)[:, :, number]
+        products += (bins @ bins.conj().T).real
+    places_m = np.stack([340 * apart_s, np.zeros(3), np.zeros(3)], axis=1)
+    model = NoiseModel(places_m, np.array([number * spacing_hz]), spacing_hz=spacing_hz, sound_speed_m_s=340)
+    mixing = np.linalg.inv(model.whitening(0.999)[0])
+    assert mixing @ mixing.T == pytest.approx(products / products.trace() * 3, abs=0.01)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.6])
@@ -82,7 +115,7 @@ def test_share_of_diffuse_noise_is_found(share):
     drawn = random.standard_normal((6, 8, 400, 2)) @ np.array([1, 1j])
     heard = np.linalg.cholesky(coherence) @ drawn
     matrix = heard @ heard.conj().transpose(0, 2, 1) / 800
-    model = NoiseModel(positions_m, frequency_hz, sound_speed_m_s=340)
+    model = NoiseModel(positions_m, frequency_hz, spacing_hz=1.0, sound_speed_m_s=340)
     found = model.diffuse_share(matrix, np.full(6, 1 / 6))
     assert found == pytest.approx(share, abs=0.05)
     white = model.whitening(found) @ matrix @ model.whitening(found).transpose(0, 2, 1)
@@ -124,15 +157,33 @@ def test_separated_powers_are_those_outside_of_the_other_sources():
         assert found[:, k] == pytest.approx((beam[:, 0] - noise) / size[:, 0])
 
 
-@pytest.mark.parametrize("directions", ["2d:181", "3d:1500"])
-def test_false_alarms_have_the_asked_rate(directions):
-    settings, asked, n_seeds = settings_of(**SPACE | {"processing__directions": directions}), 0.1, 200
+def diffuse_sound(settings, share, seed):
+    """Return noise of which a share is a diffuse field, and the rest that of each microphone."""
+    recording, places_m = settings.recording, microphones(settings.array).enabled_positions_m
+    frequency_hz = np.fft.rfftfreq(recording.n_samples, 1 / recording.sample_rate_hz)[:, None, None]
+    apart_s = np.linalg.norm(places_m[:, None] - places_m, axis=-1) / ertis.air.sound_speed_m_s(settings.air)
+    coherence = share * np.sinc(2 * frequency_hz * apart_s) + (1 - share) * np.eye(len(places_m))
+    drawn = np.random.default_rng(seed).standard_normal((*coherence.shape[:2], 2)) @ np.array([1, 1j])
+    spectra = (np.linalg.cholesky(coherence) @ drawn[:, :, None])[:, :, 0]
+    return ertis.Measurement(np.ascontiguousarray(np.fft.irfft(spectra, axis=0), np.float32), settings)
+
+
+@pytest.mark.parametrize(
+    ("directions", "band_hz", "diffuse"),
+    [
+        ("2d:181", SPACE["passive__bands_hz"][0], 0.0),
+        ("3d:1500", SPACE["passive__bands_hz"][0], 0.0),
+        ("3d:400", [10e3, 14e3], 0.95),
+    ],
+)
+def test_false_alarms_have_the_asked_rate(directions, band_hz, diffuse):
+    settings, asked, n_seeds = settings_of(processing__directions=directions, passive__bands_hz=[band_hz]), 0.1, 200
     alarms = 0
     with AcousticCamera(settings, "cpu", 1) as camera:
         finder = BearingFinder(camera, false_alarm=asked, top=1)
         for seed in range(n_seeds):
             camera.reset()
-            camera.add(sound(settings, [], noise=0.1, seed=seed))
+            camera.add(diffuse_sound(settings, diffuse, seed))
             alarms += bool(finder.find())
     low, high = scipy.stats.binom.interval(0.998, n_seeds, asked)
     assert low <= alarms <= high

@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 
 SNRS_DB: Final = (-10, -5, 0, 5, 10, 15, 20)
 BAND_HZ: Final = (35e3, 45e3)
+NOISE_BAND_HZ: Final = (30e3, 50e3)
 FALSE_ALARM: Final = 0.01
 _NOISE: Final = 0.01
 _STEP_RAD: Final = 1e-5
@@ -159,14 +160,18 @@ def away_deg(bearing: Bearing, direction: Floats) -> float:
 
 
 def leak_scene(direction: Floats, *, seed: int, with_leak: bool) -> Scene:
-    """Return a scene with diffuse noise and, 10 dB below it at the array, a leak; the sensor emits nothing."""
+    """Return a scene with diffuse noise and, 10 dB below it at the array in the band, a leak; the sensor emits nothing.
+
+    The noise extends beyond the band: in a bin where it ends, its coherence is that of other frequencies.
+    """
     x, y, z = (_LEAK_M * direction).tolist()
     level_db = -60 - 10 + 20 * math.log10(_LEAK_M)
+    noise_dbfs = -60 + 10 * math.log10((NOISE_BAND_HZ[1] - NOISE_BAND_HZ[0]) / (BAND_HZ[1] - BAND_HZ[0]))
     band = f"band_hz = [{BAND_HZ[0]}, {BAND_HZ[1]}]"
     leak = f"[[noises]]\nposition_m = [{x}, {y}, {z}]\n{band}\nlevel_db = {level_db}\n" if with_leak else ""
     return Scene.from_toml(
         f"seed = {seed}\ncount = {_AVERAGES}\n[effects]\nabsorption = false\n[[sensors]]\nemitter.silent = true\n"
-        f"{leak}[ambient]\n{band}\nlevel_dbfs = -60\n"
+        f"{leak}[ambient]\nband_hz = [{NOISE_BAND_HZ[0]}, {NOISE_BAND_HZ[1]}]\nlevel_dbfs = {noise_dbfs}\n"
     )
 
 

@@ -14,7 +14,7 @@ from ertis_numba.geometry import microphones, spacing_rad, unit_vectors
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.camera import AcousticCamera
 from ertis_numba.passive.noise_model import NoiseModel
-from ertis_numba.passive.scan_extent import is_level, scan_extent
+from ertis_numba.passive.scan_extent import ScanMesh, is_level
 from ertis_numba.passive.source_search import BandSearch, FoundSource, Scan
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.settings import Settings
@@ -76,8 +76,7 @@ class BearingFinder:
         directions = unit_vectors(camera.grid.azimuth_rad, camera.grid.elevation_rad)
         reach_rad = _REACH * min(spacing_rad(directions), _MAX_SPACING_RAD)
         delays = WaveDelays(camera.settings)
-        extent = scan_extent(directions, delays(directions))
-        scan = Scan(directions, extent, reach_rad, is_level(directions))
+        scan = Scan(directions, ScanMesh(directions, delays(directions)), reach_rad, is_level(directions))
         self._bins: list[NDArray[np.intp]] = []
         self._searches: list[BandSearch] = []
         for shares in bin_shares(camera.band_hz, camera.frequency_hz).astype(np.float64):
@@ -86,6 +85,7 @@ class BearingFinder:
             noise = NoiseModel(
                 microphones(camera.settings.array).enabled_positions_m,
                 frequency_hz,
+                spacing_hz=float(camera.frequency_hz[1] - camera.frequency_hz[0]),
                 sound_speed_m_s=sound_speed_m_s(camera.settings.air),
             )
             self._bins.append(bins)

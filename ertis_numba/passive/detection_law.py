@@ -28,7 +28,7 @@ def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: Sca
     the expected Euler characteristic of the directions that exceed R (K. J. Worsley, Local maxima and the expected
     Euler characteristic of excursion sets of χ², F and t fields, 1994). Here g is the density of
     ``φ = arccos √R``, ``g′`` its derivative, and L₁ and L₂ are the length and the area of the set in units of the
-    array's resolution.
+    array's resolution: see `ScanMesh.extent`.
 
     Parameters
     ----------
@@ -63,8 +63,8 @@ def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: Sca
     ratio = math.sqrt(share / (1 - share))
     slope = density * ((2 * rest - 1) * ratio - (2 * n_samples - 1) / ratio)
     scale = 4 * math.pi * rest
-    expected = extent.n_parts * float(law.sf(share)) + extent.length_s * density / math.sqrt(scale)
-    return min(1.0, expected + extent.area_s2 * slope / scale)
+    expected = extent.n_parts * float(law.sf(share)) + extent.length * density / math.sqrt(scale)
+    return min(1.0, expected + extent.area * slope / scale)
 
 
 def independent_samples(shares: NDArray[np.floating], n_blocks: int) -> float:

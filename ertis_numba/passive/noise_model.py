@@ -10,26 +10,41 @@ __all__ = ["NoiseModel"]
 
 _MAX_DIFFUSE: Final = 0.999  # Some noise of the microphones remains, so that whitening stays finite.
 _TINY: Final = 1e-30
+_RESPONSE_BINS: Final = 3.5  # The response of a Hann window has 3e-5 of its power beyond.
+_RESPONSE_POINTS: Final = 56  # An even number: the response at one bin is the limit of 0 / 0.
 
 
 class NoiseModel:
     """Mixture of white noise of the microphones and of a diffuse field of sound.
 
     The coherence of a diffuse field between microphones at a distance d is ``sin(k d) / (k d)`` (R. K. Cook et al.,
-    Measurement of correlation coefficients in reverberant sound fields, 1955).
+    Measurement of correlation coefficients in reverberant sound fields, 1955). A bin hears its mean over the frequency
+    response of the Hann window, which is smaller: the blocks of distant microphones hear different parts of the sound.
 
     Parameters
     ----------
     positions_m : (mic, axis) float64
     frequency_hz : (bin,) float64
+    spacing_hz : float
+        Spacing of the bins of the blocks.
     sound_speed_m_s : float
     """
 
     def __init__(
-        self, positions_m: NDArray[np.float64], frequency_hz: NDArray[np.float64], *, sound_speed_m_s: float
+        self,
+        positions_m: NDArray[np.float64],
+        frequency_hz: NDArray[np.float64],
+        *,
+        spacing_hz: float,
+        sound_speed_m_s: float,
     ) -> None:
-        apart_m = np.linalg.norm(positions_m[:, None] - positions_m, axis=-1)
-        coherence = np.sinc(2 * apart_m / sound_speed_m_s * frequency_hz[:, None, None])
+        apart_s = np.linalg.norm(positions_m[:, None] - positions_m, axis=-1) / sound_speed_m_s
+        offsets = np.linspace(-_RESPONSE_BINS, _RESPONSE_BINS, _RESPONSE_POINTS)
+        response = (np.sinc(offsets) / (1 - offsets**2)) ** 2
+        coherence = sum(
+            share * np.sinc(2 * apart_s * (frequency_hz + offset * spacing_hz)[:, None, None])
+            for share, offset in zip(response / response.sum(), offsets, strict=True)
+        )
         values, self._modes = np.linalg.eigh(coherence)
         self._values = np.maximum(values, 0.0)
 

@@ -6,31 +6,32 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-__all__ = ["ScanExtent", "is_level", "scan_extent"]
+__all__ = ["ScanExtent", "ScanMesh", "is_level"]
 
 _GAP: Final = 4.0  # An edge longer than this, relative to the median, spans directions that are not searched.
+_BATCH: Final = 4096  # pieces of the mesh, which limits the memory
+
+Floats = NDArray[np.float64]
+Places = NDArray[np.intp]
 
 
 class ScanExtent(NamedTuple):
-    """Sizes of a set of directions, measured by how much the wave of 1 rad/s changes between them.
-
-    The distance of two near directions is the standard deviation over the microphones of the change of their delays.
-    At an angular frequency ω, lengths are ω times as long, and areas ω² times as large.
+    """Sizes of a set of directions, measured by how much the whitened wave of unit power changes between them.
 
     Attributes
     ----------
     n_parts : float
         Euler characteristic of the set: 1 for a connected set without holes, the number of directions if they are
         separate.
-    length_s : float
+    length : float
         Length of directions on a line, or half of the perimeter of an area.
-    area_s2 : float
+    area : float
         Area; 0 on a line.
     """
 
     n_parts: float
-    length_s: float
-    area_s2: float
+    length: float
+    area: float
 
 
 def is_level(directions: NDArray[np.float64]) -> bool:
@@ -44,8 +45,8 @@ def is_level(directions: NDArray[np.float64]) -> bool:
     return bool(np.ptp(directions[:, 2]) < 1e-9)
 
 
-def scan_extent(directions: NDArray[np.float64], delay_s: NDArray[np.float64]) -> ScanExtent:
-    """Return the extent of a grid of directions.
+class ScanMesh:
+    """Mesh of a grid of directions: triangles on a sphere, or steps along a line.
 
     Parameters
     ----------
@@ -53,31 +54,70 @@ def scan_extent(directions: NDArray[np.float64], delay_s: NDArray[np.float64]) -
         Unit vectors.
     delay_s : (direction, mic) float64
         Delays of the sound from them.
-
-    Returns
-    -------
-    ScanExtent
     """
-    places = (delay_s - delay_s.mean(axis=1, keepdims=True)) / np.sqrt(delay_s.shape[1])
-    if len(directions) < 4:
-        return ScanExtent(float(len(directions)), 0.0, 0.0)
-    if is_level(directions):
-        order = np.argsort(np.arctan2(directions[:, 1], directions[:, 0]))
-        steps = np.linalg.norm(np.diff(directions[order], axis=0), axis=1)
-        sizes = np.linalg.norm(np.diff(places[order], axis=0), axis=1)
-        return ScanExtent(1.0, float(sizes[steps <= _GAP * np.median(steps)].sum()), 0.0)
-    return _area(directions, places)
+
+    def __init__(self, directions: Floats, delay_s: Floats) -> None:
+        self._delay_s = delay_s
+        self._n_parts = 1.0 if len(directions) >= 4 else float(len(directions))
+        self._triangles, self._steps = np.zeros((0, 3), np.intp), np.zeros((0, 2), np.intp)
+        if len(directions) < 4:
+            return
+        if is_level(directions):
+            order = np.argsort(np.arctan2(directions[:, 1], directions[:, 0]))
+            pairs = np.stack([order[:-1], order[1:]], axis=1)
+            sizes = np.linalg.norm(directions[pairs[:, 1]] - directions[pairs[:, 0]], axis=1)
+            self._steps = pairs[sizes <= _GAP * np.median(sizes)]
+        else:
+            self._triangles, self._steps = _area(directions)
+
+    def extent(self, omega_rad_s: float, whitening: Floats | None = None) -> ScanExtent:
+        """Return the extent at an angular frequency.
+
+        With the whitened wave u and its changes ``∂u`` between two near directions, their squared distance is
+        ``∂u^H (I − u u^H / u^H u) ∂u / u^H u``. Without whitening, it is ω² times the variance of the changes of the
+        delays over the microphones.
+
+        Parameters
+        ----------
+        omega_rad_s : float
+        whitening : (mode, mic) float64
+            None if noise is white.
+
+        Returns
+        -------
+        ScanExtent
+        """
+        area = length = 0.0
+        for first in range(0, len(self._triangles), _BATCH):
+            metric = self._metric(self._triangles[first : first + _BATCH], omega_rad_s, whitening)
+            area += float(np.sqrt(np.maximum(np.linalg.det(metric), 0)).sum()) / 2
+        for first in range(0, len(self._steps), _BATCH):
+            metric = self._metric(self._steps[first : first + _BATCH], omega_rad_s, whitening)
+            length += float(np.sqrt(np.maximum(metric[:, 0, 0], 0)).sum())
+        return ScanExtent(self._n_parts, length / 2 if len(self._triangles) else length, area)
+
+    def _metric(self, corners: Places, omega_rad_s: float, whitening: Floats | None) -> Floats:
+        """Return the products of the changes from the first corner to the others: (piece, other, other)."""
+        delay_s = self._delay_s[corners]
+        slopes_s = delay_s[:, 1:] - delay_s[:, :1]
+        if whitening is None:  # The phases of the wave cancel.
+            wave = np.ones((len(corners), delay_s.shape[2]), np.complex128)
+            changes = omega_rad_s * slopes_s * wave[:, None]
+        else:
+            wave = np.exp(-1j * omega_rad_s * delay_s.mean(axis=1))
+            changes = omega_rad_s * slopes_s * wave[:, None] @ whitening.T
+            wave = wave @ whitening.T
+        along = (changes * wave.conj()[:, None]).sum(axis=2)
+        size = (np.abs(wave) ** 2).sum(axis=1)[:, None, None]
+        products = changes @ changes.conj().transpose(0, 2, 1) - along[:, :, None] * along[:, None].conj() / size
+        return np.asarray(products.real / size)
 
 
-def _area(directions: NDArray[np.float64], places: NDArray[np.float64]) -> ScanExtent:
-    """Return the extent of directions on a sphere, from the triangles between them."""
+def _area(directions: Floats) -> tuple[Places, Places]:
+    """Return the triangles between directions on a sphere, and the steps along their border."""
     triangles = scipy.spatial.ConvexHull(directions).simplices
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
     long = np.linalg.norm(directions[edges[..., 0]] - directions[edges[..., 1]], axis=2).max(axis=1)
     kept = long <= _GAP * np.median(long)
-    first, second = (places[triangles[kept, i]] - places[triangles[kept, 0]] for i in (1, 2))
-    squares = (first**2).sum(axis=1) * (second**2).sum(axis=1) - (first * second).sum(axis=1) ** 2
     pairs, counts = np.unique(edges[kept].reshape(-1, 2), axis=0, return_counts=True)
-    border = pairs[counts == 1]
-    perimeter = np.linalg.norm(places[border[:, 0]] - places[border[:, 1]], axis=1).sum()
-    return ScanExtent(1.0, float(perimeter) / 2, float(np.sqrt(np.maximum(squares, 0)).sum()) / 2)
+    return triangles[kept].astype(np.intp), pairs[counts == 1].astype(np.intp)

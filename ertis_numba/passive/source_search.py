@@ -1,5 +1,6 @@
 """Search for the sources of one band of a cross-spectral matrix."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Final, NamedTuple
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.passive.detection_law import exceedance, independent_samples
 from ertis_numba.passive.likelihood import BandLikelihood, Delays
 from ertis_numba.passive.noise_model import NoiseModel
-from ertis_numba.passive.scan_extent import ScanExtent
+from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
 
 __all__ = ["BandSearch", "FoundSource", "Scan"]
 
@@ -19,6 +20,7 @@ Matrices = NDArray[np.complex128]
 
 _BLIND: Final = 0.3  # Size of a wave outside of other sources, relative to its whole, below which it is theirs.
 _FLAT: Final = 1e-9  # Information relative to the largest, below which a direction is not resolved.
+_SHARE_STEPS: Final = 10  # per decade of white noise; between steps, extents change by a few hundredths
 _SWEEPS: Final = 2  # Corrections of all sources after each new one.
 
 
@@ -29,7 +31,7 @@ class Scan(NamedTuple):
     ----------
     directions : (direction, axis) float64
         Unit vectors.
-    extent : ScanExtent
+    mesh : ScanMesh
     reach_rad : float
         Largest distance from one of the directions to a maximum.
     level : bool
@@ -37,7 +39,7 @@ class Scan(NamedTuple):
     """
 
     directions: Floats
-    extent: ScanExtent
+    mesh: ScanMesh
     reach_rad: float
     level: bool
 
@@ -91,9 +93,7 @@ class BandSearch:
         self._scan, self._noise, self._delays, self._steer = scan, noise, delays, steer
         self._shares, self._weights = shares, shares / shares.sum()
         self._omega = 2 * np.pi * frequency_hz
-        scale = math.sqrt(float(self._weights @ self._omega**2))
-        extent = scan.extent
-        self._extent = ScanExtent(extent.n_parts, scale * extent.length_s, scale**2 * extent.area_s2)
+        self._extents: dict[int, ScanExtent] = {}
 
     def __call__(
         self, matrix: Matrices, n_blocks: int, *, false_alarm: float, top: int, least: float
@@ -119,24 +119,25 @@ class BandSearch:
         scaled = matrix / level[:, None, None]
         n_samples = independent_samples(self._shares, n_blocks)
         places = np.zeros((0, 3))
-        likelihood = self._likelihood(scaled, places)
+        likelihood, share = self._likelihood(scaled, places)
         while len(places) < min(top, matrix.shape[1] - 1):
-            place = self._next(likelihood, places, n_samples, false_alarm=false_alarm, least=least)
+            law = functools.partial(exceedance, n_samples=n_samples, extent=self._extent(share))
+            place = self._next(likelihood, places, law, false_alarm=false_alarm, least=least)
             if place is None:
                 break
             places = np.concatenate([places, place[None]])
-            likelihood = self._likelihood(scaled, places)
+            likelihood, share = self._likelihood(scaled, places)
             places = self._corrected(likelihood, places)
         return [self._source(likelihood, places, k, level, n_samples) for k in range(len(places))]
 
     def _next(
-        self, likelihood: BandLikelihood, places: Floats, n_samples: float, *, false_alarm: float, least: float
+        self, likelihood: BandLikelihood, places: Floats, law: Callable[..., float], *, false_alarm: float, least: float
     ) -> Floats | None:
         """Return the direction of a further source; None if noise or errors of the known sources may cause it."""
         rest = likelihood.beside(places)
         place = rest.maximum(self._loudest(rest, likelihood), reach_rad=self._scan.reach_rad, level=self._scan.level)
         share = float(rest.relative_power(place[None])[0]) / rest.dimensions
-        chance = exceedance(share, n_samples=n_samples, n_dimensions=rest.dimensions, extent=self._extent)
+        chance = law(share, n_dimensions=rest.dimensions)
         known = self._weights @ likelihood.separated(places)[0] if len(places) else np.zeros(0)
         strongest = max(0.0, known.max(initial=0.0))
         power = float(self._weights @ _powers(rest, place)[0])
@@ -144,18 +145,28 @@ class BandSearch:
         is_source = chance <= false_alarm and power >= least * strongest and size >= _BLIND * whole
         return place if is_source else None
 
-    def _likelihood(self, matrix: Matrices, places: Floats) -> BandLikelihood:
-        """Return the likelihood of sources, in noise whose diffuse share is that of the matrix without sources."""
+    def _extent(self, share: float) -> ScanExtent:
+        """Return the extent of the scan in noise with a diffuse share, at the mean square frequency of the band."""
+        step = round(-_SHARE_STEPS * math.log10(1 - share))
+        if step not in self._extents:
+            omega = math.sqrt(float(self._weights @ self._omega**2))
+            nearest = int(np.abs(self._omega - omega).argmin())
+            whitening = self._noise.whitening(1 - 10 ** (-step / _SHARE_STEPS))[nearest] if step else None
+            self._extents[step] = self._scan.mesh.extent(omega, whitening)
+        return self._extents[step]
+
+    def _likelihood(self, matrix: Matrices, places: Floats) -> tuple[BandLikelihood, float]:
+        """Return the likelihood of sources in noise, and its diffuse share, that of the matrix without sources."""
         plain, rest = BandLikelihood(matrix, None, self._omega, self._weights, self._delays), matrix
         if len(places):
             waves, powers = plain.waves(places), np.maximum(plain.separated(places)[0], 0)
             rest = matrix - (waves * powers[:, None]) @ waves.conj().transpose(0, 2, 1)
         share = self._noise.diffuse_share(rest, self._weights)
         if not share:
-            return plain
+            return plain, share
         whitening = self._noise.whitening(share)
         white = whitening @ matrix @ whitening.transpose(0, 2, 1)
-        return BandLikelihood(white, whitening, self._omega, self._weights, self._delays)
+        return BandLikelihood(white, whitening, self._omega, self._weights, self._delays), share
 
     def _corrected(self, likelihood: BandLikelihood, places: Floats) -> Floats:
         """Return the directions of sources that are most likely together."""

@@ -28,7 +28,14 @@ class SourcePair(NamedTuple):
     weaker_db: float = 0.0
 
 
-PAIRS: Final = (SourcePair(3.0), SourcePair(5.0), SourcePair(7.5), SourcePair(10.0), SourcePair(5.0, 10.0))
+PAIRS: Final = (
+    SourcePair(2.0),
+    SourcePair(2.5),
+    SourcePair(5.0),
+    SourcePair(7.5),
+    SourcePair(10.0),
+    SourcePair(5.0, 10.0),
+)
 """Pairs that shall be separated."""
 
 BAND_HZ: Final = (38e3, 42e3)
