@@ -7,9 +7,14 @@ import random
 import threading
 import types
 
+import hypothesis
 import numpy as np
 import pytest
 import threadpoolctl
+
+# The load of a machine must not decide whether a law holds.
+hypothesis.settings.register_profile("any_load", deadline=None)
+hypothesis.settings.load_profile("any_load")
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
