@@ -250,6 +250,24 @@ def test_spectrum_and_spectrogram_show_a_source():
     assert levels[20] > levels[-50] + 3
 
 
+def test_spectra_leave_out_the_time_of_a_call():
+    settings = settings_of()
+    measurement = sound(settings, [(20, 0.01)])
+    loud = measurement.data.copy()
+    n_call = int((settings.call.end_s + 0.0005) * settings.recording.sample_rate_hz)
+    loud[:n_call] += np.sin(np.arange(n_call) * 0.8)[:, None].astype(np.float32)
+    highest, begins_ms = {}, {}
+    for behaviour in ("passive", "active"):
+        heard = ertis.Measurement(loud, settings, ertis.Stamp(behaviour=behaviour))
+        (axes,) = figures.spectrum(heard).axes
+        highest[behaviour] = axes.lines[0].get_ydata().max()
+        figure = figures.spectrogram(heard)
+        begins_ms[behaviour] = figure.axes[0].get_xlim()[0]
+        assert ("ms are left out" in texts(figure)) == (behaviour == "active")
+    assert highest["active"] < highest["passive"] - 10
+    assert begins_ms["passive"] < 1 < 1e3 * settings.call.end_s < begins_ms["active"]
+
+
 def run(line, *, code=0):
     done = CliRunner().invoke(cli, line.split())
     assert done.exit_code == code, (done.output, done.exception)

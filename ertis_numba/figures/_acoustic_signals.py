@@ -31,7 +31,7 @@ _CHUNK = 2**20  # samples of spectra at a time, so that memory stays bounded
 
 def draw_spectrum(canvas: Canvas, measurement: Measurement, *, direction_deg: tuple[float, float] | None) -> Figure:
     """Draw the level in each bin, of the mean of the microphones or of a beam."""
-    power, frequency_hz, _ = _spectra(measurement, direction_deg)
+    power, frequency_hz, _, masked_s = _spectra(measurement, direction_deg)
     reference = _reference(measurement.settings, frequency_hz, direction_deg)
     canvas, level_db = _scaled(canvas, reference, power.mean(axis=1, keepdims=True))
 
@@ -43,13 +43,13 @@ def draw_spectrum(canvas: Canvas, measurement: Measurement, *, direction_deg: tu
         axes.set_ylabel(f"level of a bin ({canvas.unit})")
         canvas.grid(axes)
 
-    heading = _heading("Spectrum", measurement, direction_deg, frequency_hz, power)
+    heading = _heading("Spectrum", measurement, direction_deg, frequency_hz, power, masked_s)
     return compose(canvas, heading, [Panel(paint, lambda width_pt: _RATIO * width_pt)])
 
 
 def draw_spectrogram(canvas: Canvas, measurement: Measurement, *, direction_deg: tuple[float, float] | None) -> Figure:
     """Draw the level in each bin over time, of the mean of the microphones or of a beam."""
-    power, frequency_hz, time_s = _spectra(measurement, direction_deg)
+    power, frequency_hz, time_s, masked_s = _spectra(measurement, direction_deg)
     canvas, level_db = _scaled(canvas, _reference(measurement.settings, frequency_hz, direction_deg), power)
     half_s = (time_s[-1] - time_s[0]) / max(1, 2 * (len(time_s) - 1)) or 0.5e-3
     half_hz = frequency_hz[1] / 2
@@ -65,7 +65,7 @@ def draw_spectrogram(canvas: Canvas, measurement: Measurement, *, direction_deg:
         return shown
 
     canvas = replace(canvas, unit=f"{canvas.unit} in a bin")
-    heading = _heading("Spectrogram", measurement, direction_deg, frequency_hz, power)
+    heading = _heading("Spectrogram", measurement, direction_deg, frequency_hz, power, masked_s)
     return compose(canvas, heading, [Panel(paint, lambda width_pt: _RATIO * width_pt)])
 
 
@@ -113,15 +113,18 @@ def power_spectra(
 
 def _spectra(
     measurement: Measurement, direction_deg: tuple[float, float] | None
-) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64], float]:
+    """Return powers, frequencies and times, and the time that is left out because of a call."""
     with HeardSignals(measurement.settings) as signals:
         if direction_deg is None:
             values = signals(measurement)
         else:
             values = listen_to(measurement, *direction_deg, signals=signals).samples[None]
-        power, frequency_hz, time_s = power_spectra(values, signals.rate_hz)
+        first = signals.n_masked if measurement.stamp.behaviour == "active" else 0
+        masked_s = first / signals.rate_hz
+        power, frequency_hz, time_s = power_spectra(values[:, first:], signals.rate_hz)
         n_bins = int(np.searchsorted(frequency_hz, signals.band_hz[1], side="right"))  # Beyond, filters attenuate.
-        return power[:n_bins], frequency_hz[:n_bins], time_s
+        return power[:n_bins], frequency_hz[:n_bins], masked_s + time_s, masked_s
 
 
 def _reference(
@@ -152,10 +155,12 @@ def _heading(
     direction_deg: tuple[float, float] | None,
     frequency_hz: NDArray[np.float64],
     power: NDArray[np.float32],
+    masked_s: float,
 ) -> _captions.Heading:
     n_mics = int(microphones(measurement.settings.array).enabled.sum())
     heard = f"mean of {n_mics} microphones"
     if direction_deg is not None:
         heard = f"beam to azimuth {angle(direction_deg[0])}, elevation {angle(direction_deg[1])}"
     bins = f"bins of {_captions.number(frequency_hz[1] / 1e3)} kHz"
-    return _captions.of_measurement(title, measurement.settings, measurement.stamp, heard, bins, values=np.sqrt(power))
+    parts = (heard, bins, *_captions.left_out(masked_s))
+    return _captions.of_measurement(title, measurement.settings, measurement.stamp, *parts, values=np.sqrt(power))

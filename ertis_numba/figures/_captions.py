@@ -15,6 +15,7 @@ __all__ = [
     "Heading",
     "highest_over",
     "khz",
+    "left_out",
     "number",
     "of_acoustic_map",
     "of_array",
@@ -84,6 +85,11 @@ def of_measurement(title: str, settings: Settings, stamp: Stamp, *parts: str, va
     )
 
 
+def left_out(masked_s: float) -> tuple[str, ...]:
+    """Return the note about the time of a call that is left out, if any."""
+    return (f"the first {number(1e3 * masked_s)} ms are left out",) if masked_s else ()
+
+
 def of_acoustic_map(title: str, found: AcousticMap, *parts: str) -> Heading:
     """Return the words above an acoustic map."""
     settings = found.settings
@@ -96,7 +102,7 @@ def of_acoustic_map(title: str, found: AcousticMap, *parts: str) -> Heading:
             f"method {passive.method.replace('_', ' ')}",
             *((f"mean of {count} measurements",) if count > 1 else ()),
             *(() if passive.focus_m is None else (f"focus at {passive.focus_m:g} m",)),
-            *((f"the first {number(1e3 * found.masked_s)} ms are left out",) if found.masked_s else ()),
+            *left_out(found.masked_s),
             f"{minus(f'{settings.air.temperature_c:g}')} °C",
             *filter(None, [found.stamp.utc]),
         ),

@@ -18,7 +18,6 @@ __all__ = ["BlockSpectra"]
 
 _MAX_SPACING_HZ: Final = 1e3
 _BINS_OF_A_BAND: Final = 3
-_RINGING_S: Final = 1e-3  # Time after the call in which the transducer and the filters ring.
 
 
 class BlockSpectra:
@@ -68,8 +67,7 @@ class BlockSpectra:
         self._heard = np.zeros((n_mics, n_samples), np.float32)
         self._window = scipy.signal.get_window("hann", self._n_block).astype(np.float32)
         self._scale = np.float32(2 / (self._n_block * float((self._window.astype(np.float64) ** 2).sum())))
-        self._masked = math.ceil((settings.call.end_s + _RINGING_S) * rate_hz)
-        self.masked_s = self._masked / rate_hz
+        self.masked_s = self._read.n_masked / rate_hz
         self._transforms: dict[int, tuple[NDArray[np.float32], fft.Transforms]] = {}
         self._sums = self._memory.zeros((len(self.bins), n_mics, n_mics), np.complex64)
 
@@ -89,7 +87,7 @@ class BlockSpectra:
         """
         heard = self._read(measurement, out=self._heard)
         hop = self._n_block // 2
-        first = self._masked if masked else 0
+        first = self._read.n_masked if masked else 0
         n_blocks = (heard.shape[1] - first - self._n_block) // hop + 1
         if n_blocks < 1:
             raise DataError(

@@ -18,6 +18,8 @@ from ertis_numba.waveform import decimation_taps, integer_taps
 
 __all__ = ["HeardSignals", "heard_bands"]
 
+_RINGING_S: Final = 1e-3  # Time after the call in which the transducer and the filters ring.
+
 _RATE: Final = 2.5  # Least signal rate relative to the highest frequency.
 
 
@@ -51,6 +53,8 @@ class HeardSignals:
         Rate of the signals in hertz.
     shape : (n_mics, n_samples)
         Shape of the signals.
+    n_masked : int
+        Samples at the start of a measurement with emission that contain its call and the ringing after it.
     band_hz : (low, high)
         Lowest and highest frequency of interest in hertz; the lowest is 0 if ``highest_hz`` is given.
 
@@ -75,6 +79,7 @@ class HeardSignals:
         self.band_hz = lowest_hz, highest_hz
         factor = max(1, math.floor(recording.sample_rate_hz / (_RATE * highest_hz)))
         self.rate_hz = recording.sample_rate_hz / factor
+        self.n_masked = math.ceil((settings.call.end_s + _RINGING_S) * self.rate_hz)
         layout = microphones(settings.array)
         self._gain = layout.gain[layout.enabled].astype(np.float32)[:, None]
         self._words = AcceptedWords(settings)
