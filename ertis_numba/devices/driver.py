@@ -28,6 +28,7 @@ __all__ = ["SonarDriver"]
 
 _TRANSFER_BYTES_PER_S = 5e6  # Lower limit.
 _MARGIN_S = 0.5
+_SLOWEST_BYTES_PER_S = 1e5  # A busy machine with four programs per core reads a pseudo terminal at 250 kB/s.
 _RETRY_S = 0.05
 
 _log = logging.getLogger("ertis_numba")
@@ -128,7 +129,11 @@ class SonarDriver:
 
     @property
     def deadline_s(self) -> float:
-        """Timeout of a measurement: its duration, its transfer at 5 MB/s, and half a second."""
+        """Timeout of a measurement: its duration, its transfer at 5 MB/s, and half a second.
+
+        On a busy machine, the transfer may take longer. While bytes of a measurement arrive, at 100 kB/s or more, it is
+        not late; it is given up half a second after the latest one.
+        """
         setup = self._state()[0]
         transfer_s = (setup.n_bytes + FRAME_BYTES) / _TRANSFER_BYTES_PER_S
         return setup.n_samples / setup.pdm_rate_hz + transfer_s + _MARGIN_S
@@ -225,9 +230,13 @@ class SonarDriver:
         self._line.send(Command("A", int(active)).encode())
         self._next, self._is_late = (self._next + 1) % COUNTERS, True  # Its number is used, even if it fails.
         began, read = time.monotonic(), 0
-        while time.monotonic() - began <= deadline_s:
+        ends = began + deadline_s
+        latest = ends + setup.n_bytes / _SLOWEST_BYTES_PER_S
+        while time.monotonic() <= ends:
             data, arrived = self._line.receive(receiver.missing)
             read += len(data)
+            if data and read < setup.n_bytes + FRAME_BYTES:
+                ends = min(max(ends, time.monotonic() + _MARGIN_S), latest)
             blocks = receiver.feed(data, arrived)
             if data and not (blocks or receiver.missing):
                 blocks = receiver.finish()  # No other block will decide.
@@ -235,7 +244,7 @@ class SonarDriver:
                 return self._counted(blocks[-1], _behaviour(active))
         receiver.expire()
         raise SonarError(
-            f"{self.port}: no complete measurement within {deadline_s:.2f} s; {read} of "
+            f"{self.port}: no complete measurement within {ends - began:.2f} s; {read} of "
             f"{setup.n_bytes + FRAME_BYTES} bytes arrived: measure again, and check the cable if this repeats"
         )
 
