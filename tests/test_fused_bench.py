@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import clock_checks, differing_calls
+from ertis_bench import clock_checks, differing_calls, emission_delays
 from ertis_bench.network import fused_receiver, live_fusion, live_maps
 from ertis_bench.network.fused_receiver import FusedReceiverJob
 from ertis_bench.network.map_viewer import MapViewerJob, n_wrong
@@ -124,3 +124,18 @@ def test_maps_bench_finds_wrong_maps(tmp_path, gain, wrong):
         found = camera.process(Measurement(words[0], camera.settings))
     job = MapViewerJob(address="", keys=("", ""), words=str(tmp_path / "words.npy"), stated="")
     assert n_wrong(job, [found.replace(power=gain * found.power)]) == wrong
+
+
+def test_delays_bench_compares_delays(tmp_path, monkeypatch):
+    monkeypatch.setattr(emission_delays, "EMITTERS_M", (0.012,))
+    monkeypatch.setattr(emission_delays, "_DELAYS_MS", (0.0, 1.0))
+    target = tmp_path / "page.md"
+    marker = "ertis bench fusion --only delays"
+    target.write_text(f"<!-- {marker} -->\nold\n<!-- /{marker} -->\n", "utf-8")
+    options = ["--only", "delays", "--count", "1", "--seed", "1000", "--json", "--quiet", "--update", str(target)]
+    done = CliRunner().invoke(cli, ["bench", "fusion", *options])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    together, apart = json.loads(done.stdout)["delays"]
+    assert (together["spurious"], apart["spurious"]) == (0, 0)
+    assert together["rms_m"] != apart["rms_m"]
+    assert "| 12 mm | 1 ms | " in target.read_text("utf-8")

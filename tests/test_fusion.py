@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ertis_bench.platform_scenes import platform_scene, random_reflectors
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
@@ -269,6 +270,20 @@ def test_emitter_that_nobody_hears_hides_no_reflector():
     assert fused().unheard == ()
     beside = 1  # The reflector between front and left.
     assert 20 * math.log10(highest(result.image, *PLACES_M[beside]) / highest(fused().image, *PLACES_M[beside])) > -6
+
+
+def test_ghosts_do_not_make_a_sensor_unheard():
+    """In this scene, only ghosts are strong where others should hear the front sensor, which emits first."""
+    made = platform_scene(1003, random_reflectors(1003), 0.012)
+    sensors = tuple(
+        each.replace(call=each.call.replace(delay_s=4e-3 * place)) for place, each in enumerate(made.sensors)
+    )
+    made, group = made.replace(sensors=sensors), []
+    for sensor in made.sensors:
+        with ertis.Pipeline(sensor.settings(), predict=False) as pipeline:
+            group.append(pipeline.process(ertis.render(made, sensor=sensor.name)))
+    mounted = {sensor.name: (sensor.position_m, sensor.quaternion()) for sensor in made.sensors}
+    assert ertis.fuse(group, mounted).unheard == ()
 
 
 def test_calls_that_differ_are_not_mixed_up():

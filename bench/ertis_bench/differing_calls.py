@@ -16,7 +16,7 @@ from ertis_numba.simulation import Scene, pulse
 from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.render import Simulator
 
-__all__ = ["form", "run"]
+__all__ = ["compared", "form", "points_of", "run"]
 
 _CALLS: Final = {
     name: Call(start_frequency_hz=1e3 * start_khz, stop_frequency_hz=1e3 * stop_khz)
@@ -49,8 +49,8 @@ def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
                 scene = platform_scene(number, random_reflectors(number), diameter_m)
                 if calls != "equal":
                     scene = scene.replace(sensors=tuple(each.replace(call=_CALLS[each.name]) for each in scene.sensors))
-                cloud, n_images = _points(scene, diameter_m, with_pairs=calls.endswith("pair"))
-                here, others = _compared(cloud, scene)
+                cloud, n_images = points_of(scene, diameter_m, with_pairs=calls.endswith("pair"))
+                here, others = compared(cloud, scene)
                 errors += here
                 spurious += others
             say(f"{calls} calls, emitters of {1000 * diameter_m:g} mm: {spurious} points without a reflector")
@@ -103,7 +103,7 @@ def _suppression_db() -> tuple[float, float]:
     return float(min(peaks_db)), float(max(peaks_db))
 
 
-def _points(scene: Scene, diameter_m: float, *, with_pairs: bool) -> tuple[PointCloud, int]:
+def points_of(scene: Scene, diameter_m: float, *, with_pairs: bool) -> tuple[PointCloud, int]:
     """Return the points of a scene, and the number of images.
 
     The image of a pair is that of a further, silent sensor at the place of the receiver.
@@ -135,7 +135,7 @@ def _image(measurement: Measurement) -> Energyscape:
         return pipeline.process(measurement)
 
 
-def _compared(cloud: PointCloud, scene: Scene) -> tuple[list[float], int]:
+def compared(cloud: PointCloud, scene: Scene) -> tuple[list[float], int]:
     """Return the errors of reflectors that points locate, and the number of points without a reflector."""
     places_m = np.array([point.position_m for point in scene.points])[:, :2]
     apart_m = np.linalg.norm(cloud.position_m[:, None, :2].astype(np.float64) - places_m, axis=2)

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench import clock_checks, differing_calls, machine
+from ertis_bench import clock_checks, differing_calls, emission_delays, machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
@@ -26,7 +26,7 @@ __all__ = ["form", "run"]
 
 Floats = NDArray[np.float64]
 
-_PARTS: Final = {"calls": differing_calls, "clocks": clock_checks}
+_PARTS: Final = {"calls": differing_calls, "clocks": clock_checks, "delays": emission_delays}
 
 _LOUD_DB = -25.0  # Level of foreign echoes that count, relative to the strongest own echo.
 _BEAM_RAD, _PULSE_M = math.radians(25.0), 0.12  # Distance of ghosts from all reflectors.
@@ -60,8 +60,8 @@ def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None], only: 
     say : callable
         Function that reports progress.
     only : sequence of str
-        ``calls`` to compare equal calls with different ones instead, or ``clocks`` to check clocks and mountings by
-        direct sound.
+        ``calls`` to compare equal calls with different ones instead, ``clocks`` to check clocks and mountings by
+        direct sound, or ``delays`` to compare delays of sensors that emit in sequence.
     """
     if only:
         report: dict[str, Any] = {}

@@ -259,10 +259,10 @@ def calibration(**given: Any) -> None:
 @click.option(
     "--only",
     multiple=True,
-    type=click.Choice(["calls", "clocks"]),
+    type=click.Choice(["calls", "clocks", "delays"]),
     metavar="PART",
-    help="Run only this part: calls compares sensors with equal and with different calls, and clocks checks clocks and "
-    "mountings by direct sound.",
+    help="Run only this part: calls compares sensors with equal and with different calls, clocks checks clocks and "
+    "mountings by direct sound, and delays compares delays of sensors that emit in sequence.",
 )
 @_update
 @options.quiet

@@ -24,7 +24,9 @@ _SUPPRESSION: Final = (1.0, 2.0, 4.0)
 _CONFIRMED: Final = 0.25  # Reflectivity in the images of other pairs, relative to that of the pixel.
 _VISIBLE: Final = 2.0  # Power of an expected echo relative to noise and side lobes.
 _BOUND: Final = 2.0  # Reflectivity relative to the least that any pair shows.
-_HEARD: Final = 0.2  # Power of foreign echoes relative to the expected one, below which no foreign call is heard.
+# Power of foreign echoes relative to the expected one, below which no foreign call is heard: if a single sensor expects
+# echoes, which may be those of a ghost, and if several do.
+_HEARD: Final = 0.1, 0.2
 _STRONG: Final = 0.1  # Reflectivity relative to the highest, from which missing echoes matter.
 _REACH: Final = 2  # Neighbouring azimuths whose reflectors cause echoes in the same pixel.
 _SAME_STEPS: Final = 2.0  # Distance, in steps, within which the reflectors of two hypotheses are one.
@@ -141,16 +143,18 @@ class Attribution:
         bound = self._bound(evidence)
         confirmed = self._confirmed(evidence, alone)
         reflectivity = alone
-        shares: dict[tuple[int, int], Singles] = {}
+        shares: Shares = {}
         for suppression in _SUPPRESSION:
             if suppression == _SUPPRESSION[-1]:
-                unheard = self._unheard | self._not_heard(evidence, reflectivity)
-                if unheard > self._unheard:
-                    return self._without(unheard)(images)
+                unheard = self._not_heard(evidence, reflectivity)
+                if unheard:
+                    # Ghosts that are left cause no foreign echoes either, so they must not decide alone.
+                    shares = self._all_shares(images, reflectivity, confirmed, suppression)
+                    unheard &= self._not_heard(evidence, self._mean(own, images, shares))
+                if unheard:
+                    return self._without(self._unheard | unheard)(images)
                 reflectivity = np.minimum(reflectivity, bound)
-            around = self._around(reflectivity)
-            for number, image in images.items():
-                shares |= self._shares(number, image, around, confirmed.get(number), suppression)
+            shares = self._all_shares(images, reflectivity, confirmed, suppression)
             reflectivity = self._mean(own, images, shares)
         return Attributed(np.minimum(self._mean(evidence, images, shares), bound), shares, self._unheard)
 
@@ -184,17 +188,23 @@ class Attribution:
 
         An emitter may be broken, covered, or not on the same SYNC chain.
         """
-        shown: dict[int, NDArray[np.float64]] = {}
+        shown: dict[int, list[NDArray[np.float64]]] = {}
         strong = np.float32(_STRONG) * reflectivity.max()
         for each in evidence:
             pair = each.pair
             if pair.emitter == pair.receiver:
                 continue
-            sums = shown.setdefault(pair.emitter, np.zeros(2))
+            sums = np.zeros(2)
             self._kernels.compare_echoes(
                 pair.cell, pair.confirms, pair.gain, each.values, reflectivity, np.float32(2 * _VISIBLE), strong, sums
             )
-        return frozenset(emitter for emitter, (found, wanted) in shown.items() if found < _HEARD * wanted)
+            if sums[1]:
+                shown.setdefault(pair.emitter, []).append(sums)
+        return frozenset(
+            emitter
+            for emitter, several in shown.items()
+            if np.divide(*np.sum(several, axis=0)) < _HEARD[len(several) > 1]
+        )
 
     def _bound(self, evidence: Sequence[_Evidence]) -> Singles:
         """Return the least reflectivity that any pair shows, with a margin: (cell,) float32."""
@@ -230,6 +240,19 @@ class Attribution:
         found = np.empty_like(cells)
         self._kernels.spread_cells(cells, _REACH if self._grid.is_planar else 1, found)
         return found.reshape(-1)
+
+    def _all_shares(
+        self,
+        images: Mapping[int, CoarseImage],
+        reflectivity: Singles,
+        confirmed: Mapping[int, Singles],
+        suppression: float,
+    ) -> Shares:
+        around = self._around(reflectivity)
+        found: dict[tuple[int, int], Singles] = {}
+        for number, image in images.items():
+            found |= self._shares(number, image, around, confirmed.get(number), suppression)
+        return found
 
     def _shares(
         self, number: int, image: CoarseImage, around: Singles, confirmed: Singles | None, suppression: float
