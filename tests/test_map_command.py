@@ -82,6 +82,29 @@ def test_map_leaves_out_pulses_without_a_call(folder):
     assert "note: 1 of 3 pulses left out, in which no sensor emitted its call" in done.stderr
 
 
+def test_map_of_space_shows_the_height_of_the_post(folder):
+    sensor = Sensor(
+        name="only",
+        position_m=(0.1, 0.0, 0.4),
+        processing=Processing(range_m=(0.4, 2.0), directions="3d:1000"),
+        emitter=Emitter(level_db=-24.0, diameter_m=0.012),
+        electronics=Electronics(noise_dbfs=-60.0),
+    )
+    post_m = (1.375, 0.225, 0.875)
+    scene = Scene(seed=6, rate_hz=10.0, count=2, sensors=(sensor,), points=(Point(position_m=post_m, strength_db=0.0),))
+    measurements = [ertis.render(scene, number, sensor="only") for number in range(2)]
+    mounting = {"only": (sensor.position_m, sensor.quaternion().tolist())}
+    write_recording(folder / "space.h5", measurements, mounting=mounting)
+    report = json.loads(run(folder, "space.h5 --poses poses.tum --dimensions 3 --height 0:2 --json -q").stdout)
+    found = ertis.read_map(folder / "space.map.h5")
+    assert len(report["size_m"]) == found.n_dimensions == 3
+    assert np.linalg.norm(found.occupied_m - np.add(post_m, (10.0, 0.0, 0.0)), axis=1).max() < 0.1
+    done = CliRunner().invoke(cli, ["plot", str(folder / "space.map.h5"), "-q", "-o", str(folder / "space.png")])
+    assert done.exit_code == 0, done.output
+    done = CliRunner().invoke(cli, ["info", str(folder / "space.map.h5"), "--json"])
+    assert len(json.loads(done.stdout)["cells"]) == 3
+
+
 def test_map_of_space_is_refused_for_planar_images_and_files(folder):
     done = run(folder, "both.h5 --poses poses.tum --dimensions 3 -o space.ply", code=1)
     assert "has a planar image, but a map of three dimensions needs directions over elevation" in done.output
