@@ -9,7 +9,7 @@ from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._captions import Heading
 from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures.style import Style
-from ertis_numba.frames import OccupancyMap
+from ertis_numba.frames import OCCUPIED_ABOVE, OccupancyMap
 
 __all__ = ["draw"]
 
@@ -22,7 +22,7 @@ def draw(style: Style, occupancy: OccupancyMap) -> Figure:
     if occupancy.n_dimensions == 2:
         panels = [_panel(occupancy.probability, limits_m[0], limits_m[1], "y")]
     else:
-        above, beside = (_seen(occupancy.log_odds, axis) for axis in (0, 1))
+        above, beside = (_seen(occupancy.probability, axis) for axis in (0, 1))
         panels = [
             _panel(above, limits_m[0], limits_m[1], "y", "from above"),
             _panel(beside, limits_m[0], limits_m[2], "z", "from the side"),
@@ -58,8 +58,7 @@ def _panel(
     return Panel(paint, lambda width_pt: min(ratio, _MAX_RATIO) * width_pt, title=title)
 
 
-def _seen(log_odds: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """Return the highest probability along an axis, or the lowest one where no cell is more likely occupied."""
-    highest = log_odds.max(axis=axis)
-    shown = np.where(highest > 0, highest, log_odds.min(axis=axis))
-    return np.asarray(1 / (1 + np.exp(-shown)), np.float32)
+def _seen(probability: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
+    """Return the highest probability along an axis, or the lowest one where no cell is occupied."""
+    highest = probability.max(axis=axis)
+    return np.asarray(np.where(highest > OCCUPIED_ABOVE, highest, probability.min(axis=axis)))
