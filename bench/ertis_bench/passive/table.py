@@ -90,6 +90,8 @@ def _times(report: dict[str, Any]) -> str:
         if other:
             cells += [f"{other['wall_ms']:.0f}", f"{other['processor_ms']:.0f}"]
             cells += [f"{other[key] / ours[key]:.0f}×" for key in ("wall_ms", "processor_ms")]
+        elif report["acoular"]:
+            cells += ["–"] * 4  # Acoular has no such method.
         rows.append([row["name"], *cells])
     head = ["method", "time, ms", "processor time, ms"]
     if report["acoular"]:
