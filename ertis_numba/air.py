@@ -78,7 +78,7 @@ def transmission_loss_db(air: Air, distance_m: float, frequency_hz: NDArray[np.f
     """Return the transmission loss of a spherical wave in dB at each frequency.
 
     ``20 log10(r / 1 m) + α r``: the level at the distance r is the source level minus this loss (R. J. Urick,
-    Principles of Underwater Sound, 1983). The source level is that at 1 m without absorption by the air.
+    Principles of Underwater Sound, 1983). The source level is the level at 1 m without absorption by the air.
 
     Parameters
     ----------

@@ -191,7 +191,7 @@ class Pipeline:
         DataError
             The measurement's array, call, record or air, or its data, are not those of the pipeline's settings.
         ArgumentError
-            ``out`` has another shape or type, the device has fewer threads, the stream is of another pipeline, or
+            ``out`` has another shape or type, the device has fewer threads, the stream belongs to another pipeline, or
             ``attitude_xyzw`` is invalid, missing or not needed.
 
         Examples

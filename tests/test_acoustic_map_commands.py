@@ -118,7 +118,7 @@ def test_bands_of_quantisation_noise_are_reported():
     assert "quantisation" not in quiet.stderr
     noisy = run("process pdm.h5 -o high.h5 --bands 20000:30000,200000:300000")
     (line,) = (line for line in noisy.stderr.splitlines() if "quantisation noise" in line)
-    assert "dominates above 130 kHz, and so in 200 to 300 kHz; give lower bands" in line
+    assert "dominates above 130 kHz, and therefore in 200 to 300 kHz; choose lower bands" in line
 
 
 def test_silent_sensor_of_a_scene_needs_no_fitting_call(folder):
@@ -146,8 +146,8 @@ def test_options_of_maps_override_the_settings(folder):
 
 def test_emission_is_masked_and_reported():
     done = run("process mixed.h5 -o maps.h5 --mode passive --device cpu")
-    assert "warning: mixed.h5: sensor sensor emitted its call in 2 of 4 measurements; the first " in done.stderr
-    assert "ms of each are left out, but maps contain its echoes" in done.stderr
+    assert "mixed.h5: sensor sensor emitted its call in 2 of 4 measurements; maps leave out the first " in done.stderr
+    assert "ms of each, but contain echoes of the call" in done.stderr
     with ertis.open_acoustic_maps("maps.h5") as found:
         assert [each.masked_s > found.settings.call.duration_s for each in found] == [True, True]
     assert "emitted" not in run("process passive.h5 -o quiet.h5 --device cpu").stderr
@@ -214,7 +214,7 @@ def test_failed_recordings_do_not_stop_maps_of_others(folder):
     (folder / "torn.h5").write_bytes((folder / "passive.h5").read_bytes()[:90_000])
     done = run("process passive.h5 torn.h5 active.h5 -o maps --mode passive --device cpu", code=1)
     assert "ertis: failed: torn.h5 is cut short or damaged" in done.stderr
-    assert "active.h5: sensor sensor emitted its call in 2 of 2 measurements; the first" in done.stderr
+    assert "active.h5: sensor sensor emitted its call in 2 of 2 measurements; maps leave out the first" in done.stderr
     assert names_in(folder / "maps") == ["active.acoustic.h5", "passive.acoustic.h5"]
     done = run("process passive.h5 active.h5 -o images --verify --device cpu", code=1)
     assert (

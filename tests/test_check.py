@@ -111,7 +111,7 @@ def test_recording_without_a_call_is_judged_by_what_it_shows(tmp_path):
     assert details["call"] == details["calibration"] == "no call was emitted"
     assert "dead microphones: no sound exceeds the noise" in details["microphones"]
     assert "not observable: polarity, order and delay of channels" in details["microphones"]
-    assert "with the sound of sources; the dynamic range needs a call" in details["noise floor"]
+    assert "including the sound of sources; the dynamic range needs a call" in details["noise floor"]
     assert checked.sensors[0].calibration is checked.sensors[0].call is None
     assert "3 measurements, 3 of them without a call, 3 examined" in run(path).stdout
     assert json.loads(run(path, "--json").stdout)["sensors"][0]["passive"] == 3

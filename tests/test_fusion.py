@@ -470,7 +470,7 @@ def test_process_leaves_out_pulses_without_a_call(recordings, tmp_path):
     write_recording(tmp_path / "mixed.h5", given, mounting=mountings())
     code, output = run("process", tmp_path / "mixed.h5", "--fuse")
     assert code == 0, output
-    assert "note: 1 of 2 pulses left out, in which no sensor emitted its call" in output
+    assert "note: 1 of 2 pulses left out, because no sensor emitted its call" in output
     with open_energyscapes(tmp_path / "mixed.fused.h5") as stored:
         assert [stamp.sync_count for stamp in stored.stamps()] == [1]
 

@@ -79,7 +79,7 @@ def test_map_of_a_recording_shows_the_post_in_the_world(folder):
 def test_map_leaves_out_pulses_without_a_call(folder):
     done = run(folder, "mixed.h5 --poses poses.tum --json -o echoes.h5")
     assert json.loads(done.stdout)["pulses"] == 2
-    assert "note: 1 of 3 pulses left out, in which no sensor emitted its call" in done.stderr
+    assert "note: 1 of 3 pulses left out, because no sensor emitted its call" in done.stderr
 
 
 def test_map_of_space_shows_the_height_of_the_post(folder):

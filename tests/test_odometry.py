@@ -109,7 +109,7 @@ def test_odometry_command_writes_the_trajectory_of_the_platform(folder, tmp_path
 def test_odometry_command_leaves_out_pulses_without_a_call(folder, tmp_path):
     code, _, stderr = run(folder / "mixed.h5", "-o", tmp_path / "path.tum")
     assert code == 0, stderr
-    assert "note: 1 of 3 pulses left out, in which no sensor emitted its call" in stderr
+    assert "note: 1 of 3 pulses left out, because no sensor emitted its call" in stderr
     path = ertis.read_trajectory(tmp_path / "path.tum")
     np.testing.assert_allclose(path.position_m, PLATFORM.trajectory(np.array([0.0, 0.2])).position_m, atol=4e-3)
 

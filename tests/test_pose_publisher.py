@@ -284,7 +284,7 @@ def test_sensor_has_the_poses_of_one_sender(monkeypatch):
     now_s = [100.0]
     monkeypatch.setattr("ertis_numba.network.central_node._poses.time.monotonic", lambda: now_s[0])
     intake.add(b"one", pose_of(sensors=("left", "right")), EVERYBODY)
-    with pytest.raises(Unwanted, match="another application sends poses of the platform of sensor right; end one"):
+    with pytest.raises(Unwanted, match="another application already sends poses for sensor right; end one"):
         intake.add(b"two", pose_of(sensors=("right", "top")), EVERYBODY)
     intake.add(b"two", pose_of(sensors=("top",)), EVERYBODY)
     intake.bye(b"one")

@@ -1,4 +1,4 @@
-"""Check of clocks and mountings by direct sound, on random platforms with right and wrong ones."""
+"""Check of clocks and mountings by direct sound, on random platforms with and without errors."""
 
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
@@ -23,7 +23,7 @@ _LATE: Final = 20
 """Number of the measurement one second after a SYNC pulse, when a drift of 1 ppm is an error of 1 µs."""
 _CLOCK_US: Final = 20.0, 300.0  # Limits of errors of clocks, of either sign.
 _MOUNTING_M: Final = 0.02, 0.1  # Limits of errors of mountings, in the plane.
-# Images are not used, so that no effect may be left out because images do not show it.
+# Images are not used, so effects that images do not show must not be left out.
 _PLAN: Final = EffectPlan(
     tuple(Verdict(name=name, on=True, reason="all effects that apply", estimate_db=None) for name in EFFECTS)
 )
@@ -93,7 +93,7 @@ def form(report: dict[str, Any]) -> str:
     head = [
         "emitters",
         "direct sounds heard",
-        "right platforms accused",
+        "correct platforms with a warning",
         "wrong clocks found (RMS error)",
         "wrong mountings found",
     ]
@@ -113,8 +113,8 @@ def form(report: dict[str, Any]) -> str:
     return (
         f"{table(head, rows)}\n\n{report['count']} platforms of four sensors among random reflectors from seed "
         f"{report['seed']}, one SYNC pulse each, with the steps of the SYNC chain. A wrong clock is {low_us:g} to "
-        f"{high_us:g} µs early or late, and a wrong mounting is stated {1000 * low_m:g} to {1000 * high_m:g} mm aside. "
-        "Both are found if the warnings name that sensor, and, for clocks, no other one. "
+        f"{high_us:g} µs early or late, and a wrong mounting is off by {1000 * low_m:g} to {1000 * high_m:g} mm. "
+        "Both count as found if the warnings name that sensor and, for clocks, no other one. "
         f"{sentence(report['machine'])}"
     )
 

@@ -11,7 +11,7 @@ from ertis_bench.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene
 
 __all__ = ["form", "run"]
 
-_DELAYS_MS: Final = 0.0, 1.0, 2.0, 3.0, 4.0  # After more, a record does not contain 4 m.
+_DELAYS_MS: Final = 0.0, 1.0, 2.0, 3.0, 4.0  # With longer delays, a record does not reach 4 m.
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:

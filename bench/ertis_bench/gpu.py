@@ -70,7 +70,7 @@ _SUMMARIES = {
     "racecheck": r"RACECHECK SUMMARY: (\d+) hazard",
 }
 _PYTEST = (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "ertis_bench.own_kernel_cache")
-_MAX_WORKERS = 8  # processes of tests, whose time is that of compiling kernels
+_MAX_WORKERS = 8  # Processes of tests, which mostly compile kernels.
 _MAX_REPORTED = 20  # names of failed tests
 
 

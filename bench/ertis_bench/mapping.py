@@ -251,10 +251,10 @@ def form(report: dict[str, Any]) -> str:
     ]
     places = _PLANES if is_planar else _SPACES
     return (
-        f"{table(head, rows)}\n\n{places} Poses and velocities are exact, and cells have 5 cm. A {kind} cell is found "
-        "if the centre of an occupied cell is within 5 cm of its own. An occupied cell is false if its centre is more "
-        f"than 7.5 cm away from all {kind}s, posts and boxes, so that no part of it is within 5 cm; the share beyond "
-        "5 cm is in brackets. Times are medians for each pulse, without and (in brackets) with fusion. "
+        f"{table(head, rows)}\n\n{places} Poses and velocities are exact, and cells are 5 cm wide. A {kind} cell is "
+        "found if the centre of an occupied cell is within 5 cm of its own. An occupied cell is false if its centre is "
+        f"more than 7.5 cm away from all {kind}s, posts and boxes, so that no part of it is within 5 cm; the share "
+        "beyond 5 cm is in brackets. Times are medians for each pulse, without and (in brackets) with fusion. "
         f"{sentence(report['machine'])}"
     )
 

@@ -76,7 +76,7 @@ class SceneRenderer:
 
     @property
     def emits(self) -> bool:
-        """True if a sensor of the scene emits its call; otherwise active measurements are those without emission."""
+        """True if a sensor of the scene emits its call; otherwise, all measurements are without emission."""
         return not all(sensor.emitter.silent for sensor in self._scene.sensors)
 
     @property

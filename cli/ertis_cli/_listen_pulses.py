@@ -79,7 +79,7 @@ def listen_pulses(
     heard = MicrophoneTable(as_json=as_json, quiet=quiet)
     with stopped_by_signals() as signals, connect(notes.append) as subscriber:
         signals.obey(subscriber.close)
-        begun_s, received = time.monotonic(), 0  # Loading kernels to connect may take longer than the duration.
+        begun_s, received = time.monotonic(), 0  # Connecting loads kernels, which may take longer than the duration.
         end_s = math.inf if duration is None else begun_s + duration
         if not as_json:
             click.echo(head)

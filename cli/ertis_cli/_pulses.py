@@ -150,7 +150,7 @@ def active_groups(
         )
     if len(active) < len(groups):
         left_out = f"{len(groups) - len(active)} of {options.counted(len(groups), 'pulse')}"
-        options.say(f"note: {left_out} left out, in which no sensor emitted its call", quiet=quiet)
+        options.say(f"note: {left_out} left out, because no sensor emitted its call", quiet=quiet)
     return active
 
 

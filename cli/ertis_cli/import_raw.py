@@ -92,8 +92,8 @@ def import_raw(
     for each measurement, and the settings of recording and processing as JSON.
 
     Files that end in .wav contain multichannel PCM, as do .h5 files with the time_data of Acoular. Their channels are
-    the rows of the layout, and their sample rate becomes that of the recording. With --passive, they are recordings
-    of other sound than that of a call, for acoustic maps.
+    the rows of the layout, and their sample rate becomes that of the recording. With --passive, the files
+    contain sound without a call, for acoustic maps.
     """
     from ertis_numba.storage import check_target, write_recording
 

@@ -46,8 +46,8 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 @click.option(
     "--level/--no-level",
     default=None,
-    help="Turn directions by roll and pitch of the poses, so that they refer to the horizontal plane; the recording's "
-    "own by default.",
+    help="Turn directions by the roll and pitch of the poses, so that they refer to the horizontal plane; the "
+    "recording's own by default.",
 )
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
 @click.option(

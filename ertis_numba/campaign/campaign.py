@@ -53,7 +53,7 @@ class _RecordingState:
 class Campaign:
     """Processing of many recordings to energyscape files, or files of acoustic maps, in a folder.
 
-    A recording whose measurements are all passive becomes acoustic maps. If only some are, they are left out.
+    A recording whose measurements are all passive becomes acoustic maps. If only some are, the others become images.
 
     The files do not depend on the number of workers or threads: only the date in them differs. A plan is chosen once
     for all recordings with the same settings. An existing file is kept if it was made from the same recording with the

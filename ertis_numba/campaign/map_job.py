@@ -70,7 +70,7 @@ class _MapsOfSensor:
         self._recording, self._camera, self._warn = recording, camera, warn
         self.times_ms: list[float] = []
         self._n_maps, self._masked_s = 0, 0.0
-        self._sum: Any = 0.0  # of powers, weighted by the measurements of their maps
+        self._sum: Any = 0.0  # Sum of powers, weighted by the measurements of their maps.
         self._last: AcousticMap | None = None
 
     def write(self, writer: AcousticMapWriter) -> Generator[None]:
@@ -103,8 +103,8 @@ class _MapsOfSensor:
             n_emitted = sum(stamp.behaviour == "active" for stamp in recording.stamps())
             self._warn(
                 f"{recording.path}: sensor {recording.sensor} emitted its call in {n_emitted} of {len(recording)} "
-                f"measurements; the first {1e3 * self._masked_s:.1f} ms of each are left out, but maps contain its "
-                "echoes"
+                f"measurements; maps leave out the first {1e3 * self._masked_s:.1f} ms of each, but contain echoes of "
+                "the call"
             )
 
     def _add(self, found: AcousticMap, elapsed_s: float) -> None:
@@ -116,7 +116,7 @@ class _MapsOfSensor:
         self._sum = self._sum + found.n_measurements * found.power.astype(np.float64)
 
     def report(self) -> dict[str, Any]:
-        """Return the report of ``--json``; ``loudest`` is that of the mean over all measurements."""
+        """Return the report of ``--json``; ``loudest`` holds those of the mean of all measurements."""
         assert self._last is not None  # noqa: S101  a recording has at least one measurement
         mean = self._last.replace(power=np.asarray(self._sum / len(self._recording), np.float32))
         return {

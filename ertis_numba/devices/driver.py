@@ -131,8 +131,8 @@ class SonarDriver:
     def deadline_s(self) -> float:
         """Timeout of a measurement: its duration, its transfer at 5 MB/s, and half a second.
 
-        On a busy machine, the transfer may take longer. While bytes of a measurement arrive, at 100 kB/s or more, it is
-        not late; it is given up half a second after the latest one.
+        On a busy machine, the transfer may take longer. A measurement is not late while its bytes arrive at 100 kB/s or
+        more. The driver gives it up half a second after the latest byte.
         """
         setup = self._state()[0]
         transfer_s = (setup.n_bytes + FRAME_BYTES) / _TRANSFER_BYTES_PER_S

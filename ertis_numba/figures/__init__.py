@@ -484,8 +484,8 @@ def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack
 def occupancy(found: OccupancyMap, **look: Unpack[StyleOptions]) -> Figure:
     """Draw an occupancy map from above: white for free, grey for unknown, and black for occupied cells.
 
-    A map of three dimensions is also drawn from the side. It shows the surest occupied cell along each line of sight,
-    so leave out floor and ceiling with ``height_m`` of `Mapper`.
+    A map of three dimensions is also drawn from the side. Each view shows the most certain occupied cell along each
+    line of sight, so leave out floor and ceiling with ``height_m`` of `Mapper`.
 
     Parameters
     ----------

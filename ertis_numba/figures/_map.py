@@ -17,7 +17,7 @@ _MAX_RATIO = 1.5  # Height of a picture relative to its width.
 
 
 def draw(style: Style, occupancy: OccupancyMap) -> Figure:
-    """Draw probabilities in grey, white for free and black for occupied cells; spaces from above and from the side."""
+    """Draw probabilities in grey, white for free and black for occupied cells; also from the side in 3D."""
     limits_m = occupancy.limits_m
     if occupancy.n_dimensions == 2:
         panels = [_panel(occupancy.probability, limits_m[0], limits_m[1], "y")]

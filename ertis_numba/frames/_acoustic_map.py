@@ -135,9 +135,9 @@ class AcousticMap(DegreesFromRadians):
     def source_level_db(self) -> NDArray[np.float32] | None:
         """Source level in dB re 20 µPa at 1 m: (direction, band) float32.
 
-        It is the level of a source at the distance ``passive.focus_m``, at 1 m from it and without absorption by the
-        air: that at the array plus the transmission loss at the centre of the band. None if the settings state no
-        distance, or not the sensitivity of the microphones.
+        The source level is the level at 1 m from a source at the distance ``passive.focus_m``, without absorption by
+        the air. It is the level at the array plus the transmission loss at the centre of the band. None if the settings
+        do not state both the distance and the sensitivity of the microphones.
         """
         return self._in_unit(LEVEL_UNITS["source_level_db"])
 
@@ -175,7 +175,7 @@ class AcousticMap(DegreesFromRadians):
         Raises
         ------
         ArgumentError
-            A limit is no frequency, or no band has its centre within the limits.
+            A limit is not a frequency, or no band has its centre within the limits.
         """
         checks.between("low_hz", low_hz, 0.0, 1e9)
         checks.between("high_hz", high_hz, 0.0, 1e9)

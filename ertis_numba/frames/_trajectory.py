@@ -40,14 +40,14 @@ class Trajectory:
     source : str, default ""
         Origin of the poses, such as "scene", "file", "application" or "odometry".
     max_gap_s : float or None, default None
-        Longest interval between two poses for an interpolation between them, in seconds. There is no pose in longer
-        intervals. None allows any.
+        Longest interval between two poses in which poses are interpolated, in seconds. Longer intervals have no poses.
+        None allows any interval.
 
     Raises
     ------
     ArgumentError
         The shapes do not match, a number is not finite, the times do not increase, or a quaternion is not of unit
-        length, or a covariance is not symmetric and positive semidefinite, or the longest interval is not above zero.
+        length, a covariance is not symmetric and positive semidefinite, or the longest interval is not above zero.
 
     Examples
     --------
@@ -240,7 +240,7 @@ class Trajectory:
     @property
     def _exception(self) -> str:
         n_gaps = int(np.count_nonzero(self._gaps()))
-        return f", except {n_gaps} intervals longer than {self.max_gap_s:g} s" if n_gaps else ""
+        return f", except {n_gaps} interval{'s' * (n_gaps != 1)} longer than {self.max_gap_s:g} s" if n_gaps else ""
 
     def _brackets(self, wanted: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Return the index of the pose before each time, and the fraction of the way to the next one."""

@@ -24,8 +24,8 @@ _SUPPRESSION: Final = (1.0, 2.0, 4.0)
 _CONFIRMED: Final = 0.25  # Reflectivity in the images of other pairs, relative to that of the pixel.
 _VISIBLE: Final = 2.0  # Power of an expected echo relative to noise and side lobes.
 _BOUND: Final = 2.0  # Reflectivity relative to the least that any pair shows.
-# Power of foreign echoes relative to the expected one, below which no foreign call is heard: if a single sensor expects
-# echoes, which may be those of a ghost, and if several do.
+# Power of foreign echoes relative to the expected one, below which no foreign call is heard. The first number applies
+# if a single sensor expects echoes, which may be those of a ghost; the second, if several do.
 _HEARD: Final = 0.1, 0.2
 _STRONG: Final = 0.1  # Reflectivity relative to the highest, from which missing echoes matter.
 _REACH: Final = 2  # Neighbouring azimuths whose reflectors cause echoes in the same pixel.
@@ -148,7 +148,7 @@ class Attribution:
             if suppression == _SUPPRESSION[-1]:
                 unheard = self._not_heard(evidence, reflectivity)
                 if unheard:
-                    # Ghosts that are left cause no foreign echoes either, so they must not decide alone.
+                    # Remaining ghosts cause no foreign echoes either, so they must not decide alone.
                     shares = self._all_shares(images, reflectivity, confirmed, suppression)
                     unheard &= self._not_heard(evidence, self._mean(own, images, shares))
                 if unheard:

@@ -37,8 +37,8 @@ def levelled_grid(grid: Grid, attitude_xyzw: ArrayLike) -> tuple[Grid, NDArray[n
     turned : Grid
         The same directions in the sensor frame.
     is_behind : (direction,) bool
-        True for directions in front of the sensor (x ≥ 0) that are behind it when they are turned. A planar array
-        cannot distinguish them from directions in front.
+        True for directions with x ≥ 0 in the level frame that lie behind the sensor. A planar array cannot distinguish
+        them from directions in front.
 
     Raises
     ------

@@ -31,7 +31,7 @@ def map_files(path: str | Path, *, n_dimensions: int = 2) -> tuple[Path, ...]:
     Raises
     ------
     ArgumentError
-        The suffix is unknown, or does not hold maps of so many dimensions.
+        The suffix is unknown, or its format does not support the dimensions of the map.
     """
     path = Path(path)
     checks.choice("suffix of the map", path.suffix.lower(), MAP_SUFFIXES)
@@ -65,8 +65,8 @@ def write_map(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = Fa
     Raises
     ------
     ArgumentError
-        The suffix is unknown or does not hold the dimensions of the map, a file exists, or the packages for MCAP are
-        not installed.
+        The suffix is unknown, its format does not support the dimensions of the map, a file exists, or the packages for
+        MCAP are not installed.
     DataError
         The disk is full or cannot be written.
 

@@ -191,8 +191,8 @@ def open_pcm(
         Time of the first emission, in nanoseconds since 1970-01-01 UTC; 0 if unknown. The times of the others follow
         from the length of a measurement.
     passive : bool
-        No call was emitted: ``processing.mode`` becomes ``passive``, and the sample rate may be too low for the call of
-        the settings, which has no meaning.
+        True if no call was emitted. ``processing.mode`` then becomes ``passive``. The call of the settings has no
+        meaning, and the sample rate may be too low for it.
 
     Returns
     -------

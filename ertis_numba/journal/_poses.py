@@ -92,9 +92,9 @@ def poses_in(database: Database, path: Path, *, after: int = 0) -> Iterator[Jour
 
 
 def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Trajectory:
-    """Return the trajectory through poses, of which the first of each time counts.
+    """Return the trajectory through poses; of several poses at one time, the first counts.
 
-    The covariance is None if that of a pose is unknown. The source lists those of the poses.
+    The covariance is None if that of any pose is unknown. The source lists the sources of the poses.
 
     Parameters
     ----------

@@ -88,7 +88,8 @@ class Memory(Protocol):
 class NewMemory(Protocol):
     """Creates the memory of a pipeline.
 
-    With ``graphs``, `Lane.run` records its steps as a CUDA graph and replays it; by default wherever the device can.
+    With ``graphs``, `Lane.run` records its steps as a CUDA graph and replays it. This is the default on devices that
+    support graphs.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Kernels of occupancy maps in plain NumPy, as a reference for the compiled ones, and where none can be compiled.
+"""Kernels of occupancy maps in plain NumPy: reference for the compiled ones, and their substitute without a compiler.
 
 They compute in the type of ``out``, so that float64 arrays give an exact reference.
 """

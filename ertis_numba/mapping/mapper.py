@@ -36,8 +36,8 @@ class Mapper:
     """Occupancy map that grows with the images of a platform at known poses.
 
     Echoes are fused (`Fuser`) and located. Each point adds evidence to the cells of its uncertainty ellipse, or in a
-    map of three dimensions, of its ellipsoid. Cells in front of the first clear echo of a direction become free, the
-    less the farther away they are. A smooth wall that the sound meets obliquely returns no echo, so silence alone shows
+    map of three dimensions, of its ellipsoid. Cells in front of the first clear echo of a direction become free, but
+    less so at larger distances. A smooth wall that the sound meets obliquely returns no echo, so silence alone shows
     free space near the platform only. Uncertain poses spread the evidence of echoes, and shorten free space.
 
     Parameters
@@ -117,8 +117,8 @@ class Mapper:
         pose : (translation_m, rotation_xyzw) or Trajectory
             Pose of the platform in the world frame: position x, y, z in metres, and the unit quaternion x, y, z, w that
             rotates the platform frame into the world frame. A trajectory is interpolated at the time of the pulse, and
-            its velocity compensates the motion during the measurement (`compensate_motion`). If it has covariances,
-            points are uncertain by those of the pose as well.
+            its velocity compensates the motion during the measurement (`compensate_motion`). Its
+            covariances, if any, add to those of the points.
         fused : Fused, optional
             Result of a `Fuser` with the same mountings for these images, if it is available; computed by default.
 

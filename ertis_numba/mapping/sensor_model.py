@@ -168,12 +168,12 @@ def _log_odds(window: Window, view: View, offset_m: Floats) -> Singles:
 def _occupied(window: Window, view: View, echoes: LocatedEchoes) -> Singles:
     """Return the evidence for occupied cells: (layer, row, column) float32.
 
-    Each echo is normally distributed, and a cell is as likely as the density at its middle. An uncertain pose stretches
-    the evidence of an echo, as if it moved with the pose: the sum over all cells remains, and the highest value falls.
+    Each echo is normally distributed, and the evidence of a cell is proportional to the density at its middle. An
+    uncertain pose spreads the evidence of an echo: the sum over all cells remains, and the highest value falls.
     """
     n_axes = 2 if window.is_planar else 3
     offset_m = echoes.offset_m @ view.rotation.T
-    # A cell is as wide as a uniform distribution.
+    # Places within a cell are uniformly distributed.
     sharp = view.rotation @ echoes.covariance_m2 @ view.rotation.T / window.cell_m**2 + np.eye(3) / 12
     covariance = sharp + view.covariance_at_m2(offset_m) / window.cell_m**2
     for each in (sharp, covariance):

@@ -31,8 +31,8 @@ class Permission(TomlTable, frozen=True, kw_only=True):
     public : str
         The key, Z85.
     role : {"sensor", "application", "admin"}
-        A sensor sends measurements of its serials and poses of their platform, an application receives products, an
-        admin may do both, and change the settings of sensors.
+        A sensor sends measurements of its serials and poses of their platform, an application receives products, and an
+        admin may do both and change the settings of sensors.
     serials : tuple of str
         Sensors that a key with the role ``sensor`` may send for.
     """

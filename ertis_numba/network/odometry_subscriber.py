@@ -30,8 +30,8 @@ class OdometryArrival:
     sensors, missing : tuple of str
         Sensors whose images were used, and other mounted sensors, which sent no image of this pulse.
     n_lost : int
-        Pulses since the one before of which no image was used: none came, no sensor emitted, or the application was too
-        slow.
+        Pulses since the previous result of which no image was used: no image arrived, no sensor emitted, or the
+        application was too slow.
     ready_utc_ns : int
         End of the computation, by the system clock of this machine.
     is_timed : bool

@@ -32,7 +32,7 @@ class PosePublisher:
 
     The central node stores the poses in the recordings that it writes, interpolated at the times of the measurements.
     While there is no connection, the latest 150 poses wait for it. Poses are not acknowledged: those of the last half
-    second before a crash of the central node are lost. One thread uses a publisher.
+    second before a crash of the central node are lost. Use a publisher in one thread only.
 
     Parameters
     ----------

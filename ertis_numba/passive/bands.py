@@ -97,8 +97,8 @@ def shaped_noise_warning(settings: Settings, bands_hz: NDArray[np.float64]) -> s
     named = ", ".join(f"{low_hz / 1e3:g} to {high_hz / 1e3:g} kHz" for low_hz, high_hz in noisy[:3])
     more = f" and {len(noisy) - 3} more" if len(noisy) > 3 else ""
     return (
-        f"the quantisation noise of one-bit microphones dominates above {limit_hz / 1e3:g} kHz, and so in "
-        f"{named}{more}; give lower bands to hear sources"
+        f"the quantisation noise of one-bit microphones dominates above {limit_hz / 1e3:g} kHz, and therefore in "
+        f"{named}{more}; choose lower bands to hear sources"
     )
 
 

@@ -18,7 +18,7 @@ Places = NDArray[np.intp]
 
 _MARKER_POWER: Final = 0.25  # Least power of a source at its marker, relative to its peak (Sijtsma et al., 2017).
 _LEAST: Final = 0.01  # Power relative to the strongest source below which a source barely disturbs others.
-_MAX_SOURCES: Final = 4  # of a bin; CLEAN-SC finds the others.
+_MAX_SOURCES: Final = 4  # Sources of a bin; CLEAN-SC finds the others.
 _SWEEPS: Final = 5
 _HOLLOW_ROUNDS: Final = 12  # Each leaves about a sixteenth of the error, as in CLEAN-SC.
 
@@ -43,16 +43,17 @@ class _Found(NamedTuple):
 
 
 class HighResolutionClean:
-    """Search for the components of sources, which markers beside their peaks keep apart.
+    """Search for the components of sources by markers beside their peaks.
 
     This is HR-CLEAN-SC (P. Sijtsma, R. Merino-Martinez, A. Malgoezar and M. Snellen, High-resolution CLEAN-SC: Theory
     and experimental validation, 2017). The component of a source is the sound coherent with its marker u, a direction
-    within the main lobe. The marker minimises the share of the other sources in this sound,
+    within the main lobe. Among the directions with ``|v^H u|² ≥ M² / 4``, the marker minimises the share of the other
+    sources in this sound,
 
-    ``F(u) = |Σ_k p_k (v_k^H u) v_k|² / |v^H u|²``, at a power of the source ``|v^H u|² ≥ M² / 4``,
+    ``F(u) = |Σ_k p_k (v_k^H u) v_k|² / |v^H u|²``,
 
     where v is the wave of the source, and p_k and v_k are the powers and waves of the others. The source moves to the
-    maximum of its component's map, and the components of weaker sources are found without this component.
+    maximum of its component's map. The component is subtracted before those of weaker sources are computed.
 
     Sources are added one by one: each at the peak of the map without all components, after which all markers are
     chosen again. The paper starts with all sources at once, and with equal weights, which requires their exact number.

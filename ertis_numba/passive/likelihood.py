@@ -140,7 +140,7 @@ class BandLikelihood:
         np.sin(lags, out=waves.imag)
         if self._whitening is None:
             return waves
-        return (self._whitening @ waves.view(np.float64)).view(np.complex128)  # real weights of both parts
+        return (self._whitening @ waves.view(np.float64)).view(np.complex128)  # Weights are real.
 
     def beams(self, directions: Floats) -> tuple[Floats, Floats]:
         """Return the power b^H C b, and the size of the wave outside of other sources, both (bin, direction)."""
@@ -151,12 +151,12 @@ class BandLikelihood:
     def separated(self, directions: Floats) -> tuple[Floats, Floats]:
         """Return the powers of sources without noise, each outside of the others, and the noise in each dimension.
 
-        The rows of the pseudoinverse of the waves are outside of the other waves.
+        Each row of the pseudoinverse of the waves is orthogonal to the waves of the other sources.
 
         Parameters
         ----------
         directions : (source, axis) float64
-            All sources, one or more; this likelihood is one without others.
+            All sources, one or more. This likelihood must have no other sources.
 
         Returns
         -------

@@ -1,7 +1,8 @@
 """Methods of acoustic maps: power from each direction, from cross-spectral matrices.
 
 ``v`` is the wave from a direction, whose M elements have a magnitude of 1, and ``C`` the cross-spectral matrix of a
-bin. Each method but those of CLEAN-SC is the quadratic form of a transformed matrix, followed by a scalar function.
+bin. All methods except CLEAN-SC and HR-CLEAN-SC are the quadratic form of a transformed matrix, followed by a scalar
+function.
 """
 
 from collections.abc import Callable

@@ -18,8 +18,9 @@ class NoiseModel:
     """Mixture of white noise of the microphones and of a diffuse field of sound.
 
     The coherence of a diffuse field between microphones at a distance d is ``sin(k d) / (k d)`` (R. K. Cook et al.,
-    Measurement of correlation coefficients in reverberant sound fields, 1955). A bin hears its mean over the frequency
-    response of the Hann window, which is smaller: the blocks of distant microphones hear different parts of the sound.
+    Measurement of correlation coefficients in reverberant sound fields, 1955). A bin measures its mean over the
+    frequency response of the Hann window, which is smaller: the blocks of distant microphones hear different parts of
+    the sound.
 
     Parameters
     ----------

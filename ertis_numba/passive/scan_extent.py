@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 __all__ = ["ScanExtent", "ScanMesh", "is_level"]
 
 _GAP: Final = 4.0  # An edge longer than this, relative to the median, spans directions that are not searched.
-_BATCH: Final = 4096  # pieces of the mesh, which limits the memory
+_BATCH: Final = 4096  # Pieces of the mesh that are processed together, which limits the memory.
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.intp]

@@ -20,7 +20,7 @@ Matrices = NDArray[np.complex128]
 
 _BLIND: Final = 0.3  # Size of a wave outside of other sources, relative to its whole, below which it is theirs.
 _FLAT: Final = 1e-9  # Information relative to the largest, below which a direction is not resolved.
-_SHARE_STEPS: Final = 10  # per decade of white noise; between steps, extents change by a few hundredths
+_SHARE_STEPS: Final = 10  # Per decade of white noise. Between steps, extents change by a few hundredths.
 _SWEEPS: Final = 2  # Corrections of all sources after each new one.
 
 
@@ -156,7 +156,7 @@ class BandSearch:
         return self._extents[step]
 
     def _likelihood(self, matrix: Matrices, places: Floats) -> tuple[BandLikelihood, float]:
-        """Return the likelihood of sources in noise, and its diffuse share, that of the matrix without sources."""
+        """Return the likelihood of sources in noise, and the diffuse share of the noise."""
         plain, rest = BandLikelihood(matrix, None, self._omega, self._weights, self._delays), matrix
         if len(places):
             waves, powers = plain.waves(places), np.maximum(plain.separated(places)[0], 0)

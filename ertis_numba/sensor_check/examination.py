@@ -42,8 +42,8 @@ def check_recording(
 
     At most 8 intact measurements of each sensor, evenly spaced, are examined for faulty microphones, noise, the call
     and the calibration, and at most 64 for lost words. Measurements without a call are examined only if there are no
-    others; the call and the calibration are then not known. Checksums, sequence numbers and time stamps are checked of
-    all.
+    others; the call and the calibration are then not known. Checksums, sequence numbers and time stamps of all
+    measurements are checked.
 
     Parameters
     ----------

@@ -112,8 +112,8 @@ def of_noise(report: Health | None, used: Settings) -> CheckResult:
         low_hz, high_hz = used.passive.extent_hz
         high_hz = min(high_hz, used.recording.sample_rate_hz / 2)
         detail = (
-            f"{report.noise_dbfs:.1f} dBFS from {low_hz / 1e3:g} to {high_hz / 1e3:g} kHz, with the sound of sources; "
-            "the dynamic range needs a call"
+            f"{report.noise_dbfs:.1f} dBFS from {low_hz / 1e3:g} to {high_hz / 1e3:g} kHz, including the sound of "
+            "sources; the dynamic range needs a call"
         )
     white_dbfs = 10 * math.log10(2 * (high_hz - low_hz) / used.recording.sample_rate_hz)
     if not used.recording.is_pdm or report.noise_dbfs <= white_dbfs + MAX_WHITE_DB:

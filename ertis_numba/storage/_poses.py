@@ -94,7 +94,7 @@ def require_times(trajectory: Trajectory, time_ns: NDArray[np.int64], sensor: st
 def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
     """Store the pose at each measurement of a sensor; the group has its rows, but no poses.
 
-    A sensor without measurements has no poses. If the trajectory has a longest gap, measurements that it does not cover
+    A sensor without measurements has no poses. If the trajectory has a `max_gap_s`, measurements that it does not cover
     have NaN.
 
     Raises
@@ -130,7 +130,7 @@ def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
 def read_poses(group: h5py.Group, path: Path) -> Trajectory | None:
     """Return the poses at the measurements of a sensor, by increasing time; None if there are none.
 
-    Measurements without a pose are left out. The trajectory then has the longest gap `MAX_GAP_S`.
+    Measurements without a pose are left out. The `max_gap_s` of the trajectory is then `MAX_GAP_S`.
 
     Raises
     ------

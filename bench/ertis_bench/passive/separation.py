@@ -36,7 +36,7 @@ PAIRS: Final = (
     SourcePair(10.0),
     SourcePair(5.0, 10.0),
 )
-"""Pairs that shall be separated."""
+"""Pairs of sources to separate."""
 
 BAND_HZ: Final = (38e3, 42e3)
 """Band of the maps."""

@@ -104,8 +104,8 @@ class Health:
         Noise in the call's band, averaged over the channels without fault. Without a call, it is the noise in the bands
         of acoustic maps, and includes the sound of sources.
     dynamic_range_db : float or None
-        Ratio of a full-scale echo of the whole call in every microphone to the noise of the image, in dB; None without
-        a call.
+        Full-scale echo of the whole call in every microphone, relative to the noise of the image, in dB; None without a
+        call.
     tones_hz : tuple of float
         Frequencies of spectral lines that most channels share; these are not faults of channels.
     unknown : tuple of str

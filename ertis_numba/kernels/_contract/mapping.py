@@ -22,7 +22,7 @@ Doubles = NDArray[np.float64]
 class FindWalls(Protocol):
     """Find the first occupied cell in each direction.
 
-    Cells outside of the map are those at its edge.
+    Places outside of the map have the values of the cells at its edge.
 
     Parameters
     ----------

@@ -131,7 +131,7 @@ def _best_s(runs: int, run: Callable[[], object]) -> float:
     run()
     for _ in range(runs):
         watch.start()
-        occupy(sums)  # so that the time excludes that of the launch
+        occupy(sums)  # so that the time excludes the launch
         watch.mark("busy")
         run()
         watch.mark("run")

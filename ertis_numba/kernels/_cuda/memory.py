@@ -24,13 +24,13 @@ class CudaMemory:
     n_lanes = 3  # one measurement being copied in, one being processed, one being copied out
 
     def __init__(self, *, graphs: bool | None = None) -> None:
-        self._graphs = graphs is not False  # graphs make a measurement two to three times as fast
+        self._graphs = graphs is not False  # Measurements are two to three times as fast with graphs.
         self._bytes = 0
         self._images = ImagePool(lambda shape: self._pinned(shape, np.float32))
 
     def table(self, array: Array) -> Array:
         """Return ``array`` on the device. Callers must not modify it afterwards."""
-        # NumPy gives an axis of length 1 any stride, but Numba then takes the array for one that is not contiguous.
+        # NumPy may give an axis of length 1 any stride, and Numba then treats the array as not contiguous.
         compact = np.ascontiguousarray(array).reshape(-1).reshape(array.shape)
         made: Array = self._made(array.nbytes, lambda: cuda.to_device(compact))
         return made

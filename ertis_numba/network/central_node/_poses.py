@@ -29,7 +29,7 @@ class _Sender:
 
 
 class PoseIntake:
-    """Receiver of poses. Each sensor has the poses of one sender, until that has been silent for some seconds.
+    """Receiver of poses. Each sensor has one sender at a time, until this sender has been silent for some seconds.
 
     Parameters
     ----------
@@ -75,8 +75,8 @@ class PoseIntake:
             elif other_id != peer_id and (shared := set(sensors).intersection(other.sensors)):
                 raise Unwanted(
                     "sensor",
-                    f"another application sends poses of the platform of sensor {min(shared)}; end one of both, or "
-                    f"wait until it has been silent for {SILENCE_LIMIT_S:g} s",
+                    f"another application already sends poses for sensor {min(shared)}; end one of them, or wait until "
+                    f"the other has been silent for {SILENCE_LIMIT_S:g} s",
                     "pose",
                 )
         if peer_id not in self._senders and len(self._senders) >= _SENDERS:

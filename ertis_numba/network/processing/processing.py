@@ -179,7 +179,7 @@ class ImageProcessing:
     def _note_passive(self, sensor: str) -> None:
         if sensor not in self._passive:
             self._passive.add(sensor)
-            text = "it emits no call: applications get its measurements, but no images of them"
+            text = "the sensor emits no call; applications receive its measurements, but no images"
             self._log.info("passive", sensor=sensor, text=text)
 
     def fds(self) -> Iterable[int]:
@@ -283,7 +283,7 @@ class ImageProcessing:
             found = any(self._start(job, runner) for job in self._queues.turns())
 
     def _start(self, job: Job, runner: Runner) -> bool:
-        """Give a waiting measurement to a worker, or to the publisher without a call; return False if it must wait."""
+        """Give a waiting measurement to a worker, or without a call to the publisher; return False if it must wait."""
         if not job.kind.settings:
             return self._forward(job)
         if not runner.takes(job.kind):
@@ -298,7 +298,7 @@ class ImageProcessing:
         return True
 
     def _forward(self, job: Job) -> bool:
-        """Pass a measurement without a call to the publisher, after the images before it; return False without room."""
+        """Pass a measurement without a call to the publisher, after the images before it; return False if full."""
         slot = self._passive_slots.take(job.words.nbytes, 0) if self._publisher.serves else None
         if slot is None:
             return False

@@ -98,7 +98,7 @@ class SlotPool:
     Parameters
     ----------
     numbers : iterable of int
-        Numbers of the slots; as many slots are in use at the same time.
+        Numbers of the slots, which limit how many are in use at the same time.
     """
 
     def __init__(self, numbers: Iterable[int]) -> None:
