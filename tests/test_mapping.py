@@ -209,6 +209,25 @@ def covariance_of(position_sd_m, yaw_sd_rad):
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
+def test_errors_of_poses_turn_places_about_the_origin_of_the_platform(dimensions):
+    """Draws of poses move places by as much as their covariance says, for sensors high above the origin as well."""
+    random = np.random.default_rng(9)
+    mixing = np.diag([0.01, 0.02, 0.03, 0.02, 0.03, 0.01]) @ random.standard_normal((6, 6))
+    covariance, origin_m = mixing @ mixing.T, np.array([1.0, -2.0, 0.4])
+    turn = Rotation.from_euler("ZYX", [40, 0, 0] if dimensions == 2 else [40, 12, -8], degrees=True)
+    places_m = turn.apply([[1.5, 0.3, 0.8], [-0.4, 2.0, 0.8]])
+    draws = random.multivariate_normal(np.zeros(6), covariance, 100_000)
+    mapper = ertis.Mapper({"high": ((0.1, 0.0, 0.8), UNTURNED)}, dimensions=dimensions)
+    view = mapper._view(  # noqa: SLF001  no public name has the covariance
+        origin_m, turn.as_matrix(), covariance
+    )
+    found = view.covariance_at_m2(origin_m + places_m - view.place_m)
+    for place_m, each in zip(places_m, found, strict=True):
+        true = np.cov((draws[:, :3] + np.cross(draws[:, 3:], place_m)).T)[:dimensions, :dimensions]
+        assert each[:dimensions, :dimensions] == pytest.approx(true, abs=0.02 * true.max())
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
 def test_exact_poses_have_no_influence_on_maps(dimensions):
     images, mounted = (views()[1][0], mountings()) if dimensions == 2 else (space()[0][0], space()[1])
     pose = (0.2, -0.1, 0.0), turned(50.0)

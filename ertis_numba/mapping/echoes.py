@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LocatedEchoes", "UsualAmplitude", "View", "echoes_of"]
+__all__ = ["LocatedEchoes", "UsualAmplitude", "View", "displaced_covariance", "echoes_of"]
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -21,6 +21,27 @@ _ANGLE_SD_RAD: Final = math.radians(0.3)
 _NEAREST_M: Final = 0.01  # Range below which directions have no meaning.
 
 
+def displaced_covariance(covariance: Floats, offset_m: Floats) -> Floats:
+    """Return the covariance of the pose of places that move with a platform: (place, 6, 6) float64.
+
+    A rotation by the small vector δ moves a place by δ × r, where r is its offset from the origin of the platform.
+
+    Parameters
+    ----------
+    covariance : (6, 6) float64
+        Covariance of x, y, z of the origin, and of the rotation about the world's x, y, z.
+    offset_m : (place, axis) float64
+        Offsets from the origin, in the world.
+    """
+    x, y, z = offset_m.T
+    slopes = np.zeros((len(offset_m), 6, 6))
+    slopes[:] = np.eye(6)
+    slopes[:, 0, 4], slopes[:, 0, 5] = z, -y
+    slopes[:, 1, 3], slopes[:, 1, 5] = -z, x
+    slopes[:, 2, 3], slopes[:, 2, 4] = y, -x
+    return np.asarray(slopes @ covariance @ slopes.transpose(0, 2, 1))
+
+
 class View(NamedTuple):
     """Place from which a platform sees its surroundings.
 
@@ -31,7 +52,7 @@ class View(NamedTuple):
     rotation : (axis, axis) float64
         Rotation from the frame of the directions to the world. In a plane, it is the heading.
     covariance : (6, 6) float64
-        Covariance of x, y, z and of the rotation about the world's x, y, z.
+        Covariance of x, y, z of this position, and of the rotation about the world's x, y, z.
     """
 
     place_m: Floats
@@ -41,20 +62,12 @@ class View(NamedTuple):
     def covariance_at_m2(self, offset_m: Floats) -> Floats:
         """Return the covariance of places, which errors of the pose cause: (point, axis, axis) float64.
 
-        A rotation by the small vector δ moves a place by δ × r, where r is its offset.
-
         Parameters
         ----------
         offset_m : (point, axis) float64
             Places relative to that of the view, in the world.
         """
-        x, y, z = offset_m.T
-        slopes = np.zeros((len(offset_m), 3, 6))
-        slopes[:, :, :3] = np.eye(3)
-        slopes[:, 0, 4], slopes[:, 0, 5] = z, -y
-        slopes[:, 1, 3], slopes[:, 1, 5] = -z, x
-        slopes[:, 2, 3], slopes[:, 2, 4] = y, -x
-        return np.asarray(slopes @ self.covariance @ slopes.transpose(0, 2, 1))
+        return displaced_covariance(self.covariance, offset_m)[:, :3, :3]
 
     @property
     def sd(self) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from ertis_numba.fusion.rig import Mountings, mounted_sensors
 from ertis_numba.geometry import mounting
 from ertis_numba.mapping.cell_grid import CellGrid
 from ertis_numba.mapping.coverage import Coverage
-from ertis_numba.mapping.echoes import LocatedEchoes, UsualAmplitude, View, echoes_of
+from ertis_numba.mapping.echoes import LocatedEchoes, UsualAmplitude, View, displaced_covariance, echoes_of
 from ertis_numba.mapping.sensor_model import add_evidence
 from ertis_numba.motion import compensate_motion
 
@@ -95,7 +95,7 @@ class Mapper:
             self._height_m = height_m
         places_m = np.array([sensor.translation_m for sensor in self._mountings.values()])
         self._near_m = float(np.hypot(*places_m.T[:2]).max())
-        self._centre_m = np.array([0.0, 0.0, places_m[:, 2].mean()])  # of directions in space
+        self._centre_m = np.array([0.0, 0.0, places_m[:, 2].mean()])  # of directions in space, at the sensors
         self._grid = CellGrid(self._cell_m, self._dimensions, self._height_m)
         self._usual = UsualAmplitude()
         self._coverages: dict[tuple[tuple[str, float, float], ...], Coverage] = {}
@@ -151,9 +151,15 @@ class Mapper:
         self._time_ns = max(time_ns, self._time_ns)
 
     def _view(self, translation_m: Floats, rotation: Floats, covariance: Floats) -> View:
-        """Return the view from the sensors in space, or from the platform with its heading in a plane."""
+        """Return the view from the sensors in space, or from the platform with its heading in a plane.
+
+        Roll and pitch also move the sensors, if they are above or below the origin of the platform.
+        """
+        centre_m = rotation @ self._centre_m
         if self._dimensions == 3:
-            return View(translation_m + rotation @ self._centre_m, rotation, covariance)
+            return View(translation_m + centre_m, rotation, displaced_covariance(covariance, centre_m[None])[0])
+        height_m = np.array([0.0, 0.0, centre_m[2]])
+        covariance = displaced_covariance(covariance, height_m[None])[0]
         heading_rad = math.atan2(rotation[1, 0], rotation[0, 0])
         c, s = math.cos(heading_rad), math.sin(heading_rad)
         planar = np.zeros((6, 6))
