@@ -31,8 +31,8 @@ def spread_echoes(place: Doubles, precision: Doubles, reach: Doubles, peak: Doub
     """Add the density of normally distributed echoes to the cells around them."""
     for centre, inverse, far, density, limit in zip(place, precision, reach, peak, most, strict=True):
         x, y, z = (
-            np.arange(max(0, math.ceil(middle - most)), min(size, math.floor(middle + most) + 1))
-            for middle, most, size in zip(centre, far, out.shape[::-1], strict=True)
+            np.arange(max(0, math.ceil(middle - within)), min(size, math.floor(middle + within) + 1))
+            for middle, within, size in zip(centre, far, out.shape[::-1], strict=True)
         )
         if not (len(x) and len(y) and len(z)):
             continue
