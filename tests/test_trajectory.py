@@ -90,6 +90,11 @@ REFUSED = {
     "huge quaternion": ({"rotation_xyzw": [[1e300] * 4] * 2}, r"rotation_xyzw has length inf at \[0\]"),
     "no pose": ({"time_ns": []}, "time_ns has no time"),
     "times": ({"time_ns": [0, 0]}, "time_ns does not increase: 0 at "),
+    "far future": (
+        {"time_ns": [0, 2**62 + 1]},
+        "time_ns runs from 0 to 4611686018427387905; give nanoseconds since 1970",
+    ),
+    "far past": ({"time_ns": [-(2**62) - 1, 0]}, "time_ns runs from -4611686018427387905 to 0; give nanoseconds since"),
     "seconds": ({"time_ns": [0.5, 1.5]}, "give one dimension of whole nanoseconds"),
     "shape": ({"position_m": np.zeros((2, 2))}, "position_m has shape"),
     "text": ({"position_m": [["x"] * 3] * 2}, "position_m is not an array of numbers"),

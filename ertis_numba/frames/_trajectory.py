@@ -13,6 +13,7 @@ from ertis_numba.frames._replacing import replaced
 __all__ = ["Trajectory"]
 
 _NS_PER_S: Final = 1e9
+_MAX_TIME_NS: Final = 2**62  # Differences of such times fit into 64 bits.
 _MAX_POSITION_M: Final = 1e8  # Beyond, float64 does not resolve nanometres.
 _MARGIN_NS: Final = 1_000_000
 _MAX_NORM_ERROR: Final = 1e-3  # Text files have few digits; a larger error is no rounding.
@@ -46,8 +47,9 @@ class Trajectory:
     Raises
     ------
     ArgumentError
-        The shapes do not match, a number is not finite, the times do not increase, or a quaternion is not of unit
-        length, a covariance is not symmetric and positive semidefinite, or the longest interval is not above zero.
+        The shapes do not match, a number is not finite, the times do not increase or exceed ±2⁶² ns, a quaternion is
+        not of unit length, a covariance is not symmetric and positive semidefinite, or the longest interval is not
+        above zero.
 
     Examples
     --------
@@ -69,6 +71,11 @@ class Trajectory:
         time_ns = _times("time_ns", self.time_ns)
         if not len(time_ns):
             raise ArgumentError("time_ns has no time; give at least one pose")
+        if time_ns.min() < -_MAX_TIME_NS or time_ns.max() > _MAX_TIME_NS:
+            raise ArgumentError(
+                f"time_ns runs from {time_ns.min()} to {time_ns.max()}; give nanoseconds since 1970 within "
+                f"±{_MAX_TIME_NS}"
+            )
         n_poses = len(time_ns)
         late = np.flatnonzero(np.diff(time_ns) <= 0)
         if late.size:
