@@ -65,7 +65,13 @@ def times_of(given):
 
 
 def pose_of(**changes):
-    fields = {"sensors": ("left",), "timestamp_ns": 5, "position_m": (1.0, 2.0, 3.0), "rotation_xyzw": IDENTITY}
+    fields = {
+        "sensors": ("left",),
+        "session_id": 1,
+        "timestamp_ns": 5,
+        "position_m": (1.0, 2.0, 3.0),
+        "rotation_xyzw": IDENTITY,
+    }
     return PlatformPose(**fields | changes)
 
 
@@ -237,6 +243,7 @@ INVALID = {
     "covariance": ({"covariance": (-1.0,) * 36}, "covariance has a negative eigenvalue"),
     "short covariance": ({"covariance": (1.0,) * 35}, "Expected `array` of length >= 36"),
     "no sensor": ({"sensors": ()}, "Expected `array` of length >= 1"),
+    "time": ({"timestamp_ns": -(2**63)}, "time_ns runs from -9223372036854775808"),
     "name": ({"sensors": ("../left",)}, "Expected `str` matching regex"),
     "source": ({"source": "s" * 65}, "Expected `str` of length <= 64"),
 }
@@ -283,20 +290,42 @@ def test_sensor_has_the_poses_of_one_sender(monkeypatch):
     intake, stored = accepted()
     now_s = [100.0]
     monkeypatch.setattr("ertis_numba.network.central_node._poses.time.monotonic", lambda: now_s[0])
-    intake.add(b"one", pose_of(sensors=("left", "right")), EVERYBODY)
+    one, two = {"session_id": 1}, {"session_id": 2}
+    intake.add(b"one", pose_of(sensors=("left", "right"), **one), EVERYBODY)
     with pytest.raises(Unwanted, match="another application already sends poses for sensor right; end one"):
-        intake.add(b"two", pose_of(sensors=("right", "top")), EVERYBODY)
-    intake.add(b"two", pose_of(sensors=("top",)), EVERYBODY)
+        intake.add(b"two", pose_of(sensors=("right", "top"), **two), EVERYBODY)
+    intake.add(b"two", pose_of(sensors=("top",), **two), EVERYBODY)
     intake.bye(b"one")
-    intake.add(b"two", pose_of(sensors=("right", "top")), EVERYBODY)
+    intake.add(b"two", pose_of(sensors=("right", "top"), **two), EVERYBODY)
     now_s[0] += messages.SILENCE_LIMIT_S + 0.1
-    intake.add(b"one", pose_of(), EVERYBODY)
-    intake.add(b"one", pose_of(sensors=("top",)), EVERYBODY)
+    intake.add(b"one", pose_of(**one), EVERYBODY)
+    intake.add(b"one", pose_of(sensors=("top",), **one), EVERYBODY)
     assert len(stored) == 5
-    for number in range(63):
-        intake.add(b"%d" % number, pose_of(sensors=(f"s{number}",)), EVERYBODY)
+    for number in range(2, 65):
+        intake.add(b"%d" % number, pose_of(sensors=(f"s{number}",), session_id=number), EVERYBODY)
     with pytest.raises(Unwanted, match="64 applications already send poses; end one of them"):
-        intake.add(b"63", pose_of(sensors=("s63",)), EVERYBODY)
+        intake.add(b"65", pose_of(sensors=("s65",), session_id=65), EVERYBODY)
+
+
+def test_sender_that_connects_again_remains_the_sender():
+    """A connection that broke and returned is another peer; the end of the former one ends nothing."""
+    intake, stored = accepted()
+    intake.add(b"before", pose_of(), EVERYBODY)
+    intake.add(b"after", pose_of(), EVERYBODY)
+    intake.bye(b"before")
+    with pytest.raises(Unwanted, match="another application already sends poses"):
+        intake.add(b"other", pose_of(session_id=2), EVERYBODY)
+    assert len(stored) == 2
+
+
+def test_invalid_poses_count_towards_the_rate(monkeypatch):
+    monkeypatch.setattr("ertis_numba.network.central_node._poses.time.monotonic", lambda: 100.0)
+    intake, _ = accepted()
+    for _ in range(MAX_RATE_HZ):
+        with pytest.raises(Unwanted, match="a pose cannot be used"):
+            intake.add(b"one", pose_of(rotation_xyzw=(0.0, 0.0, 0.0, 2.0)), EVERYBODY)
+    with pytest.raises(Unwanted, match="poses exceed"):
+        intake.add(b"one", pose_of(rotation_xyzw=(0.0, 0.0, 0.0, 2.0)), EVERYBODY)
 
 
 def test_central_node_without_storage_refuses_poses():
@@ -314,6 +343,7 @@ places = st.floats(-1e9, 1e9)
     st.builds(
         PlatformPose,
         sensors=st.lists(st.text(max_size=70), max_size=40).map(tuple) | st.just(("left", "right")),
+        session_id=st.integers(0, 2**63 - 1),
         timestamp_ns=st.integers(-(2**63), 2**63 - 1),
         position_m=st.tuples(*[places] * 3) | st.tuples(*[numbers] * 3),
         rotation_xyzw=st.tuples(*[numbers] * 4) | st.just(IDENTITY),

@@ -213,6 +213,8 @@ class PlatformPose(Message, frozen=True, kw_only=True):
     ----------
     sensors : tuple of str
         Sensors on the platform. The key must be allowed to send for each of them.
+    session_id : int
+        Session of the sender, which remains when it connects again.
     timestamp_ns : int
         Time since 1970-01-01 UTC.
     position_m, rotation_xyzw
@@ -226,6 +228,7 @@ class PlatformPose(Message, frozen=True, kw_only=True):
     routes = (("sensor", "central"),)
 
     sensors: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=32)]
+    session_id: Count
     timestamp_ns: Int64
     position_m: Position
     rotation_xyzw: Quaternion

@@ -1,6 +1,7 @@
 """Publisher of the poses of a platform, which a central node stores with the measurements of its sensors."""
 
 import collections
+import secrets
 import time
 from collections.abc import Sequence
 from types import TracebackType
@@ -70,7 +71,7 @@ class PosePublisher:
         checks.instance("source", source, str, "names the origin of the poses")
         if not 1 <= len(source) <= _MAX_SOURCE:
             raise ArgumentError(f"source has {len(source)} characters; give 1 to {_MAX_SOURCE}")
-        self._source = source
+        self._source, self._session_id = source, secrets.randbits(62)
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._connection: Connection | None = None
         self._waiting: collections.deque[bytes] = collections.deque()
@@ -135,6 +136,7 @@ class PosePublisher:
         self._hear(connection)
         message = PlatformPose(
             sensors=self._sensors,
+            session_id=self._session_id,
             timestamp_ns=int(timestamp_ns),
             position_m=tuple(pose.position_m[0].tolist()),
             rotation_xyzw=tuple(pose.rotation_xyzw[0].tolist()),

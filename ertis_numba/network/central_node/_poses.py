@@ -21,8 +21,9 @@ _SENDERS: Final = 64
 
 @dataclass(slots=True)
 class _Sender:
-    """Sender of poses: its sensors, the time of its last message, and the number of poses that it may send now."""
+    """Sender of poses: its connection and sensors, the time of its last message, and how many poses it may send now."""
 
+    peer_id: bytes
     sensors: tuple[str, ...]
     heard_s: float
     allowance: float = MAX_RATE_HZ
@@ -31,6 +32,8 @@ class _Sender:
 class PoseIntake:
     """Receiver of poses. Each sensor has one sender at a time, until this sender has been silent for some seconds.
 
+    A sender is known by its session, because a connection that breaks and returns is another peer.
+
     Parameters
     ----------
     store : Archive or None
@@ -38,7 +41,7 @@ class PoseIntake:
 
     def __init__(self, store: Archive | None) -> None:
         self._store = store
-        self._senders: dict[bytes, _Sender] = {}
+        self._senders: dict[int, _Sender] = {}  # By session.
 
     def add(self, peer_id: bytes, pose: PlatformPose, who: Permission) -> None:
         """Queue a pose to be stored.
@@ -59,31 +62,30 @@ class PoseIntake:
                     f"key {who.name} may not send for sensor {sensor}; allow it with 'ertis keys allow'",
                     "serial",
                 )
-        stored = _checked(pose)
-        self._count(peer_id, pose.sensors, time.monotonic())
-        self._store.offer_pose(stored)
+        self._count(peer_id, pose, time.monotonic())  # Before the numbers are checked, which takes longer.
+        self._store.offer_pose(_checked(pose))
 
     def bye(self, peer_id: bytes) -> None:
         """Forget a sender, so that another one may send poses of its sensors."""
-        self._senders.pop(peer_id, None)
+        self._senders = {number: sender for number, sender in self._senders.items() if sender.peer_id != peer_id}
 
-    def _count(self, peer_id: bytes, sensors: tuple[str, ...], now_s: float) -> None:
+    def _count(self, peer_id: bytes, pose: PlatformPose, now_s: float) -> None:
         """Refuse a second sender for a sensor, and a sender whose rate is too high."""
-        for other_id, other in list(self._senders.items()):
+        for session_id, other in list(self._senders.items()):
             if now_s - other.heard_s > SILENCE_LIMIT_S:
-                del self._senders[other_id]
-            elif other_id != peer_id and (shared := set(sensors).intersection(other.sensors)):
+                del self._senders[session_id]
+            elif session_id != pose.session_id and (shared := set(pose.sensors).intersection(other.sensors)):
                 raise Unwanted(
                     "sensor",
                     f"another application already sends poses for sensor {min(shared)}; end one of them, or wait until "
                     f"the other has been silent for {SILENCE_LIMIT_S:g} s",
                     "pose",
                 )
-        if peer_id not in self._senders and len(self._senders) >= _SENDERS:
+        if pose.session_id not in self._senders and len(self._senders) >= _SENDERS:
             raise Unwanted("size", f"{_SENDERS} applications already send poses; end one of them", "too many")
-        sender = self._senders.setdefault(peer_id, _Sender(sensors, now_s))
+        sender = self._senders.setdefault(pose.session_id, _Sender(peer_id, pose.sensors, now_s))
         allowance = min(MAX_RATE_HZ, sender.allowance + MAX_RATE_HZ * (now_s - sender.heard_s))
-        sender.sensors, sender.heard_s = sensors, now_s
+        sender.peer_id, sender.sensors, sender.heard_s = peer_id, pose.sensors, now_s
         sender.allowance = allowance - 1 if allowance >= 1 else allowance
         if allowance < 1:
             raise Unwanted("size", f"poses exceed {MAX_RATE_HZ} per second; send fewer", "rate")
