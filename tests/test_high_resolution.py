@@ -134,6 +134,18 @@ def test_single_source_has_one_maximum():
     assert (np.sort(power, axis=1)[:, -2] < 0.02 * power.max(axis=1)).all()
 
 
+def test_source_aside_is_not_split_in_narrow_bins():
+    """In wide bins, its sound crosses the array in a considerable part of a block, and is not coherent."""
+    spurious_db = {}
+    for spacing_hz in (1000.0, 250.0):
+        with camera_of(passive__resolution_hz=spacing_hz) as camera:
+            camera.add(heard(camera, [(60, 0.1)]))
+            power, off_deg = camera.map().power[:, 0], np.abs(np.degrees(camera.grid.azimuth_rad) - 60)
+        spurious_db[spacing_hz] = 10 * np.log10(power[off_deg > 3].max() / power[off_deg < 1.5].sum())
+    assert spurious_db[250.0] < -30
+    assert spurious_db[250.0] < spurious_db[1000.0] - 10
+
+
 @pytest.mark.parametrize("value", [0.0, np.nan])
 def test_map_without_positive_powers_has_no_sources(value):
     with camera_of() as camera:
