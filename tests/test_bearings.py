@@ -176,7 +176,7 @@ def diffuse_sound(settings, share, seed):
         ("3d:400", [10e3, 14e3], 0.95),
     ],
 )
-def test_false_alarms_have_the_asked_rate(directions, band_hz, diffuse):
+def test_false_alarms_have_the_requested_rate(directions, band_hz, diffuse):
     settings, asked, n_seeds = settings_of(processing__directions=directions, passive__bands_hz=[band_hz]), 0.1, 200
     alarms = 0
     with AcousticCamera(settings, "cpu", 1) as camera:

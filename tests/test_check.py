@@ -103,7 +103,7 @@ def silence():
     return rendered(PLANE.replace(emitter=PLANE.emitter.replace(silent=True)))
 
 
-def test_recording_without_a_call_is_judged_by_what_it_shows(tmp_path):
+def test_recording_without_a_call_is_examined_without_its_echoes(tmp_path):
     path = passive(tmp_path / "a.h5", silence(), silence(), silence())
     checked = check_recording(path)
     assert checked.verdict == f"{path}: fit for use; not known: clock drift, call, calibration"

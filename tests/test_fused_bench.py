@@ -71,7 +71,7 @@ def test_calls_bench_compares_equal_and_different_calls(tmp_path, monkeypatch):
     assert "| omnidirectional | different, an image for each pair | 16 |" in target.read_text("utf-8")
 
 
-def test_clocks_bench_counts_accusations_and_finds(tmp_path, monkeypatch):
+def test_clocks_bench_counts_false_warnings_and_found_faults(tmp_path, monkeypatch):
     monkeypatch.setattr(clock_checks, "EMITTERS_M", (0.0,))
     target = tmp_path / "page.md"
     marker = "ertis bench fusion --only clocks"

@@ -188,7 +188,7 @@ def test_pipeline_refuses_attitudes_that_cannot_be_used():
     with ertis.Pipeline(levelled(measurement), "cpu", predict=False) as pipeline:
         for wrong, message in (
             ((0, 0, 0, 2), "attitude"),
-            (attitude(0.0, 90.0).as_quat(), "looks straight up or down, so that its images have no level"),
+            (attitude(0.0, 90.0).as_quat(), "looks straight up or down, so its images have no level"),
         ):
             with pytest.raises(ertis.ArgumentError, match=message):
                 pipeline.process(measurement, attitude_xyzw=wrong)
@@ -290,7 +290,7 @@ def test_command_names_measurements_without_pose_once(recording, tmp_path):
     for path, message in (
         (part, "part.h5: sensor front has no pose at 1 of 3 measurements; add poses with 'ertis import-poses'"),
         (none, "none.h5: sensor front has no pose at 3 of 3 measurements; add poses with 'ertis import-poses'"),
-        (unmounted, "unmounted.h5: sensor front has no mounting, so that its attitude is unknown; give --mounting"),
+        (unmounted, "unmounted.h5: sensor front has no mounting, so its attitude is unknown; give --mounting"),
     ):
         done = process(path, "--level", "-o", str(tmp_path / "out.h5"), code=1)
         assert len(re.findall(re.escape(message), done.stderr)) == 1, done.stderr

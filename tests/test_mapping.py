@@ -210,7 +210,7 @@ def covariance_of(position_sd_m, yaw_sd_rad):
 
 @pytest.mark.parametrize("dimensions", [2, 3])
 def test_errors_of_poses_turn_places_about_the_origin_of_the_platform(dimensions):
-    """Draws of poses move places by as much as their covariance says, for sensors high above the origin as well."""
+    """Draws of poses move places by their covariance, also if the sensors are high above the origin."""
     random = np.random.default_rng(9)
     mixing = np.diag([0.01, 0.02, 0.03, 0.02, 0.03, 0.01]) @ random.standard_normal((6, 6))
     covariance, origin_m = mixing @ mixing.T, np.array([1.0, -2.0, 0.4])
@@ -239,7 +239,7 @@ def test_exact_poses_have_no_influence_on_maps(dimensions):
     assert np.array_equal(*found)
 
 
-def test_uncertain_poses_make_maps_softer():
+def test_uncertain_poses_make_maps_less_certain():
     """The more uncertain a pose is, the less sure are free cells, and the surest occupied ones."""
     found = []
     for position_sd_m, yaw_sd_rad in ((0.0, 0.0), (0.02, 0.0), (0.02, 0.05), (0.1, 0.05), (0.5, 0.5)):

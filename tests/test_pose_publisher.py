@@ -286,7 +286,7 @@ def test_rate_of_a_sender_is_limited(monkeypatch):
     assert 3 * MAX_RATE_HZ - 2 <= len(stored) <= 3 * MAX_RATE_HZ  # A burst of a second, and the limit for 2 s.
 
 
-def test_sensor_has_the_poses_of_one_sender(monkeypatch):
+def test_second_sender_of_poses_for_a_sensor_is_refused(monkeypatch):
     intake, stored = accepted()
     now_s = [100.0]
     monkeypatch.setattr("ertis_numba.network.central_node._poses.time.monotonic", lambda: now_s[0])
@@ -330,7 +330,7 @@ def test_invalid_poses_count_towards_the_rate(monkeypatch):
 
 def test_central_node_without_storage_refuses_poses():
     intake, _ = accepted(store=None)
-    with pytest.raises(Unwanted, match="stores no recordings, so it has no use for poses; give --record"):
+    with pytest.raises(Unwanted, match="writes no recordings that could hold poses; start it with --record"):
         intake.add(b"one", pose_of(), EVERYBODY)
 
 

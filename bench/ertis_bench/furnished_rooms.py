@@ -39,7 +39,7 @@ _MAX_YAW_RATE_RAD_S: Final = math.radians(90.0)
 _WALL_SPACING_M: Final = 0.15  # Mean spacing of the scatterers of a rough wall.
 _CLEARANCE_M: Final = 0.8
 _SPACE_CLEARANCE_M: Final = 1.0
-_SURFACE_DB: Final = -20.0  # Strength of the scatterers of a surface, of which more echo at once than of a line.
+_SURFACE_DB: Final = -20.0  # Strength of the scatterers of a surface; more of them echo at once than of a line.
 HALL_M: Final = 16.0, 10.0
 """Length and width of the hall, whose centre is the origin."""
 N_PULSES: Final = 1268

@@ -39,7 +39,7 @@ _MAX_DIFFERENCE_16_BIT_DB = -80.0  # limit where intermediate numbers are rounde
 _PUBLISHED_MS = dict(zip(map(str, DIRECTIONS), PUBLISHED_MS["GPU GTX 1080 Ti"], strict=True))
 _N_OPERATIONS, _N_BYTES = 8, 8  # per term and range: a complex multiply-add, and a complex64 to load
 _N_IMAGES = 8  # pinned images that a stream fills in turn
-_N_MAPS = 10  # per device and method
+_N_MAPS = 10  # Maps for each device and method.
 _PACKAGES = ("numba-cuda", "cupy-cuda12x", "cupy-cuda13x", "cuda-bindings", "torch", "mach-beamform")
 _SMI_FIELDS = (
     "driver_version",

@@ -36,8 +36,8 @@ __all__ = ["MappedPlace", "form", "rated", "run"]
 Floats = NDArray[np.float64]
 
 _SPACING_M: Final = 0.05  # of the scatterers of walls
-_SPACING_IN_SPACE_M: Final = 0.15  # of the scatterers of walls, floor and ceiling
-_RANGE_M: Final = {2: 4.0, 3: 3.0}  # of the images, by number of dimensions
+_SPACING_IN_SPACE_M: Final = 0.15  # Spacing of the scatterers of walls, floor and ceiling.
+_RANGE_M: Final = {2: 4.0, 3: 3.0}  # End of the images, by number of dimensions.
 _DIRECTIONS: Final = {2: "90", 3: "3d:1000"}
 # Distance of the platform up to which a sensor's image shows a surface, by number of dimensions.
 _IN_VIEW_M: Final = {2: 3.7, 3: 2.7}

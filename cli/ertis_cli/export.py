@@ -225,7 +225,7 @@ class _Items:
         chosen = [_between(places, len(reader)) for reader in readers]
         self.indices = [
             _with_call(reader, each)
-            if echoes or (process and reader.settings.processing.last_stage == "envelope")  # signals need no call
+            if echoes or (process and reader.settings.processing.last_stage == "envelope")  # Signals need no call.
             else each
             for reader, each in zip(readers, chosen, strict=True)
         ]

@@ -100,7 +100,7 @@ def peaks(
     mean square, where a full-scale tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones.
     source_level_db, in dB re 20 µPa at 1 m from the source, also needs the distance of the source (process --focus).
     Maps of the method music have no levels. Maps are counted from 0, regardless of the number of measurements that
-    they average. Only --sensor, --measurement, which chooses a map, and --json apply to them.
+    they average. Of the options, only --sensor, --measurement, which chooses a map, and --json apply to maps.
     """
     from ertis_numba.storage import file_kind
 

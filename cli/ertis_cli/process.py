@@ -165,9 +165,9 @@ def process(
 
     Passive measurements become acoustic maps.
 
-    Measurements without a call become acoustic maps: sound power from each direction, in bands of frequencies. If only
-    some measurements of a recording are passive, they are left out, and the others become images. With --mode passive,
-    all become maps, without the time of the call.
+    Measurements without a call are passive. Acoustic maps show the sound power from each direction, in bands of
+    frequencies. If only some measurements of a recording are passive, they are left out, and the others become images.
+    With --mode passive, all become maps, without the time of the call.
 
     With --fuse, all sensors of the recordings belong to one platform, and there is one image around it per SYNC pulse.
     Echoes of a sensor's call that another sensor received appear where their reflector is.

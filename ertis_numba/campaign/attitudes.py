@@ -42,7 +42,7 @@ class Attitudes:
         place = recording.rotation_xyzw if rotation_xyzw is None else rotation_xyzw
         if place is None:
             raise DataError(
-                f"{name} has no mounting, so that its attitude is unknown; give --mounting FILE, or leave out --level"
+                f"{name} has no mounting, so its attitude is unknown; give --mounting FILE, or leave out --level"
             )
         times_ns = np.unique([stamp.timestamp_ns for stamp in stamps])
         n_missing = len(stamps)

@@ -13,7 +13,7 @@ from ertis_numba.geometry.mountings import mounting
 
 __all__ = ["levelled_grid"]
 
-_MIN_HORIZONTAL = 1e-3  # of the unit vector forward, so that the sensor has a heading
+_MIN_HORIZONTAL = 1e-3  # Horizontal part of the forward unit vector from which a sensor has a heading.
 _ROUNDING = 1e-9
 
 
@@ -61,7 +61,7 @@ def levelled_grid(grid: Grid, attitude_xyzw: ArrayLike) -> tuple[Grid, NDArray[n
     forward = rotation[:, 0]
     if np.hypot(*forward[:2]) < _MIN_HORIZONTAL:
         raise ArgumentError(
-            "the sensor looks straight up or down, so that its images have no level directions; leave out "
+            "the sensor looks straight up or down, so its images have no level directions; leave out "
             "processing.level_directions"
         )
     heading_rad = np.arctan2(forward[1], forward[0])

@@ -11,7 +11,7 @@ __all__ = ["LocatedEchoes", "UsualAmplitude", "View", "displaced_covariance", "e
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
-_USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that is the usual one.
+_USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that defines the usual one.
 # Amplitude, relative to the usual one, at which one half of the points are ghosts, as measured in simulated places.
 _GHOST: Final = 0.2
 _SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.

@@ -95,7 +95,7 @@ class Mapper:
             self._height_m = height_m
         places_m = np.array([sensor.translation_m for sensor in self._mountings.values()])
         self._near_m = float(np.hypot(*places_m.T[:2]).max())
-        self._centre_m = np.array([0.0, 0.0, places_m[:, 2].mean()])  # of directions in space, at the sensors
+        self._centre_m = np.array([0.0, 0.0, places_m[:, 2].mean()])  # Origin of directions in space, at the sensors.
         self._grid = CellGrid(self._cell_m, self._dimensions, self._height_m)
         self._usual = UsualAmplitude()
         self._coverages: dict[tuple[tuple[str, float, float], ...], Coverage] = {}

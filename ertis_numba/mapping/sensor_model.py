@@ -34,10 +34,10 @@ _OPEN: Final = -0.5  # Log-odds below which a cell lets sound pass.
 _CLEAR: Final = 0.6  # Weight of a clear echo.
 # Angles between the middles of directions; the quarters of a degree make room for rounding.
 _HALF_BEAM_RAD: Final = math.radians(5.25)  # Directions beside an echo in which it may hide others.
-_HALF_RAY_RAD: Final = math.radians(1.25)  # The same for a wall of the map, whose directions are known.
+_HALF_RAY_RAD: Final = math.radians(1.25)  # The same beside a wall of the map, whose directions are known.
 _DISTRUST: Final = 0.25  # Exponent of the coverage in the weight of echoes, of which more are ghosts at the edges.
 _REACH_SD: Final = 3.0  # Standard deviations within which an echo counts.
-_POSE_SD: Final = 2.0  # Standard deviations of the pose by which free space keeps away from echoes.
+_POSE_SD: Final = 2.0  # Distance of free space from echoes, in standard deviations of the pose.
 _TOUCHED: Final = 0.02  # Probability of an echo in a cell from which the cell is not free.
 
 

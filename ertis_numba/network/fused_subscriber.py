@@ -115,7 +115,7 @@ class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
     def _result(self, received: ReceivedPulse) -> FusedArrival:
         if self._fuser is None or received.mountings != self._mountings:
             self._mountings = received.mountings
-            self._fuser = Fuser(received.mountings, **self._options)  # type: ignore[arg-type]  # all are numbers
+            self._fuser = Fuser(received.mountings, **self._options)  # type: ignore[arg-type]  # all options are numbers
         images = received.images.values()
         with nullcontext() if self._fuser.has_tables(images) else self._receiver.queue.keeping():
             fused = self._fuser(images)

@@ -27,7 +27,7 @@ def tangents(direction: Floats) -> Floats:
     size = float(np.linalg.norm(sideways))
     sideways = sideways / size if size > 1e-12 else np.array([0.0, 1.0, 0.0])
     (x, y, z), (u, v, w) = direction, sideways
-    return np.array([sideways, (y * w - z * v, z * u - x * w, x * v - y * u)])  # np.cross takes ten times as long
+    return np.array([sideways, (y * w - z * v, z * u - x * w, x * v - y * u)])  # np.cross takes ten times as long.
 
 
 def moved(direction: Floats, offsets_rad: Floats, *, level: bool) -> Floats:

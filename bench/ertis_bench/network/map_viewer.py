@@ -22,7 +22,7 @@ from ertis_numba.viewer import Live, ReceivedImage, Viewer
 __all__ = ["MapViewerJob", "n_wrong"]
 
 _CHECKED: Final = 10  # One measurement in so many is kept, and checked at the end.
-_TOLERANCE: Final = 1e-5  # of the largest power
+_TOLERANCE: Final = 1e-5  # Relative to the largest power.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

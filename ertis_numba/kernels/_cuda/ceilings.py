@@ -24,7 +24,7 @@ TURN_LOADS = _LOADS
 """Loads per thread and turn."""
 _SAMPLES = 2048  # of 8 bytes: they stay in the L1 cache of any GPU
 _MASK = np.uint32(_SAMPLES - 1)
-_OCCUPY_TURNS = 80_000  # about five milliseconds: a turn is 128 instructions per warp
+_OCCUPY_TURNS = 80_000  # About five milliseconds: a turn is 128 instructions per warp.
 _TURNS = 2_000
 _COPY_BYTES = 2**28
 
@@ -131,7 +131,7 @@ def _best_s(runs: int, run: Callable[[], object]) -> float:
     run()
     for _ in range(runs):
         watch.start()
-        occupy(sums)  # so that the time excludes the launch
+        occupy(sums)  # The time then excludes the launch.
         watch.mark("busy")
         run()
         watch.mark("run")

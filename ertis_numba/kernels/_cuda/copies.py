@@ -23,7 +23,7 @@ class Copies:
     def __init__(self, stream: Any) -> None:
         from cupy.cuda import Stream, runtime  # noqa: PLC0415 - the import takes half a second; the simulator has none
 
-        self._stream = Stream.from_external(stream)  # keeps the stream alive
+        self._stream = Stream.from_external(stream)  # This keeps the stream alive.
         self._copy = runtime.memcpyAsync
         self._up, self._down = runtime.memcpyHostToDevice, runtime.memcpyDeviceToHost
 
@@ -37,4 +37,4 @@ class Copies:
 
 
 def _address(array: Any) -> int:
-    return int(array.device_ctypes_pointer.value or 0)  # None for an empty array
+    return int(array.device_ctypes_pointer.value or 0)  # The pointer of an empty array is None.

@@ -24,7 +24,7 @@ class CudaMemory:
     n_lanes = 3  # one measurement being copied in, one being processed, one being copied out
 
     def __init__(self, *, graphs: bool | None = None) -> None:
-        self._graphs = graphs is not False  # Measurements are two to three times as fast with graphs.
+        self._graphs = graphs is not False  # Graphs make measurements two to three times as fast.
         self._bytes = 0
         self._images = ImagePool(lambda shape: self._pinned(shape, np.float32))
 

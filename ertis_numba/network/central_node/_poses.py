@@ -53,7 +53,9 @@ class PoseIntake:
         """
         if self._store is None:
             raise Unwanted(
-                "message", "this central node stores no recordings, so it has no use for poses; give --record", "pose"
+                "message",
+                "this central node writes no recordings that could hold poses; start it with --record",
+                "pose",
             )
         for sensor in pose.sensors:
             if not who.may_send(sensor):
@@ -96,7 +98,7 @@ def _checked(pose: PlatformPose) -> JournalPose:
     try:
         made = pose.trajectory
     except ArgumentError as error:
-        raise Unwanted("message", f"a pose cannot be used: {error}", "pose") from error
+        raise Unwanted("message", f"invalid pose: {error}", "pose") from error
     return JournalPose(
         pose.sensors,
         pose.timestamp_ns,
