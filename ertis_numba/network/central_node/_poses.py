@@ -32,7 +32,7 @@ class _Sender:
 class PoseIntake:
     """Receiver of poses. Each sensor has one sender at a time, until this sender has been silent for some seconds.
 
-    A sender is known by its session, because a connection that breaks and returns is another peer.
+    The session identifies a sender, because a sender that connects again is another peer.
 
     Parameters
     ----------
