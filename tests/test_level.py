@@ -13,7 +13,7 @@ from hypothesis import given, settings as hypothesis_settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
-from ertis_numba import verification
+from ertis_numba import figures, verification
 from ertis_numba.geometry import Grid, levelled_grid, unit_vectors
 from ertis_numba.network.processing.shared_pipeline import SharedPipeline
 from ertis_numba.passive import AcousticCamera
@@ -208,6 +208,8 @@ def test_parts_that_need_the_frame_of_the_sensor_refuse_level_images():
         ertis.Odometry(mountings).add([image])
     with pytest.raises(ertis.ArgumentError, match="but the ground truth is in the frame of the sensor"):
         ertis.compare(image, [])
+    with pytest.raises(ertis.ArgumentError, match="but a mounting places directions of the sensor"):
+        ertis.PointExtractor(settings)(image).on_platform_m()
     with pytest.raises(ertis.ArgumentError, match="but acoustic maps are means over measurements at several poses"):
         AcousticCamera(settings, "cpu")
     for refused in (require_images, lambda given: SharedPipeline(given.to_toml(), "cpu")):
@@ -255,6 +257,16 @@ def test_command_levels_the_images_of_a_recording(recording, tmp_path):
                 == "relative to the horizontal plane and to the heading of the sensor (processing.level_directions)"
             )
             assert "comment" not in plain["sensors/front"][name].attrs
+
+
+def test_picture_states_that_directions_are_level():
+    measurement = heard(0.0, 0.0, directions="90")
+    with ertis.Pipeline(levelled(measurement), "cpu", predict=False) as pipeline:
+        image = pipeline.process(measurement, attitude_xyzw=UNTURNED)
+    plain = image.replace(settings=measurement.settings)
+    for each, is_stated in ((image, True), (plain, False)):
+        texts = " ".join(text.get_text() for text in figures.plot(each).texts)
+        assert ("directions relative to the horizontal" in texts) == is_stated
 
 
 def test_fused_images_cannot_be_levelled(recording, tmp_path):

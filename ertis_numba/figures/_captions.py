@@ -46,6 +46,7 @@ def of_image(image: Energyscape) -> Heading:
         directions = f"azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}"
     else:
         directions = f"{len(image.azimuth_rad)} directions"
+    level = ("directions relative to the horizontal",) if processing.level_directions else ()
     parts = (processing.beamformer, "delay_and_sum"), (processing.weighting, "none")
     adaptive = "".join(f", {name.replace('_', ' ')}" for name, usual in parts if name != usual)
     budget_db = settings.accuracy.max_error_db
@@ -54,6 +55,7 @@ def of_image(image: Energyscape) -> Heading:
         (
             *_of_sensor(settings),
             directions,
+            *level,
             f"{span(image.range_m)} m in {len(image.range_m)} range{'s' if len(image.range_m) > 1 else ''}",
             f"method {processing.method}{adaptive}",
             *((f"error up to {minus(f'{budget_db:g}')} dB",) if processing.method == "fast" else ()),

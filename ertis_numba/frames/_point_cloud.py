@@ -32,7 +32,7 @@ class PointCloud(DegreesFromRadians):
     ----------
     position_m : (point, axis) float32
         Positions in metres, the strongest point first. The sensor frame is right-handed, as in REP-103: x is forward,
-        y left, z up.
+        y left, z up. If the directions of the image were levelled, they are those of `Energyscape`.
     amplitude : (point,) float32
         Envelope amplitude, as in `Energyscape`.
     settings : Settings
@@ -159,8 +159,9 @@ class PointCloud(DegreesFromRadians):
         Raises
         ------
         ArgumentError
-            The mounting of the sensor is unknown.
+            The mounting of the sensor is unknown, or the directions of the image were levelled.
         """
+        self.settings.processing.require_sensor_frame("a mounting places directions of the sensor")
         if self.translation_m is None or self.rotation_xyzw is None:
             raise ArgumentError(
                 f"the mounting of sensor {self.stamp.sensor!r} is unknown, so its points have no place on a platform; "
