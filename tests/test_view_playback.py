@@ -41,6 +41,18 @@ def test_playback_selects_one_sensor_by_name(tmp_path):
             assert [moment.measurements for moment in playback.time_steps] == [(("left", 0),), (("left", 1),)]
 
 
+@pytest.mark.parametrize("is_level", [False, True])
+def test_level_images_have_no_place_on_the_platform(tmp_path, is_level):
+    """A mounting places directions of the sensor."""
+    images = [
+        each.replace(settings=each.settings.replace("processing.level_directions", is_level)) for each in stamped(1)
+    ]
+    mounting = {images[0].stamp.sensor: (TURNED.translation_m, TURNED.rotation_xyzw)}
+    path = write_energyscapes(tmp_path / "img.h5", images, mounting=mounting)
+    with Playback(path) as playback:
+        assert [each.pose for each in playback.at(0)] == [None if is_level else TURNED]
+
+
 def test_playback_plays_pauses_and_steps(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(4))
     with Playback(path) as playback:
