@@ -134,8 +134,8 @@ def test_single_source_has_one_maximum():
     assert (np.sort(power, axis=1)[:, -2] < 0.02 * power.max(axis=1)).all()
 
 
-def test_source_aside_is_not_split_in_narrow_bins():
-    """In wide bins, its sound crosses the array in a considerable part of a block, and is not coherent."""
+def test_source_at_60_deg_is_not_split_in_narrow_bins():
+    """In wide bins, its sound takes a considerable part of a block to cross the array, and is not coherent."""
     spurious_db = {}
     for spacing_hz in (1000.0, 250.0):
         with camera_of(passive__resolution_hz=spacing_hz) as camera:
