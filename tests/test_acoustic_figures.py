@@ -111,6 +111,14 @@ def test_spectra_of_a_direction_have_source_levels():
     assert level_db[loudest] - mean.lines[0].get_ydata()[loudest] == pytest.approx(loss_db, abs=0.5)
 
 
+def test_maps_of_music_do_not_depend_on_the_distance():
+    """Their numbers have no reference, so a transmission loss must not weight the bands."""
+    near = acoustic_map("2d:91", sensitivity_dbfs=-26.0, method="music")
+    far = near.replace(settings=near.settings.replace("passive.focus_m", 10.0))
+    near_db, far_db = (figures.acoustic_map(each).axes[0].lines[0].get_ydata() for each in (near, far))
+    np.testing.assert_array_equal(near_db, far_db)
+
+
 def test_maps_of_music_are_relative():
     figure = figures.acoustic_map(acoustic_map(method="music"))
     assert figure.axes[1].get_ylabel() == "dB re strongest"

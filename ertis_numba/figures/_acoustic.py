@@ -135,7 +135,9 @@ def _levels(
 
 
 def _referred(found: AcousticMap) -> AcousticMap:
-    """Return a map whose powers are relative to the reference of its levels."""
+    """Return a map whose powers are relative to the reference of its levels, if it has any."""
+    if not found.has_level:
+        return found
     return found.replace(power=np.asarray(found.power * 10 ** (found.reference.offset_db / 10), np.float32))
 
 
