@@ -208,7 +208,7 @@ def test_parts_that_need_the_frame_of_the_sensor_refuse_level_images():
         ertis.Odometry(mountings).add([image])
     with pytest.raises(ertis.ArgumentError, match="but the ground truth is in the frame of the sensor"):
         ertis.compare(image, [])
-    with pytest.raises(ertis.ArgumentError, match="but a mounting places directions of the sensor"):
+    with pytest.raises(ertis.ArgumentError, match="but a mounting applies to directions in the frame of the sensor"):
         ertis.PointExtractor(settings)(image).on_platform_m()
     with pytest.raises(ertis.ArgumentError, match="but acoustic maps are means over measurements at several poses"):
         AcousticCamera(settings, "cpu")

@@ -43,7 +43,7 @@ def test_playback_selects_one_sensor_by_name(tmp_path):
 
 @pytest.mark.parametrize("is_level", [False, True])
 def test_level_images_have_no_place_on_the_platform(tmp_path, is_level):
-    """A mounting places directions of the sensor."""
+    """A mounting applies to directions in the frame of the sensor."""
     images = [
         each.replace(settings=each.settings.replace("processing.level_directions", is_level)) for each in stamped(1)
     ]

@@ -161,7 +161,7 @@ class PointCloud(DegreesFromRadians):
         ArgumentError
             The mounting of the sensor is unknown, or the directions of the image were levelled.
         """
-        self.settings.processing.require_sensor_frame("a mounting places directions of the sensor")
+        self.settings.processing.require_sensor_frame("a mounting applies to directions in the frame of the sensor")
         if self.translation_m is None or self.rotation_xyzw is None:
             raise ArgumentError(
                 f"the mounting of sensor {self.stamp.sensor!r} is unknown, so its points have no place on a platform; "

@@ -303,7 +303,7 @@ class Playback:
             image = self._processed(name, item) if isinstance(item, Measurement) else item
         pose = self._given.get(name) or Pose.of(reader.translation_m, reader.rotation_xyzw)
         if image.settings.processing.level_directions:
-            pose = None  # A mounting places directions of the sensor.
+            pose = None  # A mounting applies to directions in the frame of the sensor.
         return ReceivedImage(image, pose, self.time_steps[place].time_s, self._tracks[name].interval_s)
 
     def _are_maps(self, stamps: Mapping[str, Sequence[Stamp]]) -> bool:

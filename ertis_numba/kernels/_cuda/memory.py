@@ -32,7 +32,7 @@ class CudaMemory:
         """Return ``array`` on the device. Callers must not modify it afterwards."""
         # NumPy may give an axis of length 1 any stride, and Numba then treats the array as not contiguous.
         compact = np.ascontiguousarray(array)
-        if compact.size:  # An empty array has no order.
+        if compact.size:  # The order of an empty array does not matter.
             compact = compact.reshape(-1).reshape(array.shape)
         made: Array = self._made(array.nbytes, lambda: cuda.to_device(compact))
         return made
