@@ -320,7 +320,7 @@ def test_levelled_file_has_no_ground_truth_of_another_frame(tmp_path):
     ertis.add_poses(path, ertis.Trajectory([time_ns - 1, time_ns + 10**10], np.zeros((2, 3)), [UNTURNED] * 2))
     process(path, "--level", "-o", str(tmp_path / "img.h5"), "-q")
     for arguments, message in (
-        (["compare"], "but the ground truth is in the frame of the sensor; set it to false"),
+        (["compare"], "but the ground truth is in the frame of the sensor; process again without it (--no-level)"),
         (["export", "-o", str(tmp_path / "img.mcap")], "but messages of ROS are in the frame of the sensor"),
     ):
         done = CliRunner().invoke(cli, [arguments[0], str(tmp_path / "img.h5"), *arguments[1:]])

@@ -21,7 +21,7 @@ class SourcePair(NamedTuple):
     apart_deg : float
         Angle between them.
     weaker_db : float
-        Level of the first one relative to the second.
+        How far the level of the first one lies below that of the second.
     """
 
     apart_deg: float
