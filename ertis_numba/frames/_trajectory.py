@@ -172,8 +172,8 @@ class Trajectory:
         """Return linear and angular velocities by central differences between poses.
 
         At a pose, the difference spans the poses before and after it; between poses, velocities are interpolated
-        linearly. At both ends, and beside an interval longer than `max_gap_s`, the difference is one-sided. A pose alone
-        between two such intervals has the mean velocity over both.
+        linearly. At both ends, and beside an interval longer than `max_gap_s`, the difference is one-sided. A pose
+        alone between two such intervals has the mean velocity over both.
 
         Parameters
         ----------

@@ -392,7 +392,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             ``level_directions`` is true.
         """
         if self.level_directions:
-            raise ArgumentError(f"processing.level_directions is true, but {reason}; process again without it (--no-level)")
+            raise ArgumentError(
+                f"processing.level_directions is true, but {reason}; process again without it (--no-level)"
+            )
 
     def require_beams(self, wanted: str) -> None:
         """Refuse a method or beamformer without beams.
