@@ -10,7 +10,7 @@ import pytest
 
 from ertis_numba.errors import ArgumentError, DataError, DiskFullError, ErtisError, JournalInUseError
 from ertis_numba.frames import SequenceGap
-from ertis_numba.journal import SUFFIX, Journal, JournalSensor, seal_in_subprocess
+from ertis_numba.journal import SUFFIX, Journal, JournalPose, JournalSensor, seal_in_subprocess
 from ertis_numba.network.central_node import Archive, _volumes
 from ertis_numba.network.central_node._received_items import (
     Forgotten,
@@ -233,6 +233,45 @@ def test_archive_seals_full_recordings_while_storing(tmp_path):
     assert opened.archive.status().sealed == len(list(tmp_path.glob("*.h5"))) >= 2
     assert not list(tmp_path.glob(f"*{SUFFIX}"))
     assert sorted(stored(tmp_path)[0]) == sorted(wanted(given))
+
+
+def pose_of(timestamp_ns, **more):
+    fields = {"sensors": ("left",), "position_m": (1.0, 2.0, 3.0), "rotation_xyzw": (0.0, 0.0, 0.0, 1.0)}
+    return JournalPose(timestamp_ns=timestamp_ns, **fields | more)
+
+
+def test_archive_rotates_recording_full_of_poses(tmp_path):
+    """A measurement is so small that only the poses can exceed the limit of 1 MB."""
+    given = from_zero(2)
+    with Opened(tmp_path, rotate_bytes=1e6) as opened:
+        opened.give(item_of(given[0]))
+        opened.until_stored(0)
+        for number in range(4000):
+            opened.archive.offer_pose(pose_of(number, covariance=bytes(288)))
+        end_s = time.monotonic() + WAIT_S
+        while opened.archive._journal_store.volume is not None:  # noqa: SLF001
+            assert time.monotonic() < end_s
+            select.select([opened.fd], [], [], 0.05)
+        opened.give(item_of(given[1]))
+        opened.until_stored(1)
+    first, _ = sorted(tmp_path.glob(f"*{SUFFIX}"))
+    with Journal.open(first) as journal:
+        assert (len(journal), len(journal.poses)) == (1, 4000)
+
+
+def test_archive_stores_poses_once_disk_has_space_again(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    with Opened(tmp_path) as opened:
+        opened.give(item_of(from_zero(1)[0]))
+        opened.until_stored(0)
+        with monkeypatch.context() as patch:
+            patch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1_000_000))
+            opened.archive.offer_pose(pose_of(5))
+            assert "has 1.0 MB free" in opened.until(StorageFault).text
+        opened.until(Resumed)
+    (path,) = tmp_path.glob(f"*{SUFFIX}")  # The disk did not fail, so the journal was kept.
+    with Journal.open(path) as journal:
+        assert (len(journal), list(journal.poses)) == (1, [pose_of(5)])
 
 
 def test_archive_rotates_recording_after_its_time_limit(tmp_path, monkeypatch):

@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from ertis_numba.errors import DataError
-from ertis_numba.journal import Journal
+from ertis_numba.errors import DataError, DiskFullError
+from ertis_numba.journal import Journal, JournalPose
 from ertis_numba.journal._database import Database
 from tests.journals import ENVIRONMENT, EPOCH, TINY, create, entries, same
 
@@ -24,6 +24,40 @@ def test_journal_leaves_enough_space_to_seal(tmp_path, monkeypatch):
         assert len(journal) == len(journal.index()) == 3
         journal.append(entries(1, first=20))  # enough space is free again
         assert usage.free / 4 < journal.appendable_bytes() < usage.free / 2
+
+
+def test_poses_leave_enough_space_to_seal(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    poses = [
+        JournalPose(("left",), number, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), bytes(288)) for number in range(1000)
+    ]
+    with create(tmp_path) as journal:
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=10**9))
+        room = journal.appendable_bytes()
+        with monkeypatch.context() as patch:
+            patch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=9_400_000))
+            with pytest.raises(
+                DiskFullError, match=r"has 9.4 MB free, but 1\d.\d MB are needed to seal rec.h5.journal"
+            ):
+                journal.append_poses(poses)
+        assert not journal.poses
+        journal.append_poses(poses)  # enough space is free again
+        assert len(journal.poses) == 1000
+        assert 0 < journal.appendable_bytes() < room  # The recording will contain poses.
+
+
+def test_size_of_poses_is_close_to_that_in_a_journal(tmp_path):
+    poses = [
+        JournalPose(("left", "right"), 10**18 + number, (1.1, 2.2, 3.3), (0.5,) * 4, bytes(288), "odometry")
+        for number in range(20_000)
+    ]
+    with create(tmp_path) as journal:
+        journal.free_log()
+        before_bytes = journal.path.stat().st_size
+        journal.append_poses(poses)
+        journal.free_log()
+        grown_bytes = journal.path.stat().st_size - before_bytes
+    assert 0.9 < sum(pose.n_bytes for pose in poses) / grown_bytes < 1.1
 
 
 APPEND = """

@@ -13,7 +13,7 @@ from ertis_numba.frames import SequenceGap
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import JournalEntry, JournalKey, JournalSensor, verified_values
 from ertis_numba.journal._poses import JournalPose, poses_in
-from ertis_numba.journal._tables import COMPLETE_VERSION, select_statement
+from ertis_numba.journal._tables import COMPLETE_VERSION, POSES, select_statement
 
 __all__ = ["SUFFIX", "ReadableJournal"]
 
@@ -52,6 +52,7 @@ class ReadableJournal:
         self._unusable: dict[int, tuple[str, str, int]] = {}
         self._last: dict[tuple[str, int], int] = {}
         self._n_entries = self._held_bytes = 0
+        self._has_poses = False
         self._identity = 0
 
     def _load(self) -> None:
@@ -61,6 +62,7 @@ class ReadableJournal:
         target, self.source, _ = verified_values(self.path, "the journal", rows[0])
         self.target = self.path.parent / _recording_name(self.path.name, os.fsdecode(target))
         self._identity = rows[0][-1]
+        self._has_poses = self._database.has_table(POSES)
         for row in self._database.execute(select_statement("sensors", "ORDER BY id")):
             try:
                 self._register(row[0], JournalSensor.from_row(self.path, row))

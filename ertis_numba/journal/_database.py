@@ -203,6 +203,10 @@ class Database:
         if now is None or (now.st_dev, now.st_ino) != (before.st_dev, before.st_ino):
             raise JournalInUseError(f"{self._path} was removed or replaced by another process; check the folder again")
 
+    def has_table(self, name: str) -> bool:
+        """Return True if a table exists."""
+        return bool(self.execute("SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = ?", (name,)))
+
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Run a statement and return its rows.
 

@@ -14,29 +14,31 @@ __all__ = ["appendable_bytes", "recording_bytes", "require_free_space"]
 _SPARE_BYTES: Final = RESERVED_BYTES + 1_000_000  # Slightly more than sealing keeps free while it writes.
 _SENSOR_BYTES: Final = 150_000  # Tables of a recording: 90 kB were measured, and settings may be longer.
 _ROW_BYTES: Final = 150  # Bytes per row in these tables.
+_POSE_BYTES: Final = 344  # Position, quaternion and covariance of a row.
 _COMMIT_PAGES: Final = 6  # Pages that a commit changes, in addition to one for each measurement.
 
 
-def recording_bytes(words_bytes: int, *, n_rows: int, n_sensors: int) -> int:
+def recording_bytes(words_bytes: int, *, n_rows: int, n_sensors: int, has_poses: bool) -> int:
     """Return the approximate size of a recording in bytes."""
-    return words_bytes + n_rows * _ROW_BYTES + n_sensors * _SENSOR_BYTES
+    row_bytes = _ROW_BYTES + _POSE_BYTES if has_poses else _ROW_BYTES
+    return words_bytes + n_rows * row_bytes + n_sensors * _SENSOR_BYTES
 
 
 def require_free_space(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes: int) -> None:
-    """Refuse measurements after which a journal could not be sealed any more.
+    """Refuse measurements or poses after which a journal could not be sealed any more.
 
     The disk of ``target`` needs space for the recording of the whole journal, and a reserve. The disk of the journal
-    needs space to move the log to the main file. It also needs space for the new measurements, once in the log and once
-    in the main file. Without a log, it needs space for them and the changed pages.
+    needs space to move the log to the main file. It also needs space for the new content, once in the log and once in
+    the main file. Without a log, it needs space for it and the changed pages.
 
     Parameters
     ----------
     path, target : Path
         Journal, and recording to be made from it.
     sizes_bytes : sequence of int
-        Size of each new measurement, in bytes.
+        Size of each new measurement, or of all new poses, in bytes.
     seals_bytes : int
-        Size of the recording with the new measurements, in bytes.
+        Size of the recording with the new content, in bytes.
 
     Raises
     ------

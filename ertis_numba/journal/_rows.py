@@ -176,17 +176,23 @@ class WritableJournal(ReadableJournal):
 
         Raises
         ------
+        DiskFullError
+            The disk is full or nearly full, and nothing was written.
         DataError
             The disk is full or fails.
         JournalInUseError
             Another process has removed or replaced the journal.
         """
         with self._lock:
+            sizes_bytes = [sum(pose.n_bytes for pose in poses)]
+            seals_bytes = self._recording_bytes(adds_poses=True)
+            _free_space.require_free_space(self.path, self.target, sizes_bytes=sizes_bytes, seals_bytes=seals_bytes)
             self._database.require_file()
             with self._database.transaction():
                 self._database.execute(create_poses_statement())
                 for pose in poses:
                     self._insert(POSES, pose.row())
+            self._has_poses = True
 
     def discard(self, sensor: str, session_id: int, up_to: int) -> int:
         """Delete measurements of a sensor's session that another node has stored, and gaps; durably, all or none.
@@ -252,8 +258,11 @@ class WritableJournal(ReadableJournal):
         with self._lock:
             return _free_space.appendable_bytes(self.path, self.target, seals_bytes=self._recording_bytes())
 
-    def _recording_bytes(self, more_bytes: int = 0, n_more: int = 0) -> int:
-        """Return the approximate size of the recording with additional measurements."""
+    def _recording_bytes(self, more_bytes: int = 0, n_more: int = 0, *, adds_poses: bool = False) -> int:
+        """Return the approximate size of the recording with additional measurements or poses."""
         return _free_space.recording_bytes(
-            self._held_bytes + more_bytes, n_rows=len(self) + n_more, n_sensors=len(self._sensors)
+            self._held_bytes + more_bytes,
+            n_rows=len(self) + n_more,
+            n_sensors=len(self._sensors),
+            has_poses=adds_poses or self._has_poses,
         )

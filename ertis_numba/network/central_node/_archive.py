@@ -50,7 +50,7 @@ class Archive:
     name : str
         Prefix of recording names, before the time.
     rotate_bytes : float
-        Number of data bytes after which a recording is full.
+        Number of bytes of data and poses after which a recording is full.
     rotate_s : float
         Duration after which a recording is full.
     seal : bool

@@ -273,12 +273,17 @@ class JournalStore:
 
         Raises
         ------
+        DiskFullError
+            The disk is full or nearly full. The next call tries again.
         Exception
             The disk fails. The poses are stored in the next journal.
         """
         if self.volume is not None:
             try:
                 self._poses.store(self.volume)
+            except DiskFullError:  # Nothing was written.
+                self._free_logs()
+                raise
             except Exception:
                 self._fail()
                 raise

@@ -29,7 +29,7 @@ class RecentPoses:
     def __init__(self) -> None:
         self._kept: collections.deque[tuple[int, float, JournalPose]] = collections.deque(maxlen=_MAX_KEPT)
         self._next_number = 1
-        self._stored_s = -_INTERVAL_S
+        self._tried_s = -_INTERVAL_S
         self._late: dict[Path, tuple[int, float]] = {}  # First number that a journal lacks, and the end of its wait.
 
     def add(self, poses: Iterable[JournalPose], volume: Volume | None) -> None:
@@ -43,16 +43,17 @@ class RecentPoses:
             self._kept.popleft()
 
     def is_due(self, volume: Volume) -> bool:
-        """Return True if the journal in use lacks poses, and the last commit was an interval ago."""
+        """Return True if the journal in use lacks poses, and the last call of `store` was an interval ago."""
         has_more = bool(self._kept) and self._kept[-1][0] >= volume.next_pose
-        return has_more and time.monotonic() - self._stored_s >= _INTERVAL_S
+        return has_more and time.monotonic() - self._tried_s >= _INTERVAL_S
 
     def store(self, volume: Volume) -> None:
         """Store the poses that a journal lacks; see `Journal.append_poses`."""
+        self._tried_s = time.monotonic()
         lacking = list(self._from(volume.next_pose))
         if lacking:
-            volume.journal.append_poses(lacking)
-            volume.next_pose, self._stored_s = self._next_number, time.monotonic()
+            volume.append_poses(lacking)
+            volume.next_pose = self._next_number
 
     def retire(self, volume: Volume) -> None:
         """Let a finished journal wait for the poses after its last measurements if some arrived recently."""

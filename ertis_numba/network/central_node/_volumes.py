@@ -10,7 +10,7 @@ from typing import Final, Self
 
 from ertis_numba.errors import DamagedError
 from ertis_numba.frames import SequenceGap
-from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalSensor
+from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalPose, JournalSensor
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession
 
 __all__ = ["Checksums", "UnrecordedGaps", "Volume", "journal_name", "same", "sessions_in"]
@@ -58,7 +58,7 @@ class Volume:
     acked : dict of SensorSession to int
         Highest number of each session that `append` or `note_gaps` has stored.
     n_bytes : int
-        Data bytes in it.
+        Bytes of data and poses in it.
     begun_s : float
         Time of opening, by `time.monotonic`.
     next_pose : int
@@ -123,6 +123,11 @@ class Volume:
         for gap in gaps:
             run = SensorSession(gap.sensor, gap.session_id)
             self.acked[run] = max(gap.last, self.acked.get(run, -1))
+
+    def append_poses(self, poses: list[JournalPose]) -> None:
+        """Store poses durably, all or none; see `Journal.append_poses`."""
+        self.journal.append_poses(poses)
+        self.n_bytes += sum(pose.n_bytes for pose in poses)
 
     def _add(self, source: JournalSensor) -> None:
         if source.name not in self.journal.sensors:
