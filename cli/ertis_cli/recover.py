@@ -28,7 +28,7 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
     journal into a recording with its intended name and removes the journal. It skips a journal that a running capture
     uses. In a folder, it recovers all files named *.journal. If a recording cannot hold a sensor, the command seals the
     others and keeps the journal under a name that ends in .refused. The exit code is 1 if something could not be
-    sealed, and 3 if stored measurements are damaged or lost.
+    sealed, and 3 if stored measurements or poses are damaged or lost.
     """
     journals = [journal for place in places for journal in _found(place)]
     if not journals:
@@ -49,7 +49,8 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
             options.say(_reported(report), quiet=quiet)
     if as_json:
         options.print_json({"journals": reports})
-    incomplete = any(report.get("damaged") or report.get("lost") or report.get("damage") for report in reports)
+    losses = ("damaged", "lost", "damage", "pose_damage")
+    incomplete = any(report.get(loss) for report in reports for loss in losses)
     ctx.exit(_FAILED if any(map(_failed, reports)) else _INCOMPLETE if incomplete else 0)
 
 
@@ -104,6 +105,8 @@ def _reported(report: dict[str, Any]) -> str:
     reported = [options.counted(report["measurements"], "measurement"), f"{report['missing']} missing"]
     if report["damaged"]:
         reported.append(f"of which {report['damaged']} damaged; the journal is kept as {report['set_aside']}")
+    if report["pose_damage"]:
+        reported.append(f"{report['pose_damage']}; the journal is kept as {report['set_aside']}")
     if report["lost"] or report["damage"]:
         reported.append(f"up to {report['lost']} of them stored, then lost in the journal's damaged log")
     if report["damage"]:

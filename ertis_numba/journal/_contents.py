@@ -12,7 +12,7 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import JournalEntry, JournalKey, JournalSensor, verified_values
-from ertis_numba.journal._poses import JournalPose, poses_in
+from ertis_numba.journal._poses import JournalPose, read_poses
 from ertis_numba.journal._tables import COMPLETE_VERSION, POSES, select_statement
 
 __all__ = ["SUFFIX", "ReadableJournal"]
@@ -129,11 +129,16 @@ class ReadableJournal:
             if number not in self._unusable
         )
 
-    @property
-    def poses(self) -> tuple[JournalPose, ...]:
-        """Undamaged poses of platforms, in order of arrival."""
+    def read_poses(self) -> tuple[list[JournalPose], int]:
+        """Return the undamaged poses of platforms in order of arrival, and the number of damaged ones.
+
+        Raises
+        ------
+        DamagedError
+            The table of poses is damaged.
+        """
         with self._lock:
-            return tuple(poses_in(self._database, self.path))
+            return read_poses(self._database, self.path)
 
     def index(self, sensor: str | None = None) -> list[JournalKey]:
         """Return the keys of measurements of one sensor or of all, in order of arrival, without reading them."""

@@ -1,7 +1,6 @@
 """Poses of platforms in a journal."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
@@ -14,7 +13,7 @@ from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import verified_values
 from ertis_numba.journal._tables import POSES, select_statement
 
-__all__ = ["JournalPose", "poses_in", "trajectory_through"]
+__all__ = ["JournalPose", "read_poses", "trajectory_through"]
 
 _SEPARATOR: Final = ","  # Names of sensors contain none.
 _MAX_SOURCE_BYTES: Final = 1024  # Limit of a recording.
@@ -75,8 +74,8 @@ class JournalPose:
         return cls(tuple(names.split(_SEPARATOR)), time_ns, tuple(numbers[:3]), tuple(numbers[3:]), covariance, source)
 
 
-def poses_in(database: Database, path: Path, *, after: int = 0) -> Iterator[JournalPose]:
-    """Yield the undamaged poses of a journal, in order of arrival.
+def read_poses(database: Database, path: Path, *, after: int = 0) -> tuple[list[JournalPose], int]:
+    """Return the undamaged poses of a journal in order of arrival, and the number of damaged ones.
 
     Parameters
     ----------
@@ -92,10 +91,15 @@ def poses_in(database: Database, path: Path, *, after: int = 0) -> Iterator[Jour
     DamagedError
         The table is damaged.
     """
+    poses: list[JournalPose] = []
+    n_damaged = 0
     if database.has_table(POSES):
         for row in database.execute(select_statement(POSES, "WHERE id > ? ORDER BY id"), (after,)):
-            with suppress(DamagedError):
-                yield JournalPose.from_row(path, row)
+            try:
+                poses.append(JournalPose.from_row(path, row))
+            except DamagedError:
+                n_damaged += 1
+    return poses, n_damaged
 
 
 def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Trajectory:

@@ -14,7 +14,7 @@ from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import JournalEntry, JournalSensor, verified_values
 from ertis_numba.journal._files import keep_damaged_log
 from ertis_numba.journal._log import WriteAheadLog
-from ertis_numba.journal._poses import JournalPose, poses_in
+from ertis_numba.journal._poses import JournalPose, read_poses
 from ertis_numba.journal._tables import POSES, select_statement
 
 if TYPE_CHECKING:
@@ -35,7 +35,8 @@ class _RecoveredRows:
     """Rows of a repaired copy that the journal lacks.
 
     ``lost`` contains measurements with intact record and damaged samples. ``n_unreadable`` counts all other damaged
-    ones. ``is_complete`` is True if all rows have readable numbers without holes in the order of arrival.
+    ones. ``pose_damage`` describes lost poses; it is empty if there are none. ``is_complete`` is True if all rows have
+    readable numbers without holes in the order of arrival.
     """
 
     header: list[Any] = field(default_factory=list)
@@ -45,6 +46,7 @@ class _RecoveredRows:
     poses: list[JournalPose] = field(default_factory=list)
     lost: list[SequenceGap] = field(default_factory=list)
     n_unreadable: int = 0
+    pose_damage: str = ""
     is_complete: bool = False
 
 
@@ -186,8 +188,11 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Recove
             found.gaps.append(SequenceGap(sensors[number].name, first, last, reason, session_id))
     ((n_tables,),) = database.execute("SELECT count(*) FROM sqlite_schema WHERE name = ?", (POSES,))
     ((last,),) = database.execute("SELECT ifnull(max(id), 0) FROM poses") if n_tables else ((0,),)
-    with suppress(DamagedError):
-        found.poses += poses_in(repaired, journal.path, after=last)
+    try:
+        found.poses, n_damaged = read_poses(repaired, journal.path, after=last)
+        found.pose_damage = f"damaged poses: {n_damaged}" if n_damaged else ""
+    except DamagedError:
+        found.pose_damage = "poses that cannot be read"
     found.is_complete = (
         not found.n_unreadable
         and len(found.gaps) == len(gaps)
@@ -220,4 +225,5 @@ def _store_recovered(journal: "Journal", found: _RecoveredRows) -> list[str]:
     journal.note_gaps([gap for gap in found.gaps if gap.sensor in journal.sensors])
     if found.poses:
         journal.append_poses(found.poses)
-    return [f"{found.n_unreadable} measurements whose numbers cannot be read"] if found.n_unreadable else []
+    unreadable = [f"{found.n_unreadable} measurements whose numbers cannot be read"] if found.n_unreadable else []
+    return [*unreadable, found.pose_damage] if found.pose_damage else unreadable

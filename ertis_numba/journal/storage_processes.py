@@ -45,7 +45,8 @@ class SealingResult:
     damaged : int
         Number of missing measurements that were damaged in the journal, by default 0.
     set_aside : Path or None
-        New path of the journal if it has damaged or refused measurements; otherwise None, and the journal was removed.
+        New path of the journal if it has damaged poses, or damaged or refused measurements; otherwise None, and the
+        journal was removed.
     lost : int
         Number of missing measurements that the journal had noted before its log was damaged, by default 0. Each number
         belongs to a stored measurement or a gap, or was skipped by the sensor.
@@ -55,6 +56,8 @@ class SealingResult:
         Reasons why a recording cannot contain the measurements of some sensors, by sensor.
     without_pose : int
         Number of measurements without a pose, of sensors that have poses, by default 0.
+    pose_damage : str
+        Number of damaged poses, or the reason why all poses were left out; empty if there was no damage.
     """
 
     journal: Path
@@ -67,6 +70,7 @@ class SealingResult:
     damage: str = ""
     refused: dict[str, str] = field(default_factory=dict)
     without_pose: int = 0
+    pose_damage: str = ""
 
     @property
     def remark(self) -> str:
@@ -82,6 +86,8 @@ class SealingResult:
             reported.append(
                 "1 measurement is damaged" if self.damaged == 1 else f"{self.damaged} measurements are damaged"
             )
+        if self.pose_damage:
+            reported.append(self.pose_damage)
         reported += [f"no recording can hold sensor {name} ({reason})" for name, reason in self.refused.items()]
         if self.without_pose:
             reported.append(

@@ -59,8 +59,8 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     """Make the recording of a journal, verify and sync it, and then remove the journal.
 
     Measurements damaged in the journal become gaps of the recording, and the journal is kept under another name. The
-    journal is also kept if a recording cannot contain one of its sensors; the other sensors are sealed. Measurements
-    that were sealed before are not written again.
+    journal is also kept if poses in it are damaged, or if a recording cannot contain one of its sensors; the other
+    sensors are sealed. Measurements that were sealed before are not written again.
 
     Parameters
     ----------
@@ -105,17 +105,20 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
             _require_nothing_lost(journal)
             journal.remove()
             return SealingResult(path, None)
-        if target.is_file() and _is_complete_recording(target, journal, rows):
+        poses, pose_damage = _poses(journal)
+        if target.is_file() and _is_complete_recording(target, journal, rows, poses):
             for place in (target, target.parent):  # The writer may have been killed before it did this.
                 fsync(place)
         elif target.is_file() and not overwrite:
             raise DataError(f"{target} exists with other content than {path}; move it, or give --force")
         else:
-            _write(journal, rows, refused, overwrite=overwrite, progress=progress)
+            history = [f"sensor {name} was set aside: {reason}" for name, reason in refused.items()]
+            history += [pose_damage] if pose_damage else []
+            _write(journal, rows, poses, history, overwrite=overwrite, progress=progress)
         n_damaged = sum(len(held.damaged) for held in rows.values())
-        if n_damaged or refused:
-            aside = journal.set_aside("damaged" if n_damaged else REFUSED_SUFFIX)
-            return _summary(path, target, damaged=n_damaged, set_aside=aside, refused=refused)
+        if n_damaged or pose_damage or refused:
+            aside = journal.set_aside("damaged" if n_damaged or pose_damage else REFUSED_SUFFIX)
+            return _summary(path, target, damaged=n_damaged, set_aside=aside, refused=refused, pose_damage=pose_damage)
         journal.remove()
     return _summary(path, target)
 
@@ -208,10 +211,15 @@ class _SealingWriter(RecordingWriter):
 
 
 def _write(
-    journal: Journal, rows: dict[str, JournalRows], refused: dict[str, str], *, overwrite: bool, progress: Progress
+    journal: Journal,
+    rows: dict[str, JournalRows],
+    poses: dict[str, Trajectory],
+    history: list[str],
+    *,
+    overwrite: bool,
+    progress: Progress,
 ) -> None:
     sensors = [journal.sensors[name] for name in rows]
-    poses, fault = _poses(journal)
     with _SealingWriter(
         journal.target,
         overwrite=overwrite,
@@ -236,19 +244,18 @@ def _write(
             raise DataError(f"{journal.path}: all {len(journal)} measurements are damaged; copy it again if you can")
         if damage := _damage(journal, rows):
             writer.report_damage(damage)
-        kept = (f"sensor {name} was set aside: {reason}" for name, reason in refused.items())
-        left_out = [f"poses were left out: {fault}"] if fault else []
-        history = [_history_of(journal.path), *_history_of_lost_sensors(rows), *kept, *left_out]
+        history = [_history_of(journal.path), *_history_of_lost_sensors(rows), *history]
         writer.set_history("; ".join(history)[:MAX_HISTORY])
 
 
 def _poses(journal: Journal) -> tuple[dict[str, Trajectory], str]:
-    """Return the trajectory of the platform of each sensor that has one, or else why poses cannot be used."""
+    """Return the trajectory of the platform of each sensor that has one, and a line about damage to poses."""
     by_platform: dict[tuple[str, ...], list[JournalPose]] = {}
     made: dict[tuple[tuple[str, ...], ...], Trajectory] = {}
     trajectories: dict[str, Trajectory] = {}
     try:
-        for pose in journal.poses:
+        found, n_damaged = journal.read_poses()
+        for pose in found:
             by_platform.setdefault(pose.sensors, []).append(pose)
         for name in journal.sensors:
             key = tuple(sensors for sensors in by_platform if name in sensors)
@@ -258,8 +265,10 @@ def _poses(journal: Journal) -> tuple[dict[str, Trajectory], str]:
             if key:
                 trajectories[name] = made[key]
     except (DamagedError, ValueError) as error:  # Measurements are sealed without poses.
-        return {}, " ".join(str(error).split())
-    return trajectories, ""
+        return {}, f"poses were left out: {' '.join(str(error).split())}"
+    if not n_damaged:
+        return trajectories, ""
+    return trajectories, "1 pose is damaged" if n_damaged == 1 else f"{n_damaged} poses are damaged"
 
 
 def _history_of_lost_sensors(rows: dict[str, JournalRows]) -> Iterator[str]:
@@ -270,10 +279,12 @@ def _history_of_lost_sensors(rows: dict[str, JournalRows]) -> Iterator[str]:
             yield from (f"{gap.first} to {gap.last}: {gap.reason}" for gap in held.missing)
 
 
-def _is_complete_recording(target: Path, journal: Journal, rows: dict[str, JournalRows]) -> bool:
+def _is_complete_recording(
+    target: Path, journal: Journal, rows: dict[str, JournalRows], poses: dict[str, Trajectory]
+) -> bool:
     """Return True if a file is the complete, undamaged recording of a journal."""
     try:
-        names, (poses, _) = sensor_names(target), _poses(journal)
+        names = sensor_names(target)
         return set(names) <= set(rows) and all(
             _same(journal.sensors[name], held, open_recording(target, sensor=name), poses.get(name))
             if name in names
@@ -320,6 +331,7 @@ def _summary(
     damaged: int = 0,
     set_aside: Path | None = None,
     refused: dict[str, str] | None = None,
+    pose_damage: str = "",
 ) -> SealingResult:
     """Return the result of sealing."""
     n_measurements = n_missing = n_lost = n_without_pose = 0
@@ -334,7 +346,17 @@ def _summary(
             n_lost += sum(gap.n_missing for gap in reader.gaps if gap.reason == LOST)
             damage = str(reader.attributes.get(JOURNAL_DAMAGE, ""))
     return SealingResult(
-        path, recording, n_measurements, n_missing, damaged, set_aside, n_lost, damage, refused or {}, n_without_pose
+        path,
+        recording,
+        n_measurements,
+        n_missing,
+        damaged,
+        set_aside,
+        n_lost,
+        damage,
+        refused or {},
+        n_without_pose,
+        pose_damage,
     )
 
 

@@ -1,0 +1,89 @@
+"""Poses in a journal: damaged ones are reported wherever damaged measurements are."""
+
+import json
+import shutil
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+import ertis_numba as ertis
+from ertis_numba.journal import Journal, JournalPose
+from ertis_numba.storage.sealing import seal
+from tests.journals import create, entries
+from tests.test_journal_damage import spoil
+
+
+def poses_at(given, **changes):
+    """Poses at the times of measurements."""
+    fields = {"position_m": (1.0, 2.0, 3.0), "rotation_xyzw": (0.0, 0.0, 0.0, 1.0), "source": "odometry"} | changes
+    times_ns = [entry.measurement.stamp.timestamp_ns for entry in given]
+    return [JournalPose(sensors=("left",), timestamp_ns=time_ns, **fields) for time_ns in times_ns]
+
+
+def journal_with_poses(folder, **changes):
+    given = entries(4)
+    with create(folder, given) as journal:
+        journal.append_poses(poses_at(given, **changes))
+    return journal.path, given
+
+
+@pytest.mark.parametrize(
+    ("statement", "reported", "left"),
+    [
+        ("UPDATE poses SET x_m = 7 WHERE id = 2", "1 pose is damaged", (0, 2, 3)),
+        ("UPDATE poses SET source = x'00' WHERE id < 3", "2 poses are damaged", (2, 3)),
+        ("UPDATE poses SET row_crc32 = 0", "4 poses are damaged", ()),
+    ],
+)
+def test_damaged_poses_are_reported_and_the_journal_is_kept(tmp_path, statement, reported, left):
+    path, given = journal_with_poses(tmp_path)
+    spoil(path, statement)
+    with Journal.open(path) as journal:
+        assert journal.read_poses() == ([poses_at(given)[number] for number in left], 4 - len(left))
+    sealed = seal(path)
+    aside = tmp_path / "rec.h5.journal.damaged"
+    assert (sealed.pose_damage, sealed.damaged, sealed.set_aside) == (reported, 0, aside)
+    assert reported in sealed.remark
+    assert aside.exists()
+    with ertis.open_recording(tmp_path / "rec.h5") as recording:
+        assert recording.attributes["history"] == f"sealed from rec.h5.journal; {reported}"
+        assert len(recording) == 4
+        assert (recording.trajectory is None) == (not left)
+
+
+def test_poses_that_cannot_be_used_are_reported(tmp_path):
+    path, _ = journal_with_poses(tmp_path, rotation_xyzw=(0.0, 0.0, 0.0, 2.0))
+    sealed = seal(path)
+    assert sealed.pose_damage.startswith("poses were left out: rotation_xyzw has length 2")
+    assert sealed.set_aside == tmp_path / "rec.h5.journal.damaged"
+
+
+def test_recover_reports_damaged_poses(tmp_path):
+    path, _ = journal_with_poses(tmp_path)
+    spoil(path, "UPDATE poses SET x_m = 7 WHERE id = 2")
+    done = CliRunner().invoke(cli, ["recover", str(path), "--json"])
+    assert done.exit_code == 3
+    assert f"4 measurements, 0 missing, 1 pose is damaged; the journal is kept as {path}.damaged" in done.stderr
+    (report,) = json.loads(done.stdout)["journals"]
+    assert report["pose_damage"] == "1 pose is damaged"
+
+
+def test_damaged_poses_of_a_damaged_log_are_reported(tmp_path):
+    """The pose is in the damaged commit only, which a later commit of a measurement follows."""
+    given = entries(4)
+    (tmp_path / "running").mkdir()
+    with create(tmp_path / "running", given[:3]) as journal:
+        journal.append_poses(poses_at(given))
+        journal.append(given[3:])
+        for path in (tmp_path / "running").iterdir():
+            shutil.copy(path, tmp_path)
+    path = tmp_path / journal.path.name
+    log = path.with_name(f"{path.name}-wal")
+    content = bytearray(log.read_bytes())
+    content[content.rindex(b"odometry")] ^= 1
+    log.write_bytes(content)
+    with Journal.open(path) as journal:
+        assert journal.damage == "damaged poses: 1"
+        assert (len(journal), len(journal.read_poses()[0])) == (4, 3)
+    assert "also lost: damaged poses: 1" in seal(path).remark
