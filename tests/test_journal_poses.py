@@ -87,3 +87,27 @@ def test_damaged_poses_of_a_damaged_log_are_reported(tmp_path):
         assert journal.damage == "damaged poses: 1"
         assert (len(journal), len(journal.read_poses()[0])) == (4, 3)
     assert "also lost: damaged poses: 1" in seal(path).remark
+
+
+def test_poses_after_a_damaged_commit_are_recovered_once(tmp_path):
+    """The main file contains the first poses; the log contains the others after a damaged measurement."""
+    given = entries(4)
+    poses = poses_at(given)
+    (tmp_path / "running").mkdir()
+    with create(tmp_path / "running", given[:2]) as journal:
+        journal.append_poses(poses[:2])
+        journal.free_log()
+        journal.append(given[2:3])
+        journal.append_poses(poses[2:])
+        journal.append(given[3:])
+        for path in (tmp_path / "running").iterdir():
+            shutil.copy(path, tmp_path)
+    path = tmp_path / journal.path.name
+    log = path.with_name(f"{path.name}-wal")
+    content = log.read_bytes()
+    words = given[2].measurement.data.tobytes()[:64]
+    assert words in content
+    log.write_bytes(content.replace(words, bytes(64)))
+    with Journal.open(path) as journal:
+        assert journal.read_poses() == (poses, 0)
+        assert [entry.measurement.stamp.sequence for entry in journal.entries()] == [10, 11, 13]

@@ -228,7 +228,7 @@ class Database:
         self._sync_folder()
         self._delete_uncommitted()
         with self._atomic():
-            self._uncommitted_max_ids = self._max_ids()
+            self._uncommitted_max_ids = self.max_ids()
             yield
         if not self._is_log_durable:  # The first commit has created the log.
             self._is_folder_synced = False
@@ -250,10 +250,15 @@ class Database:
                 self._delete_uncommitted()
             raise
 
-    def _max_ids(self) -> dict[str, int]:
-        """Return the highest row number of each table."""
-        names = {name for (name,) in self.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")}
-        tables = [table for table in TABLES if table in names]
+    def max_ids(self) -> dict[str, int]:
+        """Return the highest row number of each table, 0 if it has no rows.
+
+        Raises
+        ------
+        DataError
+            The file is damaged or cannot be read.
+        """
+        tables = [table for table in TABLES if self.has_table(table)]
         ends = (self.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in tables)  # noqa: S608  our own
         return dict(zip(tables, ends, strict=True))
 

@@ -168,8 +168,8 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Recove
         row[0]: JournalSensor.from_row(journal.path, row) for row in repaired.execute(select_statement("sensors"))
     }
     found.sensors = [sensors[number] for number in sorted(sensors) if sensors[number].name not in journal.sensors]
-    ends = [database.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in ("measurements", "gaps")]  # noqa: S608
-    rows = repaired.execute("SELECT id FROM measurements NOT INDEXED WHERE id > ? ORDER BY id", ends[:1])
+    ends = database.max_ids()
+    rows = repaired.execute("SELECT id FROM measurements NOT INDEXED WHERE id > ? ORDER BY id", (ends["measurements"],))
     for (number,) in rows:
         record: list[int] = []
         try:
@@ -181,22 +181,21 @@ def _read(journal: "Journal", database: Database, repaired: Database) -> _Recove
                 found.lost.append(SequenceGap(sensors[record[0]].name, record[2], record[2], LOST, record[1]))
             else:
                 found.n_unreadable += 1
-    gaps = repaired.execute(select_statement("gaps", "WHERE id > ? ORDER BY id"), ends[1:])
+    gaps = repaired.execute(select_statement("gaps", "WHERE id > ? ORDER BY id"), (ends["gaps"],))
     for row in gaps:
         with suppress(DamagedError, KeyError):
             number, session_id, first, last, reason = verified_values(journal.path, "a gap", row)
             found.gaps.append(SequenceGap(sensors[number].name, first, last, reason, session_id))
-    ((n_tables,),) = database.execute("SELECT count(*) FROM sqlite_schema WHERE name = ?", (POSES,))
-    ((last,),) = database.execute("SELECT ifnull(max(id), 0) FROM poses") if n_tables else ((0,),)
     try:
-        found.poses, n_damaged = read_poses(repaired, journal.path, after=last)
+        found.poses, n_damaged = read_poses(repaired, journal.path, after=ends.get(POSES, 0))
         found.pose_damage = f"damaged poses: {n_damaged}" if n_damaged else ""
     except DamagedError:
         found.pose_damage = "poses that cannot be read"
     found.is_complete = (
         not found.n_unreadable
         and len(found.gaps) == len(gaps)
-        and all(_is_unbroken(ids, end) for ids, end in zip((rows, gaps), ends, strict=True))
+        and _is_unbroken(rows, ends["measurements"])
+        and _is_unbroken(gaps, ends["gaps"])
     )
     return found
 
