@@ -342,6 +342,28 @@ def test_passive_capture_of_a_scene_loses_no_measurement(emulate, tmp_path, monk
         assert {stamp.behaviour for stamp in made.stamps()} == {"passive"}
 
 
+@pytest.mark.parametrize(
+    ("recorded", "requested", "remedy"), [("active", "passive", "without"), ("passive", "active", "with")]
+)
+def test_emulate_reports_a_behaviour_that_the_recording_lacks(emulate, tmp_path, recorded, requested, remedy):
+    """The device warns once, and not about measurements with the behaviour of the recording."""
+    stamps = [Stamp(sensor="left", sequence=index, behaviour=recorded) for index in range(2)]
+    path = write_recording(
+        tmp_path / "rec.h5", [Measurement(words, SHORT, stamp) for words, stamp in zip(WORDS, stamps, strict=False)]
+    )
+    process = emulate(path, "--quiet")
+    emitted = {"active": b"!A,1,0,0\n", "passive": b"!A,0,0,0\n"}
+    with serial.Serial(process.stdout.readline().rstrip(), timeout=TIMEOUT_S) as port:
+        ask(port, b"!G,131072,0,0\n")
+        for counter, behaviour in enumerate((recorded, requested, requested, recorded)):
+            port.write(emitted[behaviour])
+            assert is_block(block(port), counter, WORDS[counter % 2])
+    assert ended(process, signal.SIGTERM)[2] == (
+        f"ertis: warning: left: the requested measurements are {requested}, but those of the recording are {recorded} "
+        f"and cannot change; capture {remedy} --passive, or emulate the scene\n"
+    )
+
+
 class Unrenderable(list):
     """Measurements of a scene that cannot be rendered."""
 

@@ -123,12 +123,26 @@ class Replayed(Sequence["NDArray[np.uint32]"]):
 
     def __init__(self, recording: "RecordingReader") -> None:
         self._recording = recording
+        self._behaviours = [stamp.behaviour for stamp in recording.stamps()]
+        self._reported: set[bool] = set()  # Requested behaviours whose difference was reported.
 
     def __len__(self) -> int:
         return len(self._recording)
 
     def __getitem__(self, index: Any) -> Any:
         return self._recording[index].data
+
+    def difference(self, index: int, active: bool) -> str:  # noqa: FBT001 - a callback of Emulator
+        """Return a message if a measurement differs from the requested behaviour, once for each; else an empty text."""
+        requested, recorded = ("active" if active else "passive"), self._behaviours[index]
+        if recorded in {requested, "unknown"} or active in self._reported:
+            return ""
+        self._reported.add(active)
+        remedy = "with --passive" if active else "without --passive"
+        return (
+            f"{self._recording.sensor}: the requested measurements are {requested}, but those of the recording are "
+            f"{recorded} and cannot change; capture {remedy}, or emulate the scene"
+        )
 
     def refusal(self, name: str, config: "DeviceConfig") -> str:
         """Return the reason if the recording does not match this configuration, or an empty text."""

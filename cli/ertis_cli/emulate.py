@@ -17,7 +17,7 @@ from ertis_cli._stop_signals import broken_off_by_signals, stopped_by_signals
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from ertis_cli._emulation import SceneRenderer
+    from ertis_cli._emulation import Replayed, SceneRenderer
     from ertis_numba.devices.emulator import DeviceConfig, Emulator
 
     Refusal = Callable[[str, DeviceConfig], str]
@@ -110,7 +110,8 @@ def emulate(
 
     A scene is rendered for the call that was uploaded. Without --sync-rate, all measurements with the scene's call, and
     all without emission, are rendered in advance. With --sync-rate, each is rendered at its pulse, and the first pulses
-    are slower. A recording supports only its own call; with any other call, the sensor does not measure.
+    are slower. A recording supports only its own call; with any other call, the sensor does not measure. A recording
+    also keeps its behaviour: a warning is printed if only one of host and recording has a call.
 
     'ertis capture' can read the mounting of the sensors from the same file: --mounting SCENE.toml|REC.h5.
     """
@@ -150,6 +151,7 @@ def emulate(
                     log=log,
                     accepts=partial(_accepts, refusal, name),
                     on_port=partial(_emit_event, name, quiet=quiet),
+                    on_measurement=partial(_report_difference, words) if renderer is None else None,
                 )
             )
             for place, (name, (words, passive, refusal)) in enumerate(given.items())
@@ -241,6 +243,12 @@ def _accepts(refusal: "Refusal", name: str, config: "DeviceConfig") -> bool:
     if reason:
         click.echo(f"ertis: warning: {reason}", err=True)
     return not reason
+
+
+def _report_difference(replayed: "Replayed", index: int, active: bool) -> None:  # noqa: FBT001 - a callback
+    """Print a warning if the recording has another behaviour than the host has requested."""
+    if message := replayed.difference(index, active):
+        click.echo(f"ertis: warning: {message}", err=True)
 
 
 def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> None:

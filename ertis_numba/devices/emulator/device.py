@@ -69,6 +69,9 @@ class Emulator:
     on_port : callable, optional
         Called with the new port when the device is plugged in again, from the device's thread; it must not wait for
         that thread.
+    on_measurement : callable, optional
+        Called for each measurement with the index of its samples, and True if it emits the call, from the device's
+        thread.
 
     Attributes
     ----------
@@ -103,9 +106,12 @@ class Emulator:
         accepts: Accepts | None = None,
         quirks: Quirks | None = None,
         on_port: Callable[[str], None] | None = None,
+        on_measurement: Callable[[int, bool], None] | None = None,
     ) -> None:
         require_terminals()
-        self._measurements = Measurements(words, passive, name=name, faults=faults, log=log)
+        self._measurements = Measurements(
+            words, passive, name=name, faults=faults, log=log, on_measurement=on_measurement
+        )
         self.name, self.link, self.quirks = name, link, quirks or Quirks()
         self._on_port, self._accepts = on_port, accepts
         self._held = None if link is None else HeldLink(link)

@@ -5,7 +5,7 @@ import threading
 import time
 import zlib
 from collections import deque
-from collections.abc import Sequence, Sized
+from collections.abc import Callable, Sequence, Sized
 from dataclasses import dataclass, field
 from typing import Any, TextIO
 
@@ -45,6 +45,7 @@ class Measurements:
         name: str,
         faults: Faults | None,
         log: TextIO | None,
+        on_measurement: Callable[[int, bool], None] | None = None,
     ) -> None:
         self._words = {True: words, False: words if passive is None else passive}
         checks.instance("words", words, Sized, "has the words of each measurement")
@@ -56,11 +57,14 @@ class Measurements:
                     "per sample"
                 )
         self._name, self._faults, self._log = name, faults, log
+        self._on_measurement = on_measurement
 
     def output(self, index: int, counter: int, *, active: bool, n_samples: int) -> Output:
         """Return measurement ``index`` in the requested length, with a number."""
         given = self._words[active]
         index %= len(given)
+        if self._on_measurement is not None:
+            self._on_measurement(index, active)
         words = given[index]
         if len(words) != n_samples:
             words = np.resize(words, n_samples)  # Cuts, or repeats from the beginning.
