@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ertis_cli._listen_bearings import _show
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba.air import transmission_loss_db
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Measurement
+from ertis_numba.frames import Bearing, Measurement
 from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
 from ertis_numba.passive import AcousticCamera
 from tests.publishing import PATIENCE_S, Publisher, measurement
@@ -119,16 +120,26 @@ def short():
     return Measurement(made.data[:81_920], settings, made.stamp)
 
 
-def test_listen_prints_bearings():
+def heard_leak(directions, n=1):
     scene = ertis.load_scene(ROOT / "data" / "synthetic" / "scenes" / "leak.toml")
-    changes = {"processing.directions": "3d:1000", "passive.bands_hz": [[40e3, 60e3]], "passive.focus_m": 2.5}
-    sensor = scene.sensors[0]
-    heard = ertis.render(scene.replace(sensors=(sensor.replace(**{"processing.directions": "3d:1000"}),)))
+    sensor = scene.sensors[0].replace(**{"processing.directions": directions})
+    heard = ertis.render(scene.replace(sensors=(sensor,)))
+    changes = {"processing.directions": directions, "passive.bands_hz": [[40e3, 60e3]], "passive.focus_m": 2.5}
     settings = heard.settings.replace(**changes)
-    with Publisher() as publisher, publisher.playing([Measurement(heard.data, settings, heard.stamp)]):
-        arguments = ["--bearings", "--average", "1", "-n", "1", "--duration", "60", "-q"]
-        shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments, "--json"])
+    return [Measurement(heard.data, settings, dataclasses.replace(heard.stamp, sequence=k)) for k in range(n)]
+
+
+def listen_to_bearings(measurements, *arguments):
+    with Publisher() as publisher, publisher.playing(measurements):
+        asked = ["--bearings", "--average", "1", "-n", str(len(measurements)), "--duration", "60", *arguments]
+        shown = CliRunner().invoke(cli, ["listen", publisher.address, *asked])
     assert shown.exit_code == 0, shown.output
+    return shown
+
+
+def test_listen_prints_bearings():
+    (heard,) = heard_leak("3d:1000")
+    settings, shown = heard.settings, listen_to_bearings([heard], "-q", "--json")
     found, summary = map(json.loads, shown.stdout.splitlines())
     assert (summary["received"], found["averages"], found["sensor"]) == (1, 1, "inspector")
     (leak,) = found["bearings"]
@@ -136,6 +147,44 @@ def test_listen_prints_bearings():
     assert leak["level_db"] - leak["level_dbfs"] == pytest.approx(94 + 26 + 3, abs=0.05)
     loss_db = transmission_loss_db(settings.air, 2.5, np.sqrt([40e3 * 60e3]))[0]
     assert leak["source_level_db"] - leak["level_db"] == pytest.approx(loss_db, abs=0.01)
+
+
+def test_listen_states_once_that_one_elevation_is_assumed():
+    heard = heard_leak("2d:61", n=2)
+    shown = listen_to_bearings(heard)
+    assert shown.stderr.count("sensor inspector searches one elevation") == 1
+    lines = [line for line in shown.stdout.splitlines() if "kHz" in line]
+    assert len(lines) >= 2
+    assert all(line.split("kHz")[1].count("unknown") == 1 for line in lines)
+    shown = listen_to_bearings(heard[:1], "--json")
+    found = json.loads(shown.stdout.splitlines()[0])["bearings"]
+    assert found
+    assert all(each["upwards_deg"] is None and each["sideways_deg"] > 0 for each in found)
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_unknown_direction_is_printed_as_such(capsys, as_json):
+    (heard,) = heard_leak("2d:61")
+    with AcousticCamera(heard.settings, "cpu") as camera:
+        found = camera.process(heard)
+    bearing = Bearing(
+        azimuth_deg=20.0,
+        elevation_deg=0.0,
+        sideways_deg=np.inf,
+        upwards_deg=np.inf,
+        correlation=0.0,
+        band_hz=(40e3, 60e3),
+        level_dbfs=-70.0,
+        snr_db=3.0,
+    )
+    _show(found, [bearing], 1.0, as_json=as_json)
+    shown = capsys.readouterr().out
+    if as_json:
+        (printed,) = json.loads(shown)["bearings"]
+        assert (printed["sideways_deg"], printed["upwards_deg"]) == (None, None)
+    else:
+        assert shown.count("unknown") == 2
+        assert "inf" not in shown
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from ertis_numba.passive.detection_law import exceedance, independent_samples
 from ertis_numba.passive.likelihood import BandLikelihood, moved
 from ertis_numba.passive.noise_model import NoiseModel
 from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
+from ertis_numba.passive.source_search import _inverse
 from tests.test_acoustic_camera import settings_of, sound
 
 SPACE = {"processing__directions": "3d:400", "passive__bands_hz": [[30e3, 45e3]]}
@@ -222,7 +223,7 @@ def test_elevation_of_a_flat_grid_is_kept():
     assert len(found) == 2  # one in each band
     for bearing in found:
         assert bearing.elevation_deg == pytest.approx(1)
-        assert bearing.upwards_deg == 0
+        assert bearing.upwards_deg == np.inf  # The elevation is assumed, not found.
         assert bearing.azimuth_deg == pytest.approx(30, abs=1)
 
 
@@ -235,8 +236,14 @@ def test_array_on_a_line_resolves_one_angle(directions):
         found = find_bearings(camera, top=1)[0]
     sine = np.cos(np.radians(found.elevation_deg)) * np.sin(np.radians(found.azimuth_deg))
     assert sine == pytest.approx(np.sin(np.radians(20)), abs=0.005)
-    assert found.upwards_deg == (0 if directions == "2d:61" else np.inf)
+    assert found.upwards_deg == np.inf
     assert (found.sideways_deg < 1) == (directions == "2d:61")
+
+
+@pytest.mark.parametrize("level", [True, False])
+def test_directions_without_information_are_unknown(level):
+    n = 1 if level else 2
+    np.testing.assert_array_equal(_inverse(np.zeros((n, n))), np.diag([np.inf, np.inf]))
 
 
 def test_silence_has_no_bearings():

@@ -1,5 +1,6 @@
 """Output of ``ertis listen --bearings``: one line per bearing of each acoustic map."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["listen_bearings"]
 
+_LEVEL_DEG = 1e-6
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'band':>15}  {'azimuth':>14}  {'elevation':>14}  {'level':>9}"
 
 
@@ -33,6 +35,7 @@ def listen_bearings(
     from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
 
     subscribers: list[AcousticMapSubscriber] = []
+    level: set[str] = set()
 
     def connect(on_note: Callable[[str], None]) -> AcousticMapSubscriber:
         changes = {} if average is None else {"passive.averages": average}
@@ -44,6 +47,15 @@ def listen_bearings(
         return subscribers[0]
 
     def show(found: "AcousticMap") -> None:
+        sensor, elevation_deg = found.stamp.sensor, found.elevation_deg
+        if sensor not in level and elevation_deg.max() - elevation_deg.min() < _LEVEL_DEG:
+            level.add(sensor)
+            options.say(
+                f"note: sensor {sensor} searches one elevation, {elevation_deg[0]:g}°; a source above or below has a "
+                "wrong azimuth; use directions in space, such as processing.directions 3d:2000, in the settings of the "
+                "sensor",
+                quiet=quiet,
+            )
         _show(found, subscribers[0].bearings, _age_ms(subscribers[0]), as_json=as_json)
 
     def report_active(subscriber: AcousticMapSubscriber) -> None:
@@ -98,8 +110,7 @@ def _show(found: "AcousticMap", bearings: "Sequence[Bearing]", age_ms: float | N
         click.echo(f"{start}  no source")
     for each in bearings:
         band = f"{each.band_hz[0] / 1e3:.1f}-{each.band_hz[1] / 1e3:.1f} kHz"
-        azimuth = f"{each.azimuth_deg:+.2f} ± {each.sideways_deg:.2f}°"
-        elevation = f"{each.elevation_deg:+.2f} ± {each.upwards_deg:.2f}°"
+        azimuth, elevation = _angle(each.azimuth_deg, each.sideways_deg), _angle(each.elevation_deg, each.upwards_deg)
         level, unit = each.level
         click.echo(f"{start}  {band:>15}  {azimuth:>14}  {elevation:>14}  {level:.1f} {unit}")
 
@@ -109,11 +120,18 @@ def _numbers(bearing: "Bearing") -> dict[str, object]:
         "band_hz": list(bearing.band_hz),
         "azimuth_deg": round(bearing.azimuth_deg, 4),
         "elevation_deg": round(bearing.elevation_deg, 4),
-        "sideways_deg": bearing.sideways_deg,
-        "upwards_deg": bearing.upwards_deg,
+        **{name: _finite(getattr(bearing, name)) for name in ("sideways_deg", "upwards_deg")},
         **{name: _rounded(getattr(bearing, name)) for name in ("level_dbfs", "level_db", "source_level_db")},
         "snr_db": round(bearing.snr_db, 3),
     }
+
+
+def _angle(angle_deg: float, size_deg: float) -> str:
+    return f"{angle_deg:+.2f} ± {size_deg:.2f}°" if math.isfinite(size_deg) else "unknown"
+
+
+def _finite(size_deg: float) -> float | None:
+    return size_deg if math.isfinite(size_deg) else None
 
 
 def _rounded(level_db: float | None) -> float | None:

@@ -21,8 +21,8 @@ class Bearing(RadiansFromDegrees):
         Direction in the sensor frame in degrees.
     sideways_deg, upwards_deg : float
         Standard deviations of the direction along the sphere, horizontally and vertically, in degrees. They include
-        noise only, not errors of the array. ``upwards_deg`` is 0 if the elevation was given, and both are infinite for
-        an array that cannot resolve the direction.
+        noise only, not errors of the array. They are infinite if they are unknown: ``upwards_deg`` for directions of
+        one elevation, which bearings then keep, and both for an array that cannot resolve the direction.
     correlation : float
         Correlation of the two errors.
     band_hz : (low, high)

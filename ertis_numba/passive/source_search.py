@@ -212,15 +212,12 @@ def _powers(beside: BandLikelihood, place: Floats) -> tuple[Floats, Floats]:
 
 def _inverse(information: Floats) -> Floats:
     """Return the covariance (2, 2), infinite along directions without information; one row has a given elevation."""
-    out = np.zeros((2, 2))
+    out = np.diag([math.inf, math.inf])
     n = len(information)
     values, vectors = np.linalg.eigh(information)
     if values[0] > _FLAT * values[-1]:
         out[:n, :n] = (vectors / values) @ vectors.T
-        return out
-    blind = np.abs(vectors[:, 0]) > math.sqrt(_FLAT)
-    out[:n, :n] = np.where(np.eye(n, dtype=bool) & blind, math.inf, 0)
-    seen = np.flatnonzero(~blind)
-    if n > 1 and values[-1] > 0:
+    elif values[-1] > 0:
+        seen = np.flatnonzero(np.abs(vectors[:, 0]) <= math.sqrt(_FLAT))
         out[seen, seen] = 1 / values[-1]
     return out
