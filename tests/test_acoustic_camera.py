@@ -8,7 +8,7 @@ import ertis_numba as ertis
 from ertis_numba.air import transmission_loss_db
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
-from ertis_numba.passive import AcousticCamera, is_passive, octave_bands
+from ertis_numba.passive import AcousticCamera, find_bearings, is_passive, octave_bands
 from ertis_numba.settings import MAP_METHODS, Settings
 from tests.on_device import KERNELS
 
@@ -284,6 +284,18 @@ def test_source_level_needs_distance_and_sensitivity(focus_m, sensitivity_dbfs):
     assert found.source_level_db is None
     assert {each.source_level_db for each in found.loudest()} == {None}
     assert found.reference.unit == ("dBFS" if sensitivity_dbfs is None else "dB re 20 µPa")
+
+
+def test_source_level_is_unknown_where_air_absorbs_too_much():
+    settings = settings_of(array__sensitivity_dbfs=-26.0, passive__focus_m=10_000.0)
+    with AcousticCamera(settings, "cpu") as camera:
+        camera.add(sound(settings, [(20, 0.1)], noise=0.02))
+        found, bearings = camera.map(), find_bearings(camera, top=1)
+    assert np.isnan(found.source_level_db).all()
+    assert np.isfinite(found.level_db).all()
+    assert {each.source_level_db for each in found.loudest()} == {None}
+    assert {each.as_dict()["source_level_db"] for each in found.loudest()} == {None}
+    assert {each.level[1] for each in bearings} == {found.reference.unit} == {"dB re 20 µPa"}
 
 
 def test_mode_decides_between_images_and_maps():

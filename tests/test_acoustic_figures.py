@@ -13,7 +13,7 @@ from scipy.signal import welch
 
 import ertis_numba as ertis
 from ertis_numba import figures
-from ertis_numba.air import transmission_loss_db
+from ertis_numba.air import absorption_db_m, transmission_loss_db
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.figures import _acoustic_signals
 from ertis_numba.frames import Stamp
@@ -109,6 +109,32 @@ def test_spectra_of_a_direction_have_source_levels():
     loudest = level_db.argmax()
     loss_db = transmission_loss_db(heard.settings.air, 2.0, 1e3 * frequency_khz[[loudest]])[0]
     assert level_db[loudest] - mean.lines[0].get_ydata()[loudest] == pytest.approx(loss_db, abs=0.5)
+
+
+def test_plots_leave_out_source_levels_that_absorption_hides():
+    found = acoustic_map(sensitivity_dbfs=-26.0)
+    absorbed_db_m = absorption_db_m(found.settings.air, found.centre_hz)
+    between_m = 60 / absorbed_db_m.mean()  # The air absorbs less than 60 dB in the lower band, and more in the upper.
+    found = found.replace(settings=found.settings.replace("passive.focus_m", float(between_m)))
+    assert figures.acoustic_map(found).axes[1].get_ylabel() == "dB re 20 µPa"
+    assert figures.acoustic_map(found, band_hz=(20e3, 25e3)).axes[1].get_ylabel() == "dB re 20 µPa at 1 m"
+    (axes,) = figures.spectrum(found).axes
+    assert axes.get_ylabel() == "level of a band (dB re 20 µPa at 1 m)"
+    assert [np.isfinite(bar.get_height()) for bar in axes.patches] == [True, False]
+    far = found.replace(settings=found.settings.replace("passive.focus_m", 10_000.0))
+    assert figures.acoustic_map(far).axes[1].get_ylabel() == "dB re 20 µPa"
+    assert figures.spectrum(far).axes[0].get_ylabel() == "level of a band (dB re 20 µPa)"
+
+
+def test_spectra_leave_out_source_levels_that_absorption_hides():
+    settings = settings_of(array__sensitivity_dbfs=-26.0, passive__focus_m=50.0)
+    heard = sound(settings, [(20, 0.1)])
+    (beam,) = figures.spectrum(heard, direction_deg=(20.0, 0.0)).axes
+    frequency_khz, level_db = beam.lines[0].get_data()
+    is_heard = 50.0 * absorption_db_m(settings.air, 1e3 * frequency_khz) <= 60
+    np.testing.assert_array_equal(np.isfinite(level_db), is_heard)
+    assert 0 < np.count_nonzero(is_heard) < len(is_heard)
+    assert figures.spectrogram(heard, direction_deg=(20.0, 0.0)).axes
 
 
 def test_maps_of_music_do_not_depend_on_the_distance():

@@ -18,7 +18,7 @@ from ertis_numba.figures._images import level_map
 from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures._sampling import PIXELS, centres, look_raster
 from ertis_numba.figures.style import angle, minus
-from ertis_numba.frames import AcousticMap
+from ertis_numba.frames import AcousticMap, LevelReference
 from ertis_numba.geometry import unit_vectors
 
 __all__ = ["draw", "draw_bands", "draw_on_photo"]
@@ -96,9 +96,10 @@ def draw_on_photo(
 
 def draw_bands(canvas: Canvas, found: AcousticMap, *, direction_deg: tuple[float, float] | None) -> Figure:
     """Draw the level of each band in a direction, by default the loudest of all bands together."""
-    found = _referred(found)
-    place = _place(found, direction_deg)
-    canvas, level_db = _scaled(canvas, found, found.power[place])
+    reference = LevelReference.of(found.settings, found.centre_hz)
+    power = _referred(found, reference)
+    place = _place(found, direction_deg, power)
+    canvas, level_db = _scaled(canvas, found, reference, power[place])
     edges_khz = found.band_hz / 1e3
     floor_db = canvas.top_db - canvas.dynamic_range_db
 
@@ -130,21 +131,25 @@ def _levels(
     canvas: Canvas, found: AcousticMap, band_hz: tuple[float, float] | None
 ) -> tuple[Canvas, NDArray[np.float32]]:
     """Return the levels of a band in all directions, and a canvas with their scale."""
-    found = _referred(found)
-    return _scaled(canvas, found, found.power.sum(axis=1) if band_hz is None else found.in_band(*band_hz))
+    if band_hz is not None:
+        found.in_band(*band_hz)  # raises an error if there is none
+        shown = (found.centre_hz >= band_hz[0]) & (found.centre_hz <= band_hz[1])
+        found = found.replace(power=found.power[:, shown], band_hz=found.band_hz[shown])
+    reference = found.reference
+    return _scaled(canvas, found, reference, _referred(found, reference).sum(axis=1))
 
 
-def _referred(found: AcousticMap) -> AcousticMap:
-    """Return a map whose powers are relative to the reference of its levels, if it has any."""
-    if not found.has_level:
-        return found
-    return found.replace(power=np.asarray(found.power * 10 ** (found.reference.offset_db / 10), np.float32))
+def _referred(found: AcousticMap, reference: LevelReference) -> NDArray[np.float64]:
+    """Return powers relative to a reference, if the map has levels; NaN where that is unknown."""
+    return found.power * 10 ** (reference.offset_db / 10) if found.has_level else found.power.astype(np.float64)
 
 
-def _scaled(canvas: Canvas, found: AcousticMap, power: NDArray[np.float32]) -> tuple[Canvas, NDArray[np.float32]]:
+def _scaled(
+    canvas: Canvas, found: AcousticMap, reference: LevelReference, power: NDArray[np.float64]
+) -> tuple[Canvas, NDArray[np.float32]]:
     """Return levels limited to the dynamic range below the highest, and a canvas with their scale."""
-    unit = found.reference.unit if found.has_level else canvas.unit
-    highest = float(power.max(initial=0.0)) or 1.0
+    unit = reference.unit if found.has_level else canvas.unit
+    highest = float(np.nanmax(power, initial=0.0)) or 1.0
     top_db = 10 * math.log10(highest) if found.has_level else 0.0
     lowest = 10 ** (-canvas.dynamic_range_db / 10)
     below_db = 10 * np.log10(np.maximum(power / highest, lowest))
@@ -189,10 +194,10 @@ def _with_loudest(canvas: Canvas, found: AcousticMap, level_db: NDArray[np.float
     return replace(panel, finish=finish)
 
 
-def _place(found: AcousticMap, direction_deg: tuple[float, float] | None) -> int:
+def _place(found: AcousticMap, direction_deg: tuple[float, float] | None, power: NDArray[np.float64]) -> int:
     """Return the index of the direction nearest to one, or of the loudest."""
     if direction_deg is None:
-        return int(np.argmax(found.power.sum(axis=1)))
+        return int(np.argmax(np.nansum(power, axis=1)))
     wanted = unit_vectors(*np.radians(direction_deg).reshape(2, 1))[0]
     return int(np.argmax(unit_vectors(found.azimuth_rad, found.elevation_rad) @ wanted))
 

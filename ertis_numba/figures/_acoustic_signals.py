@@ -140,9 +140,9 @@ def _reference(
 def _scaled(
     canvas: Canvas, reference: LevelReference, power: NDArray[np.float32]
 ) -> tuple[Canvas, NDArray[np.float32]]:
-    """Return levels over frequency and time, and a canvas with their scale."""
+    """Return levels over frequency and time, NaN where they are unknown, and a canvas with their scale."""
     power = power * np.asarray(10 ** (reference.offset_db / 10), np.float32)[:, None]
-    highest = float(power.max(initial=0.0)) or 1.0
+    highest = float(np.nanmax(power, initial=0.0)) or 1.0
     top_db = 10 * math.log10(highest)
     lowest = 10 ** (-canvas.dynamic_range_db / 10)
     level_db = top_db + 10 * np.log10(np.maximum(power / highest, lowest))

@@ -32,7 +32,8 @@ class Loudest(NamedTuple):
     level_db : float or None
         Sound pressure level at the array in dB re 20 µPa; None if the sensitivity of the microphones is unknown.
     source_level_db : float or None
-        Source level in dB re 20 µPa at 1 m; None if the sensitivity or the distance of the sources is unknown.
+        Source level in dB re 20 µPa at 1 m; None if the sensitivity or the distance of the sources is unknown, or if
+        the air absorbs more than 60 dB over this distance.
     """
 
     band_hz: tuple[float, float]
@@ -137,7 +138,8 @@ class AcousticMap(DegreesFromRadians):
 
         The source level is the level at 1 m from a source at the distance ``passive.focus_m``, without absorption by
         the air. It is the level at the array plus the transmission loss at the centre of the band. None if the settings
-        do not state both the distance and the sensitivity of the microphones.
+        do not state both the distance and the sensitivity of the microphones. NaN in bands of which the air absorbs
+        more than 60 dB over this distance: the absorption is known to ±10 %, so that 6 dB or more would be unknown.
         """
         return self._in_unit(LEVEL_UNITS["source_level_db"])
 
@@ -148,8 +150,8 @@ class AcousticMap(DegreesFromRadians):
 
     @property
     def reference(self) -> LevelReference:
-        """Reference of the levels in plots: source level, sound pressure level or full scale, as the settings allow."""
-        return LevelReference.of(self.settings, self.centre_hz)
+        """Reference of all levels: source level, sound pressure level or full scale, the first known in every band."""
+        return LevelReference.of(self.settings, self.centre_hz, is_complete=True)
 
     def _in_unit(self, unit: LevelUnit) -> NDArray[np.float32] | None:
         offset_db = level_offset_db(self.settings, self.centre_hz, unit)
@@ -201,7 +203,7 @@ class AcousticMap(DegreesFromRadians):
                 (float(low_hz), float(high_hz)),
                 float(self.azimuth_rad[place]),
                 float(self.elevation_rad[place]),
-                *(None if each is None else float(each[place, band]) for each in levels),
+                *(None if each is None or np.isnan(each[place, band]) else float(each[place, band]) for each in levels),
             )
             for band, (place, (low_hz, high_hz)) in enumerate(
                 zip(np.argmax(self.power, axis=0), self.band_hz, strict=True)

@@ -5,7 +5,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import transmission_loss_db
+from ertis_numba.air import absorption_db_m, transmission_loss_db
 from ertis_numba.settings import Settings
 from ertis_numba.units import sound_pressure_level_db
 
@@ -20,13 +20,17 @@ LEVEL_UNITS: Final[dict[str, LevelUnit]] = {
 }
 """Units of levels by the name of a field, the most informative first."""
 
+# ISO 9613-1 (7.1) states the absorption to ±10 %, so that beyond this limit, a source level is off by 6 dB and more.
+_MAX_ABSORPTION_DB: Final = 60.0
+
 
 def level_offset_db(
     settings: Settings, frequency_hz: NDArray[np.float64], unit: LevelUnit
 ) -> NDArray[np.float64] | None:
     """Return the level of a mean square of 1 at the array in a unit: (frequency,) float64.
 
-    None if ``array.sensitivity_dbfs``, or for the source level ``passive.focus_m``, is unknown.
+    None if ``array.sensitivity_dbfs``, or for the source level ``passive.focus_m``, is unknown. NaN for source levels
+    at frequencies of which the air absorbs more than 60 dB over the distance.
 
     Parameters
     ----------
@@ -42,7 +46,10 @@ def level_offset_db(
     pressure_db = np.full(len(frequency_hz), sound_pressure_level_db(0.0, sensitivity_dbfs))
     if unit == "dB re 20 µPa":
         return pressure_db
-    return None if focus_m is None else pressure_db + transmission_loss_db(settings.air, focus_m, frequency_hz)
+    if focus_m is None:
+        return None
+    is_heard = focus_m * absorption_db_m(settings.air, frequency_hz) <= _MAX_ABSORPTION_DB
+    return np.where(is_heard, pressure_db + transmission_loss_db(settings.air, focus_m, frequency_hz), np.nan)
 
 
 class LevelReference(NamedTuple):
@@ -52,13 +59,21 @@ class LevelReference(NamedTuple):
     ----------
     unit : {"dBFS", "dB re 20 µPa", "dB re 20 µPa at 1 m"}
     offset_db : (frequency,) float64
+        NaN where it is unknown.
     """
 
     unit: LevelUnit
     offset_db: NDArray[np.float64]
 
     @classmethod
-    def of(cls, settings: Settings, frequency_hz: NDArray[np.float64]) -> "LevelReference":
-        """Return the most informative reference that the settings allow at frequencies."""
+    def of(
+        cls, settings: Settings, frequency_hz: NDArray[np.float64], *, is_complete: bool = False
+    ) -> "LevelReference":
+        """Return the most informative reference that the settings allow at some frequencies, or at all."""
+        enough = np.all if is_complete else np.any
         found = ((unit, level_offset_db(settings, frequency_hz, unit)) for unit in LEVEL_UNITS.values())
-        return next(cls(unit, offset_db) for unit, offset_db in found if offset_db is not None)
+        return next(
+            cls(unit, offset_db)
+            for unit, offset_db in found
+            if offset_db is not None and enough(np.isfinite(offset_db))
+        )

@@ -169,4 +169,4 @@ def _bearing(source: FoundSource, band_hz: NDArray[np.float64], settings: Settin
 def _level(level_dbfs: float, settings: Settings, band_hz: NDArray[np.float64], name: str) -> float | None:
     """Return the level in the unit of a field of `Bearing`; None if it is unknown."""
     offset_db = level_offset_db(settings, np.sqrt(band_hz.prod(keepdims=True)), LEVEL_UNITS[name])
-    return None if offset_db is None else level_dbfs + float(offset_db[0])
+    return None if offset_db is None or np.isnan(offset_db[0]) else level_dbfs + float(offset_db[0])
