@@ -468,8 +468,9 @@ def test_process_leaves_out_pulses_without_a_call(recordings, tmp_path):
             )
             given.append(dataclasses.replace(measurement, stamp=stamp))
     write_recording(tmp_path / "mixed.h5", given, mounting=mountings())
-    code, output = run("process", tmp_path / "mixed.h5", "--fuse")
+    code, output = run("process", tmp_path / "mixed.h5", "--fuse", "--json")
     assert code == 0, output
+    assert '"left_out": 1' in output
     assert "note: 1 of 2 pulses left out, because no sensor emitted its call" in output
     with open_energyscapes(tmp_path / "mixed.fused.h5") as stored:
         assert [stamp.sync_count for stamp in stored.stamps()] == [1]

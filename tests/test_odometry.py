@@ -78,6 +78,14 @@ def folder(tmp_path_factory):
     )
     silent = [replace(each, stamp=replace(each.stamp, behaviour="passive")) for each in measurements[COUNT:]]
     write_recording(place / "silent_back.h5", [*measurements[:COUNT], *silent], mounting=mountings)
+    other_chain = [
+        replace(
+            each,
+            stamp=replace(each.stamp, sensor="other", behaviour="passive", timestamp_ns=each.stamp.timestamp_ns * 8),
+        )
+        for each in measurements[:COUNT]
+    ]
+    write_recording(place / "other_chain.h5", other_chain, mounting={"other": mountings["front"]})
     write_recording(place / "slow.h5", slow, mounting={"front": mountings["front"]})
     return place
 
@@ -95,7 +103,13 @@ def test_odometry_command_writes_the_trajectory_of_the_platform(folder, tmp_path
     report = json.loads(stdout)
     assert report.pop("length_m") == pytest.approx(math.hypot(0.12, 0.04), abs=2e-3)
     assert report.pop("duration_s") == pytest.approx(0.2, abs=1e-5)
-    assert report == {"output": str(target), "sensors": ["front", "back"], "poses": COUNT, "measured": 1.0}
+    assert report == {
+        "output": str(target),
+        "sensors": ["front", "back"],
+        "poses": COUNT,
+        "left_out": 0,
+        "measured": 1.0,
+    }
     assert f"{target}: 3 poses, 0.13 m in 0.2 s, 100% measured" in stderr
     path = ertis.read_trajectory(target)
     true = PLATFORM.trajectory(np.arange(COUNT) / 10)
@@ -107,8 +121,9 @@ def test_odometry_command_writes_the_trajectory_of_the_platform(folder, tmp_path
 
 
 def test_odometry_command_leaves_out_pulses_without_a_call(folder, tmp_path):
-    code, _, stderr = run(folder / "mixed.h5", "-o", tmp_path / "path.tum")
+    code, stdout, stderr = run(folder / "mixed.h5", "-o", tmp_path / "path.tum", "--json")
     assert code == 0, stderr
+    assert json.loads(stdout)["left_out"] == 1
     assert "note: 1 of 3 pulses left out, because no sensor emitted its call" in stderr
     path = ertis.read_trajectory(tmp_path / "path.tum")
     np.testing.assert_allclose(path.position_m, PLATFORM.trajectory(np.array([0.0, 0.2])).position_m, atol=4e-3)
@@ -147,6 +162,11 @@ def test_odometry_command_takes_mountings_from_a_file(folder, tmp_path):
         (["front.h5", "both.h5"], 2, "have the same sensor 'front'"),
         (["timeless.h5"], 1, "timeless.h5 has different pulses at the same time"),
         (["front.h5", "late.h5"], 1, "no pulse has measurements of two sensors: front has pulses 0 to 2 from 0.000 s"),
+        (
+            ["front.h5", "other_chain.h5"],
+            1,
+            "of SYNC count 1 are 0.7 s apart; give recordings of one SYNC chain, whose",
+        ),
         (["slow.h5"], 1, "slow.h5: no two successive pulses have enough echoes in common, at most a second apart"),
         (["passive.h5"], 1, "passive.h5: all measurements are passive and have no echoes; give recordings of emitted"),
         (["both.h5", "--preset", "none"], 2, "preset 'none' is unknown"),

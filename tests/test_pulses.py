@@ -86,3 +86,22 @@ def test_first_pulse_of_unknown_sensors_ends_when_the_second_begins():
     order = [("front", 0), ("left", 0), ("back", 0), ("front", 1), ("left", 1), ("back", 1)]
     found = [summary(groups.add(item(*each))) for each in order]
     assert found == [[], [], [], [(0, "back", "front", "left")], [], [(1, "back", "front", "left")]]
+
+
+@pytest.mark.parametrize("apart_ns", [0, 120_000_000, 450_000_000])
+def test_recorded_items_are_grouped_whatever_the_difference_of_clocks_below_half_a_second(apart_ns):
+    """At 10 Hz, clocks that differ by 0.45 s put four pulses of one sensor before the first of the other."""
+    items = [item("front", count) for count in range(20)]
+    items += [item("left", count, later_ns=apart_ns) for count in range(20) if count != 7]
+    expected = [(count, "front", *(["left"] if count != 7 else [])) for count in range(20)]
+    assert summary(PulseGroups.recorded(items)) == expected
+    assert summary(PulseGroups.recorded(reversed(items))) == expected
+
+
+def test_recorded_items_of_another_chain_remove_no_pulse():
+    """Pulses twice a second and ten times a second, which begin at the same time."""
+    slow = [StampedItem(Stamp(sensor="front", sync_count=n, timestamp_ns=n * 500_000_000)) for n in range(6)]
+    fast = [StampedItem(Stamp(sensor="left", sync_count=n, timestamp_ns=n * 100_000_000)) for n in range(10)]
+    groups = PulseGroups.recorded(slow + fast)
+    assert sorted(group["front"].stamp.sync_count for group in groups if "front" in group) == list(range(6))
+    assert sorted(group["left"].stamp.sync_count for group in groups if "left" in group) == list(range(10))

@@ -157,7 +157,7 @@ def _measured(
 
     if len(readers) == 1 and ears.sensor not in known:
         known = {ears.sensor: _IDENTITY}
-    groups = _pulses.active_groups(readers, _as_recorded, quiet=quiet)
+    groups = _pulses.active_groups(readers, _as_recorded, quiet=quiet).groups
     kept = set(chosen)
     wanted = [
         number for number, group in enumerate(groups) if ears.sensor in group and group[ears.sensor].index in kept

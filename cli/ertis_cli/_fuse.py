@@ -64,7 +64,8 @@ def write_fused(
         mountings = _pulses.mountings_of(readers, mounting)
         fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
         pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, **device)
-        groups = _pulses.active_groups(readers, changed, quiet=quiet)
+        active = _pulses.active_groups(readers, changed, quiet=quiet)
+        groups = active.groups
         by_name = {reader.sensor: reader for reader in readers}
         clocks = _clock_check(mountings, groups, by_name)
         for text in clocks.warnings():
@@ -83,7 +84,13 @@ def write_fused(
     pulses = options.counted(len(groups), "pulse")
     options.say(f"{target}: {pulses} of {', '.join(by_name)}, fused", quiet=quiet)
     if as_json:
-        report = {"output": str(target), "sensors": list(by_name), "pulses": len(groups), "incomplete": incomplete}
+        report = {
+            "output": str(target),
+            "sensors": list(by_name),
+            "pulses": len(groups),
+            "incomplete": incomplete,
+            "left_out": active.n_passive,
+        }
         options.print_json(report | _direct_sound(clocks))
 
 

@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -10,7 +11,7 @@ from ertis_cli import _mountings, _presets, _results, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from ertis_cli._mountings import Mounting
@@ -103,21 +104,62 @@ class StampedIndex:
     stamp: "Stamp"
 
 
-def pulse_groups(readers: "Sequence[RecordingReader]") -> "Iterator[dict[str, StampedIndex]]":
-    """Yield the measurements of each pulse, by sensor."""
+def pulse_groups(readers: "Sequence[RecordingReader]") -> "list[dict[str, StampedIndex]]":
+    """Return the measurements of each pulse, by sensor.
+
+    Raises
+    ------
+    DataError
+        The stamps belong to different SYNC chains.
+    """
     from ertis_numba.fusion.pulses import PulseGroups
 
     places = [StampedIndex(index, stamp) for reader in readers for index, stamp in enumerate(reader.stamps())]
-    groups: PulseGroups[StampedIndex] = PulseGroups.of(reader.sensor for reader in readers)
-    for place in sorted(places, key=lambda place: (place.stamp.timestamp_ns, place.stamp.sync_count)):
-        yield from groups.add(place)
-    while rest := groups.close():
-        yield rest
+    groups = PulseGroups.recorded(places)
+    _require_one_chain(places, groups)
+    return groups
+
+
+def _require_one_chain(places: "Sequence[StampedIndex]", groups: "Sequence[dict[str, StampedIndex]]") -> None:
+    """Raise DataError if two sensors share a pulse, but have another SYNC count in common at different times.
+
+    Only counts that each sensor has once in a session are compared, since others do not identify a pulse.
+    """
+    from ertis_numba.errors import DataError
+    from ertis_numba.fusion.pulses import is_same_pulse
+
+    stamps: dict[tuple[str, int], dict[int, list[Stamp]]] = {}  # By session of a sensor, and by SYNC count.
+    for place in places:
+        session = stamps.setdefault((place.stamp.sensor, place.stamp.session_id), {})
+        session.setdefault(place.stamp.sync_count, []).append(place.stamp)
+    sharing = {
+        pair
+        for group in groups
+        for pair in combinations(sorted((place.stamp.sensor, place.stamp.session_id) for place in group.values()), 2)
+    }
+    for one, other in sorted(sharing):
+        for count in sorted(stamps[one].keys() & stamps[other].keys()):
+            first, *repeats = (*stamps[one][count], *stamps[other][count])
+            if len(repeats) == 1 and not is_same_pulse(first, repeats[0]):
+                apart_s = abs(first.timestamp_ns - repeats[0].timestamp_ns) / 1e9
+                raise DataError(
+                    f"sensors {one[0]} and {other[0]} belong to different SYNC chains: their measurements of SYNC "
+                    f"count {count} are {apart_s:.3g} s apart; give recordings of one SYNC chain, whose clocks agree "
+                    "within half a second"
+                )
+
+
+@dataclass(frozen=True)
+class ActiveGroups:
+    """Measurements of each pulse in which a sensor emitted its call, by sensor, and the number of other pulses."""
+
+    groups: "list[dict[str, StampedIndex]]"
+    n_passive: int
 
 
 def active_groups(
     readers: "Sequence[RecordingReader]", changed: "Callable[[Settings], Settings]", *, quiet: bool
-) -> "list[dict[str, StampedIndex]]":
+) -> ActiveGroups:
     """Return the measurements of each pulse in which a sensor emitted its call, by sensor.
 
     A sensor that was silent in such a pulse hears the echoes of the others, so its measurement belongs to the pulse. A
@@ -134,13 +176,13 @@ def active_groups(
     Raises
     ------
     DataError
-        No sensor emitted in any pulse.
+        No sensor emitted in any pulse, or the stamps belong to different SYNC chains.
     """
     from ertis_numba.errors import DataError
     from ertis_numba.frames import is_passive
 
     settings = {reader.sensor: changed(reader.settings) for reader in readers}
-    groups = list(pulse_groups(readers))
+    groups = pulse_groups(readers)
     active = [
         group for group in groups if not all(is_passive(settings[name], place.stamp) for name, place in group.items())
     ]
@@ -151,7 +193,7 @@ def active_groups(
     if len(active) < len(groups):
         left_out = f"{len(groups) - len(active)} of {options.counted(len(groups), 'pulse')}"
         options.say(f"note: {left_out} left out, because no sensor emitted its call", quiet=quiet)
-    return active
+    return ActiveGroups(active, len(groups) - len(active))
 
 
 def image_settings(settings_file: "Path | None", preset: str | None) -> "Callable[[Settings], Settings]":

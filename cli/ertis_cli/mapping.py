@@ -110,7 +110,8 @@ def mapping(
             height_m=height_m,
             emitter_diameter_m=emitter_diameter_m,
         )
-        groups = _pulses.active_groups(readers, changed, quiet=quiet)
+        active = _pulses.active_groups(readers, changed, quiet=quiet)
+        groups = active.groups
         located = _located(groups, trajectory)
         by_name = {reader.sensor: reader for reader in readers}
         with options.progress(located, length=len(located), label="mapping", quiet=quiet) as shown:
@@ -121,7 +122,7 @@ def mapping(
     if len(located) < len(groups):
         left_out = options.counted(len(groups) - len(located), "pulse")
         options.say(f"note: {left_out} of {len(groups)} outside of the time of the poses left out", quiet=quiet)
-    report = _report(written, readers, occupancy) | {"left_out": len(groups) - len(located)}
+    report = _report(written, readers, occupancy) | {"left_out": active.n_passive + len(groups) - len(located)}
     size = " × ".join(f"{side_m:.2f}" for side_m in report["size_m"])
     options.say(
         f"{target}: {options.counted(len(located), 'pulse')}, {size} m, {report['occupied']} cells occupied, "

@@ -67,8 +67,8 @@ def odometry(
         mountings = _pulses.mountings_of(readers, mounting)
         changed = _pulses.image_settings(settings_file, preset)
         pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
-        groups = _pulses.active_groups(readers, changed, quiet=quiet)
-        found = odometry_of(readers, groups, pipelines, mountings, quiet=quiet)
+        active = _pulses.active_groups(readers, changed, quiet=quiet)
+        found = odometry_of(readers, active.groups, pipelines, mountings, quiet=quiet)
     write_tum(file, found.trajectory, overwrite=force)
     measured = sum(pose.is_measured for pose in found.poses[1:]) / (len(found.poses) - 1)
     duration_s = (found.poses[-1].timestamp_ns - found.poses[0].timestamp_ns) / _NS_PER_S
@@ -79,6 +79,7 @@ def odometry(
             "output": str(file),
             "sensors": [reader.sensor for reader in readers],
             "poses": len(found.poses),
+            "left_out": active.n_passive,
             "length_m": round(found.length_m, 6),
             "duration_s": round(duration_s, 6),
             "measured": round(measured, 6),

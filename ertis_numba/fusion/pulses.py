@@ -58,6 +58,14 @@ class PulseGroups(Generic[Item]):
         found._recent.append(set(found._expected))
         return found
 
+    @classmethod
+    def recorded(cls, items: Iterable[Item]) -> list[dict[str, Item]]:
+        """Return the groups of all items of recordings, in any order; none of them is late."""
+        found = cls()
+        for item in sorted(items, key=lambda item: (item.stamp.timestamp_ns, item.stamp.sync_count)):
+            found._insert(item)
+        return found._open
+
     def add(self, item: Item) -> list[dict[str, Item]]:
         """Add an item, and return the groups that are complete now, by sensor.
 
