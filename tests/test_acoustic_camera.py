@@ -9,6 +9,7 @@ from ertis_numba.air import transmission_loss_db
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
 from ertis_numba.passive import AcousticCamera, find_bearings, is_passive, octave_bands
+from ertis_numba.passive.bands import bin_shares
 from ertis_numba.settings import MAP_METHODS, Settings
 from tests.on_device import KERNELS
 
@@ -313,11 +314,33 @@ def test_octaves_are_those_of_the_standard():
     assert octave_bands(707, 1413, fraction=1) == pytest.approx(np.array([[707.9, 1412.5]]), rel=1e-3)
 
 
+def test_adjacent_bands_sum_to_the_band_that_contains_them():
+    power = []
+    for bands_hz in ([[20e3, 40e3]], [[30.3e3, 40e3], [20e3, 30.3e3]]):
+        with AcousticCamera(settings_of(passive__bands_hz=bands_hz, passive__resolution_hz=500.0), "cpu") as camera:
+            power.append(camera.process(sound(camera.settings, [(20, 0.1)])).power.sum(axis=1))
+    assert power[1] == pytest.approx(power[0], rel=1e-4)
+
+
+@pytest.mark.parametrize("fraction", [1, 3])
+def test_octaves_share_each_frequency_once(fraction):
+    bands_hz, frequency_hz = octave_bands(8.9e3, 89.5e3, fraction=fraction), np.arange(8.0e3, 95.0e3, 250.0)
+    shares = bin_shares(bands_hz, frequency_hz).sum(axis=0)
+    inside = (frequency_hz > bands_hz.min() + 125) & (frequency_hz < bands_hz.max() - 125)
+    assert shares[inside] == pytest.approx(1)
+    assert shares.max() <= 1 + 1e-6
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({"passive__bands_hz": [[20e3, 100e3]]}, "reaches only 90000 Hz"),
         ({"passive__bands_hz": [[25e3, 20e3]]}, "passive.bands_hz[0]"),
+        (
+            {"passive__bands_hz": [[40e3, 41e3], [20e3, 30e3], [40e3, 41e3]]},
+            "has overlapping bands, 40000 to 41000 Hz and 40000 to 41000 Hz; give bands that share at most an edge",
+        ),
+        ({"passive__bands_hz": [[25e3, 40e3], [20e3, 26e3]]}, "20000 to 26000 Hz and 25000 to 40000 Hz"),
         ({"passive__bands_hz": "third_octaves", "passive__limits_hz": [100e3, 101e3]}, "give wider limits"),
         ({"passive__resolution_hz": 10.0}, "longer than the record"),
         ({"passive__method": "music", "passive__n_sources": 6}, "6 microphones"),

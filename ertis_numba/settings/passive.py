@@ -1,5 +1,6 @@
 """Passive listening: maps of sound that the sensor did not emit."""
 
+import itertools
 from typing import Final, Literal
 
 from ertis_numba import checks
@@ -24,7 +25,7 @@ class Passive(TomlTable, frozen=True, kw_only=True):
     Attributes
     ----------
     bands_hz : "third_octaves", "octaves" or list of (low, high), default "third_octaves"
-        Bands in hertz, up to 100: those of IEC 61260-1 within ``limits_hz``, or your own.
+        Bands in hertz, up to 100, which must not overlap: those of IEC 61260-1 within ``limits_hz``, or your own.
     limits_hz : (low, high), default (8900, 89500)
         Limits of third octaves and octaves, in hertz; the default has those from 10 to 80 kHz.
     method : {"delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc"}, default "delay_and_sum"
@@ -94,3 +95,9 @@ class Passive(TomlTable, frozen=True, kw_only=True):
             raise ArgumentError(f"passive.bands_hz lists {len(given)} bands; give 1 to {MAX_BANDS}")
         for number, band in enumerate(given):
             checks.interval(f"passive.bands_hz[{number}]", band, 1.0, 1e9)
+        for (low_hz, high_hz), (next_low_hz, next_high_hz) in itertools.pairwise(sorted(given)):
+            if next_low_hz < high_hz:  # The sum of all bands would count their frequencies twice.
+                raise ArgumentError(
+                    f"passive.bands_hz has overlapping bands, {low_hz:g} to {high_hz:g} Hz and {next_low_hz:g} to "
+                    f"{next_high_hz:g} Hz; give bands that share at most an edge"
+                )
