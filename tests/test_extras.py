@@ -65,12 +65,18 @@ for name in COMMANDS:
 )
 
 
+def names_in(requirements):
+    """Names of the distributions of lines of requirements."""
+    return [re.split(r"[\[<>=;]", line)[0].strip() for line in requirements.split("\n") if line]
+
+
 def extras():
-    """Distributions of each extra that users install."""
+    """Distributions of each extra that users install; extras may also limit the version of one that all users have."""
     parser = ConfigParser()
     parser.read(ROOT / "setup.cfg")
+    always = names_in(parser["options"]["install_requires"])
     return {
-        name: [re.split(r"[\[<>=;]", line)[0].strip() for line in lines.split("\n") if line]
+        name: [each for each in names_in(lines) if each not in always]
         for name, lines in parser["options.extras_require"].items()
         if name not in FOR_AUTHORS
     }

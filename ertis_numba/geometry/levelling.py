@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry.delays import unit_vectors
@@ -56,6 +55,8 @@ def levelled_grid(grid: Grid, attitude_xyzw: ArrayLike) -> tuple[Grid, NDArray[n
     >>> turned.elevation_deg.round(6).tolist()
     [10.0]
     """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  importing it takes longer than this package
+
     given_xyzw: Any = np.asarray(attitude_xyzw)
     rotation = Rotation.from_quat(mounting("attitude", None, given_xyzw)["rotation_xyzw"]).as_matrix()
     forward = rotation[:, 0]

@@ -1,6 +1,7 @@
 """Acoustic maps of passive sensors in a live view."""
 
 import signal
+import time
 from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any, Final
 
 from ertis_bench.network.map_viewer import MapViewerJob
 from ertis_bench.network.oracle import read_diaries
+from ertis_bench.network.processes import JsonLinesProcess
 from ertis_bench.network.processor_time import ProcessorTime
 from ertis_bench.network.sender import SETTINGS, SenderJob
 from ertis_bench.network.serving import Serve, create_keys, some_words
@@ -17,6 +19,8 @@ __all__ = ["measure"]
 GOAL: Final = "0 dropped"
 _N_SENSORS: Final = 4
 _RATE_HZ: Final = 10.0
+_SETTLING_S: Final = 30.0
+_LOOK_S: Final = 0.1
 _WARM_UP: Final = 30  # Measurements of each sensor, for which the view compiles kernels and makes cameras.
 Found = dict[str, Any]
 
@@ -61,8 +65,7 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
         n_before = len(read_diaries(diaries[:1]).kept)
         serve.settle(n_before)
         published = _published(serve)
-        viewer.signal(signal.SIGUSR1)
-        begun = viewer.wait_for("counts")
+        begun = _settled(viewer, published)
         sender = stack.enter_context(job.replace(diary=str(diaries[1]), count=round(duration_s * _RATE_HZ)).start())
         sender.wait_for("begun")
         load = ProcessorTime(serve.processes() | {"sensor nodes": [sender.pid], "view": [viewer.pid]})
@@ -74,9 +77,10 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
             if serve.latest is None
             else sum((Counter(each.dropped) for each in serve.latest.sensors.values()), Counter[str]())
         )
-        published = _published(serve) - published
+        before, published = published, _published(serve)
         cpu_percent, cpu_ms = load.percent(), load.rows(max(1, n_sent))
-        viewer.signal(15)
+        _settled(viewer, published)
+        viewer.signal(signal.SIGTERM)
         end = viewer.wait_for("shown", timeout_s=60.0)
         serve.node.stop()
     since = {name: end[name] - begun[name] for name in ("received", "dropped", "replaced", "frames")}
@@ -87,7 +91,7 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
         "rate_hz": _RATE_HZ,
         "goal": GOAL,
         "sent": n_sent - n_before,
-        "published": published,
+        "published": published - before,
         "dropped": dict(dropped),
         "maps": since["received"],
         "maps_dropped": since["dropped"],
@@ -104,3 +108,15 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
 def _published(serve: Serve) -> int:
     """Return the number of published measurements without a call."""
     return 0 if serve.latest is None else sum(each.passive for each in serve.latest.sensors.values())
+
+
+def _settled(viewer: JsonLinesProcess, n_published: int) -> Found:
+    """Return the counts of the view once all measurements have become maps or were dropped, or after a timeout."""
+    end_s = time.monotonic() + _SETTLING_S
+    while True:
+        n_events = len(viewer.events)
+        viewer.signal(signal.SIGUSR1)
+        counts = viewer.wait_for("counts", since=n_events)
+        if counts["received"] + counts["dropped"] >= n_published or time.monotonic() > end_s:
+            return counts
+        time.sleep(_LOOK_S)
