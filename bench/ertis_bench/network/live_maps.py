@@ -64,7 +64,7 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
             first.wait_for("sent", timeout_s=120.0)
         n_before = len(read_diaries(diaries[:1]).kept)
         serve.settle(n_before)
-        published = _published(serve)
+        published, dropped = _published(serve), _dropped(serve)
         begun = _settled(viewer, published)
         sender = stack.enter_context(job.replace(diary=str(diaries[1]), count=round(duration_s * _RATE_HZ)).start())
         sender.wait_for("begun")
@@ -72,11 +72,7 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
         sender.wait_for("sent", timeout_s=duration_s + 60.0)
         n_sent = len(read_diaries(diaries).kept)
         serve.settle(n_sent)
-        dropped = (
-            Counter[str]()
-            if serve.latest is None
-            else sum((Counter(each.dropped) for each in serve.latest.sensors.values()), Counter[str]())
-        )
+        dropped = _dropped(serve) - dropped
         before, published = published, _published(serve)
         cpu_percent, cpu_ms = load.percent(), load.rows(max(1, n_sent))
         _settled(viewer, published)
@@ -108,6 +104,12 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
 def _published(serve: Serve) -> int:
     """Return the number of published measurements without a call."""
     return 0 if serve.latest is None else sum(each.passive for each in serve.latest.sensors.values())
+
+
+def _dropped(serve: Serve) -> Counter[str]:
+    """Return the number of measurements that the central node dropped, by reason."""
+    counts = () if serve.latest is None else (Counter(each.dropped) for each in serve.latest.sensors.values())
+    return sum(counts, Counter[str]())
 
 
 def _settled(viewer: JsonLinesProcess, n_published: int) -> Found:
