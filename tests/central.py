@@ -84,8 +84,9 @@ def data_of(entry, **changes):
 def running(folder=None, **options):
     """Run a central node in a thread, with its archive in ``folder``."""
     events = []
+    address = options.pop("address", "tcp://127.0.0.1:0")
     archive = options.pop("archive", None) or (None if folder is None else Archive(folder, seal=False))
-    with CentralNode("tcp://127.0.0.1:0", archive=archive, on_event=events.append, **options) as central:
+    with CentralNode(address, archive=archive, on_event=events.append, **options) as central:
         central.events = events
         thread = threading.Thread(target=central.run)
         thread.start()

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq
 from click.testing import CliRunner
 from ertis_cli.main import cli
 from hypothesis import given, settings, strategies as st
@@ -20,7 +21,7 @@ import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError, NetworkError, RefusedError
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalPose
 from ertis_numba.journal._tables import row_crc32
-from ertis_numba.network import messages
+from ertis_numba.network import messages, sockets
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.central_node import Archive, _recent_poses
 from ertis_numba.network.central_node._admission import Unwanted
@@ -369,6 +370,40 @@ def test_publisher_reports_a_missing_central_node():
         publisher.flush(0.1)
     with pytest.raises(NetworkError, match="this publisher is not open; use it in a with statement"):
         publisher.send(5, (0, 0, 0), IDENTITY)
+
+
+def test_publisher_sends_a_pose_although_an_earlier_one_is_refused():
+    context = zmq.Context()
+    server = sockets.server(context, "tcp://127.0.0.1:0", keys=None)
+    with PosePublisher(sockets.bound(server), ["left"]) as publisher:
+        publisher.send(5, (0, 0, 0), IDENTITY)
+        connection = publisher._connection  # noqa: SLF001
+        while not server.poll(10):
+            publisher._has_sent(connection)  # noqa: SLF001
+        peer, _ = server.recv_multipart()
+        server.send_multipart([peer, messages.encode(Refused(code="size", reason="too many"))])
+        connection.wait(60.0)
+        with pytest.raises(RefusedError, match="too many"):
+            publisher.send(6, (0, 0, 0), IDENTITY)
+        assert server.poll(60_000)
+        assert messages.decode(server.recv_multipart()[1]).timestamp_ns == 6
+    context.destroy(linger=0)
+
+
+def test_flush_reports_an_interrupted_connection_once(tmp_path):
+    with contextlib.ExitStack() as stack:
+        with running(tmp_path / "a") as central:
+            publisher = stack.enter_context(PosePublisher(central.address, ["left"]))
+            publisher.flush(60.0)
+            publisher.send(5, (0, 0, 0), IDENTITY)
+            publisher.flush(60.0)
+            publisher.send(6, (0, 0, 0), IDENTITY)
+        with running(tmp_path / "b", address=central.address) as other:
+            with pytest.raises(NetworkError, match="was interrupted, so that up to 1 sent pose may be lost"):
+                publisher.flush(60.0)
+            publisher.send(7, (0, 0, 0), IDENTITY)
+            publisher.flush(60.0)
+        assert other.latest.archive.poses == 1
 
 
 def test_publisher_checks_its_arguments():

@@ -71,6 +71,11 @@ class Connection:
         """Return True if ZeroMQ has given up; see `refusals` for the reason."""
         return self._monitor.final
 
+    @property
+    def n_disconnections(self) -> int:
+        """Number of connections that had ended by the last call of `refusals`."""
+        return self._monitor.n_disconnections
+
     def wait(self, timeout_s: float, wakeup_socket: WakeupSocket | None = None) -> None:
         """Wait until there is a message, a refusal, room for a message, or a wake-up."""
         self._poller.register(self._socket, _READ_OR_WRITE if self.is_blocked else zmq.POLLIN)

@@ -33,7 +33,8 @@ class PosePublisher:
 
     The central node stores the poses in the recordings that it writes, interpolated at the times of the measurements.
     While there is no connection, the latest 150 poses wait for it. Poses are not acknowledged: those of the last half
-    second before a crash of the central node are lost. Use a publisher in one thread only.
+    second before a crash of the central node are lost. `flush` reports an interrupted connection. Use a publisher in
+    one thread only.
 
     Parameters
     ----------
@@ -75,6 +76,8 @@ class PosePublisher:
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._connection: Connection | None = None
         self._waiting: collections.deque[bytes] = collections.deque()
+        self._n_sent = self._n_uncertain = 0  # Poses since the last flush, in this connection and in earlier ones.
+        self._n_disconnections = 0
 
     def __enter__(self) -> Self:
         self._context = zmq.Context()
@@ -125,7 +128,8 @@ class PosePublisher:
         NetworkError
             The publisher is not open.
         RefusedError
-            The central node has refused the publisher or an earlier pose; the message says why.
+            The central node has refused the publisher or an earlier pose; the message says why. The new pose is
+            nevertheless sent, or waits for a connection.
         """
         checks.integer("timestamp_ns", timestamp_ns, -(2**63), 2**63 - 1)
         known: Any = None if covariance is None else [covariance]
@@ -133,7 +137,6 @@ class PosePublisher:
         turn: Any = [rotation_xyzw]
         pose = Trajectory(np.array([timestamp_ns]), place, turn, known, self._source)  # It converts and checks them.
         connection = self._opened()
-        self._hear(connection)
         message = PlatformPose(
             sensors=self._sensors,
             session_id=self._session_id,
@@ -148,10 +151,11 @@ class PosePublisher:
         has_room = len(self._waiting) <= _BACKLOG
         if not has_room:
             self._waiting.popleft()
+        self._hear(connection)
         return has_room
 
     def flush(self, patience_s: float = SILENCE_LIMIT_S) -> None:
-        """Wait until the central node has received all poses that were sent.
+        """Wait until the central node has received all poses that were sent since the last call.
 
         Call it before the first pose to wait for the connection.
 
@@ -165,17 +169,22 @@ class PosePublisher:
         ArgumentError
             The timeout is not above zero.
         NetworkError
-            There was no answer within the timeout, or the publisher is not open.
+            There was no answer within the timeout, or the publisher is not open. Or a connection was interrupted, so
+            that sent poses may be lost; the message states their number at most, and later calls do not count them.
         RefusedError
             The central node has refused the publisher or a pose; the message says why.
         """
         end_s = time.monotonic() + checks.positive("patience_s", patience_s)
         connection, is_sent = self._opened(), False
-        while time.monotonic() < end_s:
+        while True:
+            if self._hear(connection) and is_sent:
+                self._n_sent = 0
+                return
+            self._require_no_loss()
+            if time.monotonic() >= end_s:
+                break
             is_sent = is_sent or (self._has_sent(connection) and connection.send(messages.encode(Ping())))
             connection.wait(min(_TURN_S, patience_s))
-            if self._hear(connection):
-                return
         self._hang_up()  # A late answer must not end the next call.
         raise NetworkError(
             f"no answer from {self._address} within {patience_s:g} s; start a central node there with 'ertis record' "
@@ -193,16 +202,37 @@ class PosePublisher:
         """Send waiting poses while there is room, and return True if none is left."""
         while self._waiting and connection.send(self._waiting[0]):
             self._waiting.popleft()
+            self._n_sent += 1
         return not self._waiting
+
+    def _require_no_loss(self) -> None:
+        """Raise an error if poses of an interrupted connection may be lost."""
+        n_uncertain, self._n_uncertain = self._n_uncertain, 0
+        if n_uncertain:
+            poses = "1 sent pose" if n_uncertain == 1 else f"{n_uncertain} sent poses"
+            raise NetworkError(
+                f"the connection to {self._address} was interrupted, so that up to {poses} may be lost; "
+                "send again what the recording needs"
+            )
 
     def _hang_up(self, linger_s: float = 0.0) -> None:
         if self._connection is not None:
             self._connection.close(linger_s)
         self._connection = None
+        self._n_disconnections = 0
+        self._interrupt()
+
+    def _interrupt(self) -> None:
+        """Count the poses of the ended connection as uncertain."""
+        self._n_uncertain += self._n_sent
+        self._n_sent = 0
 
     def _hear(self, connection: Connection) -> bool:
         """Read answers, raise a refusal, and return True if a ping was answered."""
         reasons = connection.refusals()
+        if connection.n_disconnections != self._n_disconnections:
+            self._n_disconnections = connection.n_disconnections
+            self._interrupt()
         if connection.has_ended:
             self._hang_up()  # The next call connects again.
             raise RefusedError(f"{self._address}: {reasons[-1]}")

@@ -50,7 +50,10 @@ _DISAGREE = (
     "the central node has no keys; start it with keys, or leave out --key",
 )
 _CLIENT_EVENTS = (
-    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+    zmq.EVENT_DISCONNECTED
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 )
 # EVENT_HANDSHAKE_FAILED_PROTOCOL is excluded: libzmq 4.3.5 loses errno while it sends that event. It then keeps
 # a connection with an undecipherable message for ever, instead of closing it.
@@ -213,12 +216,14 @@ class _Events:
 
 
 class Monitor(_Events):
-    """Monitor of a client's failed connections.
+    """Monitor of a client's failed and interrupted connections.
 
     Attributes
     ----------
     socket : zmq.Socket
         Socket to poll; call `read` when it is readable.
+    n_disconnections : int
+        Number of connections that have ended, as far as read.
     final : bool
         The client has given up: only a new socket tries again.
     """
@@ -227,10 +232,17 @@ class Monitor(_Events):
         # `client` has made the monitor before it connected: a refusal may come at once.
         super().__init__(client, client.get_monitor_socket(_CLIENT_EVENTS))
         self.final = False
+        self.n_disconnections = 0
 
     def read(self) -> list[str]:
         """Return new failures as lines, each once."""
-        return list(dict.fromkeys(self._reported(event, value) for event, value in self._events()))
+        failures = []
+        for event, value in self._events():
+            if event == zmq.EVENT_DISCONNECTED:
+                self.n_disconnections += 1
+            else:
+                failures.append(self._reported(event, value))
+        return list(dict.fromkeys(failures))
 
     def _reported(self, event: int, value: int) -> str:
         with_keys = self._watched.getsockopt(zmq.MECHANISM) == zmq.CURVE
