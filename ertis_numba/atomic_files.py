@@ -17,6 +17,7 @@ __all__ = [
     "check_target",
     "fsync",
     "make_folder",
+    "reason",
     "remedy",
     "require_free_space",
     "temporary_path",
@@ -68,6 +69,12 @@ def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -
         raise ArgumentError(f"output {path} is the input itself; give another name")
     if path.exists() and not overwrite:
         raise ArgumentError(f"output {path} exists; give another name, or ask to overwrite it (--force)")
+
+
+def reason(error: Exception) -> str:
+    """Return the message of the operating system, which HDF5 has within its own, or else the first line of an error."""
+    inner = re.search(r"error message = '(.*?)'", str(error))
+    return inner[1] if inner else getattr(error, "strerror", None) or str(error).partition("\n")[0]
 
 
 def remedy(error: Exception) -> str:

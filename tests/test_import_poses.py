@@ -135,6 +135,16 @@ def test_import_poses_reads_tables_and_refuses_other_topics(recording, tmp_path)
     assert "none.tum does not exist" in run("import-poses", recording, "none.tum", code=1).stderr
 
 
+@pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="only Linux has folders that root cannot write either")
+def test_import_poses_reports_a_folder_without_write_permission_in_one_line(recording, trajectory, monkeypatch):
+    monkeypatch.setattr("ertis_numba.storage.poses.require_free_space", lambda *_, **__: None)  # /sys has none
+    done = run("import-poses", recording, trajectory, "-o", "/sys/m.h5", code=1)
+    assert done.stderr == (
+        "ertis: error: /sys/m.h5 cannot be written (Permission denied); check the permissions of the file and its "
+        "folder, or choose another\n"
+    )
+
+
 def test_import_poses_refuses_a_folder_without_recordings(tmp_path, trajectory):
     folder = tmp_path / "IMAGES"
     folder.mkdir()

@@ -108,9 +108,23 @@ def test_map_of_space_shows_the_height_of_the_post(folder):
 
 def test_map_of_space_is_refused_for_planar_images_and_files(folder):
     done = run(folder, "both.h5 --poses poses.tum --dimensions 3 -o space.ply", code=1)
-    assert "has a planar image, but a map of three dimensions needs directions over elevation" in done.output
+    assert "images include a planar image, but a map of three dimensions needs directions over elev" in done.output
     done = run(folder, "both.h5 --poses poses.tum --dimensions 3 -o space.pgm", code=1)
     assert "give a name that ends in .h5 or .ply" in done.output
+
+
+@pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="only Linux has folders that root cannot write either")
+@pytest.mark.parametrize("suffix", ["h5", "ply"])
+def test_map_reports_a_folder_without_write_permission_in_one_line(folder, suffix):
+    done = CliRunner().invoke(
+        cli,
+        ["map", str(folder / "both.h5"), "--poses", str(folder / "poses.tum"), "-q", "-o", f"/sys/m.{suffix}"],
+    )
+    assert done.exit_code == 1
+    assert done.stderr == (
+        f"ertis: error: /sys/m.{suffix} cannot be written (Permission denied); check the permissions of the file and "
+        "its folder, or choose another\n"
+    )
 
 
 def test_maps_of_one_or_several_recordings_are_equal(folder):

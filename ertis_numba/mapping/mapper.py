@@ -134,8 +134,8 @@ class Mapper:
         group = tuple(checks.items("images", images, Energyscape, "Pipeline.process returns"))
         if self._dimensions == 3 and any(image.is_planar for image in group):
             raise ArgumentError(
-                "images has a planar image, but a map of three dimensions needs directions over elevation; process "
-                "with directions such as 3d:1000, or leave out dimensions"
+                "images include a planar image, but a map of three dimensions needs directions over elevation; process "
+                "with directions such as 3d:1000, or give dimensions 2"
             )
         fused = self._fuser(group) if fused is None else fused
         time_ns = fused.image.stamp.timestamp_ns

@@ -1,7 +1,6 @@
 """Base class of the writers of files with one row per measurement: part file, rows, and verification."""
 
 import os
-import re
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,7 +12,7 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import h5py
 from numpy.typing import NDArray
 
-from ertis_numba.atomic_files import atomic_write, check_target, remedy, require_free_space
+from ertis_numba.atomic_files import atomic_write, check_target, reason, remedy, require_free_space
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import AcousticMap, Energyscape, Measurement
 from ertis_numba.storage._rows import RowReader, RowWriter
@@ -195,10 +194,4 @@ class FileWriter(ABC, Generic[Item]):
         try:
             yield
         except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails.
-            raise DataError(f"{self.path} cannot be written ({_reason(error)}); {remedy(error)}") from error
-
-
-def _reason(error: Exception) -> str:
-    """Return the system's error message, which HDF5 embeds in its own."""
-    inner = re.search(r"error message = '(.*?)'", str(error))
-    return inner[1] if inner else str(error).partition("\n")[0]
+            raise DataError(f"{self.path} cannot be written ({reason(error)}); {remedy(error)}") from error

@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 
 from ertis_numba import checks
-from ertis_numba.atomic_files import atomic_write, remedy
+from ertis_numba.atomic_files import atomic_write, reason, remedy
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
 from ertis_numba.frames import OccupancyMap
 from ertis_numba.storage._reader import open_file, reading
@@ -88,7 +88,7 @@ def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool
     except (OSError, RuntimeError) as error:  # h5py raises both when the disk fails.
         if isinstance(error, ArgumentError | DataError):
             raise
-        raise DataError(f"{path} cannot be written ({error}); {remedy(error)}") from error
+        raise DataError(f"{path} cannot be written ({reason(error)}); {remedy(error)}") from error
     return Path(path)
 
 

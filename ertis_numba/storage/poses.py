@@ -11,7 +11,7 @@ from typing import Final
 import h5py
 import numpy as np
 
-from ertis_numba.atomic_files import atomic_write, check_target, remedy, require_free_space
+from ertis_numba.atomic_files import atomic_write, check_target, reason, remedy, require_free_space
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Trajectory
 from ertis_numba.storage._poses import checked_poses, remove_poses, require_times, write_poses
@@ -311,5 +311,4 @@ def _errors_with_path(path: Path) -> Iterator[None]:
     except ErtisError:
         raise
     except (OSError, RuntimeError, ValueError, LookupError) as error:  # Errors of h5py for disks and foreign files.
-        reason = str(error).partition("\n")[0]
-        raise DataError(f"{path} cannot be written ({reason}); {remedy(error)}") from error
+        raise DataError(f"{path} cannot be written ({reason(error)}); {remedy(error)}") from error
