@@ -104,6 +104,13 @@ def test_map_of_space_shows_the_height_of_the_post(folder):
     assert done.exit_code == 0, done.output
     done = CliRunner().invoke(cli, ["info", str(folder / "space.map.h5"), "--json"])
     assert len(json.loads(done.stdout)["cells"]) == 3
+    message = "no point of the images lies within the heights of 100 to 200 m; give --height in the world frame of"
+    done = run(folder, "space.h5 --poses poses.tum --dimensions 3 --height 100:200 -o high.h5", code=1)
+    assert f"ertis: error: {message}" in done.stderr
+    assert not (folder / "high.h5").exists()
+    done = run(folder, "space.h5 --poses poses.tum --height 100:200 -o high.h5")
+    assert f"note: {message}" in done.stderr
+    assert not ertis.read_map(folder / "high.h5").is_occupied.any()
 
 
 def test_map_of_space_is_refused_for_planar_images_and_files(folder):

@@ -118,6 +118,8 @@ def mapping(
             for group in shown:
                 mapper.add([pipelines.image(by_name[name][place.index]) for name, place in group.items()], trajectory)
     occupancy = mapper.map
+    if height_m is not None and not mapper.n_points:
+        _report_heights(occupancy, height_m, quiet=quiet)
     written = write_map(target, occupancy, overwrite=force)
     if len(located) < len(groups):
         left_out = options.counted(len(groups) - len(located), "pulse")
@@ -131,6 +133,20 @@ def mapping(
     )
     if as_json:
         options.print_json(report)
+
+
+def _report_heights(occupancy: "OccupancyMap", height_m: tuple[float, float], *, quiet: bool) -> None:
+    """State that no point lies within the heights, as an error if the map has no known cell."""
+    from ertis_numba.errors import DataError
+
+    low_m, high_m = height_m
+    reason = (
+        f"no point of the images lies within the heights of {low_m:g} to {high_m:g} m; give --height in the world "
+        "frame of the poses, or leave it out"
+    )
+    if not occupancy.log_odds.any():
+        raise DataError(reason)
+    options.say(f"note: {reason}", quiet=quiet)
 
 
 def _trajectory(poses_file: Path | None, paths: "Sequence[Path]") -> "Trajectory":

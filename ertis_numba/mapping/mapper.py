@@ -99,13 +99,18 @@ class Mapper:
         self._grid = CellGrid(self._cell_m, self._dimensions, self._height_m)
         self._usual = UsualAmplitude()
         self._coverages: dict[tuple[tuple[str, float, float], ...], Coverage] = {}
-        self._n_groups, self._time_ns = 0, 0
+        self._n_groups, self._time_ns, self._n_points = 0, 0, 0
 
     @property
     def map(self) -> OccupancyMap:
         """Map of all groups so far, as a copy."""
         log_odds, origin_m = self._grid.used()
         return OccupancyMap(log_odds, origin_m, self._cell_m, self._n_groups, self._time_ns)
+
+    @property
+    def n_points(self) -> int:
+        """Number of points of all groups so far that lie within the heights."""
+        return self._n_points
 
     def add(self, images: Iterable[Energyscape], pose: Pose, *, fused: Fused | None = None) -> None:
         """Add the images of one SYNC pulse.
@@ -201,6 +206,7 @@ class Mapper:
         """Return the points within the limits of height, in the frame of a view."""
         place_m = points.position_m.astype(np.float64) @ rotation.T + translation_m
         kept = (place_m[:, 2] >= self._height_m[0]) & (place_m[:, 2] <= self._height_m[1])
+        self._n_points += int(kept.sum())
         offset_m = (place_m[kept] - view.place_m) @ view.rotation
         if self._dimensions == 2:
             offset_m[:, 2] = 0.0
