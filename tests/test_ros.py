@@ -5,9 +5,11 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
+from ertis_cli._ros_sources import publish_node
 from ertis_cli.main import cli
 
 from ertis_numba.analysis.point_finder import PointFinder
@@ -19,10 +21,12 @@ from ertis_numba.interop.ros_messages import MESSAGES, ImageMessages, points_mes
 from ertis_numba.network.status import SensorStatus, Status
 from ertis_numba.ros import Participant, PublishingSettings, RosPublisher, interfaces
 from ertis_numba.ros.diagnostics import diagnostics_message
-from ertis_numba.storage import open_recording, write_energyscapes
+from ertis_numba.storage import open_recording, write_energyscapes, write_recording
 from tests.files import image
 from tests.journals import ENVIRONMENT
+from tests.publishing import Publisher, status
 from tests.ros_topics import DOMAIN, await_subscribers, subscribed
+from tests.test_acoustic_map_commands import heard
 
 pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
 pytest.importorskip("cyclonedds")
@@ -291,3 +295,42 @@ def test_left_out_measurements_are_not_counted_as_published(tmp_path):
     last = json.loads(done.stdout.splitlines()[-1])
     assert (last["measurements"], last["left_out"], last["messages"]["/front/points"]) == (3, 12, 3)
     assert "3 measurements published, 12 messages left out by rates or pauses" in done.stderr
+
+
+@pytest.mark.filterwarnings("error")
+def test_measurements_of_a_file_without_a_call_are_left_out(tmp_path):
+    path, silent = tmp_path / "mixed.h5", tmp_path / "silent.h5"
+    write_recording(path, heard(["active", "passive", "active", "passive", "passive"]))
+    write_recording(silent, heard(["passive"] * 2))
+    common = ["--domain", str(DOMAIN), "--use-sim-time", "--json"]
+    done = CliRunner().invoke(cli, ["ros", str(path), *common])
+    assert done.exit_code == 0, done.output
+    *_, last = events = [json.loads(line) for line in done.stdout.splitlines()]
+    assert (last["measurements"], last["left_out"], last["messages"]["/sensor/points"]) == (2, 3, 2)
+    (note,) = [event["text"] for event in events if event["event"] == "note"]
+    assert note.startswith("note: 3 measurements without a call left out; ")
+    assert "Warning" not in done.stderr
+    done = CliRunner().invoke(cli, ["ros", str(silent), *common])
+    assert done.exit_code == 1
+    assert "silent.h5: all measurements are passive and have no echoes" in done.stderr
+
+
+def test_central_node_without_images_of_a_sensor_is_noted_once():
+    states = {"front": SensorStatus(connected=True, passive=3), "left": SensorStatus(connected=True)}
+    received, notes = [], []
+    with Publisher() as publisher, publisher.playing([status(sensors=states) for _ in range(2)]):
+        publish_node(
+            publisher.address,
+            SimpleNamespace(publish_status=received.append),
+            images=True,
+            sensors=(),
+            keys=None,
+            is_over=lambda: len(received) == 2,
+            on_note=notes.append,
+            on_published=lambda: None,
+            on_ready=lambda: None,
+            signals=SimpleNamespace(obey=lambda _: None),
+        )
+    assert [note for note in notes if note.startswith("note")] == [
+        "note: sensor front has measurements without a call, which give no images"
+    ]

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["publish_file", "publish_node", "publish_ports"]
 
+_Place = tuple[int, str, int]  # Time in ns, sensor and index of a measurement.
 _POLL_INTERVAL_S: Final = 0.1
 _CLOCK_INTERVAL_S: Final = 0.02
 _UNANSWERED_S: Final = 3.0
@@ -47,6 +48,7 @@ def publish_node(
     from ertis_numba.network.status import Status
     from ertis_numba.network.subscriber import Subscriber
 
+    silent: set[str] = set()
     products: tuple[Any, ...] = ("energyscape" if images else "points", "status")
     with Subscriber(address, products=products, sensors=sensors or None, keys=keys, on_note=on_note) as subscriber:
         signals.obey(subscriber.close)
@@ -61,6 +63,10 @@ def publish_node(
                     on_note(f"waiting for {address}: no answer; is 'ertis serve' running?")
                 continue
             if isinstance(item, Status):
+                for name, state in item.sensors.items():
+                    if state.passive and name not in silent and (not sensors or name in sensors):
+                        silent.add(name)
+                        on_note(f"note: sensor {name} has measurements without a call, which give no images")
                 ros.publish_status(item)
                 continue
             place = None
@@ -83,6 +89,7 @@ def publish_file(
     loop: bool,
     sim_time: bool,
     is_over: Callable[[], bool],
+    on_passive: Callable[[int], None],
     on_published: Callable[[], None],
     on_ready: Callable[[], None],
     signals: Signals,
@@ -90,7 +97,8 @@ def publish_file(
     """Publish the images of a file at the speed of the publisher's settings.
 
     With ``sim_time``, the stamps are those of the file, and ``/clock`` has the same time; otherwise the stamps are the
-    present.
+    present. Measurements of a recording without a call are left out, and ``on_passive`` is called with their number. A
+    DataError is raised if no others remain.
     """
     from dataclasses import replace
 
@@ -101,6 +109,8 @@ def publish_file(
         opened: Any = open_energyscapes if file_kind(path) == "energyscape" else open_recording
         readers = {name: stack.enter_context(opened(path, sensor=name)) for name in (sensors or sensor_names(path))}
         order = _in_order({name: reader.stamps() for name, reader in readers.items()})
+        if opened is open_recording:
+            order = _with_call(path, readers, order, on_passive)
         pipelines: dict[str, Pipeline] = {}
         signals.obey(lambda: None)
         on_ready()
@@ -112,7 +122,7 @@ def publish_file(
                 item = readers[name][index]
                 if not hasattr(item, "range_m"):
                     if name not in pipelines:
-                        pipelines[name] = stack.enter_context(Pipeline(item.settings, device=device))
+                        pipelines[name] = stack.enter_context(Pipeline(item.settings, device=device, predict=False))
                         clock.start(time_ns)  # Compilation takes seconds, and the file waits for it.
                     item = pipelines[name].process(item)
                 if not clock.wait_until(time_ns):
@@ -215,7 +225,27 @@ class _ImageSink:
         """Ignore missing measurements, which the session reports."""
 
 
-def _in_order(stamps: Mapping[str, Sequence[Any]]) -> list[tuple[int, str, int]]:
+def _with_call(
+    path: Path, readers: Mapping[str, Any], order: list[_Place], on_passive: Callable[[int], None]
+) -> list[_Place]:
+    """Return the measurements of a recording that have echoes of a call, and report the number of others."""
+    from ertis_numba.errors import DataError
+    from ertis_numba.frames import is_passive
+
+    stamps = {name: reader.stamps() for name, reader in readers.items()}
+    kept = [
+        (time_ns, name, index)
+        for time_ns, name, index in order
+        if not is_passive(readers[name].settings, stamps[name][index])
+    ]
+    if not kept:
+        raise DataError(f"{path}: all measurements are passive and have no echoes; give a recording of emitted calls")
+    if len(kept) < len(order):
+        on_passive(len(order) - len(kept))
+    return kept
+
+
+def _in_order(stamps: Mapping[str, Sequence[Any]]) -> list[_Place]:
     """Return time, sensor and index of all measurements of a file, in the order of their times."""
     found = []
     for name, each in stamps.items():

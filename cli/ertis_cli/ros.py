@@ -256,6 +256,7 @@ def ros(
                 device=device,
                 loop=loop,
                 sim_time=sim_time,
+                on_passive=report.passive,
                 **common,
             )
         publisher.close()
@@ -320,6 +321,7 @@ class _RosReport:
     def __init__(self, publisher: Any, notes: deque[str], *, quiet: bool, as_json: bool) -> None:
         self._publisher, self._notes, self._quiet, self._as_json = publisher, notes, quiet, as_json
         self._listed: set[str] = set()
+        self._n_passive = 0
 
     def start(self, source: str, participant: Any) -> None:
         """Report the domain and the interface."""
@@ -340,6 +342,14 @@ class _RosReport:
         options.say(text, quiet=self._quiet)
         if self._as_json:
             options.print_json({"event": "note", "text": text})
+
+    def passive(self, count: int) -> None:
+        """Report that measurements of a file without a call are left out."""
+        self._n_passive = count
+        self.note(
+            f"note: {options.counted(count, 'measurement')} without a call left out; 'ertis process --mode passive' "
+            "makes acoustic maps"
+        )
 
     def show_notes(self) -> None:
         """Report the notes of other threads."""
@@ -373,7 +383,7 @@ class _RosReport:
                     "measurements": n_published,
                     "messages": counts,
                     "dropped": dropped,
-                    "left_out": left_out,
+                    "left_out": left_out + self._n_passive,
                     "skipped": skipped,
                 }
             )
