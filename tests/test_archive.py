@@ -11,7 +11,7 @@ import pytest
 from ertis_numba.errors import ArgumentError, DataError, DiskFullError, ErtisError, JournalInUseError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import SUFFIX, Journal, JournalPose, JournalSensor, seal_in_subprocess
-from ertis_numba.network.central_node import Archive, _volumes
+from ertis_numba.network.central_node import Archive, _recent_poses, _volumes
 from ertis_numba.network.central_node._received_items import (
     Forgotten,
     ReceivedItem,
@@ -257,6 +257,25 @@ def test_archive_rotates_recording_full_of_poses(tmp_path):
     first, _ = sorted(tmp_path.glob(f"*{SUFFIX}"))
     with Journal.open(first) as journal:
         assert (len(journal), len(journal.read_poses()[0])) == (1, 4000)
+
+
+def test_archive_stores_poses_of_known_sensors_only(tmp_path, monkeypatch):
+    """The pose of a sensor may arrive before its first measurement, when the journal already has other poses."""
+    monkeypatch.setattr(_recent_poses, "_KEPT_S", 600.0)
+    with Opened(tmp_path) as opened:
+        for time_ns, sensors in enumerate([("unknown",), ("left",), ("right",), ("unknown", "left")]):
+            opened.archive.offer_pose(pose_of(time_ns, sensors=sensors))
+        opened.give(item_of(from_zero(1)[0]))
+        opened.until_stored(0)
+        end_s = time.monotonic() + WAIT_S
+        while opened.archive._journal_store.volume.posed != {"left"}:  # noqa: SLF001
+            assert time.monotonic() < end_s
+            select.select([opened.fd], [], [], 0.05)
+        opened.give(item_of(from_zero(1, sensor="right")[0], RIGHT))
+        opened.until(Stored, lambda event: event.items[-1].run.sensor == "right")
+    (path,) = tmp_path.glob(f"*{SUFFIX}")
+    with Journal.open(path) as journal:
+        assert [pose.timestamp_ns for pose in journal.read_poses()[0]] == [1, 3, 2]
 
 
 def test_archive_stores_poses_once_disk_has_space_again(tmp_path, monkeypatch):

@@ -63,6 +63,8 @@ class Volume:
         Time of opening, by `time.monotonic`.
     next_pose : int
         First number of `RecentPoses` that it lacks; 0 before any.
+    posed : frozenset of str
+        Sensors of which it has the poses before `next_pose`.
     """
 
     def __init__(self, journal: Journal) -> None:
@@ -73,6 +75,7 @@ class Volume:
         self.acked = sessions_in(journal)
         self.begun_s = time.monotonic()
         self.next_pose = 0
+        self.posed: frozenset[str] = frozenset()
 
     @classmethod
     def create(cls, path: Path) -> Self:
