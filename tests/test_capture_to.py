@@ -23,6 +23,7 @@ from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.central_client import CentralClient
 from ertis_numba.network.keys import KeyPair, ServerKeys
 from ertis_numba.network.log import logger
+from ertis_numba.network.pose_publisher import PosePublisher
 from ertis_numba.network.processing import ProcessingOptions
 from ertis_numba.network.processing.publisher import Publisher
 from ertis_numba.network.sensor_node import SensorNode
@@ -273,12 +274,12 @@ def test_capture_to_requires_allowed_keys(tmp_path):
 
 
 FOR_APPLICATIONS = (
-    "this address is for applications; for sensor nodes and 'ertis configure', give the first address that 'ertis "
-    "serve' prints"
+    "this address is for applications that receive products; for sensor nodes, poses and 'ertis configure', give the "
+    "first address that 'ertis serve' prints"
 )
 
 
-def test_image_address_refuses_long_settings_and_admins_with_the_other_address():
+def test_image_address_refuses_long_settings_admins_and_poses_with_the_other_address():
     long = TINY.replace(call=Call(waveform=tuple(np.sin(np.arange(1500)).tolist())))
     text = long.to_toml().encode()
     assert len(text) > 20_000
@@ -290,6 +291,11 @@ def test_image_address_refuses_long_settings_and_admins_with_the_other_address()
             assert node.hear(messages.Refused).reason == FOR_APPLICATIONS
         with CentralClient(publisher.address) as client, pytest.raises(RefusedError) as refused:
             client.configure("a", TINY, SOON_S)
+        assert str(refused.value) == FOR_APPLICATIONS
+        with PosePublisher(publisher.address, ["a"]) as poses:
+            poses.send(5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            with pytest.raises(RefusedError) as refused:
+                poses.flush(SOON_S)
         assert str(refused.value) == FOR_APPLICATIONS
     finally:
         publisher.close()

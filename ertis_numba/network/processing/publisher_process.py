@@ -22,6 +22,7 @@ from ertis_numba.network.messages import (
     Image,
     Message,
     Ping,
+    PlatformPose,
     Points,
     Pong,
     Raw,
@@ -51,8 +52,8 @@ _REPORT_INTERVAL_S: Final = 1.0
 # address send settings.
 _HEARD_BYTES: Final = Settings.max_bytes
 _SENSORS_ELSEWHERE: Final = (
-    "this address is for applications; for sensor nodes and 'ertis configure', give the first address that 'ertis "
-    "serve' prints"
+    "this address is for applications that receive products; for sensor nodes, poses and 'ertis configure', give the "
+    "first address that 'ertis serve' prints"
 )
 
 
@@ -209,7 +210,8 @@ class _Publisher:
         except FormatVersionError as error:
             self._refuse(frames, Refused(code="version", reason=as_line(str(error))), "version")
         except DataError as error:
-            self._refuse(frames, Refused(code="message", reason=as_line(str(error))), "message")
+            text = _SENSORS_ELSEWHERE if _is_for_sensors(frames) else as_line(str(error))
+            self._refuse(frames, Refused(code="message", reason=text), "message")
         else:
             self._answer(frames, permission.name, message)
 
@@ -238,9 +240,9 @@ class _Publisher:
 
 
 def _is_for_sensors(frames: list[zmq.Frame]) -> bool:
-    """Return True for a message of a sensor node or an admin, which belongs to the other address."""
+    """Return True for a message of a sensor node, an admin or a source of poses, which belongs to the other address."""
     try:
-        return len(frames) > 1 and isinstance(decode(frames[1].bytes), Hello | Configure | Data | Gap)
+        return len(frames) > 1 and isinstance(decode(frames[1].bytes), Hello | Configure | Data | Gap | PlatformPose)
     except DataError:
         return False
 
