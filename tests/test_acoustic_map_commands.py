@@ -212,7 +212,13 @@ def test_finished_maps_are_kept(folder):
 @pytest.mark.usefixtures("in_test_process")
 def test_failed_recordings_do_not_stop_maps_of_others(folder):
     (folder / "torn.h5").write_bytes((folder / "passive.h5").read_bytes()[:90_000])
-    done = run("process passive.h5 torn.h5 active.h5 -o maps --mode passive --device cpu", code=1)
+    done = run("process passive.h5 torn.h5 active.h5 -o maps --mode passive --device cpu --json", code=1)
+    *rows, _ = [json.loads(line) for line in done.stdout.splitlines()]
+    assert {row["recording"]: (row["outcome"], row["output"]) for row in rows} == {
+        "passive.h5": ("made", "maps/passive.acoustic.h5"),
+        "torn.h5": ("failed", "maps/torn.acoustic.h5"),
+        "active.h5": ("made", "maps/active.acoustic.h5"),
+    }
     assert "ertis: failed: torn.h5 is cut short or damaged" in done.stderr
     assert "active.h5: sensor sensor emitted its call in 2 of 2 measurements; maps leave out the first" in done.stderr
     assert names_in(folder / "maps") == ["active.acoustic.h5", "passive.acoustic.h5"]

@@ -240,6 +240,7 @@ def process(
         mounting=_mountings.mountings(mounting, None if sensor is None else [sensor]),
         explain=explain,
         verify=verify,
+        maps_only=other["mode"] == "passive",
     )
     if _process_many.are_meant(paths, target):
         _acoustic_maps.require_options_of(other["mode"])

@@ -39,12 +39,17 @@ class _RecordingState:
     """Recording in progress."""
 
     found: RecordingFile
-    target: Path
-    kind: ResultKind = "energyscape"
+    targets: dict[ResultKind, Path]
+    kind: ResultKind
     measurements: int = 0
     wanted: dict[str, Settings] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     is_kept: bool = False
+
+    @property
+    def target(self) -> Path:
+        """Output of the kind of result that is expected or, after the inspection, chosen."""
+        return self.targets[self.kind]
 
     def ended(self, outcome: Outcome, **more: Any) -> RecordingEnded:
         return RecordingEnded(self.found.path, self.target, outcome, **more)
@@ -100,7 +105,11 @@ class Campaign:
         targets = output_paths(recordings, self.folder)
         self._names = {name for target in targets for name in (target.name, map_path(target).name)}
         self._n_recordings = len(recordings)
-        self._waiting = deque(_RecordingState(*pair) for pair in zip(recordings, targets, strict=True))
+        expected: ResultKind = "acoustic_map" if self._options.maps_only else "energyscape"
+        self._waiting = deque(
+            _RecordingState(found, {"energyscape": target, "acoustic_map": map_path(target)}, expected)
+            for found, target in zip(recordings, targets, strict=True)
+        )
         self._workers, self._scheduler = workers, scheduler
         self._plans = Plans()
         self._unplanned: deque[_RecordingState] = deque()
@@ -186,10 +195,9 @@ class Campaign:
         return Task(self._n_tasks, action, arguments)
 
     def _inspection(self, case: _RecordingState) -> dict[str, Any]:
-        targets = {"energyscape": case.target, "acoustic_map": map_path(case.target)}
         return {
             "path": self._path(case.found.path),
-            "targets": {kind: self._path(target) for kind, target in targets.items()},
+            "targets": {kind: self._path(target) for kind, target in case.targets.items()},
             "named": case.found.named,
             "dtype": self._options.dtype,
             "sensor": self._options.sensor,
@@ -278,9 +286,10 @@ class Campaign:
         case.measurements = sum(n_images.values())
         if not case.measurements:
             self._options.require_maps(path)
-            case.kind, case.target, case.wanted = "acoustic_map", map_path(case.target), wanted
+            case.kind, case.wanted = "acoustic_map", wanted
             case.measurements = sum(sum(counts.values()) for counts in behaviours.values())
             return
+        case.kind = "energyscape"
         for name, settings in wanted.items():
             if n_images[name]:  # Otherwise, the sensor has no measurement that a worker could report.
                 case.wanted[name] = settings

@@ -63,6 +63,9 @@ class CampaignOptions:
     verify : bool
         Measure the error of each sensor's first image, and report it under the key ``verified``. A recording fails if
         the error exceeds the budget.
+    maps_only : bool
+        All results are acoustic maps, because ``settings`` returns the mode ``passive``. A recording that cannot be
+        read is then reported with the name of a file of acoustic maps.
     """
 
     settings: Callable[[Settings], Settings] = lambda recorded: recorded
@@ -77,6 +80,7 @@ class CampaignOptions:
     mounting: Mapping[str, Mounting] | None = None
     explain: bool = False
     verify: bool = False
+    maps_only: bool = False
 
     def __post_init__(self) -> None:
         checks.choice("dtype", self.dtype, ("float32", "float16"))
