@@ -284,6 +284,30 @@ def test_spectrum_and_spectrogram_show_a_source():
     assert levels[20] > levels[-50] + 3
 
 
+@pytest.mark.parametrize(
+    ("method", "name"),
+    [
+        ("delay_and_sum", "delay-and-sum"),
+        ("functional", "functional"),
+        ("capon", "Capon"),
+        ("music", "MUSIC"),
+        ("clean_sc", "CLEAN-SC"),
+        ("hr_clean_sc", "HR-CLEAN-SC"),
+    ],
+)
+def test_captions_name_methods_as_the_field_does(method, name):
+    assert f"method {name}" in texts(figures.acoustic_map(acoustic_map(method=method)))
+
+
+@pytest.mark.parametrize(("behaviour", "is_named"), [("passive", False), ("active", True), ("unknown", True)])
+def test_captions_name_the_call_unless_none_was_emitted(behaviour, is_named):
+    heard = sound(settings_of(), [(20, 0.1)])
+    heard = dataclasses.replace(heard, stamp=Stamp(sensor="ring", behaviour=behaviour))
+    for figure in (figures.spectrum(heard), figures.spectrogram(heard), figures.signals(heard)):
+        assert ("· call 25" in texts(figure)) == is_named
+        assert ("· no call" in texts(figure)) != is_named
+
+
 def test_spectra_leave_out_the_time_of_a_call():
     settings = settings_of()
     measurement = sound(settings, [(20, 0.01)])

@@ -25,6 +25,14 @@ __all__ = [
 ]
 
 
+_METHODS = {
+    "delay_and_sum": "delay-and-sum",
+    "capon": "Capon",
+    "music": "MUSIC",
+    "clean_sc": "CLEAN-SC",
+    "hr_clean_sc": "HR-CLEAN-SC",
+}
+
 _FAINT_DB = -100.0
 """Of full scale: about what the noise of one-bit conversion alone has; bits that never change stay below it."""
 
@@ -79,7 +87,7 @@ def of_measurement(title: str, settings: Settings, stamp: Stamp, *parts: str, va
     return Heading(
         (title, stamp.sensor, f"measurement {stamp.sequence}", *_if_faint(values)),
         (
-            *_of_sensor(settings),
+            *((settings.array.layout, "no call") if stamp.behaviour == "passive" else _of_sensor(settings)),
             *parts,
             f"{minus(f'{settings.air.temperature_c:g}')} °C",
             *filter(None, [stamp.utc]),
@@ -101,7 +109,7 @@ def of_acoustic_map(title: str, found: AcousticMap, *parts: str) -> Heading:
         (
             settings.array.layout,
             *parts,
-            f"method {passive.method.replace('_', ' ')}",
+            f"method {_METHODS.get(passive.method, passive.method)}",
             *((f"mean of {count} measurements",) if count > 1 else ()),
             *(() if passive.focus_m is None else (f"focus at {passive.focus_m:g} m",)),
             *left_out(found.masked_s),
