@@ -223,10 +223,7 @@ def test_failed_recordings_do_not_stop_maps_of_others(folder):
     assert "active.h5: sensor sensor emitted its call in 2 of 2 measurements; maps leave out the first" in done.stderr
     assert names_in(folder / "maps") == ["active.acoustic.h5", "passive.acoustic.h5"]
     done = run("process passive.h5 active.h5 -o images --verify --device cpu", code=1)
-    assert (
-        "passive.h5: all measurements are passive and become acoustic maps, which have no error budget; leave"
-        in done.stderr
-    )
+    assert "passive.h5: all measurements become acoustic maps, which have no error budget; leave" in done.stderr
     assert names_in(folder / "images") == ["active.energy.h5"]
     done = run("process passive.h5 silent.h5 -o more --bands 80000:100000 --device cpu", code=1)
     assert done.stderr.count("passive.bands_hz[0] ends at 100000 Hz, but the record reaches only 90000 Hz") == 2
@@ -256,12 +253,17 @@ def test_check_names_the_kind_of_a_file_of_maps():
     ("line", "message"),
     [
         ("active.h5 --average 2", "--average is for acoustic maps, but measurements with a call become images"),
-        ("passive.h5 --range 0.5:1", "--range is for images, but all measurements are passive and become acoustic"),
-        ("passive.h5 --verify", "--verify is for images, but all measurements are passive"),
+        ("passive.h5 --range 0.5:1", "--range is for images, but all measurements become acoustic maps; give --mode"),
+        ("passive.h5 --verify", "--verify is for images, but all measurements become acoustic maps; give --mode"),
+        (
+            "passive.h5 active.h5 -o out/ --verify --mode passive",
+            "--verify is for images, but --mode passive makes acoustic maps; leave out --mode, or leave out --verify",
+        ),
+        ("active.h5 --verify --mode passive", "--verify is for images, but --mode passive makes acoustic maps; leave"),
         ("passive.h5 --bands wide", "'wide' is not a list of bands; give third_octaves, octaves, or edges in Hz"),
         ("passive.h5 --bands 20000:30000:40000", "is not a list of bands"),
         ("passive.h5 active.h5 -o out/ --focus 2 --mode active", "--focus is for acoustic maps, but --mode active"),
-        ("passive.h5 active.h5 -o out/ --range 1:2 --mode passive", "--range is for images, but all measurements"),
+        ("passive.h5 active.h5 -o out/ --range 1:2 --mode passive", "--range is for images, but --mode passive"),
         ("passive.h5 -o s.npz --last-stage demodulation --bands octaves", "--bands is for acoustic maps, but s.npz"),
         ("both.h5 --fuse --map-method capon", "--map-method is for acoustic maps, but --fuse makes images"),
     ],

@@ -133,12 +133,13 @@ def require_none(reason: str) -> None:
 def _require_maps() -> None:
     """Raise an error for options of images, which have no effect on acoustic maps."""
     context = click.get_current_context()
+    reason = "all measurements become acoustic maps; give --mode active for images"
+    if context.params.get("mode") == "passive":  # also of measurements with a call
+        reason = "--mode passive makes acoustic maps; leave out --mode"
     for parameter in context.command.params:
         if parameter.name in _OF_IMAGES and typed(parameter.name):
             raise click.UsageError(
-                f"{parameter.opts[0]} is for images, but all measurements are passive and become acoustic maps; give "
-                f"--mode active for images, or leave out {parameter.opts[0]}",
-                context,
+                f"{parameter.opts[0]} is for images, but {reason}, or leave out {parameter.opts[0]}", context
             )
 
 

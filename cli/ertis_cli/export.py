@@ -232,7 +232,10 @@ class _Items:
         n_passive = sum(map(len, chosen)) - len(self)
         if n_passive:
             left_out = options.counted(n_passive, "measurement")
-            options.say(f"note: {left_out} without a call left out; 'ertis process' makes acoustic maps", quiet=quiet)
+            options.say(
+                f"note: {left_out} without a call left out; 'ertis process --mode passive' makes acoustic maps",
+                quiet=quiet,
+            )
 
     def __len__(self) -> int:
         return sum(map(len, self.indices))
@@ -270,7 +273,7 @@ def _with_call(reader: "RecordingReader | EnergyscapeReader", chosen: range) -> 
     if chosen and not found:
         raise DataError(
             f"{reader.path}: all chosen measurements of sensor {reader.sensor} are passive and have no echoes; make "
-            "acoustic maps with 'ertis process', or images with its option --mode active, and export these"
+            "acoustic maps with 'ertis process --mode passive', or images with --mode active, and export these"
         )
     return found
 

@@ -99,7 +99,7 @@ class CampaignOptions:
         for name in ("explain", "verify"):
             if getattr(self, name):
                 raise DataError(
-                    f"{path}: all measurements are passive and become acoustic maps, which have no error budget; leave "
+                    f"{path}: all measurements become acoustic maps, which have no error budget; leave "
                     f"out --{name}, or give --mode active for images"
                 )
 
