@@ -130,7 +130,7 @@ def export(
         return
     from ertis_numba import interop
 
-    name = interop.choose_format(target, file_format)
+    name = _format_of(target, file_format)
     for file in interop.output_files(target, name):
         check_target(file, overwrite=force, sources=paths)
     _export_drive.require_fitting(name, paths)
@@ -191,6 +191,17 @@ def _readers(
     )
     readers = [stack.enter_context(open_file(path, sensor=each)) for each in options.sensors_of(path, sensor)]
     return readers, readers
+
+
+def _format_of(target: Path, file_format: str | None) -> str:
+    """Return the name of the format of images or signals, given or by the suffix; refuse unknown suffixes."""
+    from ertis_numba import checks, interop
+
+    if file_format is None:
+        others = (f".{name}" for name in (*FORMATS_OF_POSES, *FORMATS_OF_SOUND))
+        endings = (*(each.suffix for each in interop.FORMATS.values()), *others)
+        checks.choice("ending of the export", target.suffix.lower(), endings)
+    return interop.choose_format(target, file_format)
 
 
 def _known(
