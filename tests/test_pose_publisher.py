@@ -373,21 +373,22 @@ def test_publisher_reports_a_missing_central_node():
 
 
 def test_publisher_sends_a_pose_although_an_earlier_one_is_refused():
-    context = zmq.Context()
-    server = sockets.server(context, "tcp://127.0.0.1:0", keys=None)
-    with PosePublisher(sockets.bound(server), ["left"]) as publisher:
+    with contextlib.ExitStack() as stack:
+        context = zmq.Context()
+        stack.callback(context.destroy, linger=0)
+        server = sockets.server(context, "tcp://127.0.0.1:0", keys=None)
+        publisher = stack.enter_context(PosePublisher(sockets.bound(server), ["left"]))
         publisher.send(5, (0, 0, 0), IDENTITY)
         connection = publisher._connection  # noqa: SLF001
         while not server.poll(10):
             publisher._has_sent(connection)  # noqa: SLF001
         peer, _ = server.recv_multipart()
         server.send_multipart([peer, messages.encode(Refused(code="size", reason="too many"))])
-        connection.wait(60.0)
+        assert connection._socket.poll(60_000)  # noqa: SLF001
         with pytest.raises(RefusedError, match="too many"):
             publisher.send(6, (0, 0, 0), IDENTITY)
         assert server.poll(60_000)
         assert messages.decode(server.recv_multipart()[1]).timestamp_ns == 6
-    context.destroy(linger=0)
 
 
 def test_flush_reports_an_interrupted_connection_once(tmp_path):
