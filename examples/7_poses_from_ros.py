@@ -17,7 +17,7 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
-from ertis_numba.errors import RefusedError
+from ertis_numba.errors import ArgumentError, RefusedError
 from ertis_numba.network.pose_publisher import PosePublisher
 
 
@@ -40,7 +40,7 @@ class PoseForwarder(Node):
                 (turn.x, turn.y, turn.z, turn.w),
                 covariance if covariance.any() else None,  # ROS programs leave an unknown covariance at 0.
             )
-        except RefusedError as error:
+        except (ArgumentError, RefusedError) as error:  # An invalid pose, such as a zero quaternion, is not sent.
             self.get_logger().error(str(error), throttle_duration_sec=1.0)
 
 

@@ -11,13 +11,25 @@ it. The level is then that at 1 m from the leak, if the layout of the sensor sta
 import sys
 
 import ertis_numba as ertis
+from ertis_numba.storage import RecordingReader
 
 BAND_HZ = (40e3, 80e3)  # Machines are quieter here than leaks.
+USAGE = "give a recording and, optionally, the distance of the leak in metres"
+
+
+def require_sound(recording: RecordingReader) -> None:
+    """End the program if the recording contains echoes, or no sound because all microphones are faulty."""
+    if any(stamp.behaviour == "active" for stamp in recording.stamps()):
+        sys.exit(f"{recording.path} has measurements with a call; give a recording of 'ertis capture --passive'")
+    health = ertis.health(recording[0])
+    if all(channel.faults for channel in health.channels):
+        sys.exit(f"{recording.path}: {health.verdict()}; find the cause with 'ertis check' and record again")
 
 
 def main(path: str, distance_m: str | None = None) -> None:
     """Print the loudest source of all measurements together."""
     with ertis.open_recording(path) as recording:
+        require_sound(recording)
         settings = recording.settings.replace(
             **{"passive.bands_hz": [BAND_HZ], "passive.focus_m": None if distance_m is None else float(distance_m)}
         )
@@ -36,6 +48,9 @@ def main(path: str, distance_m: str | None = None) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) not in {2, 3}:
-        sys.exit("give a recording and, optionally, the distance of the leak in metres")
-    main(*sys.argv[1:])
+    if len(sys.argv) not in {2, 3} or sys.argv[1].startswith("-"):
+        sys.exit(USAGE)
+    try:
+        main(*sys.argv[1:])
+    except (ertis.ErtisError, OSError, ValueError) as error:
+        sys.exit(f"{error}")

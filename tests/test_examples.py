@@ -4,10 +4,13 @@ import contextlib
 import csv
 import importlib.util
 import io
+import os
 import re
+import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -306,6 +309,36 @@ def test_leak_example_states_the_level_at_the_array_without_a_distance(leak_reco
     assert [level[2] for level in levels] == ["dB re 20 µPa", "dB re 20 µPa at 1 m"]
     loss_db = ertis.air.transmission_loss_db(ertis.Settings().air, leak.range_m, np.array([np.sqrt(40e3 * 80e3)]))
     assert float(levels[1][1]) - float(levels[0][1]) == pytest.approx(loss_db[0], abs=0.2)
+
+
+def test_leak_example_explains_unusable_input_in_one_line(leak_recording, tmp_path):
+    """It claims no leak in echoes, or if no microphone works."""
+    path, _ = leak_recording
+    with ertis.open_recording(path) as recording:
+        heard = recording[0]
+    call = replace(heard, stamp=replace(heard.stamp, behaviour="active"))
+    write_recording(tmp_path / "call.h5", [call])
+    write_recording(tmp_path / "stuck.h5", [replace(heard, data=np.zeros_like(heard.data))])
+    with ertis.AcousticCamera(heard.settings) as camera:
+        ertis.write_acoustic_maps(tmp_path / "maps.h5", [camera.process(heard)])
+    for arguments, message in {
+        ("--help",): "give a recording and, optionally, the distance of the leak in metres",
+        ("none.h5",): "none.h5: No such file or directory",
+        ("maps.h5",): "maps.h5 is a file of acoustic maps, wanted a recording",
+        ("call.h5",): "call.h5 has measurements with a call; give a recording of 'ertis capture --passive'",
+        ("stuck.h5",): "stuck.h5: stuck at 0: every channel; find the cause with 'ertis check' and record again",
+        (str(path), "near"): "could not convert string to float: 'near'",
+    }.items():
+        done = subprocess.run(
+            [sys.executable, EXAMPLES / "8_find_a_leak.py", *arguments],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done.stderr
+        assert done.stderr.startswith(message)
 
 
 def test_leak_example_finds_nothing_in_noise(tmp_path, capsys):

@@ -110,7 +110,9 @@ def test_odometry_of_a_robot_is_stored_with_the_measurements(tmp_path):
             topic = participant.topic("/odom", "nav_msgs/msg/Odometry")
             await_subscribers([topic])
             seen_ns = set()
+            unturned = odometry_of(poses.time_ns[0].item(), [0.0] * 3, [0.0] * 4, [0.0] * 36)  # No rotation is known.
             for _ in range(60):  # A subscriber that has not discovered the publisher yet misses messages.
+                topic.publish(unturned)
                 for time_ns, place, turn, covariance in zip(
                     poses.time_ns.tolist(), poses.position_m, poses.rotation_xyzw, poses.covariance, strict=True
                 ):
