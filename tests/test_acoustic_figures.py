@@ -118,8 +118,9 @@ def test_plots_leave_out_source_levels_that_absorption_hides():
     found = found.replace(settings=found.settings.replace("passive.focus_m", float(between_m)))
     assert figures.acoustic_map(found).axes[1].get_ylabel() == "dB re 20 µPa"
     assert figures.acoustic_map(found, band_hz=(20e3, 25e3)).axes[1].get_ylabel() == "dB re 20 µPa at 1 m"
-    (axes,) = figures.spectrum(found).axes
+    (axes,) = (figure := figures.spectrum(found)).axes
     assert axes.get_ylabel() == "level of a band (dB re 20 µPa at 1 m)"
+    assert "without frequencies of which the air absorbs over 60 dB" in texts(figure)
     assert [np.isfinite(bar.get_height()) for bar in axes.patches] == [True, False]
     far = found.replace(settings=found.settings.replace("passive.focus_m", 10_000.0))
     assert figures.acoustic_map(far).axes[1].get_ylabel() == "dB re 20 µPa"
@@ -134,7 +135,9 @@ def test_spectra_leave_out_source_levels_that_absorption_hides():
     is_heard = 50.0 * absorption_db_m(settings.air, 1e3 * frequency_khz) <= 60
     np.testing.assert_array_equal(np.isfinite(level_db), is_heard)
     assert 0 < np.count_nonzero(is_heard) < len(is_heard)
-    assert figures.spectrogram(heard, direction_deg=(20.0, 0.0)).axes
+    for figure in (figures.spectrum, figures.spectrogram):
+        beam, mean = texts(figure(heard, direction_deg=(20.0, 0.0))), texts(figure(heard))
+        assert ["without frequencies of which" in each for each in (beam, mean)] == [True, False]
 
 
 def test_maps_of_music_do_not_depend_on_the_distance():

@@ -123,7 +123,8 @@ def draw_bands(canvas: Canvas, found: AcousticMap, *, direction_deg: tuple[float
     place_deg = np.degrees([found.azimuth_rad[place], found.elevation_rad[place]])
     towards = f"azimuth {angle(place_deg[0])}, elevation {angle(place_deg[1])}"
     chosen = towards if direction_deg is not None else f"loudest direction: {towards}"
-    heading = _captions.of_acoustic_map("Spectrum", found, chosen)
+    unknown = _captions.unknown_levels(reference.offset_db) if found.has_level else ()
+    heading = _captions.of_acoustic_map("Spectrum", found, chosen, *unknown)
     return compose(canvas, heading, [Panel(paint, lambda width_pt: _BAND_RATIO * width_pt)])
 
 

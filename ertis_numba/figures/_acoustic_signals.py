@@ -162,5 +162,6 @@ def _heading(
     if direction_deg is not None:
         heard = f"beam to azimuth {angle(direction_deg[0])}, elevation {angle(direction_deg[1])}"
     bins = f"bins of {_captions.number(frequency_hz[1] / 1e3)} kHz"
-    parts = (heard, bins, *_captions.left_out(masked_s))
+    unknown = _captions.unknown_levels(_reference(measurement.settings, frequency_hz, direction_deg).offset_db)
+    parts = (heard, bins, *unknown, *_captions.left_out(masked_s))
     return _captions.of_measurement(title, measurement.settings, measurement.stamp, *parts, values=np.sqrt(power))

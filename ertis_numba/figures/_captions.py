@@ -22,6 +22,7 @@ __all__ = [
     "of_image",
     "of_measurement",
     "span",
+    "unknown_levels",
 ]
 
 
@@ -98,6 +99,11 @@ def of_measurement(title: str, settings: Settings, stamp: Stamp, *parts: str, va
 def left_out(masked_s: float) -> tuple[str, ...]:
     """Return the note about the time of a call that is left out, if any."""
     return (f"the first {number(1e3 * masked_s)} ms are left out",) if masked_s else ()
+
+
+def unknown_levels(offset_db: NDArray[np.float64]) -> tuple[str, ...]:
+    """Return the note about source levels that are unknown at some frequencies, if any."""
+    return ("without frequencies of which the air absorbs over 60 dB",) if np.isnan(offset_db).any() else ()
 
 
 def of_acoustic_map(title: str, found: AcousticMap, *parts: str) -> Heading:
