@@ -65,7 +65,7 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
         n_before = len(read_diaries(diaries[:1]).kept)
         serve.settle(n_before)
         published, dropped = _published(serve), _dropped(serve)
-        begun = _settled(viewer, published)
+        begun = _await_maps(viewer, published)
         sender = stack.enter_context(job.replace(diary=str(diaries[1]), count=round(duration_s * _RATE_HZ)).start())
         sender.wait_for("begun")
         load = ProcessorTime(serve.processes() | {"sensor nodes": [sender.pid], "view": [viewer.pid]})
@@ -75,7 +75,7 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
         dropped = _dropped(serve) - dropped
         before, published = published, _published(serve)
         cpu_percent, cpu_ms = load.percent(), load.rows(max(1, n_sent))
-        _settled(viewer, published)
+        _await_maps(viewer, published)
         viewer.signal(signal.SIGTERM)
         end = viewer.wait_for("shown", timeout_s=60.0)
         serve.node.stop()
@@ -112,7 +112,7 @@ def _dropped(serve: Serve) -> Counter[str]:
     return sum(counts, Counter[str]())
 
 
-def _settled(viewer: JsonLinesProcess, n_published: int) -> Found:
+def _await_maps(viewer: JsonLinesProcess, n_published: int) -> Found:
     """Return the counts of the view once all measurements have become maps or were dropped, or after a timeout."""
     end_s = time.monotonic() + _SETTLING_S
     while True:
