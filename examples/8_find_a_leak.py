@@ -8,6 +8,7 @@ it. The level is then that at 1 m from the leak, if the layout of the sensor sta
     python examples/8_find_a_leak.py leak.h5 2.5
 """
 
+import math
 import sys
 
 import ertis_numba as ertis
@@ -43,7 +44,10 @@ def main(path: str, distance_m: str | None = None) -> None:
     (leak,) = bearings
     level, unit = leak.level
     print(f"azimuth {leak.azimuth_deg:+.3f}° ± {leak.sideways_deg:.3f}°")
-    print(f"elevation {leak.elevation_deg:+.3f}° ± {leak.upwards_deg:.3f}°")
+    if math.isfinite(leak.upwards_deg):
+        print(f"elevation {leak.elevation_deg:+.3f}° ± {leak.upwards_deg:.3f}°")
+    else:
+        print("elevation unknown: the recording has directions of one elevation only")
     print(f"{level:.1f} {unit} from {BAND_HZ[0] / 1e3:g} to {BAND_HZ[1] / 1e3:g} kHz")
 
 
