@@ -74,7 +74,7 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 	$(BIN)/ertis bench verification --update docs/explanation/accuracy.md
 	$(BIN)/ertis bench points --update docs/explanation/accuracy.md
 	$(BIN)/ertis bench calibration --update docs/how-to/calibrate.md
-	$(BIN)/ertis bench fusion --update docs/how-to/fusion.md
+	$(BIN)/ertis bench fusion --seed 1000 --update docs/how-to/fusion.md
 	$(BIN)/ertis bench fusion --only calls --count 6 --seed 1000 --update docs/how-to/fusion.md
 	$(BIN)/ertis bench fusion --only clocks --update docs/how-to/fusion.md
 	$(BIN)/ertis bench fusion --only delays --count 6 --seed 1000 --update docs/how-to/fusion.md
