@@ -1,6 +1,6 @@
 """Copies between host and GPU that take the processor a few microseconds.
 
-Copies of Numba create several views and take about 50 µs each, as long as the GPU needs for a whole image. CuPy calls
+Copies of Numba create several views, which takes the processor tens of microseconds. CuPy calls
 the copy of CUDA directly.
 """
 
