@@ -1,6 +1,7 @@
 """Fused images of a central node, as an application receives them."""
 
 import json
+import threading
 
 import numpy as np
 import pytest
@@ -43,18 +44,27 @@ def test_each_pulse_is_fused_once():
 
 def test_pulses_that_arrive_while_tables_are_computed_are_fused_later(monkeypatch):
     fuse = Fuser.__call__
+    begun = threading.Event()
 
     def slowly(fuser, images):
         """Fuse, and the first time return only once all further pulses have arrived."""
+        begun.set()
         fused = fuse(fuser, images)
         if fused.image.stamp.sync_count == 0:
             assert until(lambda: subscriber.counts.received == 16)
         return fused
 
+    def first_one_and_then_others():
+        """Send nothing between the first pulse and the begin of its fusion, so that none is skipped before."""
+        front, back, *others = pulses(count=8)
+        yield from (front, back)
+        assert begun.wait(PATIENCE_S)
+        yield from others
+
     with (
         Publisher() as publisher,
         FusedSubscriber(publisher.address, mountings=MOUNTINGS) as subscriber,
-        publisher.playing(pulses(count=8)),
+        publisher.playing(first_one_and_then_others()),
     ):
         monkeypatch.setattr(Fuser, "__call__", slowly)
         counts = [subscriber.receive(PATIENCE_S).fused.image.stamp.sync_count for _ in range(8)]
