@@ -21,8 +21,9 @@ LISTED = AllowList(
     )
 )
 LOOPBACK = "tcp://127.0.0.1:*"
-PATIENCE_S = 10.0  # timeout for events that must happen
+PATIENCE_S = 60.0  # timeout for events that must happen
 MOMENT_S = 0.4  # wait for events that must not happen; a handshake takes a hundredth of this
+_NOBODY = "tcp://127.0.0.1:1"
 
 
 class Door:
@@ -81,11 +82,11 @@ class Door:
     def knock(self, pair, *, server=CENTRAL.public, options=(), text=b"hello"):
         """Connect a client and queue a text that it sends once connected."""
         keys = ClientKeys(pair, server) if pair else None
-        client = sockets.client(self.outside, self.address, keys=keys)
+        client = sockets.client(self.outside, _NOBODY if options else self.address, keys=keys)
         for option, value in options:
             client.setsockopt(option, value)
         if options:  # options apply to the next connection only
-            client.disconnect(self.address)
+            client.disconnect(_NOBODY)
             client.connect(self.address)
         self.monitors[client] = sockets.Monitor(client)
         self._clients.append(client)
@@ -103,8 +104,14 @@ class Door:
         return lines[0]
 
     def admits(self, pair, **options):
-        """Identity of the client if its message arrives within ``MOMENT_S``, otherwise None."""
+        """Identity of the client once its message arrives, or None once its monitor reports a refused connection."""
         text = random.randbytes(8)
-        self.knock(pair, text=text, **options)
-        self.until(lambda: any(came == text for came, _ in self.came), MOMENT_S)
+        client = self.knock(pair, text=text, **options)
+        assert self.until(lambda: any(came == text for came, _ in self.came) or self.monitors[client].read())
         return next((who for came, who in self.came if came == text), None)
+
+    def hears(self, pair):
+        """Return True if the message of a client arrives within ``MOMENT_S``; a refusal need not be reported."""
+        text = random.randbytes(8)
+        self.knock(pair, text=text)
+        return self.until(lambda: any(came == text for came, _ in self.came), MOMENT_S)
