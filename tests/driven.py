@@ -106,7 +106,7 @@ class Loop:
 def driven(**options):
     log = Lines("processing")
     processing = ImageProcessing(
-        ProcessingOptions(**({"publish": ANY, "device": "numpy", "workers": 1} | options)), log
+        ProcessingOptions(**({"publish": ANY, "device": "numpy", "workers": 1, "deadline_s": TIMEOUT_S} | options)), log
     )
     processing.start()
     loop = Loop(processing)

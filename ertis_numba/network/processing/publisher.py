@@ -28,7 +28,7 @@ _KEEP_MEMORY: Final = {
     "MALLOC_TRIM_THRESHOLD_": str(256 * 2**20),
     "MALLOC_ARENA_MAX": "1",
 }
-_STARTED_S: Final = 20.0
+_STARTED_S: Final = 60.0
 _HUNG_S: Final = 10.0  # Limit on silence; it sends a message each second.
 _DELAYS_S: Final = (0.0, 0.2, 0.5, 1.0, 2.0, 5.0)
 _CLOSED_S: Final = 2.0
