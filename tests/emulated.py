@@ -10,7 +10,7 @@ from ertis_numba.devices.blocks import FOOTER, HEADER
 
 N_SAMPLES = 32_768
 WORDS = [np.random.default_rng(index).integers(0, 2**32, N_SAMPLES, dtype=np.uint32) for index in range(3)]
-TIMEOUT_S = 20.0
+TIMEOUT_S = 60.0
 
 
 class Log(queue.Queue):

@@ -27,14 +27,15 @@ class Listener:
 
 
 def test_pulses_are_steady_and_pass_from_device_to_device():
-    devices = [Listener(takes=False), Listener(takes=True)]
-    with SyncChain(devices, 200.0):
-        first, second = ([device.came.get(timeout=TIMEOUT_S) for _ in range(10)] for device in devices)
-    assert [pulse for pulse, _ in first] == [pulse for pulse, _ in second] == list(range(10))
-    assert {late - early for (_, early), (_, late) in zip(first, second, strict=True)} == {400}
-    periods = np.diff([at_ns for _, at_ns in first]) / 5e6
+    devices, pulses, periods = [Listener(takes=False), Listener(takes=True)], [], []
+    with SyncChain(devices, 50.0):
+        # A busy machine may miss most pulses, but never all.
+        while len(pulses) < 10 or 1 not in periods:
+            pulses.append([device.came.get(timeout=TIMEOUT_S) for device in devices])
+            periods = np.diff([at_ns for (_, at_ns), _ in pulses]) / 20e6
+    assert [number for (number, _), _ in pulses] == [number for _, (number, _) in pulses] == list(range(len(pulses)))
+    assert {late - early for (_, early), (_, late) in pulses} == {400}
     assert np.all(periods == np.rint(periods))  # one that is missed is left out, and none is moved
-    assert np.median(periods) == 1
 
 
 def test_missed_pulses_are_skipped():
@@ -70,6 +71,28 @@ def test_invalid_pulse_rate_is_refused():
         SyncChain([], 0.0)
 
 
+class ReadDevice:
+    """Device of a chain that waits with each pulse until its measurement of the one before was read."""
+
+    def __init__(self, device):
+        self._device = device
+        self._is_free = threading.Semaphore()
+        self.ended = False
+
+    def trigger(self, pulse, *, at_ns):
+        if self.ended:
+            return False
+        assert self._is_free.acquire(timeout=TIMEOUT_S)
+        taken = self._device.trigger(pulse, at_ns=at_ns)
+        if not taken:  # it is not armed
+            self._is_free.release()
+        return taken
+
+    def release(self, *, ended):
+        self.ended = ended
+        self._is_free.release()
+
+
 def test_four_devices_on_a_chain_measure_at_the_same_time():
     begun = [threading.Event() for _ in range(5)]
     begun[0].set()
@@ -78,9 +101,10 @@ def test_four_devices_on_a_chain_measure_at_the_same_time():
         """Start sensors one after the other; later ones miss pulses."""
         assert begun[place].wait(TIMEOUT_S)
         ask(port, b"!J,1,1,0\n")
-        for _ in range(6):
+        for number in range(6):
             yield block(port)
             begun[place + 1].set()
+            chained[place].release(ended=number == 5)
 
     with ExitStack() as stack:
         devices = [stack.enter_context(Emulator(Numbered())) for _ in range(4)]
@@ -88,7 +112,8 @@ def test_four_devices_on_a_chain_measure_at_the_same_time():
         for place, port in enumerate(ports):
             ask(port, b"!G,131072,0,0\n")
             ask(port, b"!B,%d,0,0\n" % (100 * place))
-        stack.enter_context(SyncChain(devices, 6.0))  # slow enough for readers on a busy machine
+        chained = [ReadDevice(device) for device in devices]
+        stack.enter_context(SyncChain(chained, 50.0))
         hosts = stack.enter_context(ThreadPoolExecutor(4))
         came = list(hosts.map(lambda place, port: list(listen(place, port)), range(4), ports))
     assert [[counter for counter, _ in blocks] for blocks in came] == [

@@ -174,11 +174,12 @@ class Dialogue(SerialLine):
     def _answers(self, count: int) -> bytes:
         """Return the requested number of answers, or fewer after a timeout."""
         data = b""
-        latest = time.monotonic()
-        while len(data) < count * _ANSWER_BYTES and time.monotonic() - latest <= self._timeout_s:
+        latest, is_late = time.monotonic(), False
+        while len(data) < count * _ANSWER_BYTES and not is_late:
+            is_late = time.monotonic() - latest > self._timeout_s  # Answers that have come meanwhile are still read.
             piece, _ = self.receive(count * _ANSWER_BYTES - len(data))
             if piece:
-                data, latest = data + piece, time.monotonic()
+                data, latest, is_late = data + piece, time.monotonic(), False
         return data
 
     def _no_answer(self, command: Command | CustomCommand, data: bytes) -> SonarError:

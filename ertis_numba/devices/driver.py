@@ -232,11 +232,14 @@ class SonarDriver:
         began, read = time.monotonic(), 0
         ends = began + deadline_s
         latest = ends + setup.n_bytes / _SLOWEST_BYTES_PER_S
-        while time.monotonic() <= ends:
+        is_late = False
+        while not is_late:
+            is_late = time.monotonic() > ends  # Bytes that came while this process was suspended are still read.
             data, arrived = self._line.receive(receiver.missing)
             read += len(data)
             if data and read < setup.n_bytes + FRAME_BYTES:
                 ends = min(max(ends, time.monotonic() + _MARGIN_S), latest)
+                is_late = time.monotonic() > ends
             blocks = receiver.feed(data, arrived)
             if data and not (blocks or receiver.missing):
                 blocks = receiver.finish()  # No other block will decide.
@@ -333,22 +336,21 @@ class SonarDriver:
             The sensor is not back within that time.
         """
         began = time.monotonic()
-        last: SonarError | None = None
 
         def abandoned() -> bool:
             return self._closing.is_set() or stop()
 
         self.hang_up()
         while not abandoned():
-            if time.monotonic() - began > within_s:
-                raise SonarDisconnectedError(f"{self.port} did not return within {within_s:g} s: {last}")
             try:
                 port = find_again(self._port)
                 self._line, self._port = self._opened(port, abandoned), port
                 self._go_on()
             except SonarError as error:
-                last = error
                 self.hang_up(_why_absent(error))
+                if time.monotonic() - began > within_s and not abandoned():
+                    text = f"{self.port} did not return within {within_s:g} s: {error}"
+                    raise SonarDisconnectedError(text) from error
                 self._closing.wait(_RETRY_S)
             else:
                 self._line.stop = self._closing.is_set
