@@ -3,6 +3,7 @@
 import contextlib
 import threading
 import time
+import types
 import zlib
 from dataclasses import dataclass, field
 
@@ -230,6 +231,24 @@ class Publisher:
 def kind_of(item):
     kinds = {Energyscape: "energyscape", PointCloud: "points", Measurement: "raw", Status: "status"}
     return kinds.get(type(item), "group")
+
+
+def results_of(monkeypatch, owner, name):
+    """Return a list to which each call of a method adds its result."""
+    results, method = [], getattr(owner, name)
+
+    def call(*arguments, **options):
+        results.append(method(*arguments, **options))
+        return results[-1]
+
+    monkeypatch.setattr(owner, name, call)
+    return results
+
+
+def end_when(monkeypatch, module, is_over):
+    """Let the duration of a command in a module be over once a condition holds, even on a slow machine."""
+    clock = types.SimpleNamespace(monotonic=lambda: 1e6 if is_over() else 0.0)
+    monkeypatch.setattr(f"{module}.time", clock)
 
 
 def subscribed(publisher, count=1):

@@ -9,7 +9,7 @@ import threading
 import time
 import tty
 import zlib
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -37,6 +37,20 @@ PASSIVE = [words[::-1].copy() for words in WORDS]
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
     return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch):
+    """Let drivers wait for measurements as long as a busy machine needs."""
+    monkeypatch.setattr("ertis_numba.devices.driver._MARGIN_S", TIMEOUT_S)
+
+
+@contextmanager
+def impatient(margin_s=0.5):
+    """Let drivers give up a measurement that does not arrive."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ertis_numba.devices.driver._MARGIN_S", margin_s)
+        yield
 
 
 @pytest.fixture
@@ -113,7 +127,7 @@ def receive_blocks(sonar, count):
     return list(itertools.islice(sonar.listen(stop=lambda: False, timeout_s=TIMEOUT_S), count))
 
 
-def refusal(device, *, timeout_s=0.2):
+def refusal(device, *, timeout_s=1.0):
     """Return the error of opening a fake device."""
     with device, pytest.raises(SonarError) as caught:
         SonarDriver.open(device.port, timeout_s=timeout_s)
@@ -199,7 +213,7 @@ def test_silent_device_is_reported(device):
 
 def test_device_of_another_kind_is_reported():
     error = refusal(Fake(lambda _, write: write(b"OK")))
-    assert "does not answer 'firmware version?' within 0.2 s, but sends b'OK'" in str(error)
+    assert "does not answer 'firmware version?' within 1 s, but sends b'OK'" in str(error)
     error = refusal(Fake(lambda _, write: write(b"unknown command\r\n")))
     assert "answers 'firmware version?' with more than a number, first b'unkn'" in str(error)
     numbers = itertools.count()
@@ -270,9 +284,9 @@ def test_driver_sends_the_whole_configuration(device, caplog):
 
 
 def test_slow_device_receives_its_call(device):
-    device.quirks = Quirks(answer_delay_s=2e-3)
+    device.quirks = Quirks(answer_delay_s=20e-3)
     setup = Setup.of(SETTINGS.replace(call=Call(duration_s=2e-4)))
-    with SonarDriver.open("left", timeout_s=0.2) as sonar:
+    with SonarDriver.open("left", timeout_s=1.5) as sonar:  # The answers to its samples take longer.
         sonar.configure(setup)
         assert np.array_equal(device.registers.codes[: len(setup.codes)], setup.codes)
 
@@ -289,8 +303,9 @@ def test_call_that_did_not_arrive_is_reported(device):
 
 
 def test_device_that_falls_silent_is_reported(device):
-    with SonarDriver.open("left", timeout_s=0.1) as sonar:
+    with SonarDriver.open("left") as sonar:
         device.quirks = Quirks(silent=True)
+        sonar._line._timeout_s = 0.1  # noqa: SLF001
         with pytest.raises(SonarError, match=r"does not answer 'SYNC input 1: off' within 0\.1 s"):
             sonar.configure(Setup.of(SETTINGS))
 
@@ -304,8 +319,8 @@ def test_missing_answers_name_their_command():
 
     with (
         Fake(forgetful) as device,
-        SonarDriver.open(device.port, timeout_s=0.1) as sonar,
-        pytest.raises(SonarError, match=r"does not answer 'sample 31 of the call: \d+' within 0\.1 s"),
+        SonarDriver.open(device.port) as sonar,
+        pytest.raises(SonarError, match=r"does not answer 'sample 31 of the call: \d+' within 1 s"),
     ):
         sonar.configure(Setup.of(SETTINGS))  # The missing answer of sixteen is unknown, so the last is named.
 
@@ -349,15 +364,20 @@ def test_stale_bytes_are_dropped(sonar, device):
 def test_measurement_whose_bytes_still_arrive_is_not_late(sonar, device):
     """A busy machine transfers slowly; the whole measurement takes longer than its usual timeout of 0.53 s."""
     device.quirks = Quirks(bytes_per_s=200_000)
+    with impatient():
+        usual_s = sonar.deadline_s
     began_s = time.monotonic()
     assert is_block(sonar.measure(), 0, WORDS[0])
-    assert time.monotonic() - began_s > sonar.deadline_s
+    assert time.monotonic() - began_s > usual_s
 
 
 def test_late_measurement_is_not_taken_for_the_next(sonar, device):
     device.quirks = Quirks(bytes_per_s=50_000)
-    with pytest.raises(
-        SonarError, match=r"no complete measurement within \d\.\d\d s; \d+ of 131084 bytes arrived: measure"
+    with (
+        impatient(),
+        pytest.raises(
+            SonarError, match=r"no complete measurement within \d\.\d\d s; \d+ of 131084 bytes arrived: measure"
+        ),
     ):
         sonar.measure()
     device.quirks = Quirks()
@@ -383,7 +403,7 @@ def test_delayed_measurement_is_recognised_by_its_number(pause_s):
 
     with Fake(slow) as device, SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
-        with pytest.raises(SonarError, match="; 0 of 131084 bytes arrived"):
+        with impatient(), pytest.raises(SonarError, match="; 0 of 131084 bytes arrived"):
             sonar.measure()
         assert is_block(sonar.measure(), 1, WORDS[1])
         assert sonar.receiver.rejected == {"counter": BLOCK_BYTES}
@@ -401,7 +421,7 @@ def test_lost_byte_loses_one_measurement():
 
     with Fake(lossy) as device, SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
-        with pytest.raises(SonarError, match="; 131083 of 131084 bytes arrived"):
+        with impatient(2.0), pytest.raises(SonarError, match="; 131083 of 131084 bytes arrived"):
             sonar.measure()
         assert is_block(sonar.measure(), 1, WORDS[1])
         assert sonar.receiver.rejected == {"cut short": BLOCK_BYTES - 1}
@@ -420,7 +440,7 @@ def test_lost_command_does_not_shift_the_numbers():
 
     with Fake(deaf_once) as device, SonarDriver.open(device.port) as sonar:
         sonar.configure(Setup.of(SETTINGS))
-        with pytest.raises(SonarError, match="; 0 of 131084 bytes arrived"):
+        with impatient(), pytest.raises(SonarError, match="; 0 of 131084 bytes arrived"):
             sonar.measure()
         assert is_block(sonar.measure(), 1, WORDS[1])
 
@@ -429,7 +449,7 @@ def test_lost_command_does_not_shift_the_numbers():
 def test_implausible_bits_are_refused():
     with SonarDriver.open("left") as sonar:
         sonar.configure(Setup.of(SETTINGS), bits=lambda words: "odd" if np.array_equal(words, WORDS[0]) else None)
-        with pytest.raises(SonarError, match="no complete measurement"):
+        with impatient(2.0), pytest.raises(SonarError, match="no complete measurement"):
             sonar.measure()
         assert sonar.receiver.rejected_blocks == {"odd": 1}
         assert is_block(sonar.measure(), 1, WORDS[1])
@@ -456,17 +476,9 @@ def test_driver_receives_twenty_pulses_per_second(folder):
 
 
 def test_listening_stops_at_once(armed):
-    stop, stopped = threading.Event(), []
-
-    def end():
-        stopped.append(time.monotonic())
-        stop.set()
-
-    timer = threading.Timer(0.1, end)
-    timer.start()
-    assert list(armed.listen(stop=stop.is_set, timeout_s=TIMEOUT_S)) == []
-    assert time.monotonic() - stopped[0] < 0.2
-    timer.join()
+    asked = itertools.count()
+    assert list(armed.listen(stop=lambda: next(asked) == 20, timeout_s=TIMEOUT_S)) == []
+    assert next(asked) == 21
 
 
 def test_stopped_command_fails_and_can_be_repeated(device):
@@ -499,7 +511,10 @@ def test_close_ends_listening_and_disarms_the_trigger(armed, device):
 
 
 def test_listening_without_pulses_ends(armed):
-    with pytest.raises(SonarError, match=r"nothing arrived within 0\.\d+ s; check the trigger and its cable"):
+    with (
+        impatient(),
+        pytest.raises(SonarError, match=r"nothing arrived within 0\.\d+ s; check the trigger and its cable"),
+    ):
         list(armed.listen(stop=lambda: False, timeout_s=0.1))
 
 
@@ -523,8 +538,11 @@ def test_listening_with_another_record_length_is_reported(device):
     registers.n_bytes, registers.armed = 4 * N_SAMPLES, 1
     with SonarDriver.open("left", listen_only=True) as sonar, SyncChain([device], 50.0):
         sonar.configure(Setup.of(SETTINGS.replace(recording=Recording(n_samples=2 * N_SAMPLES))))
-        with pytest.raises(
-            SonarError, match=r"\d+ bytes arrived within .* no complete measurement of 65536 samples; give"
+        with (
+            impatient(2.0),
+            pytest.raises(
+                SonarError, match=r"\d+ bytes arrived within .* no complete measurement of 65536 samples; give"
+            ),
         ):
             list(sonar.listen(stop=lambda: False, timeout_s=0.1))
 
@@ -573,12 +591,18 @@ def test_operations_out_of_order_are_refused():
 def test_unplugging_within_a_measurement_is_reported(sonar, device):
     first = sonar.port
     assert is_block(sonar.measure(), 0, WORDS[0])
-    device.quirks = Quirks(bytes_per_s=400_000)
-    timer = threading.Timer(0.15, device.unplug)
-    timer.start()
+    device.quirks = Quirks(bytes_per_s=50_000)
+    receive = sonar._line.receive  # noqa: SLF001
+
+    def receive_and_unplug(missing):
+        data, arrived = receive(missing)
+        if data:
+            device.unplug()
+        return data, arrived
+
+    sonar._line.receive = receive_and_unplug  # noqa: SLF001
     with pytest.raises(SonarDisconnectedError, match=f"{first} was unplugged; plug it in again"):
         sonar.measure()
-    timer.join()
     with pytest.raises(SonarDisconnectedError, match="was unplugged"):
         sonar.measure()
     device.quirks = Quirks()
@@ -589,20 +613,18 @@ def test_unplugging_within_a_measurement_is_reported(sonar, device):
 
 
 def test_unplugging_while_listening_is_reported(armed, device):
-    with SyncChain([device], 50.0):
+    with SyncChain([device], 50.0) as chain:
         blocks = receive_blocks(armed, 3)
         device.unplug()
         with pytest.raises(SonarDisconnectedError):
             blocks += receive_blocks(armed, 100)
         device.replug()
-        before = time.monotonic()
         assert armed.reconnect(within_s=TIMEOUT_S)
         [back] = receive_blocks(armed, 1)
-    assert time.monotonic() - before < 3
     # On a busy machine the driver may read too late, and the device drops some measurements.
     counters = [block.counter for block in blocks]
     assert counters == sorted(set(counters))
-    assert counters[-1] + 1 <= back.counter < counters[-1] + 20
+    assert counters[-1] + 1 <= back.counter < chain.pulses
 
 
 def test_device_that_does_not_return_is_reported(sonar, device):

@@ -96,10 +96,17 @@ def test_recording_is_saved_as_a_page(tmp_path):
     assert len(text) > 500_000
 
 
-def test_live_view_is_saved_as_a_page(tmp_path):
-    page = tmp_path / "page.html"
+def test_live_view_is_saved_as_a_page(tmp_path, monkeypatch):
+    page, draw = tmp_path / "page.html", Viewer._draw  # noqa: SLF001  a busy machine draws late
+
+    def draw_and_stop(view, now_s):
+        draw(view, now_s)
+        if view.shown:
+            view.stop()
+
+    monkeypatch.setattr(Viewer, "_draw", draw_and_stop)
     with Publisher() as publisher, publisher.playing([published(number) for number in range(3)]):
-        command = f"view {publisher.address} --save-html {page} --duration 1.5 --port 0 --no-open --json"
+        command = f"view {publisher.address} --save-html {page} --duration 200 --port 0 --no-open --json"
         done = CliRunner().invoke(cli, command.split())
     assert done.exit_code == 0, (done.stderr, done.exception)
     viewing, recorded = map(json.loads, done.stdout.splitlines())

@@ -18,7 +18,7 @@ from ertis_numba.storage import write_energyscapes
 from ertis_numba.viewer import Choices, Playback, Viewer, _recordings as recordings, _view as viewing
 from ertis_numba.viewer._origins import is_loopback
 from ertis_numba.viewer._page import ControlRequest
-from tests.views import PATIENCE_S, Client, Source, spot, stamped, taken, wait_for
+from tests.views import PATIENCE_S, Client, Source, run_once, spot, stamped, taken, wait_for
 
 
 def test_occupied_port_is_refused(tmp_path):
@@ -118,7 +118,7 @@ def test_failed_saving_is_reported_and_the_view_continues(tmp_path):
         wait_for(lambda: view.run(duration_s=0.05) or view.shown)
         for order in orders:
             view._orders.put(order)  # noqa: SLF001  as a browser does
-        view.run(duration_s=0.2)
+        run_once(view)
         assert view.choices == Choices()
     ((title, body),) = client.notices
     assert title == "Nothing is saved"
@@ -154,15 +154,16 @@ def test_browser_does_not_end_the_recording_of_another(tmp_path):
             view._orders.put(ControlRequest(name, client=client))  # noqa: SLF001  as a browser does
 
         press(one)
-        view.run(duration_s=0.1)
+        run_once(view)
         press(other)
         press(one)
-        wait_for(lambda: view.run(duration_s=0.05, html=tmp_path / "ours.html", overwrite=True) or one.files)
+        run_once(view, html=tmp_path / "ours.html")
+        assert one.files
         assert view.recorded is not None
         press(other, "leave")  # with its recording
         press(other)
         press(other)
-        view.run(duration_s=0.3)
+        run_once(view)
         assert not view._page._server._websock_server._record_handles  # noqa: SLF001  nothing is kept for nobody
     assert embedded((tmp_path / "ours.html").read_text())
     ((name, content),) = one.files
@@ -205,7 +206,7 @@ def test_browser_recording_does_not_end_that_of_run(tmp_path):
     source.waiting = [taken(spot(0, 2.0), time_s=source.clock_s)]
     with Viewer(source, port=0) as view:
         view._orders.put(ControlRequest("record", client=client))  # noqa: SLF001  which once ended that of the command
-        view.run(duration_s=0.2, html=tmp_path / "live.html")
+        run_once(view, html=tmp_path / "live.html")
         assert view.recorded == 1
     assert (tmp_path / "live.html").stat().st_size > 500_000
 
@@ -323,11 +324,11 @@ def test_range_slider_shows_the_window(window_m, shown_m, top_m, reported):
     source = Source()
     source.waiting = [taken(spot(0, 2.0), time_s=100.0)]
     with Viewer(source, port=0, choices=Choices(range_m=window_m)) as view:
-        view.run(duration_s=0.1)
+        run_once(view)
         slider = controls(view)["range_m"]
         assert (slider.value, slider.max, slider.label) == (pytest.approx(shown_m), pytest.approx(top_m), reported)
         view._orders.put(ControlRequest("range_m", (1.0, 2.0)))  # noqa: SLF001  as a browser does
-        view.run(duration_s=0.1)
+        run_once(view)
         assert slider.label == "Range 1–2 m"
 
 
@@ -339,9 +340,10 @@ def test_invalid_numbers_are_reset(monkeypatch):
         def type_in(number):
             box.value = number
             view._orders.put(ControlRequest("threshold_db", number))  # noqa: SLF001  as a browser does
-            view.run(duration_s=0.05)
+            run_once(view)
             return box.value, view.choices.threshold_db
 
+        monkeypatch.setattr(viewing, "_TYPED_S", 1000.0)
         assert type_in(5.0) == (5.0, -15.0)  # it may be half of a number
         monkeypatch.setattr(viewing, "_TYPED_S", 0.0)
         assert type_in(-100.0) == (-15.0, -15.0)

@@ -86,13 +86,28 @@ class Source:
         return None
 
 
-def acked_through(view, *, within_s=0.12):
+def run_once(view, **options):
+    """Run a view until it has processed its pending requests and images."""
+    draw = view._draw  # noqa: SLF001  nothing else ends with the drawing
+
+    def draw_and_end(now_s):
+        draw(now_s)
+        view._ended = True  # noqa: SLF001
+
+    view._draw = draw_and_end  # noqa: SLF001
+    try:
+        view.run(duration_s=PATIENCE_S, **options)
+    finally:
+        view._draw, view._ended = draw, False  # noqa: SLF001
+
+
+def acked_through(view):
     """Let a view draw its pending images, and return its last message."""
     rows = {}
     page = view._page  # noqa: SLF001  what it tells goes to browsers only
     notify = page.notify
     page.notify = lambda reported, *, playing: rows.update(reported) or notify(reported, playing=playing)
-    view.run(duration_s=within_s)
+    run_once(view)
     view._emit_event()  # noqa: SLF001
     page.notify = notify
     return {name: value for name, (_, value) in rows.items()}
