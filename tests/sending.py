@@ -1,5 +1,6 @@
 """A sensor node that queues its notes and acks, and checks of the messages that a stand-in received."""
 
+import contextlib
 import queue
 import threading
 import time
@@ -11,15 +12,15 @@ from ertis_numba.network.sensor_node import SensorNode, _link as link, _outgoing
 from tests.journals import EPOCH, TINY
 
 KEY = "left", EPOCH
-SOON_S = 20.0
+SOON_S = 60.0
 
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """Shorten all timeouts to fractions of a second."""
+    """Shorten all intervals to fractions of a second; a busy machine is not taken for a silent central node."""
     for module, name, value in (
         (connection, "PING_INTERVAL_S", 0.05),
-        (link, "SILENCE_LIMIT_S", 0.5),
+        (link, "SILENCE_LIMIT_S", SOON_S),
         (link, "_GREET_AGAIN_S", 0.1),
         (link, "_REFUSED_S", 0.1),
         (link, "_TURN_S", 0.01),
@@ -30,6 +31,17 @@ def impatient(monkeypatch):
 
 
 IMPATIENT = pytest.mark.usefixtures("impatient")
+
+
+@contextlib.contextmanager
+def silent(central, node):
+    """Let a stand-in be silent until the node has noticed it, and in the block."""
+    central.silent = True
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(link, "SILENCE_LIMIT_S", 0.5)
+        until(lambda: node.central == "away")
+    yield
+    central.silent = False
 
 
 class Node(SensorNode):

@@ -10,7 +10,7 @@ from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.sensor_node import SensorNode, _link as link, _outgoing_sessions as runs
 from tests.journals import EPOCH, TINY, entries
-from tests.sending import IMPATIENT, SOON_S, Node, has_all, impatient, until
+from tests.sending import IMPATIENT, SOON_S, Node, has_all, impatient, silent, until
 from tests.stand_in import StandIn
 
 __all__ = ["impatient"]  # A fixture, imported for use here.
@@ -161,11 +161,9 @@ def test_link_reconnects_to_a_silent_central_node():
     with StandIn() as central, Node(central.address) as node:
         node.append(given[:5])
         assert node.flush(SOON_S)
-        central.silent = True
-        assert "does not answer; measurements are kept meanwhile" in node.notes.get(timeout=SOON_S)
-        assert node.central == "away"
-        node.append(given[5:])
-        central.silent = False
+        with silent(central, node):
+            assert "does not answer; measurements are kept meanwhile" in node.notes.get(timeout=SOON_S)
+            node.append(given[5:])
         assert "connected to the central node" in node.notes.get(timeout=SOON_S)
         assert node.flush(SOON_S)
         assert node.reconnects == 1
@@ -211,10 +209,8 @@ def test_link_survives_a_failing_event_listener(caplog):
         node.add_sensor("left", TINY)
         node.append(given[:3])
         assert node.flush(SOON_S)
-        central.silent = True
-        until(lambda: node.central == "away")  # The node reports the missing central node.
-        node.append(given[3:])
-        central.silent = False
+        with silent(central, node):  # The node reports the missing central node.
+            node.append(given[3:])
         assert node.flush(SOON_S)
         assert node.counts["left"].stored == 6
     assert has_all(central, given)

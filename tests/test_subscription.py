@@ -6,13 +6,14 @@ import re
 import signal
 import time
 import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import zmq
 
 from ertis_numba.errors import RefusedError
-from ertis_numba.network import _subscription, connection, messages
+from ertis_numba.network import _subscription, connection, messages, subscriber as subscriber_module
 from ertis_numba.network.allow_list import AllowList
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
@@ -30,7 +31,7 @@ from tests.publishing import (
     subscribed,
 )
 
-WAIT_S = 10.0
+WAIT_S = 60.0
 
 
 @pytest.fixture
@@ -41,9 +42,9 @@ def publisher():
 
 @pytest.fixture
 def hasty(monkeypatch):
-    """Shorten the waiting times."""
+    """Shorten the waiting times, but do not take a busy machine for a silent publisher."""
     monkeypatch.setattr(connection, "PING_INTERVAL_S", 0.1)
-    for name, time_s in {"SILENCE_LIMIT_S": 0.5, "_AGAIN_S": 0.1, "_UNMADE_S": 1.0}.items():
+    for name, time_s in {"SILENCE_LIMIT_S": WAIT_S, "_AGAIN_S": 0.1, "_UNMADE_S": 1.0}.items():
         monkeypatch.setattr(_subscription, name, time_s)
 
 
@@ -71,22 +72,36 @@ def test_restarted_publisher_is_found_and_numbers_restart(publisher):
 
 
 @pytest.mark.usefixtures("hasty")
-def test_silence_ends_a_connection():
+def test_silence_ends_a_connection(monkeypatch):
     notes = []
     with Publisher() as silent, Subscriber(silent.address, on_note=notes.append) as subscriber:
         silent.pump(lambda: subscriber.connected)
         silent.answers = False
+        monkeypatch.setattr(_subscription, "SILENCE_LIMIT_S", 0.5)
         silent.pump(lambda: len(silent.peers) == 2)
         assert subscriber.counts.reconnects == 1
     assert notes == ["connected", "the publisher has been silent for 0.5 s; connecting again"]
 
 
 @pytest.mark.usefixtures("hasty")
-def test_answering_publisher_without_images_is_not_silent(publisher):
+def test_answering_publisher_without_images_is_not_silent(publisher, monkeypatch):
+    """The time passes by 0.4 s after each answer, and silence is noticed after 0.5 s."""
+    clock = SimpleNamespace(now_s=1.0, monotonic=lambda: clock.now_s, monotonic_ns=time.monotonic_ns)
+    for module in (connection, _subscription, subscriber_module):
+        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(_subscription, "SILENCE_LIMIT_S", 0.5)
     with Subscriber(publisher.address) as subscriber:
-        publisher.pump(lambda: sum(isinstance(message, messages.Ping) for message in publisher.heard) == 15)
+        for _ in range(5):
+            publisher.pump(lambda: _heard_s(subscriber) == clock.now_s)
+            clock.now_s += 0.4
         assert len(publisher.peers) == 1
         assert subscriber.counts.reconnects == 0
+
+
+def _heard_s(subscriber):
+    """Time of the last answer by the clock of a subscriber."""
+    made = subscriber._subscription._connection  # noqa: SLF001
+    return None if made is None else made.heard_s
 
 
 @pytest.mark.parametrize(
