@@ -12,7 +12,7 @@ from ertis_numba.network.central_node import Archive, CentralNode
 from ertis_numba.storage import open_recording, sensor_names
 from tests.journals import EPOCH, TINY
 
-WAIT_MS = 10_000
+WAIT_MS = 60_000
 
 
 class Node:

@@ -1,6 +1,7 @@
 """Subscribers of rclpy in processes of their own, for tests of ROS 2 topics."""
 
 import base64
+import fcntl
 import json
 import os
 import signal
@@ -9,11 +10,29 @@ import sys
 import tempfile
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
 from tests.journals import ENVIRONMENT
 
-DOMAIN = 1 + os.getpid() % 200  # Tests that run at the same time have their own domains.
-WAIT_S = 30.0
+N_DOMAINS = 101  # The ports of higher domains may be in use by clients of any protocol.
+WAIT_S = 60.0
+
+
+def own_domain():
+    """Domain that no other running test uses: its file is locked until this process ends."""
+    for domain in range(1, N_DOMAINS):
+        path = Path(tempfile.gettempdir()) / f"ertis-test-domain-{os.getuid()}-{domain}.lock"
+        lock = os.open(path, os.O_CREAT | os.O_RDWR, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(lock)
+        else:
+            return domain
+    raise AssertionError("all domains are in use")
+
+
+DOMAIN, OTHER_DOMAIN = own_domain(), own_domain()
 
 
 class Subscriber:
@@ -25,6 +44,12 @@ class Subscriber:
     def pause(self):
         """Stop the process, as a debugger does."""
         self._process.send_signal(signal.SIGSTOP)
+
+    def take_after(self, time_ns):
+        """Bytes of the next message that has arrived after a time."""
+        while (line := json.loads(self._process.stdout.readline()))["received_ns"] < time_ns:
+            pass
+        return base64.b64decode(line["cdr"])
 
     def take(self, count):
         """Next messages, as a dict of topic to a list of their bytes."""

@@ -56,7 +56,7 @@ class StandIn:
         self._end, ready = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._serve, args=(ready,))
         self._thread.start()
-        assert ready.wait(10)
+        assert ready.wait(60)
 
     def stop(self, *, forget=False):
         """Stop without any message; stored data stays, and ``forget`` clears the acknowledged numbers."""

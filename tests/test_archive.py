@@ -32,7 +32,7 @@ from tests.journals import EPOCH, TINY, create, entries
 
 SOURCE, RIGHT = JournalSensor.from_settings("left", TINY), JournalSensor.from_settings("right", TINY)
 RUN = SensorSession("left", EPOCH)
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 def item_of(entry, source=SOURCE):

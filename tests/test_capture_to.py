@@ -36,7 +36,7 @@ from tests.stand_in import StandIn
 
 ERTIS = (sys.executable, "-m", "ertis_cli")
 SETTINGS = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.1, 0.5)))
-SOON_S = 30.0
+SOON_S = 60.0
 MOUNTING = """
 [[sensors]]
 name = "one"

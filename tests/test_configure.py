@@ -41,7 +41,7 @@ LONGER = SETTINGS.replace(recording=Recording(n_samples=2 * N_SAMPLES))
 IMPOSSIBLE = SETTINGS.replace(recording=Recording(n_samples=N_SAMPLES // 2))
 """Settings that the serial protocol cannot express."""
 
-SOON_S = 20.0
+SOON_S = 60.0
 
 
 class Session:

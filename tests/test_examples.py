@@ -28,7 +28,7 @@ from tests.publishing import Publisher, cloud, image
 from tests.stand_in import StandIn
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-WAIT_S = 10.0
+WAIT_S = 60.0
 
 
 def example(name):

@@ -263,10 +263,11 @@ PYTHON = {
 
 @pytest.mark.parametrize("name", CALLS)
 def test_common_call_mistakes_are_refused_in_one_line(name, given):
-    began_s = time.monotonic()
+    began_s, began_cpu_s = time.monotonic(), time.process_time()
     with pytest.raises((ertis.ErtisError, TypeError, IndexError)) as refused:
         CALLS[name](given)
-    assert time.monotonic() - began_s < TIMEOUT_S
+    assert time.process_time() - began_cpu_s < TIMEOUT_S
+    assert time.monotonic() - began_s < 10 * TIMEOUT_S  # A busy machine needs longer.
     text = str(refused.value)
     assert text
     assert "\n" not in text

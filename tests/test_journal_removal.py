@@ -130,7 +130,7 @@ def test_remove_waits_for_the_lock(tmp_path, act):
             assert thread.is_alive()
             assert journal.path.exists()
             journal.append(entries(1, first=20))
-        thread.join(10)
+        thread.join()
         assert not journal.path.exists()
 
 

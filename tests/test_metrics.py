@@ -18,7 +18,7 @@ from tests.test_status import BUSY
 
 
 def _scraped(address):
-    with urllib.request.urlopen(f"http://{address}/metrics", timeout=10) as answer:
+    with urllib.request.urlopen(f"http://{address}/metrics", timeout=60) as answer:
         text = answer.read().decode()
     return {
         (sample.name, *sorted(sample.labels.items())): sample.value
@@ -145,7 +145,7 @@ def test_events_below_the_level_are_hidden(lines):
 )
 def test_metrics_are_served_to_loopback_hosts_only(host, code):
     with Metrics("127.0.0.1:0", lambda: BUSY) as metrics:
-        connection = http.client.HTTPConnection(metrics.address, timeout=10)
+        connection = http.client.HTTPConnection(metrics.address, timeout=60)
         connection.putrequest("GET", "/metrics", skip_host=True)
         connection.putheader("Host", host)
         connection.endheaders()

@@ -97,9 +97,9 @@ class Shell:
     def __exit__(self, *_):
         for process in reversed(self.running):
             process.send_signal(signal.SIGTERM)
-            process.wait(30)
+            process.wait(60)
         for process, reader in zip(self.running, self.readers, strict=True):
-            reader.join(30)
+            reader.join(60)
             process.stdout.close()
 
     def run(self, line):

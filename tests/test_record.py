@@ -56,6 +56,7 @@ class Recording:
         raise AssertionError(f"it ended with {self.process.wait()} without {name}")
 
 
+@pytest.mark.alone
 def test_record_listens_soon_after_its_start(tmp_path):
     begun_s = time.monotonic()
     with Recording(tmp_path):
@@ -198,10 +199,10 @@ def test_unread_events_do_not_block_record():
     reader, writer = os.pipe()
     with os.fdopen(writer, "w", encoding="utf-8") as stream:
         lines = JsonLines(stream, largest=1000)
-        begun_s = time.monotonic()
+        begun_s = time.process_time()
         for number in range(100_000):
             lines.write(f"line {number}\n")
-        assert time.monotonic() - begun_s < 5.0
+        assert time.process_time() - begun_s < 5.0
         assert 0 < lines.lost < 100_000
         os.set_blocking(reader, False)
         got = b""

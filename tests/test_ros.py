@@ -25,7 +25,7 @@ from ertis_numba.storage import open_recording, write_energyscapes, write_record
 from tests.files import image
 from tests.journals import ENVIRONMENT
 from tests.publishing import Publisher, status
-from tests.ros_topics import DOMAIN, await_subscribers, subscribed
+from tests.ros_topics import DOMAIN, OTHER_DOMAIN, await_subscribers, subscribed
 from tests.test_acoustic_map_commands import heard
 
 pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
@@ -115,7 +115,7 @@ def test_status_and_clock_arrive_in_rclpy():
 
 def test_other_domains_receive_nothing():
     with (
-        subscribed({"/clock": "rosgraph_msgs/msg/Clock"}, domain=DOMAIN + 1),
+        subscribed({"/clock": "rosgraph_msgs/msg/Clock"}, domain=OTHER_DOMAIN),
         subscribed({"/clock": "rosgraph_msgs/msg/Clock"}),
         Participant(domain=DOMAIN) as participant,
     ):
@@ -278,7 +278,7 @@ def test_loopback_is_the_default():
 def test_command_reports_that_no_central_node_answers(monkeypatch):
     monkeypatch.setattr("ertis_cli._ros_sources._UNANSWERED_S", 0.3)
     address = "tcp://127.0.0.1:9"
-    done = CliRunner().invoke(cli, ["ros", address, "--domain", str(DOMAIN), "--duration", "1"])
+    done = CliRunner().invoke(cli, ["ros", address, "--domain", str(DOMAIN), "--duration", "3"])
     assert done.exit_code == 1
     assert f"waiting for {address}: no answer; is 'ertis serve' running?\n" in done.stderr
     assert done.stderr.endswith(

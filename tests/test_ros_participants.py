@@ -18,12 +18,11 @@ from ertis_numba.interop.ros_messages import MESSAGES
 from ertis_numba.ros import Participant, RosPublisher
 from tests.files import image
 from tests.journals import ENVIRONMENT
-from tests.ros_topics import await_subscribers, subscribed
+from tests.ros_topics import DOMAIN, await_subscribers, subscribed
 
 pytest.importorskip("rclpy.serialization")  # Wheels exist for some versions of Python only.
 pytest.importorskip("cyclonedds")
 
-DOMAIN = 1 + (os.getpid() + 50) % 200
 N_PARTICIPANTS = 10
 PERIOD_S = 0.02
 MAX_GROWTH_BYTES = 30e6

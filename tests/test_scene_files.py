@@ -317,10 +317,10 @@ def test_rotation_and_quaternion_are_equivalent(yaw_deg, pitch_deg, roll_deg):
 
 def test_error_in_a_long_scene_is_found_quickly():
     lines = ["[[points]]\nrange_m = 1"] * 1000 + ["[[points]]\nrnage_m = 1"] + ["[[points]]\nrange_m = 1"] * 1000
-    started_s = time.perf_counter()
+    started_s = time.process_time()
     with pytest.raises(SettingsError, match=r"scene, line 2002, points\[1000\]: unknown key `rnage_m`"):
         Scene.from_toml("\n".join(lines))
-    assert time.perf_counter() - started_s < 5
+    assert time.process_time() - started_s < 5
 
 
 @pytest.mark.parametrize(

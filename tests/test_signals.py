@@ -30,7 +30,7 @@ def run(program):
         "from ertis_cli import _stop_signals; _stop_signals.obey_signals()\nimport signal, sys, time\n"
         + textwrap.dedent(program)
     )
-    return subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, timeout=30)
+    return subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, timeout=100)
 
 
 @pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
@@ -41,7 +41,7 @@ def test_swallowed_signal_is_sent_again(number, code):
         except BaseException:
             pass  # as some libraries do
         try:
-            time.sleep(20)
+            time.sleep(80)
         except KeyboardInterrupt:
             sys.exit(130)
         """)
@@ -79,7 +79,7 @@ sys.argv = ["ertis", "devices"]
 {textwrap.dedent(program)}
 main()
 """
-    return subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, timeout=30)
+    return subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False, timeout=100)
 
 
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
@@ -144,7 +144,7 @@ sys.meta_path.insert(0, Finder())
     )
     environment = ENVIRONMENT | {"PYTHONPATH": os.pathsep.join([str(tmp_path), ENVIRONMENT["PYTHONPATH"]])}
     command = [sys.executable, "-m", "ertis_cli", "devices"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=30)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment, timeout=100)
     assert (done.returncode, done.stderr) == (130, "\nertis: error: interrupted\n")
 
 
@@ -173,6 +173,6 @@ def test_signal_in_the_code_of_imports_waits_for_its_end():
         text = "def find():\\n    signal.raise_signal(signal.SIGTERM)\\n    return 'found'"
         exec(compile(text, "<frozen importlib._bootstrap>", "exec"))
         print(find(), flush=True)
-        time.sleep(20)
+        time.sleep(80)
         """)
     assert (done.returncode, done.stdout, done.stderr) == (143, "found\n", "")

@@ -36,9 +36,9 @@ def simulate(*arguments):
 
 def test_simulation_without_free_space_is_refused_before_computing(path, monkeypatch):
     monkeypatch.setattr("ertis_numba.simulation.effect_plan.make_plan", lambda _: pytest.fail("a plan was made"))
-    began_s = time.monotonic()
+    began_s = time.process_time()
     refused = simulate(path, "--count", 10**9)
-    assert time.monotonic() - began_s < 20
+    assert time.process_time() - began_s < 20
     assert refused.exit_code == 1
     assert re.search(
         r"has [\d.]+ MB free, but [\d.]+ MB are needed for 1000000000 measurements of 1 sensor, .*; free some",

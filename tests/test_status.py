@@ -30,7 +30,7 @@ from ertis_numba.network.status import (
 )
 
 CENTRAL, ROBOT, VIEWER = (KeyPair.new(name) for name in ("central", "robot", "viewer"))
-PATIENCE_S = 10.0
+PATIENCE_S = 60.0
 BUSY = Status(
     version="1",
     pid=7,
@@ -142,7 +142,7 @@ def test_refused_status_client_gets_the_reason_at_once(keys):
             CentralClient(address, keys=ClientKeys(VIEWER, ROBOT.public)) as node,
             pytest.raises(RefusedError, match="its key differs from --server-key"),
         ):
-            node.status(0.5)
+            node.status(PATIENCE_S)
         with CentralClient(address) as node, pytest.raises(RefusedError, match="give --key and --server-key"):
             node.status(PATIENCE_S)
 

@@ -24,7 +24,7 @@ from tests.publishing import (
     subscribed,
 )
 
-WAIT_S = 10.0
+WAIT_S = 60.0
 
 
 @pytest.fixture
