@@ -177,5 +177,23 @@ def test_velocity_beside_a_long_interval_is_one_sided():
     x_m = [0.0, 0.1, 0.2, 9.2, 9.3, 9.4]
     given = ertis.Trajectory(time_ns, [[x, 0, 0] for x in x_m], [IDENTITY] * 6, max_gap_s=0.5)
     np.testing.assert_allclose(given.velocity_at(time_ns)[0][:, 0], 1.0, rtol=1e-9)
-    alone = given.replace(max_gap_s=0.01)  # No interval is short enough, so that all count.
-    np.testing.assert_array_equal(alone.velocity_at(time_ns)[0], given.replace(max_gap_s=None).velocity_at(time_ns)[0])
+
+
+@pytest.mark.parametrize("lone", [0, 3, 6])
+def test_velocity_at_a_pose_alone_between_long_intervals_is_unknown(lone):
+    """Times next to the other poses have a velocity, although the lone pose is the next one."""
+    seconds = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6])
+    seconds[lone:] += 2.0 * (lone > 0)
+    seconds[lone + 1 :] += 2.0
+    time_ns = START_NS + (1e9 * seconds).astype(np.int64)
+    rotation = Rotation.from_rotvec(seconds[:, None] * [0.0, 0.0, 0.5]).as_quat()
+    path = ertis.Trajectory(time_ns, seconds[:, None] * [1.0, 0.0, 0.0], rotation, max_gap_s=1.0)
+    is_known = np.arange(7) != lone
+    for offset_ns in (0, 500_000):
+        late = time_ns + (offset_ns if lone < 6 else -offset_ns)
+        linear_m_s, angular_rad_s = path.velocity_at(late)
+        np.testing.assert_allclose(linear_m_s[is_known], [[1.0, 0.0, 0.0]] * 6, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(angular_rad_s[is_known], [[0.0, 0.0, 0.5]] * 6, rtol=1e-6, atol=1e-6)
+        assert np.isnan(linear_m_s[lone]).all()
+        assert np.isnan(angular_rad_s[lone]).all()
+    assert np.isfinite(path.replace(max_gap_s=None).velocity_at(time_ns)[0]).all()

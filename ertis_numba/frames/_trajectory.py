@@ -172,8 +172,8 @@ class Trajectory:
         """Return linear and angular velocities by central differences between poses.
 
         At a pose, the difference spans the poses before and after it; between poses, velocities are interpolated
-        linearly. At both ends, and beside an interval longer than `max_gap_s`, the difference is one-sided. A pose
-        alone between two such intervals has the mean velocity over both.
+        linearly. At both ends, and beside an interval longer than `max_gap_s`, the difference is one-sided. Differences
+        span no such interval, so the velocity at a pose alone between two of them is unknown.
 
         Parameters
         ----------
@@ -183,14 +183,24 @@ class Trajectory:
         Returns
         -------
         linear_m_s : (n, 3) float64
-            Velocity in the world frame, in metres per second.
+            Velocity in the world frame, in metres per second; NaN if it is unknown.
         angular_rad_s : (n, 3) float64
-            Rotation vector per second, in the world frame, in radians per second.
+            Rotation vector per second, in the world frame, in radians per second; NaN if it is unknown.
 
         Raises
         ------
         ArgumentError
             A time lies outside the trajectory, or the trajectory has a single pose.
+
+        Examples
+        --------
+        Poses at 0 s and 0.1 s have a velocity; the one at 5 s has none:
+
+        >>> from ertis_numba import Trajectory
+        >>> time_ns = [0, 100_000_000, 5_000_000_000]
+        >>> path = Trajectory(time_ns, [[0, 0, 0], [0.1, 0, 0], [2, 0, 0]], [[0, 0, 0, 1]] * 3, max_gap_s=1.0)
+        >>> path.velocity_at(time_ns)[0][:, 0].tolist()
+        [1.0, 1.0, nan]
         """
         from scipy.spatial.transform import Rotation  # noqa: PLC0415  importing it takes longer than this package
 
@@ -199,17 +209,17 @@ class Trajectory:
         wanted = _times("time_ns", time_ns)
         self._require_covered(wanted)
         poses = np.arange(len(self))
-        before, after = np.maximum(poses - 1, 0), np.minimum(poses + 1, len(self) - 1)
         is_gap = self._gaps()
-        follows, precedes = is_gap[before] & (before < poses), is_gap[poses]
-        before, after = (
-            np.where(follows & ~precedes & (after > poses), poses, before),
-            np.where(precedes & ~follows & (before < poses), poses, after),
-        )
+        before = poses - np.r_[False, ~is_gap[:-1]]
+        after = poses + np.r_[~is_gap[:-1], False]
         duration_s = ((self.time_ns[after] - self.time_ns[before]) / _NS_PER_S)[:, None]
+        duration_s[before == after] = np.nan
         linear_m_s = (self.position_m[after] - self.position_m[before]) / duration_s
         turns = Rotation.from_quat(self.rotation_xyzw[after]) * Rotation.from_quat(self.rotation_xyzw[before]).inv()
         index, fraction = self._brackets(wanted)
+        # Within a long interval, only times next to a pose are covered. Its velocity applies.
+        is_next = is_gap[index] & (fraction > 0.5)
+        index, fraction = index + is_next, np.where(is_gap[index], 0.0, fraction)
         return _linear(linear_m_s, index, fraction), _linear(turns.as_rotvec() / duration_s, index, fraction)
 
     def covers(self, time_ns: ArrayLike) -> NDArray[np.bool_]:
@@ -315,8 +325,8 @@ def _covariances(values: ArrayLike, n_poses: int) -> NDArray[np.float64]:
 def _linear(values: NDArray[np.float64], index: NDArray[np.intp], fraction: NDArray[np.float64]) -> NDArray[np.float64]:
     weight = fraction.reshape(-1, *[1] * (values.ndim - 1))
     following = np.minimum(index + 1, len(values) - 1)
-    linear: NDArray[np.float64] = values[index] * (1 - weight) + values[following] * weight
-    return linear
+    linear = values[index] * (1 - weight) + values[following] * weight
+    return np.where(weight == 0, values[index], linear)  # An unknown value, NaN, has no part in its neighbour.
 
 
 def _seconds(time_ns: np.int64) -> str:

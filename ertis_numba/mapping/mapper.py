@@ -121,9 +121,9 @@ class Mapper:
             At most one image of each sensor. Sensors may be missing.
         pose : (translation_m, rotation_xyzw) or Trajectory
             Pose of the platform in the world frame: position x, y, z in metres, and the unit quaternion x, y, z, w that
-            rotates the platform frame into the world frame. A trajectory is interpolated at the time of the pulse, and
-            its velocity compensates the motion during the measurement (`compensate_motion`). Its
-            covariances, if any, add to those of the points.
+            rotates the platform frame into the world frame. A trajectory is interpolated at the time of the pulse. Its
+            velocity, if known, compensates the motion during the measurement (`compensate_motion`). Its covariances, if
+            any, add to those of the points.
         fused : Fused, optional
             Result of a `Fuser` with the same mountings for these images, if it is available; computed by default.
 
@@ -216,10 +216,12 @@ class Mapper:
 
 
 def _at_rest(points: PointCloud, trajectory: Trajectory, rotation: Floats) -> PointCloud:
-    """Return points compensated for the velocity of a trajectory."""
+    """Return points compensated for the velocity of a trajectory, if that is known."""
     if len(trajectory) == 1:
         return points
     linear_m_s, angular_rad_s = (each[0] @ rotation for each in trajectory.velocity_at([points.stamp.timestamp_ns]))
+    if np.isnan(linear_m_s).any():
+        return points
     return compensate_motion(points, linear_m_s.tolist(), float(angular_rad_s[2]))
 
 
