@@ -13,6 +13,7 @@ from ertis_numba.fusion.rig import mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor
 from ertis_numba.motion.flow import fit_flow
 from ertis_numba.motion.odometry import PlanarPose, _Errors
+from ertis_numba.settings import Array
 
 MOUNTINGS = {"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
 TIME_NS = 100_000_000
@@ -87,6 +88,53 @@ def test_weak_echoes_from_behind_do_not_reverse_the_turn():
     found = ertis.ego_velocity([cloud(0.0, 0)], [cloud(turn_rad, 1)], MOUNTINGS)
     assert found.yaw_rate_rad_s == pytest.approx(twist[2], abs=0.02)
     assert found.velocity_m_s == pytest.approx([0.0, 0.0], abs=0.02)
+
+
+def cloud_of(sensor, local_m, settings=None):
+    """Return a point cloud in the frame of a sensor."""
+    count = len(local_m)
+    stamp = ertis.Stamp(sensor=sensor, sync_count=1, timestamp_ns=TIME_NS)
+    return ertis.PointCloud(local_m.astype(np.float32), np.ones(count, np.float32), settings or ertis.Settings(), stamp)
+
+
+def heard_m(sensor, emitter, places, *, mirrored=False):
+    """Return where a sensor shows reflectors that echo the call of an emitter, after the mean of both distances."""
+    local_m, from_emitter_m = sensor.local_m(places), np.linalg.norm(places - emitter.translation_m, axis=1)
+    if mirrored:
+        local_m = local_m * [-1, 1, 1]
+    distance_m = np.linalg.norm(local_m, axis=1)
+    return local_m * ((distance_m + from_emitter_m) / 2 / distance_m)[:, None]
+
+
+BOWED = ertis.Settings(array=Array(positions_m=((0.0, 0.0, 0.0), (0.02, 0.01, 0.0), (0.0, 0.02, 0.01))))
+
+
+@pytest.mark.parametrize(
+    ("receiver", "settings", "n_foreign"),
+    [("left", None, 12), ("front", None, 12), ("left", BOWED, 0)],
+    ids=["behind", "nearer to another axis", "behind an array that is not flat"],
+)
+def test_echoes_of_calls_of_other_sensors_are_left_out(receiver, settings, n_foreign):
+    """The right sensor shows reflectors, whose echoes of its call return to another sensor too."""
+    given = mountings(["front", "left", "right"])
+    sensors = {sensor.name: sensor for sensor in mounted_sensors(given)}
+    draws = np.random.default_rng(4)
+    # Azimuths in the frame of the right sensor; those to its left are ahead of the front sensor.
+    angle_rad = draws.uniform(*np.radians([-50, 50] if receiver == "left" else [38, 44]), 12)
+    local_m = np.linspace(1.0, 4.0, 12)[:, None] * np.column_stack([np.cos(angle_rad), np.sin(angle_rad), np.zeros(12)])
+    right, other = sensors["right"], sensors[receiver]
+    places = local_m @ right.rotation.T + right.translation_m
+    own_m = np.linspace(1.1, 3.9, 8)[:, None] * np.array([np.cos(0.3), -np.sin(0.3), 0.0])
+    foreign_m = heard_m(other, right, places, mirrored=receiver == "left")
+    clouds = {
+        "right": cloud_of("right", local_m),
+        receiver: cloud_of(receiver, np.concatenate([own_m, foreign_m]), settings),
+    }
+    echoes = EchoExtractor(mounted_sensors(given))(clouds)
+    assert np.sum(echoes.sensor == list(given).index("right")) == 12
+    kept_m = echoes.range_m[echoes.sensor == list(given).index(receiver)]
+    assert kept_m[:8] == pytest.approx(np.linalg.norm(own_m, axis=1), abs=1e-6)
+    assert len(kept_m) == 8 + 12 - n_foreign
 
 
 def test_ego_velocity_in_a_furnished_room():

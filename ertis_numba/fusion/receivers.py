@@ -24,7 +24,6 @@ _SIDE_LOBES: Final = 10 ** (-13.0 / 10)  # Power of side lobes relative to the s
 _LEAST_POWER: Final = 1e-16  # Keeps squares of ratios within single precision.
 _BEAM_RAD: Final = math.radians(5.0)  # Half of the width of the main lobe near its top.
 _CLOSE_RAD: Final = math.radians(3.0)  # Error of a direction in a search for a confirming echo.
-_FLAT_M: Final = 1e-3
 _THINNED: Final = 4  # One of so many ranges serves to estimate the noise.
 
 
@@ -81,8 +80,7 @@ class Receiver:
         self.mounting, self.step_m = mounting, step_m
         self._azimuth_rad, self._elevation_rad, self._range_m = image.azimuth_rad, image.elevation_rad, image.range_m
         self.directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-        positions_m = microphones(image.settings.array).enabled_positions_m
-        self.is_flat = bool(np.ptp(positions_m[:, 0]) < _FLAT_M)
+        self.is_flat = microphones(image.settings.array).is_flat
         """True if the array cannot distinguish front and back."""
         self.n_steps = int(image.range_m[-1] / step_m) + 1
         steps = (image.range_m / step_m).astype(np.int64)

@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 _SMALLEST_M = 1e-3  # minimum size of an array: metres given instead of millimetres are below it
+_FLAT_M = 1e-3  # extent along x below which an array counts as flat
 _SPLIT_ROW = re.compile(r"\[\s+((?:[-\d.e]+,\s+)+)\]")  # numbers of a list on lines of their own
 _CENTRED_M = 1e-12  # rounding error in the mean of centred positions
 
@@ -117,6 +118,11 @@ class Layout:
     def enabled_positions_m(self) -> NDArray[np.float64]:
         """Positions of the enabled microphones: (mic, axis) float64."""
         return self.positions_m[self.enabled]
+
+    @property
+    def is_flat(self) -> bool:
+        """True if the enabled microphones lie in a plane across x, so that they do not distinguish front and back."""
+        return bool(np.ptp(self.enabled_positions_m[:, 0]) < _FLAT_M)
 
     def to_array(self) -> Array:
         """Return array settings that contain the positions themselves, and depend on no file."""
