@@ -1,5 +1,6 @@
 """Velocity of a platform from two groups of images, and odometry."""
 
+import functools
 import math
 
 import numpy as np
@@ -12,7 +13,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.fusion.rig import mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor
 from ertis_numba.motion.flow import fit_flow
-from ertis_numba.motion.odometry import PlanarPose, _Errors
+from ertis_numba.motion.odometry import PlanarPose
 from ertis_numba.settings import Array
 
 MOUNTINGS = {"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
@@ -174,29 +175,26 @@ def test_odometry_integrates_a_circle():
     assert not path.covariance[:, 2:5].any()
 
 
-@pytest.mark.parametrize("systematic", range(3))
-def test_effect_of_systematic_errors_is_that_of_wrong_steps(systematic):
-    """Steps whose distance, yaw per metre or turn is slightly wrong lead to another pose."""
-    draws, small = np.random.default_rng(7), 1e-7
-    pose = wrong = PlanarPose(0, 0.0, 0.0, 0.3, np.zeros((3, 3)))
-    errors = _Errors(np.zeros((3, 3)), np.zeros((3, 3)))
-    for _ in range(30):
-        step = draws.uniform(-0.2, 0.2, 3)
-        change = np.array([[*step[:2], 0.0], [0.0, 0.0, np.hypot(*step[:2])], [0.0, 0.0, step[2]]])[systematic]
-        errors = errors.moved(pose, step, np.zeros((3, 3)))
-        pose = pose.moved(step, np.zeros((3, 3)), 0, is_measured=True)
-        wrong = wrong.moved(step + small * change, np.zeros((3, 3)), 0, is_measured=True)
-    difference = np.array(wrong[1:4]) - np.array(pose[1:4])
-    assert difference / small == pytest.approx(errors.effect[:, systematic], rel=1e-4, abs=1e-4)
+def test_covariance_of_a_path_is_that_of_its_random_errors():
+    """The mean of the normalised squared error of 500 paths is its number of dimensions, within five deviations."""
+    draws = np.random.default_rng(7)
+    steps = draws.uniform([0.1, -0.05, -0.3], [0.2, 0.05, 0.4], (20, 3))
+    covariance = np.diag([4e-6, 9e-6, 1e-4]) + 1e-5 * np.outer([1.0, -0.5, 2.0], [1.0, -0.5, 2.0])
+    start = PlanarPose(0, 0.0, 0.0, 0.3, np.zeros((3, 3)))
 
+    def end_of(displacements):
+        return functools.reduce(
+            lambda pose, step: pose.moved(step, covariance, 0, is_measured=True), displacements, start
+        )
 
-def test_covariance_of_systematic_errors_grows_with_the_square_of_the_distance():
-    odometry = ertis.Odometry(MOUNTINGS)
-    for pulse in range(21):
-        odometry.add([seen_from((0.05 * pulse, 0, 0), places_m(2, 60), pulse, (0.5, 0.0, 0.0))])
-    half, full = (odometry.poses[pulse].covariance[0, 0] for pulse in (10, 20))
-    assert half > (0.5 * 0.003) ** 2
-    assert 2.4 < full / half < 4.0  # Independent errors alone would double it.
+    true = end_of(steps)
+    squares = []
+    for _ in range(500):
+        pose = end_of(steps + draws.multivariate_normal(np.zeros(3), covariance, 20))
+        error = np.array(pose[1:4]) - np.array(true[1:4])
+        error[2] = math.remainder(error[2], 2 * math.pi)
+        squares.append(error @ np.linalg.solve(true.covariance, error))
+    assert np.mean(squares) == pytest.approx(3.0, abs=5 * math.sqrt(2 * 3 / 500))
 
 
 def test_velocity_is_assumed_to_continue_for_at_most_a_second():

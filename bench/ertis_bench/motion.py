@@ -74,25 +74,31 @@ def _hall(seed: int, length_m: float, say: Callable[[str], None]) -> dict[str, A
     odometry = ertis.Odometry(mountings())
     start = motions[0]
     c, s = math.cos(start.yaw_rad), math.sin(start.yaw_rad)
-    errors_m, unmeasured = [], 0
+    errors_m, predicted_m, squares, unmeasured = [], [], [], 0
     for number, (motion, time_s) in enumerate(zip(motions, times_s, strict=True)):
         odometry.add(imager(motion, number, time_s))
         pose = odometry.poses[-1]
         x, y = motion.x_m - start.x_m, motion.y_m - start.y_m
-        errors_m.append(math.hypot(pose.x_m - c * x - s * y, pose.y_m + s * x - c * y))
+        turn_rad = math.remainder(pose.yaw_rad - motion.yaw_rad + start.yaw_rad, 2 * math.pi)
+        error = np.array([pose.x_m - c * x - s * y, pose.y_m + s * x - c * y, turn_rad])
+        errors_m.append(math.hypot(*error[:2]))
+        predicted_m.append(float(np.sqrt(np.trace(pose.covariance[:2, :2]))))
+        if number:  # The first pose is exact.
+            squares.append(float(error @ np.linalg.solve(pose.covariance, error)))
         unmeasured += not pose.is_measured
         if number % 20 == 0:
             say(f"group {number} of {len(motions)}: {errors_m[-1]:.3f} m off after {odometry.length_m:.1f} m")
     imager.close()
-    yaw_error_rad = math.remainder(odometry.poses[-1].yaw_rad - motions[-1].yaw_rad + start.yaw_rad, 2 * math.pi)
     return {
         "length_m": times_s[-1],  # at 1 m/s
         "n_groups": len(motions),
         "unmeasured": unmeasured,
         "end_m": errors_m[-1],
         "largest_m": max(errors_m),
-        "yaw_deg": math.degrees(yaw_error_rad),
-        "predicted_m": float(np.sqrt(np.trace(odometry.poses[-1].covariance[:2, :2]))),
+        "yaw_deg": math.degrees(turn_rad),
+        "predicted_m": predicted_m[-1],
+        "ratio": math.sqrt(np.mean(np.square(errors_m)) / np.mean(np.square(predicted_m))),
+        "normalised": float(np.mean(squares)) / 3,
     }
 
 
@@ -118,6 +124,8 @@ def form(report: dict[str, Any]) -> str:
             f"{hall['end_m']:.2f} m off at the end, {hall['end_m'] / hall['length_m']:.1%} of the path (predicted "
             f"{hall['predicted_m']:.2f} m), and {hall['largest_m']:.2f} m at most. Yaw is "
             f"{abs(hall['yaw_deg']):.1f}° off at the end, and "
-            f"{hall['unmeasured']} groups have too few matches."
+            f"{hall['unmeasured']} groups have too few matches. Over the path, the RMS error of the position is "
+            f"{hall['ratio']:.2f} of the predicted one. The mean normalised squared error of position and yaw is "
+            f"{hall['normalised']:.2f} of its expectation."
         )
     return f"{text} {sentence(report['machine'])}"

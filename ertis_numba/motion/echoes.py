@@ -29,7 +29,7 @@ _ANGLE_SD_RAD: Final = math.radians(0.25)
 _MAX_OFF_AXIS_RAD: Final = math.radians(55.0)
 _NEAREST_M: Final = 0.05
 # Largest differences between an echo of another sensor's call and its prediction. In simulated halls, most are within
-# 6 mm and 2°. About 1 own echo in 20 agrees with a prediction by accident.
+# 6 mm and 2°. There, 6 % to 15 % of the own echoes agree with a prediction by accident.
 _FOREIGN_M: Final = 0.01
 _FOREIGN_RAD: Final = math.radians(2.5)
 _FOREIGN_LEVEL: Final = math.log(2.0)  # 6 dB

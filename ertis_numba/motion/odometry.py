@@ -31,14 +31,6 @@ _PLANAR: Final = 0, 1, 5  # of x, y, z, and the rotations about them
 _UNKNOWN_VARIANCE: Final = np.diag([0.5, 0.5, 1.0]) ** 2  # of the assumed velocity; times time² for the pose
 
 
-# Errors of steps are correlated. Steps that share an image err in opposite directions, which matters little, but all
-# steps overestimate distances and turns by similar amounts. These are standard deviations of systematic errors: the
-# scale of distances, the yaw per metre, and the scale of turns; and of the scale that differs from step to step. They
-# were measured in simulated halls other than that of `ertis bench motion`.
-_SYSTEMATIC_SD: Final = np.array([0.004, math.radians(0.03), 0.003])
-_CHANGING_ERROR: Final = 0.008
-
-
 class PlanarPose(NamedTuple):
     """Pose of a platform in the plane, relative to its pose at the first group.
 
@@ -83,43 +75,11 @@ class PlanarPose(NamedTuple):
         )
 
 
-class _Errors(NamedTuple):
-    """Errors of a pose: independent ones of each step, and systematic ones, which add up along the path.
-
-    Attributes
-    ----------
-    independent : (3, 3) float64
-        Covariance of x, y and yaw.
-    effect : (3, 3) float64
-        Derivatives of x, y and yaw by the systematic errors.
-    """
-
-    independent: Floats
-    effect: Floats
-
-    def moved(self, origin: PlanarPose, displacement: Floats, covariance: Floats) -> "_Errors":
-        """Return the errors after a displacement from a pose with these errors."""
-        carried, turned = _propagation(origin.yaw_rad, displacement)
-        x, y, turn = displacement.tolist()
-        distance_m = math.hypot(x, y)
-        own = covariance + np.diag([_CHANGING_ERROR * distance_m] * 2 + [0.0]) ** 2
-        effect = np.array([[x, 0.0, 0.0], [y, 0.0, 0.0], [0.0, distance_m, turn]])
-        return _Errors(
-            carried @ self.independent @ carried.T + turned @ own @ turned.T, carried @ self.effect + turned @ effect
-        )
-
-    @property
-    def covariance(self) -> Floats:
-        """Covariance of all errors: (3, 3) float64."""
-        return np.asarray(self.independent + (self.effect * _SYSTEMATIC_SD**2) @ self.effect.T)
-
-
 class _View(NamedTuple):
     """Echoes of a group, and the pose and twist of the platform; None if the twist is unknown."""
 
     echoes: GroupEchoes
     pose: PlanarPose
-    errors: _Errors
     twist: Floats | None
 
 
@@ -128,6 +88,9 @@ class Odometry:
 
     Each group is compared with the one before, which yields the velocity, and with a keyframe up to 0.3 m back, which
     yields the pose. Errors of the pose thus grow with the number of keyframes rather than of groups.
+
+    The covariance of a pose assumes that the errors of these comparisons are independent. It does not include errors of
+    the mountings and of the temperature, of which 1 K changes distances by 0.17 %.
 
     Parameters
     ----------
@@ -158,7 +121,6 @@ class Odometry:
         self._keyframe: _View | None = None
         self._twist = np.zeros(3)
         self._path: list[PlanarPose] = []
-        self._errors = _Errors(np.zeros((3, 3)), np.zeros((3, 3)))  # of the last pose
 
     @property
     def poses(self) -> tuple[PlanarPose, ...]:
@@ -261,16 +223,16 @@ class Odometry:
         if found is None:
             unknown = _UNKNOWN_VARIANCE * time_s**2
             assumed = _displacement(self._twist, min(time_s, MAX_TIME_S))
-            self._move(self._path[-1], self._errors, assumed, unknown, timestamp_ns, is_measured=False)
+            self._path.append(self._path[-1].moved(assumed, unknown, timestamp_ns, is_measured=False))
             self._begin(echoes)
             return None
         self._twist = twist_of(found.displacement, time_s)
         self._locate(echoes, found, self._twist, timestamp_ns)
-        self._last = _View(echoes, self._path[-1], self._errors, self._twist)
+        self._last = _View(echoes, self._path[-1], self._twist)
         return velocity_of(found, timestamp_ns, time_s) if found.is_certain else None
 
     def _begin(self, echoes: GroupEchoes | None) -> None:
-        self._last = None if echoes is None else _View(echoes, self._path[-1], self._errors, None)
+        self._last = None if echoes is None else _View(echoes, self._path[-1], None)
         self._keyframe = None
 
     def _since_last(self, echoes: GroupEchoes, time_s: float) -> FlowFit | None:
@@ -297,21 +259,6 @@ class Odometry:
         fits = [each for each in (near, other) if each is not None]
         return _significant(max(fits, key=lambda each: each.score, default=None))
 
-    def _move(
-        self,
-        origin: PlanarPose,
-        errors: _Errors,
-        displacement: Floats,
-        covariance: Floats,
-        timestamp_ns: int,
-        *,
-        is_measured: bool,
-    ) -> None:
-        """Add the pose after a displacement from a pose with some errors."""
-        pose = origin.moved(displacement, covariance, timestamp_ns, is_measured=is_measured)
-        self._errors = errors.moved(origin, displacement, covariance)
-        self._path.append(pose._replace(covariance=self._errors.covariance))
-
     def _locate(self, echoes: GroupEchoes, found: FlowFit, twist: Floats, timestamp_ns: int) -> None:
         """Add the pose relative to the keyframe, or to the last group if the keyframe is out of reach."""
         step = self._path[-1].moved(found.displacement, found.covariance, timestamp_ns, is_measured=found.is_certain)
@@ -332,24 +279,12 @@ class Odometry:
                 )
                 if fit is not None and _confirms(fit, found, expected):
                     covariance = fit.covariance if found.is_certain else fit.covariance + found.covariance
-                    self._move(
-                        keyframe.pose,
-                        keyframe.errors,
-                        fit.displacement,
-                        covariance,
-                        timestamp_ns,
-                        is_measured=found.is_certain,
+                    self._path.append(
+                        keyframe.pose.moved(fit.displacement, covariance, timestamp_ns, is_measured=found.is_certain)
                     )
                     return
         self._keyframe = self._last
-        self._move(
-            self._path[-1],
-            self._errors,
-            found.displacement,
-            found.covariance,
-            timestamp_ns,
-            is_measured=found.is_certain,
-        )
+        self._path.append(step)
 
 
 def _propagation(yaw_rad: float, displacement: Floats) -> tuple[Floats, Floats]:
