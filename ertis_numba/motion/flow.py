@@ -308,7 +308,9 @@ def _starts(flow: _Flow, pairs: _EchoPairs, centre: Floats, limit: Floats) -> Fl
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     strong = (_rank(flow.before)[pairs.before] < _STRONGEST) & (_rank(flow.after)[pairs.after] < _STRONGEST)
     pairs = _EchoPairs(pairs.before[strong], pairs.after[strong])
-    sd = np.array(_SEARCH_SD)[:, None]
+    step = np.array([2 * most / (n - 1) for most, n in zip(limit, counts, strict=True)])
+    # Displacements between two points of the grid must not escape.
+    sd = np.maximum(_SEARCH_SD, step[1:] / 2)[:, None]
     residual, slopes = flow.linear(centre, pairs)
     residual, slopes = residual / sd, slopes / sd[:, :, None]
     strength = flow.strengths(pairs)
@@ -318,7 +320,6 @@ def _starts(flow: _Flow, pairs: _EchoPairs, centre: Floats, limit: Floats) -> Fl
         square = sum((residual[axis][:, None] - slopes[axis] @ offset.T) ** 2 for axis in (0, 1))
         score[part] = strength @ np.maximum(0.0, 1 - square / _GATE) ** 2
     found: list[Floats] = []
-    step = np.array([2 * most / (n - 1) for most, n in zip(limit, counts, strict=True)])
     for place in np.argsort(-score):
         if all(np.any(np.abs(grid[place] - other) > 2.5 * step) for other in found):
             found.append(grid[place])
