@@ -14,7 +14,7 @@ from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
 from ertis_numba.settings import Recording, Settings
 from tests import cases
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = 200.0  # Some tests wait for compilers.
 ANY = "tcp://127.0.0.1:0"
 SHORT = cases.CASES["line of 8"].replace(
     recording=Recording(n_samples=20_480), processing=cases.SHORT.processing.replace(range_m=(0.3, 0.6))

@@ -22,7 +22,7 @@ from tests.dask_clusters import cluster_of_threads
 from tests.driven import MEASUREMENT
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
-LONG_S = 60.0
+LONG_S = 200.0
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def scheduler():
 
 @pytest.fixture
 def cluster(scheduler):
-    runner = Cluster(ProcessingOptions(cluster=scheduler, deadline_s=30.0), lambda _: None)
+    runner = Cluster(ProcessingOptions(cluster=scheduler, deadline_s=LONG_S), lambda _: None)
     yield runner
     runner.close()
 
@@ -50,7 +50,7 @@ def events_of(runner, count=1):
         for fd in select.select(list(runner.fds()), [], [], 0.1)[0]:
             found += runner.ready(fd)
         found += runner.tick(time.monotonic(), Load())
-    assert len(found) >= count, "the cluster took longer than a minute"
+    assert len(found) >= count, "the cluster took longer than 200 s"
     return found
 
 
@@ -68,7 +68,7 @@ def get_all_ready(runner, n_workers, kind):
     end_s = time.monotonic() + LONG_S
     members = runner._members  # noqa: SLF001
     while sum(kind.number in each.ready for each in members.values()) < n_workers:
-        assert time.monotonic() < end_s, "workers took longer than a minute"
+        assert time.monotonic() < end_s, "workers took longer than 200 s"
         assert not runner.tick(time.monotonic(), Load())
         time.sleep(0.01)
 
@@ -145,7 +145,7 @@ def test_cluster_reports_samples_of_wrong_length(cluster, measurement):
 @pytest.fixture
 def cluster_to_kill():
     with local_cluster(2) as address:
-        runner = Cluster(ProcessingOptions(cluster=address, device="numpy", deadline_s=30.0), lambda _: None)
+        runner = Cluster(ProcessingOptions(cluster=address, device="numpy", deadline_s=LONG_S), lambda _: None)
         yield runner
         runner.close()
 
@@ -163,7 +163,7 @@ def test_cluster_recovers_jobs_of_a_killed_worker(cluster_to_kill):
     waiting, made = [job_of(measurement, number, kind) for number in range(2, 4)], set()
     end_s = time.monotonic() + LONG_S
     while len(made) < 4:
-        assert time.monotonic() < end_s, "it took longer than a minute"
+        assert time.monotonic() < end_s, "it took longer than 200 s"
         while waiting and cluster.takes(kind):
             cluster.submit(waiting.pop(0))
         for event in cluster.tick(time.monotonic(), Load()):

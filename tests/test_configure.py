@@ -510,13 +510,13 @@ def test_request_ends_at_once_if_the_sensor_node_leaves(tmp_path, says_bye):
     with running(tmp_path / "archive") as central, CentralClient(central.address) as client:
         with Node(central.address) as node:
             node.hello("front")
-            answer = ThreadPoolExecutor(1).submit(client.configure, "front", TINY, SOON_S)
+            answer = ThreadPoolExecutor(1).submit(client.configure, "front", TINY, 2 * SOON_S)
             node.hear(messages.Configure)
             if says_bye:
                 node.send(messages.Bye())
-                error = answer.exception(3.0)
+                error = answer.exception(SOON_S)
         if not says_bye:  # The connection has ended without a message.
-            error = answer.exception(3.0)
+            error = answer.exception(SOON_S)
     assert isinstance(error, RefusedError)
     assert str(error).startswith("sensor front keeps its settings: its sensor node has left before it answered; start")
 
@@ -554,10 +554,10 @@ def test_threads_share_a_client(tmp_path):
 def test_client_that_is_closed_ends_the_request_of_another_thread(tmp_path):
     requests = []
     with answering(tmp_path, requests.append) as client, ThreadPoolExecutor(1) as thread:
-        answer = thread.submit(client.configure, "front", WARM, SOON_S)
+        answer = thread.submit(client.configure, "front", WARM, 2 * SOON_S)
         until(lambda: requests)
         client.__exit__(None, None, None)
-        assert "is not open" in str(answer.exception(2.0))
+        assert "is not open" in str(answer.exception(SOON_S))
 
 
 @pytest.mark.parametrize(
