@@ -4,9 +4,11 @@ import json
 import queue
 
 import numpy as np
+import pytest
 import serial
 
 from ertis_numba.devices.blocks import FOOTER, HEADER
+from ertis_numba.devices.emulator import SyncChain
 
 N_SAMPLES = 32_768
 WORDS = [np.random.default_rng(index).integers(0, 2**32, N_SAMPLES, dtype=np.uint32) for index in range(3)]
@@ -34,6 +36,32 @@ class Numbered:
 
     def __getitem__(self, index):
         return np.full(N_SAMPLES, index, np.uint32)
+
+
+@pytest.fixture
+def patient(monkeypatch):
+    """Let drivers wait for measurements as long as a busy machine needs."""
+    monkeypatch.setattr("ertis_numba.devices.driver._MARGIN_S", TIMEOUT_S)
+
+
+PATIENT = pytest.mark.usefixtures("patient")
+
+
+class PacedChain(SyncChain):
+    """SYNC line whose pulses wait until the hosts have read all measurements, so that none is dropped."""
+
+    def _pulse(self, due_ns):
+        while any(map(has_unread, self._devices)):
+            if self._stopped.wait(0.001):
+                return
+        super()._pulse(due_ns)
+
+
+def has_unread(device):
+    """Return True while an emulated device records, or while the host has not read all bytes."""
+    with device._changed:  # noqa: SLF001  hosts see bytes only
+        board, terminal = device._board, device._terminal  # noqa: SLF001
+        return terminal is not None and bool(board.due_ns is not None or board.outputs or terminal.unread)
 
 
 def opened(device):

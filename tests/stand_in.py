@@ -10,6 +10,7 @@ import zmq
 from ertis_numba.errors import ErtisError
 from ertis_numba.network import messages, sockets
 from ertis_numba.network.zap_authenticator import ZapAuthenticator
+from tests.ports import reserved_address
 
 TURN_MS = 20
 
@@ -40,7 +41,8 @@ class StandIn:
         self.hellos, self.seen = queue.Queue(), set()
         self.taken = self.resent = self.connections = 0
         self.keys, self.max_bytes = keys, max_bytes
-        self.address = "tcp://127.0.0.1:*"
+        self._reserved = reserved_address()  # until this object is deleted
+        self.address = self._reserved.__enter__()
         self._kept_back = []
         self._thread = None
 
@@ -71,7 +73,7 @@ class StandIn:
         context = zmq.Context()
         gate = ZapAuthenticator(context, self.keys)
         router = sockets.server(context, self.address, keys=self.keys, max_bytes=self.max_bytes)
-        self.address, self._peers, self._kept_back = sockets.bound(router), {}, []
+        self._peers, self._kept_back = {}, []
         poller = zmq.Poller()
         for each in filter(None, (router, gate.socket)):
             poller.register(each, zmq.POLLIN)

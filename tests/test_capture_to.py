@@ -30,10 +30,13 @@ from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.settings import Call, Processing, Recording, Settings
 from ertis_numba.storage import open_recording, sensor_names
 from tests.central import Node, running
-from tests.emulated import N_SAMPLES
+from tests.emulated import N_SAMPLES, PATIENT, patient
 from tests.journals import ENVIRONMENT, TINY, entries
 from tests.stand_in import StandIn
 
+__all__ = ["patient"]  # A fixture, imported for use here.
+
+pytestmark = PATIENT
 ERTIS = (sys.executable, "-m", "ertis_cli")
 SETTINGS = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.1, 0.5)))
 SOON_S = 60.0

@@ -28,7 +28,7 @@ from ertis_numba.settings import Air, Processing, Recording, Settings
 from ertis_numba.stages.memory import require_images
 from ertis_numba.storage import open_recording
 from tests.central import Node, running
-from tests.emulated import N_SAMPLES, WORDS
+from tests.emulated import N_SAMPLES, PATIENT, WORDS, patient
 from tests.journals import ENVIRONMENT, TINY, entries
 from tests.pages import page, python_in
 from tests.sending import until
@@ -37,6 +37,8 @@ from tests.test_central_images import Images
 
 SETTINGS = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.1, 0.5)))
 WARM = SETTINGS.replace(air=Air(temperature_c=31.5))
+__all__ = ["patient"]  # A fixture, imported for use here.
+
 LONGER = SETTINGS.replace(recording=Recording(n_samples=2 * N_SAMPLES))
 IMPOSSIBLE = SETTINGS.replace(recording=Recording(n_samples=N_SAMPLES // 2))
 """Settings that the serial protocol cannot express."""
@@ -114,6 +116,7 @@ def by_settings(stored):
     return list(found.values())
 
 
+@PATIENT
 @pytest.mark.parametrize("settings", [WARM, LONGER], ids=["air", "length"])
 def test_session_applies_new_settings_between_measurements(sessions, settings):
     with sessions() as run:

@@ -67,7 +67,7 @@ def test_processor_time_separates_threads_of_this_process():
     thread = threading.Thread(target=work)
     thread.start()
     try:
-        for _ in range(500):
+        for _ in range(6000):
             rows = {kind: time_ms for _, kind, time_ms in used.rows(2)}
             if rows["other threads"] >= 45:
                 break

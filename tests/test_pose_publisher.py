@@ -35,6 +35,7 @@ from ertis_numba.simulation import Electronics, Point, Scene, Sensor
 from tests.central import Node, running, stored, wanted
 from tests.journals import ENVIRONMENT, entries
 from tests.pages import ROOT
+from tests.ports import reserved_address
 from tests.test_record import Recording
 
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -392,14 +393,14 @@ def test_publisher_sends_a_pose_although_an_earlier_one_is_refused():
 
 
 def test_flush_reports_an_interrupted_connection_once(tmp_path):
-    with contextlib.ExitStack() as stack:
-        with running(tmp_path / "a") as central:
+    with reserved_address() as address, contextlib.ExitStack() as stack:
+        with running(tmp_path / "a", address=address) as central:
             publisher = stack.enter_context(PosePublisher(central.address, ["left"]))
             publisher.flush(60.0)
             publisher.send(5, (0, 0, 0), IDENTITY)
             publisher.flush(60.0)
             publisher.send(6, (0, 0, 0), IDENTITY)
-        with running(tmp_path / "b", address=central.address) as other:
+        with running(tmp_path / "b", address=address) as other:
             with pytest.raises(NetworkError, match="was interrupted, so that up to 1 sent pose may be lost"):
                 publisher.flush(60.0)
             publisher.send(7, (0, 0, 0), IDENTITY)

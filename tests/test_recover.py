@@ -119,7 +119,7 @@ from ertis_numba.processes import connect
 
 pipe = connect(SealJournal, outlives_parent=True)
 pipe.send(SealingProgress(1, 3))
-time.sleep(5)
+time.sleep(60)
 pipe.send(Sealed(SealingResult(Path("it was not asked to end"), Path("none"))))
 """
 

@@ -26,7 +26,11 @@ from ertis_numba.devices.line import SerialLine
 from ertis_numba.devices.setup import Setup, call_hash
 from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.settings import Call, Recording, Settings
-from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, Log
+from tests.emulated import N_SAMPLES, PATIENT, TIMEOUT_S, WORDS, Log, patient
+
+__all__ = ["patient"]  # A fixture, imported for use here.
+
+pytestmark = PATIENT
 
 SETTINGS = Settings(recording=Recording(n_samples=N_SAMPLES))
 BLOCK_BYTES = 4 * N_SAMPLES + 12
@@ -37,12 +41,6 @@ PASSIVE = [words[::-1].copy() for words in WORDS]
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
     return tmp_path
-
-
-@pytest.fixture(autouse=True)
-def _patient(monkeypatch):
-    """Let drivers wait for measurements as long as a busy machine needs."""
-    monkeypatch.setattr("ertis_numba.devices.driver._MARGIN_S", TIMEOUT_S)
 
 
 @contextmanager

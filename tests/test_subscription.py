@@ -19,6 +19,7 @@ from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
 from ertis_numba.network.subscriber import Subscriber
 from ertis_numba.pipeline import Pipeline
+from tests.ports import reserved_address
 from tests.publishing import (
     ALL,
     SETTINGS,
@@ -48,9 +49,13 @@ def hasty(monkeypatch):
         monkeypatch.setattr(_subscription, name, time_s)
 
 
-def test_restarted_publisher_is_found_and_numbers_restart(publisher):
+def test_restarted_publisher_is_found_and_numbers_restart():
     notes = []
-    with Subscriber(publisher.address, on_note=notes.append) as subscriber:
+    with (
+        reserved_address() as address,
+        Publisher(address=address) as publisher,
+        Subscriber(address, on_note=notes.append) as subscriber,
+    ):
         subscribed(publisher)
         for sequence in range(4):
             publisher.publish(image(sequence))
@@ -61,7 +66,7 @@ def test_restarted_publisher_is_found_and_numbers_restart(publisher):
         got(publisher, subscriber)
         publisher.__exit__()
         # ZeroMQ connects again by itself, faster than any silence is noticed.
-        with Publisher(address=publisher.address) as other:
+        with Publisher(address=address) as other:
             for sequence in range(50, 55):
                 other.pump(lambda: other.peers and all(peer.has_room for peer in other.peers.values()))
                 other.publish(image(sequence))
@@ -140,9 +145,7 @@ def test_damaged_messages_end_the_connection_only(publisher, spoil, match):
 
 
 def test_subscriber_waits_for_a_publisher():
-    with Publisher() as gone:
-        address = gone.address
-    with Subscriber(address) as subscriber:
+    with reserved_address() as address, Subscriber(address) as subscriber:
         assert not subscriber.connected
         with Publisher(address=address) as late:
             subscribed(late)

@@ -10,6 +10,7 @@ from ertis_numba.network.messages import Refused
 from ertis_numba.network.status import SensorStatus
 from ertis_numba.viewer import Choices, Live, Pose, Viewer, _live
 from ertis_numba.viewer._page import ControlRequest
+from tests.ports import reserved_address
 from tests.publishing import Publisher, image as published, status
 from tests.views import TABLE, Source, acked_through, run_once, spot, taken, wait_for
 
@@ -154,9 +155,7 @@ def notes_of(live):
 
 def test_missing_publisher_is_reported_once(monkeypatch):
     monkeypatch.setattr(_live, "_SOON_S", 1000.0)
-    with Publisher() as publisher:
-        address = publisher.address
-    with Live(address) as live:
+    with reserved_address() as address, Live(address) as live:
         assert live.notes() == []
         monkeypatch.setattr(_live, "_SOON_S", 0.2)
         assert notes_of(live) == [f"no publisher at {address} yet; is 'ertis serve' running?"]

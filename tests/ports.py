@@ -1,0 +1,13 @@
+"""Ports for servers that start later, or again."""
+
+import contextlib
+import socket
+
+
+@contextlib.contextmanager
+def reserved_address():
+    """Yield an address at which only servers of this test listen: a bound socket keeps others from its port."""
+    with socket.socket() as held:
+        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        held.bind(("127.0.0.1", 0))
+        yield f"tcp://127.0.0.1:{held.getsockname()[1]}"
