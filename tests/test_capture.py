@@ -266,7 +266,7 @@ def test_capture_resumes_when_unplugged_sensor_returns(captures, words, trigger)
         runner.join()
     assert capture.session.counts["one"].unplugged == 1
     (away_s,) = [what for _, what in capture.notes if isinstance(what, float)]
-    assert away_s < 3
+    assert 0 < away_s < 60
     with capture.recording() as recording:
         sequences = [stamp.sequence for stamp in recording.stamps()]
         assert sequences == sorted(set(sequences))
