@@ -12,7 +12,7 @@ from ertis_numba.network.central_node._reporting import Condition
 from ertis_numba.network.messages import Ack, Gap, Ping, Pong, Refused, Report, Welcome
 from ertis_numba.network.status import Status
 from ertis_numba.settings import Air, Recording
-from tests.central import Node, data_of, running, stored, wanted
+from tests.central import WAIT_MS, Node, data_of, running, stored, wanted
 from tests.files import line
 from tests.journals import EPOCH, TINY, entries
 
@@ -228,7 +228,7 @@ def test_status_request_is_answered(tmp_path):
         node.measure(*entries(2))
         node.hear_settled(11)
         node.send(messages.AskStatus())
-        assert node.socket.poll(5000)
+        assert node.socket.poll(WAIT_MS)
         header, payload = node.socket.recv_multipart()
         assert messages.decode(header) == Report()
         status = msgspec.msgpack.decode(payload, type=Status)
@@ -275,6 +275,7 @@ def test_archive_folder_is_locked_by_one_central_node(tmp_path):
 
 def test_internal_error_of_one_message_does_not_stop_the_node(tmp_path, monkeypatch):
     given = entries(2)
+    monkeypatch.setattr("ertis_numba.network.central_node._reporting._LOG_INTERVAL_S", 1000.0)
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
         with monkeypatch.context() as patch:
@@ -295,6 +296,7 @@ def test_internal_error_of_one_message_does_not_stop_the_node(tmp_path, monkeypa
 @pytest.mark.parametrize("step", ["read", "require_role", "ServerSocket.who"])
 def test_internal_error_while_reading_a_message_is_answered(step, tmp_path, monkeypatch):
     given = entries(2)
+    monkeypatch.setattr("ertis_numba.network.central_node._reporting._LOG_INTERVAL_S", 1000.0)
     with running(tmp_path) as central, Node(central.address) as node:
         node.hello()
         with monkeypatch.context() as patch:
@@ -323,6 +325,7 @@ def test_fault_text_with_non_utf8_path_is_sent(tmp_path, monkeypatch):
 
 def test_status_is_computed_once_for_simultaneous_requests(tmp_path, monkeypatch):
     made, status = [], Condition.status
+    monkeypatch.setattr("ertis_numba.network.central_node._reporting._REPORT_S", 1000.0)
     with running(tmp_path) as central, Node(central.address) as node:
         monkeypatch.setattr(Condition, "status", lambda condition: made.append(1) or status(condition))
         for _ in range(20):
