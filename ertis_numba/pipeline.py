@@ -58,7 +58,8 @@ class Pipeline:
     max_error_db : float or {"draft", "standard", "fine", "exact"}, optional
         Error budget of the images in dB; that of ``settings.accuracy`` by default.
     graphs : bool, optional
-        Record the chain as a CUDA graph, which saves the time to launch its kernels; True by default on a GPU.
+        Record the chain as a CUDA graph, which saves the time to launch its kernels; True by default on a GPU, except
+        with ``processing.level_directions``.
     max_bytes : int, optional
         Limit on the predicted memory, checked before any is allocated. By default, only the tables of a plan are
         limited: to 2 GiB, or to the available memory if no plan within 2 GiB keeps the error budget.
@@ -117,6 +118,8 @@ class Pipeline:
         plan: PlanCosts = "nominal",
     ) -> None:
         checks.choice("plan", plan, PLAN_COSTS)
+        if graphs is not None and not isinstance(graphs, bool):
+            raise ArgumentError(f"graphs is {graphs!r}; give True or False, or leave it out")
         if isinstance(settings, str | Path):
             settings = Settings.load(settings)
         if not isinstance(settings, Settings):
@@ -177,7 +180,7 @@ class Pipeline:
             Unit quaternion that rotates the sensor frame into the world frame; required if
             ``processing.level_directions`` is true. The directions of the image then refer to the horizontal plane; see
             `levelled_grid`. Directions that lie behind a sensor in this attitude, but in front of a level one, have the
-            amplitude 0. The tables of the chain are computed for each measurement.
+            amplitude 0. The tables of directions are computed for each measurement.
         clean : bool, default True
             False to omit the cleaning that ``settings.processing`` may request. The settings of the image then request
             none.
@@ -210,17 +213,20 @@ class Pipeline:
                 "level_directions"
             )
         words, exponent = self._words_of(measurement)
+        grid = is_behind = None
+        if attitude_xyzw is None:
+            self.settings.processing.require_sensor_frame(_NO_ATTITUDE)
+        else:
+            grid, is_behind = levelled_grid(self.grid, attitude_xyzw)
         amplitude = self._chain.new_image() if out is None else self._checked_out(out)
-        if attitude_xyzw is not None:
-            self._process_levelled(words, amplitude, attitude_xyzw, threads=threads)
-            return self._checked_image(rescaled(amplitude, exponent), measurement, clean=clean)
-        self.settings.processing.require_sensor_frame(_NO_ATTITUDE)
         if stream is not None and isinstance(self._chain, KernelChain):
-            self._chain.process_streamed(stream, words, amplitude, threads=threads)
+            self._chain.process_streamed(stream, words, amplitude, threads=threads, grid=grid)
         elif stream is None or stream.is_of(None):
-            self._chain.process(words, amplitude, threads=threads)
+            self._chain.process(words, amplitude, threads=threads, grid=grid)
         else:
             raise foreign_stream()
+        if is_behind is not None:
+            amplitude[is_behind] = 0.0
         return self._checked_image(rescaled(amplitude, exponent), measurement, clean=clean)
 
     def stream(self) -> WordStream:
@@ -496,19 +502,6 @@ class Pipeline:
         # Raised here, because a pending exception would keep the memory allocated, and a smaller pipeline would fail.
         raise DeviceError(failed)
 
-    def _process_levelled(
-        self, words: NDArray[Any], out: NDArray[np.float32], attitude_xyzw: ArrayLike, *, threads: int | None
-    ) -> None:
-        """Compute the image of one measurement in directions relative to the horizontal plane."""
-        grid, is_behind = levelled_grid(self.grid, attitude_xyzw)
-        kernel_set = kernels.load(self.device)
-        chain = _chain(self.settings, kernel_set, self._threads, graphs=False, grid=grid)
-        try:
-            chain.process(words, out, threads=threads)
-        finally:
-            chain.close()
-        out[is_behind] = 0.0
-
     def _require_open(self) -> None:
         if self._closed:
             raise ArgumentError("the pipeline is closed; create another one")
@@ -550,11 +543,16 @@ def _without_cleaning(settings: Settings) -> Settings:
     return settings.replace(**{"processing.clean_within_db": None, "processing.clean_above_mean_db": None})
 
 
-def _chain(
-    settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool | None, grid: Grid | None = None
-) -> Chain:
+def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, graphs: bool | None) -> Chain:
+    if settings.processing.level_directions:
+        if graphs:
+            raise ArgumentError(
+                "graphs is True, but with processing.level_directions each image has tables of its own, which no graph "
+                "can replace; leave graphs out"
+            )
+        graphs = False
     if settings.processing.method == "fast":
-        return FastChain(settings, kernel_set, threads=threads, graphs=graphs, grid=grid)
+        return FastChain(settings, kernel_set, threads=threads, graphs=graphs)
     if kernel_set.device == "numpy":
-        return paper_scipy.ScipyPaperChain(settings, grid=grid)
-    return paper.PaperChain(settings, kernel_set, threads=threads, graphs=graphs, grid=grid)
+        return paper_scipy.ScipyPaperChain(settings)
+    return paper.PaperChain(settings, kernel_set, threads=threads, graphs=graphs)

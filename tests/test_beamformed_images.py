@@ -126,7 +126,9 @@ def test_capon_separates_independent_sources_within_a_beam(device):
     for name, options in {"plain": {"diagonal_loading": 1e6}, "capon": {"diagonal_loading": 1e-3}}.items():
         processing = Processing(beamformer="capon", snapshots=32, **options)
         out = np.empty((len(sines), 32), dtype=np.float32)
-        AdaptiveBeamform(processing, KERNELS[device], KERNELS[device].memory(), offsets, weights)(signals[:, None], out)
+        AdaptiveBeamform(processing, KERNELS[device], KERNELS[device].memory(), offsets, weights)(
+            signals[:, None], (), out
+        )
         power[name] = 10 * np.log10((out.astype(float) ** 2).mean(axis=1))
     middle = len(sines) // 2
     assert power["plain"][middle] > power["plain"][np.abs(sines) > apart / 2].max()

@@ -57,7 +57,7 @@ def combined(kernel_set, beamformer, signals, **options):
     out = np.full((1, n_ranges), 12_345, dtype=np.float32)
     processing = Processing(beamformer=beamformer, **options)
     beamform = AdaptiveBeamform(processing, kernel_set, kernel_set.memory(), offsets, weights)
-    beamform(np.ascontiguousarray(signals, dtype=np.complex64)[:, None], out)
+    beamform(np.ascontiguousarray(signals, dtype=np.complex64)[:, None], (), out)
     return out[0]
 
 
@@ -123,7 +123,7 @@ def test_every_beamformer_equals_its_definition(kernel_set, beamformer, weightin
     processing, n_mics = Processing(beamformer=beamformer, weighting=weighting), offsets.shape[1]
     weights /= np.abs(weights).sum(axis=1, keepdims=True)
     out = np.full((n_directions, n_ranges), 12_345, dtype=np.float32)
-    AdaptiveBeamform(processing, kernel_set, kernel_set.memory(), offsets, weights)(signals, out)
+    AdaptiveBeamform(processing, kernel_set, kernel_set.memory(), offsets, weights)(signals, (), out)
     delayed = n_mics * reference.delayed(signals, offsets, weights, n_ranges)
     expected = np.stack([combine(y, processing) for y in delayed])
     assert np.abs(out - expected).max() < 2 * FLOAT32 * expected.max()
@@ -268,7 +268,7 @@ def test_capon_has_double_precision_where_single_precision_may_exceed_the_budget
         processing = Processing(beamformer="capon", diagonal_loading=loading)
         budget = 10 ** (budget_db / 10)
         beamform = AdaptiveBeamform(processing, kernels, KERNELS["cpu"].memory(), offsets, weights, budget=budget)
-        beamform(np.zeros((32, 1, 1), np.complex64), np.zeros((1, 1), np.float32))
+        beamform(np.zeros((32, 1, 1), np.complex64), (), np.zeros((1, 1), np.float32))
         used[loading, budget_db] = kept[0].dtype
     assert list(used.values()) == [np.complex64, np.complex64, np.complex128, np.complex128]
 

@@ -7,8 +7,9 @@
 from ertis_numba.kernels._compile_notice import on_compiling
 from ertis_numba.kernels._contract.fusion import FusionKernels
 from ertis_numba.kernels._contract.mapping import MappingKernels
+from ertis_numba.kernels._contract.steering import SteeringKernels
 from ertis_numba.kernels._device_protocols import Lane, Memory
-from ertis_numba.kernels._dispatch import DEVICES, load, load_fusion, load_mapping, usable
+from ertis_numba.kernels._dispatch import DEVICES, load, load_fusion, load_mapping, load_steering, usable
 from ertis_numba.kernels._kernel_set import KernelSet
 
 __all__ = [
@@ -18,9 +19,11 @@ __all__ = [
     "Lane",
     "MappingKernels",
     "Memory",
+    "SteeringKernels",
     "load",
     "load_fusion",
     "load_mapping",
+    "load_steering",
     "on_compiling",
     "usable",
 ]

@@ -10,9 +10,10 @@ from ertis_numba import checks
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._contract.fusion import FusionKernels
 from ertis_numba.kernels._contract.mapping import MappingKernels
+from ertis_numba.kernels._contract.steering import SteeringKernels
 from ertis_numba.kernels._kernel_set import KernelSet
 
-__all__ = ["DEVICES", "load", "load_fusion", "load_mapping", "usable"]
+__all__ = ["DEVICES", "load", "load_fusion", "load_mapping", "load_steering", "usable"]
 
 _LOG = logging.getLogger("ertis_numba")
 
@@ -110,15 +111,43 @@ def load_mapping() -> MappingKernels:
     return kernels
 
 
+@functools.cache
+def load_steering(device: str = "auto") -> SteeringKernels:
+    """Return the kernels of steering, which compute tables on the host for all devices.
+
+    Parameters
+    ----------
+    device : {"auto", "numpy"}
+        ``numpy`` is plain NumPy. ``auto``, the default, has compiled kernels, or those of NumPy if none can be compiled
+        on this machine.
+
+    Returns
+    -------
+    SteeringKernels
+
+    Examples
+    --------
+    >>> from ertis_numba import kernels
+    >>> kernels.load_steering().sum_polynomials.__name__
+    'sum_polynomials'
+    """
+    checks.choice("device", device, ("auto", "numpy"))
+    kernels: SteeringKernels = _compiled("steering") if device == "auto" else _in_numpy("steering")
+    return kernels
+
+
 def _compiled(name: str) -> Any:
     """Return the compiled kernels of a module, or their twins of NumPy."""
     try:
         load("cpu")
-        module = f"ertis_numba.kernels._cpu.{name}"
     except DeviceError as error:
         _LOG.info("%s uses NumPy: %s", name, error)
-        module = f"ertis_numba.kernels._numpy_{name}"
-    return importlib.import_module(module).KERNELS
+        return _in_numpy(name)
+    return importlib.import_module(f"ertis_numba.kernels._cpu.{name}").KERNELS
+
+
+def _in_numpy(name: str) -> Any:
+    return importlib.import_module(f"ertis_numba.kernels._numpy_{name}").KERNELS
 
 
 def usable() -> tuple[str, ...]:

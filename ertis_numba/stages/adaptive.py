@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Processing
+from ertis_numba.stages.beamform import Buffers
 
 __all__ = ["AdaptiveBeamform"]
 
@@ -15,7 +16,7 @@ _NEGLIGIBLE = 0.01  # share of the budget
 
 
 class AdaptiveBeamform:
-    """Adaptive beamformer: amplitude of every direction and range.
+    """Adaptive beamformer: amplitude of every direction and range; implements `Beamform`.
 
     An echo that reaches all microphones alike has the same level as with delay-and-sum. `kernels` defines the
     computation of each beamformer. The object holds no buffers, so several threads may call it at the same time.
@@ -62,7 +63,16 @@ class AdaptiveBeamform:
         scaled = beamformer.weights(weights, *self._options) if beamformer.kernel else weights
         self._weights = memory.table(scaled.astype(np.complex64 if single else np.complex128))
 
-    def __call__(self, analytic: NDArray[np.complex64], out: NDArray[np.float32]) -> None:
+    def new_buffers(self) -> Buffers:
+        """Return no work arrays, since the kernels need none."""
+        return ()
+
+    def __call__(
+        self,
+        analytic: NDArray[np.complex64],
+        buffers: Buffers,  # noqa: ARG002
+        out: NDArray[np.float32],
+    ) -> None:
         """Fill ``out``, (direction, range) float32, from ``analytic``, (mic, phase, sample) complex64."""
         self._combine(analytic, self._offsets, self._weights, *self._options, out)
         if self._weight is not None:

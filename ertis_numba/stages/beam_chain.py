@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages import planner
+from ertis_numba.stages.beamform import Beamform
 from ertis_numba.stages.buffer_pool import MeasurementBuffers
 from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.stages.phase_shifts import PhaseShifts
@@ -37,6 +38,13 @@ class BeamChain(FastChain):
         """Return an array for beams: (direction, range) complex64."""
         return np.zeros((len(self.grid), len(self.range_m)), dtype=np.complex64)
 
-    def _image(self, buffers: MeasurementBuffers, out: NDArray[Any], threads: int) -> None:
-        assert isinstance(self._beamform, PhaseShifts)  # noqa: S101  the settings ask for it
-        self._beamform.fill_beams(buffers.transforms, buffers.analytic, buffers.beamform, out, threads=threads)
+    def _image(
+        self,
+        buffers: MeasurementBuffers,
+        out: NDArray[Any],
+        threads: int,
+        beamform: Beamform | PhaseShifts | None = None,
+    ) -> None:
+        beamform = beamform or self._beamform
+        assert isinstance(beamform, PhaseShifts)  # noqa: S101  the settings ask for it
+        beamform.fill_beams(buffers.transforms, buffers.analytic, buffers.beamform, out, threads=threads)

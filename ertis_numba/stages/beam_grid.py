@@ -10,10 +10,11 @@ The grid lies in the axes of the array: a line array needs one axis, a plane arr
 plane, not of the sphere. Points outside the unit circle correspond to no direction but serve interpolation equally.
 """
 
+import copy
 import functools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -21,7 +22,8 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
-from ertis_numba.stages.interpolation_fit import Spectrum, fit, gain_of, weights_of
+from ertis_numba.kernels import SteeringKernels, load_steering
+from ertis_numba.stages.interpolation_fit import Spectrum, fit, gain_of, two_columns, weights_of, without_small
 
 __all__ = ["FEWEST_RANGES", "Aperture", "BeamGrid", "estimated_mics", "require_beam_grid"]
 
@@ -32,7 +34,6 @@ FEWEST_RANGES = 64
 _FLAT_M = 1e-6  # An axis counts only if the array's extent along it exceeds this.
 _MIN_POWER = 1e-8  # Regularisation. Large weights that cancel each other would amplify the rounding to 16 bits.
 _POLYNOMIALS = 16  # Number of polynomials that interpolate weights along an axis.
-_AT_A_TIME = 4096  # Number of directions in a block.
 _MAX_FITTED = 96  # Maximum number of directions, and of microphones, from which gain and error are computed.
 _WAVES = 17  # Number of frequencies; the gain of a microphone is smooth over frequency.
 _MAX_ESTIMATED, _WAVES_ESTIMATED = 40, 9  # These suffice for an error within some tenths of a decibel.
@@ -53,18 +54,45 @@ class Aperture:
         Components of the unit vectors along these axes.
     square_m2 : (mic,) float64
         Squared distance from the array centre, in m².
+    axes : (axis, 3) float64
+        Axes of the array as unit vectors in the sensor frame.
+    is_turned : bool
+        True if images have other directions than these, because the array is tilted. A beam grid is then fitted to
+        directions anywhere between its points.
     """
 
     positions_m: NDArray[np.float64]
     directions: NDArray[np.float64]
     square_m2: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    is_turned: bool = False
 
     @classmethod
-    def of(cls, positions_m: NDArray[np.float64], directions: NDArray[np.float64]) -> Self:
+    def of(cls, positions_m: NDArray[np.float64], directions: NDArray[np.float64], *, is_turned: bool = False) -> Self:
         """Return the aperture for microphone positions, (mic, 3) in metres, and unit vectors, (direction, 3)."""
         _, extent_m, axes = np.linalg.svd(positions_m, full_matrices=False)
         axes = axes[extent_m > _FLAT_M * math.sqrt(len(positions_m))]
-        return cls(positions_m @ axes.T, directions @ axes.T, np.sum(positions_m**2, axis=1))
+        return cls(positions_m @ axes.T, directions @ axes.T, np.sum(positions_m**2, axis=1), axes, is_turned)
+
+    def turned(self, directions: NDArray[np.float64]) -> Self:
+        """Return the aperture with other directions, as unit vectors: (direction, 3)."""
+        return replace(self, directions=directions @ self.axes.T)
+
+    def largest_delay_s(self, reach: float, own_s: NDArray[np.float64], *, sound_speed_m_s: float) -> float:
+        """Return a limit on the delays of all points within a distance from the centre, in seconds.
+
+        Parameters
+        ----------
+        reach : float
+            Distance in the array's plane, relative to the unit circle; at least 1.
+        own_s : (mic,) float64
+            Delay of each microphone, in seconds.
+        sound_speed_m_s : float
+        """
+        # The difference of distances, r − √(r² − 2 r u·p + p²), is largest where the root vanishes, and at most p for
+        # directions, whose magnitude u is 1.
+        farthest = reach + math.sqrt(reach**2 - 1)
+        return float(np.max(np.abs(own_s) + farthest * np.sqrt(self.square_m2) / sound_speed_m_s))
 
     @property
     def n_axes(self) -> int:
@@ -179,6 +207,8 @@ class BeamGrid:
         Lower grid point of each pair, in the order of ``rows``; the other point is the next one.
     weights : (direction, pair, 2) float64
         Weights of each pair, in the order of ``rows``.
+    reach : float
+        Limit on the distance of grid points from the centre, for any directions.
     frequency_hz, errors : (wave,) float64
         Frequencies in hertz, and the error power relative to the beam, averaged over uncorrelated microphones and over
         directions. The errors exist for estimates only.
@@ -203,15 +233,22 @@ class BeamGrid:
         self.is_curved = not math.isinf(nearest_m)
         self._sound_speed_m_s = sound_speed_m_s
         spacing = aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=sound_speed_m_s)
+        self._spacing, self._n_taps = spacing, n_taps
+        self.reach = 1 + n_taps / 2 * float(np.linalg.norm(spacing))
         lowest = aperture.fewest_grid_points(spacing, n_taps)
         # All patches of grid points are alike, so only the position of the direction within its patch matters.
-        self._inside = aperture.directions - lowest * spacing
+        inside = aperture.directions - lowest * spacing
         patch = _around(np.zeros((1, aperture.n_axes), dtype=np.int64), n_taps)[0] * spacing
         mics, chosen = _mics_and_waves(len(aperture.positions_m), len(spectrum.power), estimate=estimate)
-        directions = _some(len(lowest), _MAX_ESTIMATED if estimate else _MAX_FITTED)
+        largest = _MAX_ESTIMATED if estimate else _MAX_FITTED
+        directions = _some(len(lowest), largest)
+        inside = inside[directions]
+        if aperture.is_turned:
+            directions = np.resize(directions, largest)
+            inside = (n_taps // 2 - 1 + _evenly(largest, aperture.n_axes)) * spacing
         self.frequency_hz = spectrum.frequency_hz[chosen]
         power = np.tile(spectrum.power[chosen] / spectrum.power[chosen].sum() / len(mics), len(mics))
-        taps, wanted = (self._waves(points, mics) for points in (patch, self._inside[directions]))
+        taps, wanted = (self._waves(points, mics) for points in (patch, inside))
         self._has_gain = with_gain
         if with_gain:
             gain, weights = fit(taps, wanted, power, real=True, min_power=_MIN_POWER)
@@ -223,7 +260,7 @@ class BeamGrid:
             gain = self._estimate(
                 lowest[directions] * spacing,
                 patch,
-                self._inside[directions],
+                inside,
                 mics,
                 weights,
                 spectrum.frequency_hz if judged_hz is None else judged_hz,
@@ -232,60 +269,76 @@ class BeamGrid:
             reach_m = math.sqrt(float(aperture.square_m2.max()))
             for distance_m in {max(nearest_m, share * reach_m) for share in _REACHES} if self.is_curved else ():
                 bent = self._curvature_errors(
-                    lowest[directions] * spacing, patch, directions, mics, gain, weights, distance_m
+                    lowest[directions] * spacing, patch, inside, mics, gain, weights, distance_m
                 )
                 self.errors = np.maximum(self.errors, bent)
             return
-        self._patch, self._fitted_weights = patch, weights
-        self._fitted_directions = directions
-        found = self._weights(
-            spacing,
-            n_taps,
+        self._patch, self._fitted_weights, self._fitted = patch, weights, inside
+        self._coefficients = self._coefficients_of(
             lambda inside: (
                 weights_of(gain, taps, self._waves(inside, mics), power, real=True, min_power=_MIN_POWER).real.T
-            ),
+            )
         )
-        nodes = _around(lowest, n_taps)
-        _, one, index = np.unique(_numbers(nodes).reshape(-1), return_index=True, return_inverse=True)
-        self.points = nodes.reshape(-1, aperture.n_axes)[one] * spacing
-        places = index.reshape(len(lowest), -1, 2)[:, :, 0]
-        order = np.argsort(places[:, 0], kind="stable")  # Adjacent directions find shared points in the L1 cache.
-        self.rows = order.astype(np.int32)
-        self.places = np.ascontiguousarray(places[order], np.int32)
-        self.weights = np.ascontiguousarray(found[order]).reshape(len(lowest), -1, 2)
+        self._place(aperture.directions, load_steering("numpy"))
 
-    def _weights(
-        self,
-        spacing: NDArray[np.float64],
-        n_taps: int,
-        weights_at: Callable[[NDArray[np.float64]], NDArray[np.float64]],
-    ) -> NDArray[np.float64]:
-        """Return the weights of all directions, (direction, tap), interpolated from points of one grid cell.
+    def turned(self, directions: NDArray[np.float64], kernels: SteeringKernels) -> Self:
+        """Return the beam grid for other directions, with the same gain.
+
+        Parameters
+        ----------
+        directions : (direction, axis) float64
+            As those of `Aperture`.
+        kernels : SteeringKernels
+        """
+        other = copy.copy(self)
+        other._coefficients = self._short_coefficients  # noqa: SLF001
+        other._place(directions, kernels)  # noqa: SLF001  of the same class
+        return other
+
+    @functools.cached_property
+    def _short_coefficients(self) -> NDArray[np.float64]:
+        return without_small(self._coefficients)
+
+    def _place(self, directions: NDArray[np.float64], kernels: SteeringKernels) -> None:
+        """Compute the grid points of directions, and their weights."""
+        lowest = np.floor(directions / self._spacing).astype(np.int64) - (self._n_taps // 2 - 1)
+        first = lowest.min(axis=0)
+        strides = np.concatenate([[1], np.cumprod(lowest.max(axis=0) - first + self._n_taps)])
+        numbers = (lowest - first) @ strides[:-1]
+        order = np.argsort(numbers, kind="stable")  # Adjacent directions find shared points in the L1 cache.
+        numbers = numbers[order]
+        steps = _around(np.zeros((1, len(first)), dtype=np.int64), self._n_taps)[0] @ strides[:-1]
+        is_used = np.zeros(strides[-1], dtype=np.bool_)
+        is_used[np.unique(numbers)[:, None] + steps] = True
+        used = np.flatnonzero(is_used)
+        self.points = (first + used[:, None] // strides[:-1] % (strides[1:] // strides[:-1])) * self._spacing
+        place = np.cumsum(is_used, dtype=np.int32) - np.int32(1)
+        self.rows = order.astype(np.int32)
+        self.places = place[numbers[:, None] + steps[::2]]
+        inside = directions[order] - lowest[order] * self._spacing - (self._n_taps // 2 - 1) * self._spacing
+        weights = np.empty((len(directions), self._coefficients.shape[2]))
+        kernels.sum_polynomials(two_columns(2 * inside / self._spacing - 1), self._coefficients, weights)
+        self.weights = weights.reshape(len(directions), -1, 2)
+
+    def _coefficients_of(self, weights_at: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return the coefficients of the polynomials of the weights in one grid cell: (degree, degree, tap).
 
         A weight is a sum of waves over microphones and frequencies. Across a cell, these waves turn by at most half a
         period. Polynomials therefore reproduce the weights in double precision, in a fraction of the time.
         """
+        spacing = self._spacing
         places = chebyshev.chebpts1(_POLYNOMIALS)
         inverse = np.linalg.inv(chebyshev.chebvander(places, _POLYNOMIALS - 1))
         axes = [places] * len(spacing)
         cell = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(spacing))
-        lowest = (n_taps // 2 - 1) * spacing
+        lowest = (self._n_taps // 2 - 1) * spacing
         parts = np.array_split(cell, -(-len(cell) // _MAX_FITTED))
         values = np.concatenate([weights_at(lowest + (part + 1) / 2 * spacing) for part in parts])
         coefficients = values.reshape(*(_POLYNOMIALS,) * len(spacing), -1)
         for axis in range(len(spacing)):
             coefficients = np.moveaxis(np.tensordot(inverse, coefficients, axes=(1, axis)), 0, axis)
-        coefficients = coefficients.reshape(len(cell), -1)
-        found = np.empty((len(self._inside), coefficients.shape[1]))
-        scaled = 2 * (self._inside - lowest) / spacing - 1
-        for first in range(0, len(found), _AT_A_TIME):
-            part = scaled[first : first + _AT_A_TIME]
-            terms = np.ones((len(part), 1))
-            for axis in range(len(spacing)):
-                along = chebyshev.chebvander(part[:, axis], _POLYNOMIALS - 1)
-                terms = (terms[:, :, None] * along[:, None, :]).reshape(len(part), -1)
-            found[first : first + len(part)] = terms @ coefficients
-        return found
+        shape = (_POLYNOMIALS, coefficients.size // coefficients.shape[-1] // _POLYNOMIALS, -1)
+        return np.ascontiguousarray(coefficients).reshape(shape)
 
     def _estimate(
         self,
@@ -321,7 +374,7 @@ class BeamGrid:
         self,
         moved: NDArray[np.float64],
         patch: NDArray[np.float64],
-        directions: NDArray[np.intp],
+        inside: NDArray[np.float64],
         mics: NDArray[np.intp],
         gain: NDArray[np.complex128],
         weights: NDArray[np.complex128],
@@ -329,19 +382,19 @@ class BeamGrid:
     ) -> NDArray[np.float64]:
         """Return the errors, (wave,), of the plane-wave weights for waves from a point at ``nearest_m``."""
         errors = np.zeros(len(self.frequency_hz))
-        for k, direction in enumerate(directions):
-            points = np.concatenate([moved[k] + patch, self._aperture.directions[direction][None]])
+        for k, place in enumerate(inside):
+            points = np.concatenate([moved[k] + patch, (moved[k] + place)[None]])
             delays_s = self._aperture.delays_s(points, sound_speed_m_s=self._sound_speed_m_s, range_m=nearest_m)
             waves = np.exp(2j * math.pi * delays_s.T[mics, None, :] * self.frequency_hz[:, None])
             made = gain * (waves[:, :, :-1] @ weights[:, k])
             errors += np.mean(np.abs(made - waves[:, :, -1]) ** 2, axis=0)
-        return errors / len(directions)
+        return errors / len(inside)
 
     def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the gain of each microphone that complements the weights: (mic, frequency) complex128."""
         mics = np.arange(len(self._aperture.positions_m))
         made = self._waves(self._patch, mics) @ self._fitted_weights
-        wanted = self._waves(self._inside[self._fitted_directions], mics)
+        wanted = self._waves(self._fitted, mics)
         gain = gain_of(made, wanted)
         rows = gain.reshape(len(mics), len(self.frequency_hz))
         return np.stack(
@@ -374,6 +427,17 @@ def _mics_and_waves(n_mics: int, n_waves: int, *, estimate: bool) -> tuple[NDArr
     mics = estimated_mics(n_mics) if estimate else _some(n_mics, _MAX_FITTED)
     enough = max(_WAVES_ESTIMATED if estimate else _WAVES, _FEWEST_EQUATIONS // len(mics))
     return mics, _some(n_waves, enough)
+
+
+def _evenly(count: int, n_axes: int) -> NDArray[np.float64]:
+    """Return places spread evenly over a cell, (place, axis) from 0 to 1, as an additive sequence.
+
+    M. Roberts, The unreasonable effectiveness of quasirandom sequences (2018): the powers of the inverse of a root of
+    ``x^(n + 1) = x + 1`` are the steps along the axes.
+    """
+    root = {1: (1 + math.sqrt(5)) / 2, 2: 1.324717957244746}[n_axes]
+    steps = root ** -np.arange(1.0, n_axes + 1)
+    return np.asarray((0.5 + np.arange(count)[:, None] * steps) % 1.0)
 
 
 def _some(count: int, largest: int) -> NDArray[np.intp]:

@@ -53,6 +53,7 @@ def beamform(
     *,
     n_phases: int,
     threads: int,
+    last_sample: int | None = None,
 ) -> "BeamformFloat32 | BeamformInt16":
     """Return the delay-and-sum beamformer of a plan.
 
@@ -63,10 +64,13 @@ def beamform(
         As for `BeamformFloat32`.
     n_phases : int
         Number of phases of the analytic signals.
+    last_sample : int, optional
+        Limit on the index of samples at the first range, for tiles with room for other tables; by default, that of
+        these tables.
     """
     if precision == "float32":
         return BeamformFloat32(kernels, memory, window, zones, nodes, threads=threads)
-    return BeamformInt16(kernels, memory, zones, nodes, n_phases=n_phases, threads=threads)
+    return BeamformInt16(kernels, memory, zones, nodes, n_phases=n_phases, threads=threads, last_sample=last_sample)
 
 
 class _NodeTables:
@@ -184,16 +188,16 @@ class WholeWeights:
     """
 
     def __init__(self, tables: Sequence[DelayTable], nodes: BeamGrid | None) -> None:
-        largest = max(float(np.max(np.abs(table.weights))) for table in tables)
-        weight_limit, limit = whole_limits(
-            max(float(np.max(np.abs(table.weights).sum(axis=1))) for table in tables) / largest
-        )
+        sizes = [np.abs(table.weights) for table in tables]
+        largest = max(float(size.max()) for size in sizes)
+        weight_limit, limit = whole_limits(max(float(size.sum(axis=1).max()) for size in sizes) / largest)
         unit = largest / weight_limit
         self.limit = np.float32(limit)
         self.weights = [_pairs(table.weights / np.float32(unit)) for table in tables]
         for pairs in self.weights:
             # Rounding may have increased a sum of many small weights.
-            sums = np.hypot(pairs[:, :, 0, 0], pairs[:, :, 1, 0], dtype=np.float64).sum(axis=1)
+            real, imaginary = pairs[:, :, 0, 0].astype(np.float64), pairs[:, :, 1, 0].astype(np.float64)
+            sums = np.sqrt(real**2 + imaginary**2).sum(axis=1)
             self.limit = min(self.limit, np.float32(_SAFE * 2**31 / max(1.0, float(sums.max())) - 1))
         self.unit = np.float32(unit)
         self.last_sample = max(int(table.samples.max()) for table in tables)
@@ -233,11 +237,12 @@ class BeamformInt16:
         *,
         n_phases: int,
         threads: int,
+        last_sample: int | None = None,
     ) -> None:
         whole = WholeWeights([zone.table for zone in zones], nodes)
         self._limit, self._weight_scale = whole.limit, whole.unit
         self._kernels, self._memory, self._threads = kernels, memory, threads
-        width = kernels.tile_ranges + whole.last_sample + 1
+        width = kernels.tile_ranges + (whole.last_sample if last_sample is None else last_sample) + 1
         starts: list[int] = []
         self._zones: list[_WholeZone] = []
         for zone, weights in zip(zones, whole.weights, strict=True):
@@ -296,8 +301,11 @@ class BeamformInt16:
 
 def _pairs(weights: NDArray[np.complex128]) -> NDArray[np.int16]:
     """Return ``((re w, −im w), (im w, re w))`` of each weight, rounded: (beam, term, 2, 2) int16."""
-    pairs = np.array([[weights.real, -weights.imag], [weights.imag, weights.real]])
-    return np.ascontiguousarray(np.rint(np.moveaxis(pairs, (0, 1), (2, 3)))).astype(np.int16)
+    pairs = np.empty((*weights.shape, 2, 2), np.int16)
+    pairs[:, :, 0, 0] = pairs[:, :, 1, 1] = np.rint(weights.real)
+    pairs[:, :, 1, 0] = whole = np.rint(weights.imag)
+    pairs[:, :, 0, 1] = -whole
+    return pairs
 
 
 def _blocks(threads: int, n_tiles: int) -> int:

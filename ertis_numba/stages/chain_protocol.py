@@ -25,7 +25,12 @@ class Chain(Protocol):
         ...
 
     def process(
-        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32], *, threads: int | None = None
+        self,
+        words: NDArray[np.unsignedinteger[Any]],
+        out: NDArray[np.float32],
+        *,
+        threads: int | None = None,
+        grid: Grid | None = None,
     ) -> None:
         """Compute the image of one measurement.
 
@@ -37,6 +42,9 @@ class Chain(Protocol):
             Array to fill with amplitudes.
         threads : int, optional
             Number of threads; by default, that of the chain.
+        grid : Grid, optional
+            Directions in the sensor frame, as many as those of the chain, for settings with level directions; by
+            default, those of the chain.
         """
         ...
 

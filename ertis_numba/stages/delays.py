@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError
+from ertis_numba.kernels import SteeringKernels
 from ertis_numba.stages.interpolation_fit import DelayFit
 
 __all__ = ["DelayTable", "Zone"]
@@ -36,6 +37,7 @@ class DelayTable:
         delays_s: NDArray[np.float64],
         amplitudes: NDArray[np.float64],
         fit: DelayFit,
+        steering: SteeringKernels | None = None,
         *,
         n_phases: int,
         lead: int,
@@ -50,6 +52,8 @@ class DelayTable:
             Weight of each microphone.
         fit : DelayFit
             Fractional-delay filters.
+        steering : SteeringKernels, optional
+            Kernels that compute the weights on all cores.
         n_phases : int
             Number of phases of the analytic signals.
         lead : int
@@ -59,7 +63,7 @@ class DelayTable:
         first, fractions = fit.split(delays_s)
         samples, phases = np.divmod(first[:, :, None] + np.arange(fit.n_taps), n_phases)
         rows = np.arange(n_mics)[:, None] * n_phases + phases
-        weights = fit.weights(fractions) * amplitudes[:, None]
+        weights = fit.weights(fractions, steering) * amplitudes[:, None]
         flat = (n_beams, n_mics * fit.n_taps)
         return cls(rows.reshape(flat), samples.reshape(flat) + lead, weights.reshape(flat))
 

@@ -27,7 +27,19 @@ import threadpoolctl
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-__all__ = ["WAVES", "DelayFit", "Spectrum", "fit", "gain_of", "one_thread", "weights_of"]
+from ertis_numba.kernels import SteeringKernels
+
+__all__ = [
+    "WAVES",
+    "DelayFit",
+    "Spectrum",
+    "fit",
+    "gain_of",
+    "one_thread",
+    "two_columns",
+    "weights_of",
+    "without_small",
+]
 
 WAVES = 40
 """Number of frequencies of the spectra that weight fits and errors."""
@@ -35,6 +47,7 @@ WAVES = 40
 _TURNS = 12  # Number of iterations; further ones reduce the error by less than 0.1 dB.
 _MIN_POWER = 1e-14  # Regularisation relative to the power of the taps. It keeps weights small if taps are nearly equal.
 _IMAGES = (-2, -1, 1, 2)  # The nearest images hold nearly all of the error.
+_MIN_COEFFICIENT = 1e-9  # Relative to the largest one; rounding to single precision adds more.
 _TARGETS = 65  # Number of targets over one step of the stored samples.
 
 
@@ -152,6 +165,21 @@ def weights_of(
     return np.asarray(np.linalg.solve(gram, right))
 
 
+def without_small(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return coefficients of polynomials, (degree, degree, value), without the highest degrees if these are small."""
+    largest = np.abs(coefficients).max(axis=2)
+    is_kept = largest > _MIN_COEFFICIENT * largest.max()
+    rows, columns = (int(np.flatnonzero(is_kept.any(axis=axis))[-1]) + 1 for axis in (1, 0))
+    return np.ascontiguousarray(coefficients[:rows, :columns])
+
+
+def two_columns(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return places with one or two coordinates, (place, axis), as (place, 2); the second one is 0 if it is missing."""
+    found = np.zeros((len(places), 2))
+    found[:, : places.shape[1]] = places
+    return found
+
+
 class DelayFit:
     """Fractional-delay filters: interpolation of a sample at any time from samples stored at a fixed step.
 
@@ -231,10 +259,18 @@ class DelayFit:
         first = nearest - (self.n_taps - 1) // 2
         return first.astype(np.int64), steps - first
 
-    def weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the weights of the taps: (..., tap) complex128, for fractions as `split` returns them."""
-        found = chebyshev.chebval(2 * (fractions - self._middle), self._polynomials)
-        return np.asarray(self._scale * np.ascontiguousarray(np.moveaxis(found, 0, -1)), np.complex128)
+    def weights(self, fractions: NDArray[np.float64], kernels: SteeringKernels | None = None) -> NDArray[np.complex128]:
+        """Return the weights of the taps: (..., tap) complex128, for fractions as `split` returns them.
+
+        The kernels, if given, compute the same on all cores.
+        """
+        places = 2 * (fractions - self._middle)
+        if kernels is None:
+            found = chebyshev.chebval(places, self._polynomials)
+            return np.asarray(self._scale * np.ascontiguousarray(np.moveaxis(found, 0, -1)), np.complex128)
+        made = np.empty((fractions.size, self.n_taps), np.complex128)
+        kernels.sum_polynomials(two_columns(places.reshape(-1, 1)), self._short_polynomials, made.view(np.float64))
+        return made.reshape(*fractions.shape, self.n_taps)
 
     @functools.cached_property
     def _polynomials(self) -> NDArray[np.complex128]:
@@ -248,6 +284,11 @@ class DelayFit:
         places = chebyshev.chebpts1(degree + 1)
         values = self._weights(self._middle + places / 2).T
         return np.asarray(np.linalg.solve(chebyshev.chebvander(places, degree), values))
+
+    @functools.cached_property
+    def _short_polynomials(self) -> NDArray[np.float64]:
+        """Coefficients of the scaled weights for kernels: (degree, 1, 2 · tap) float64, real and imaginary parts."""
+        return without_small((self._scale * self._polynomials).view(np.float64)[:, None])
 
     def _weights(self, fractions: NDArray[np.float64]) -> NDArray[np.complex128]:
         taps = self._taps(self.spectrum.frequency_hz)

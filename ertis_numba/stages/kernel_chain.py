@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import fft
-from ertis_numba.geometry import Grid, direction_grid
+from ertis_numba.geometry import Grid
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beamform import Beamform
@@ -54,8 +54,6 @@ class KernelChain(ABC):
         Default number of threads.
     graphs : bool, optional
         True to record the chain as a CUDA graph and replay it; by default on every GPU.
-    grid : Grid, optional
-        Directions of the image in the sensor frame; those of the settings by default.
 
     Attributes
     ----------
@@ -83,30 +81,55 @@ class KernelChain(ABC):
         *,
         threads: int,
         graphs: bool | None = None,
-        grid: Grid | None = None,
     ) -> None:
         self._memory = kernels.memory(graphs=graphs)
         self._pool = BufferPool()
         self._kernels, self._threads = kernels, threads
+        self._is_turned = settings.processing.level_directions
         with one_thread():
-            self._make(settings, direction_grid(settings.processing) if grid is None else grid)
+            self._make(settings)
 
     @abstractmethod
-    def _make(self, settings: Settings, grid: Grid) -> None:
+    def _make(self, settings: Settings) -> None:
         """Create the axes and the stages."""
 
+    @abstractmethod
+    def _turned(self, grid: Grid) -> Beamform | PhaseShifts:
+        """Return the beamformer for as many other directions, which shares all buffers."""
+
     def process(
-        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32], *, threads: int | None = None
+        self,
+        words: NDArray[np.unsignedinteger[Any]],
+        out: NDArray[np.float32],
+        *,
+        threads: int | None = None,
+        grid: Grid | None = None,
     ) -> None:
         """Compute the image of one measurement; parameters as for `Chain.process`."""
-        self._finish(self._begin(words, out, self._threads if threads is None else threads))
+        threads = self._threads if threads is None else threads
+        beamform = self._beamform_for(grid, threads)
+        self._finish(self._begin(words, out, threads, beamform))  # Its tables stay in memory until then.
+
+    def _beamform_for(self, grid: Grid | None, threads: int) -> Beamform | PhaseShifts:
+        if grid is None:
+            return self._beamform
+        with one_thread(), self._kernels.threads(threads):
+            return self._turned(grid)
 
     def stream(self, words: NDArray[np.unsignedinteger[Any]]) -> WordStream:
         """Return a stream of words; ``words`` is an array for a whole measurement, (sample, word)."""
         if self._kernels.device == "cuda" or not isinstance(self._demodulate, DemodulatePdm):
             return WordStream()
         return WordStream(
-            StreamedImage(self._demodulate, self._image, self._kernels, self._new_buffers(), words, self.new_image())
+            StreamedImage(
+                self._demodulate,
+                self._image,
+                self._kernels,
+                self._new_buffers(),
+                words,
+                self.new_image(),
+                is_turned=self._is_turned,
+            )
         )
 
     def process_streamed(
@@ -116,6 +139,7 @@ class KernelChain(ABC):
         out: NDArray[np.float32],
         *,
         threads: int | None = None,
+        grid: Grid | None = None,
     ) -> None:
         """Compute the image of a measurement whose words, or some of them, were added to a stream of this chain."""
         if not stream.is_of(self._demodulate):
@@ -123,8 +147,11 @@ class KernelChain(ABC):
         threads = self._threads if threads is None else threads
         with self._kernels.threads(threads):  # An image that is complete already would need none.
             pass
-        if not stream.process(words, out, threads=threads):
-            self.process(words, out, threads=threads)
+        image = (
+            self._image if grid is None else functools.partial(self._image, beamform=self._beamform_for(grid, threads))
+        )
+        if not stream.process(words, out, image, threads=threads):
+            self.process(words, out, threads=threads, grid=grid)
 
     def process_batch(
         self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]
@@ -178,12 +205,16 @@ class KernelChain(ABC):
         """Wait for measurements in progress, then free the memory of the device."""
         self._pool.close()
         filters = ("_made_unmodulated", "_made_plain_filter", "_matched_filter")
-        for name in ("_demodulate", *filters, "_beamform", "_adaptive"):
+        for name in ("_demodulate", *filters, "_beamform"):
             self.__dict__.pop(name, None)
         self._memory.close()
 
     def _begin(
-        self, words: NDArray[np.unsignedinteger[Any]], out: NDArray[np.float32] | None, threads: int
+        self,
+        words: NDArray[np.unsignedinteger[Any]],
+        out: NDArray[np.float32] | None,
+        threads: int,
+        beamform: Beamform | PhaseShifts | None = None,
     ) -> MeasurementBuffers:
         """Start to process one measurement; its image is in ``out`` once the lane has finished."""
         with self._taken(threads) as buffers:
@@ -192,7 +223,7 @@ class KernelChain(ABC):
 
             def steps() -> None:
                 self._demodulate(here, buffers.room, buffers.signals)
-                self._image(buffers, image, threads)
+                self._image(buffers, image, threads, beamform)
 
             buffers.lane.run(steps)
             if out is not None:
@@ -205,12 +236,20 @@ class KernelChain(ABC):
         finally:
             self._pool.release(buffers)
 
-    def _image(self, buffers: MeasurementBuffers, out: NDArray[np.float32], threads: int) -> None:
-        if isinstance(self._beamform, PhaseShifts):
-            self._beamform(buffers.transforms, buffers.analytic, buffers.beamform, out, threads=threads)
+    def _image(
+        self,
+        buffers: MeasurementBuffers,
+        out: NDArray[np.float32],
+        threads: int,
+        beamform: Beamform | PhaseShifts | None = None,
+    ) -> None:
+        """Compute an image from the signals in buffers, with the beamformer of the chain by default."""
+        beamform = beamform or self._beamform
+        if isinstance(beamform, PhaseShifts):
+            beamform(buffers.transforms, buffers.analytic, buffers.beamform, out, threads=threads)
         else:
             self._matched_filter(buffers.transforms, buffers.analytic, threads=threads)
-            self._beamform(buffers.analytic, buffers.beamform, out)
+            beamform(buffers.analytic, buffers.beamform, out)
 
     @contextmanager
     def _taken(self, threads: int) -> Iterator[MeasurementBuffers]:

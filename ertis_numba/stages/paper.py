@@ -13,15 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import fft
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import Grid, array_weights, microphones, plane_delays
+from ertis_numba.geometry import Grid, array_weights, direction_grid, microphones
 from ertis_numba.kernels import KernelSet, Memory
 from ertis_numba.settings import Settings
 from ertis_numba.stages.beamform import Buffers
 from ertis_numba.stages.demodulate import FilterPcm, Room
 from ertis_numba.stages.kernel_chain import KernelChain
 from ertis_numba.stages.matched_filter import flat_spectrum
-from ertis_numba.stages.paper_scipy import range_axis
+from ertis_numba.stages.paper_scipy import largest_delay, range_axis, whole_delays
 from ertis_numba.stages.plan_elements import chain_taps
 from ertis_numba.stages.time_window import TimeWindow
 from ertis_numba.waveform import matched_guard_s
@@ -42,15 +41,12 @@ class PaperChain(KernelChain):
         The device has too little memory.
     """
 
-    def _make(self, settings: Settings, grid: Grid) -> None:
+    def _make(self, settings: Settings) -> None:
         layout, memory, kernels = microphones(settings.array), self._memory, self._kernels
-        self.grid = grid
+        self.grid = direction_grid(settings.processing)
         n_samples = -(-settings.recording.n_samples // settings.decimation)
         self.range_m, outputs = range_axis(settings, n_samples)
-        waves_s = plane_delays(settings, self.grid, sound_speed_m_s=sound_speed_m_s(settings.air))
-        delays_s = layout.delay_s[layout.enabled] + waves_s
-        delays = np.rint(delays_s * settings.signal_rate_hz).astype(np.int64)
-        lead = int(np.max(np.abs(delays)))
+        lead = largest_delay(settings, whole_delays(settings, self.grid))
         taps, channels = chain_taps(settings), np.flatnonzero(layout.enabled).astype(np.int32)
         guard_s = settings.call.end_s + 2 * matched_guard_s(settings)
         n_fft = n_samples + 2 * lead + math.ceil(guard_s * settings.signal_rate_hz) + 1
@@ -67,11 +63,19 @@ class PaperChain(KernelChain):
         self._matched_filter = _MultiplyByTemplate(
             settings, kernels, memory, taps=taps, shape=(len(channels), 1, n_fft), lead=lead
         )
-        starts = np.arange(len(channels)) * n_fft + delays + lead + outputs.start * settings.output_decimation
+        first = np.arange(len(channels)) * n_fft + lead + outputs.start * settings.output_decimation
         weights = array_weights(settings) / (layout.gain[layout.enabled] * len(channels))
-        self._beamform = _DelayAndSum(
-            kernels, memory, starts, weights, step=settings.output_decimation, n_ranges=len(self.range_m)
-        )
+        step, n_ranges = settings.output_decimation, len(self.range_m)
+
+        def turned(grid: Grid) -> _DelayAndSum:
+            starts = first + whole_delays(settings, grid)
+            return _DelayAndSum(kernels, memory, starts, weights, step=step, n_ranges=n_ranges)
+
+        self._new_beamform = turned
+        self._beamform = turned(self.grid)
+
+    def _turned(self, grid: Grid) -> "_DelayAndSum":
+        return self._new_beamform(grid)
 
 
 class _UnpackAndFilter:

@@ -20,7 +20,7 @@ from ertis_numba.geometry import Grid, array_weights, direction_grid, microphone
 from ertis_numba.settings import Settings
 from ertis_numba.waveform import call_at
 
-__all__ = ["ScipyPaperChain", "range_axis"]
+__all__ = ["ScipyPaperChain", "largest_delay", "range_axis", "whole_delays"]
 
 _ORDER = 6  # Order of all Butterworth filters. The authors' MATLAB notes state it for the first filter.
 _CUTOFF = 2 / 9  # Cutoff relative to the signal rate: the authors use 100 kHz at 450 kHz.
@@ -34,8 +34,6 @@ class ScipyPaperChain:
     Parameters
     ----------
     settings : Settings
-    grid : Grid, optional
-        Directions of the image; those of the settings by default.
 
     Attributes
     ----------
@@ -51,15 +49,13 @@ class ScipyPaperChain:
         The range window extends beyond the record or contains no sample.
     """
 
-    def __init__(self, settings: Settings, *, grid: Grid | None = None) -> None:
-        layout = microphones(settings.array)
-        self.grid: Grid = direction_grid(settings.processing) if grid is None else grid
+    def __init__(self, settings: Settings) -> None:
+        layout, self._settings = microphones(settings.array), settings
+        self.grid: Grid = direction_grid(settings.processing)
         self._n_samples = -(-settings.recording.n_samples // settings.decimation)
         self.range_m, self._window = range_axis(settings, self._n_samples)
-        waves_s = plane_delays(settings, self.grid, sound_speed_m_s=sound_speed_m_s(settings.air))
-        delays_s = layout.delay_s[layout.enabled] + waves_s
-        delays = np.rint(delays_s * settings.signal_rate_hz).astype(int)
-        lead = int(np.max(np.abs(delays)))
+        delays = whole_delays(settings, self.grid)
+        self._lead = lead = largest_delay(settings, delays)
         self._starts: list[list[int]] = (delays + lead).tolist()
         self._channels = np.flatnonzero(layout.enabled).tolist()
         self._is_pdm, self._scale = settings.recording.is_pdm, np.float32(0.5 / settings.recording.full_scale)
@@ -107,8 +103,12 @@ class ScipyPaperChain:
         out: NDArray[np.float32],
         *,
         threads: int | None = None,  # noqa: ARG002  This chain has one thread.
+        grid: Grid | None = None,
     ) -> None:
         """Compute the image of one measurement on one thread; parameters as for `Chain.process`."""
+        all_starts = self._starts
+        if grid is not None:
+            all_starts = (whole_delays(self._settings, grid) + self._lead).tolist()
         unpacked = _unpacked(words, self._channels) if self._is_pdm else _halved(words, self._channels, self._scale)
         signals = self._demodulate(unpacked)
         spectra = scipy.fft.rfft(signals, self._n_fft)
@@ -117,7 +117,7 @@ class ScipyPaperChain:
         beams = np.empty((_DIRECTIONS, self._n_samples + self._low_pass.delay), dtype=np.float32)
         for first in range(0, len(out), _DIRECTIONS):
             part = beams[: len(out) - first]
-            for beam, starts in zip(part, self._starts[first : first + _DIRECTIONS], strict=True):
+            for beam, starts in zip(part, all_starts[first : first + _DIRECTIONS], strict=True):
                 _delay_and_sum(rows, starts, beam)
             envelopes = self._low_pass(np.abs(part, out=part))
             out[first : first + _DIRECTIONS] = envelopes[:, self._window]
@@ -129,6 +129,22 @@ def _delay_and_sum(rows: list[NDArray[np.float32]], starts: list[int], out: NDAr
     out[:] = rows[0][starts[0] : starts[0] + n]
     for row, start in zip(rows[1:], starts[1:], strict=True):
         np.add(out, row[start : start + n], out)
+
+
+def whole_delays(settings: Settings, grid: Grid) -> NDArray[np.int64]:
+    """Return the delays of directions in signal samples: (direction, mic) int64."""
+    layout = microphones(settings.array)
+    waves_s = plane_delays(settings, grid, sound_speed_m_s=sound_speed_m_s(settings.air))
+    return np.rint((layout.delay_s[layout.enabled] + waves_s) * settings.signal_rate_hz).astype(np.int64)
+
+
+def largest_delay(settings: Settings, delays: NDArray[np.int64]) -> int:
+    """Return the largest magnitude of delays in signal samples, or its limit if directions are level ones."""
+    if not settings.processing.level_directions:
+        return int(np.max(np.abs(delays)))
+    layout = microphones(settings.array)
+    farthest_s = np.linalg.norm(layout.enabled_positions_m, axis=1) / sound_speed_m_s(settings.air)
+    return math.ceil(float(np.max(np.abs(layout.delay_s[layout.enabled]) + farthest_s)) * settings.signal_rate_hz)
 
 
 def range_axis(settings: Settings, n_samples: int) -> tuple[NDArray[np.float64], slice]:

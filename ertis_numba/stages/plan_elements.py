@@ -85,7 +85,7 @@ def few_delays(
     *,
     sound_speed_m_s: float,
 ) -> NDArray[np.float64] | None:
-    """Return all delays in seconds, (delay,) float64; None if they are so many that they spread evenly over a step.
+    """Return all delays in seconds, (delay,) float64; None if they spread evenly over a step, or change with a tilt.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def few_delays(
     sound_speed_m_s : float
     """
     reach_s = math.sqrt(float(np.max(aperture.square_m2, initial=0.0))) / sound_speed_m_s
-    if len(weights) * (1 + 2 * reach_s / step_s) > _MANY_FRACTIONS:
+    if aperture.is_turned or len(weights) * (1 + 2 * reach_s / step_s) > _MANY_FRACTIONS:
         return None
     waves_s = aperture.delays_s(aperture.directions, sound_speed_m_s=sound_speed_m_s, range_m=math.inf)
     return np.asarray(own_s - ahead_of(weights, step_s) + waves_s).ravel()

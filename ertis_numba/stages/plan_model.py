@@ -128,7 +128,9 @@ class PlanModel:
         self.n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
         self._own_s = layout.delay_s[layout.enabled]
         self.aperture = _aperture_of(
-            layout.enabled_positions_m.tobytes(), unit_vectors(grid.azimuth_rad, grid.elevation_rad).tobytes()
+            layout.enabled_positions_m.tobytes(),
+            unit_vectors(grid.azimuth_rad, grid.elevation_rad).tobytes(),
+            settings.processing.level_directions,
         )
         self._weights = array_weights(settings)
         amplitudes = self._weights / layout.gain[layout.enabled]
@@ -418,9 +420,10 @@ def plan_of(accuracy: Accuracy) -> ImagePlan:
 
 
 @functools.lru_cache(maxsize=_MAX_APERTURES)
-def _aperture_of(positions_m: bytes, directions: bytes) -> Aperture:
+def _aperture_of(positions_m: bytes, directions: bytes, is_turned: bool) -> Aperture:  # noqa: FBT001  cached
     """Return the aperture, as the same object for the same positions and directions, so its errors can be cached."""
-    return Aperture.of(*(np.frombuffer(values).reshape(-1, 3) for values in (positions_m, directions)))
+    given = (np.frombuffer(values).reshape(-1, 3) for values in (positions_m, directions))
+    return Aperture.of(*given, is_turned=is_turned)
 
 
 @functools.lru_cache(maxsize=_MAX_FITS)

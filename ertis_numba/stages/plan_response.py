@@ -68,7 +68,8 @@ def _deviation_of(settings: Settings, directions: bytes) -> Deviation | None:
 
 def _computed(settings: Settings, directions: NDArray[np.float64]) -> Deviation | None:
     layout, spectrum = microphones(settings.array), spectrum_of(settings)
-    aperture = Aperture.of(layout.enabled_positions_m, directions)
+    is_turned = settings.processing.level_directions
+    aperture = Aperture.of(layout.enabled_positions_m, directions, is_turned=is_turned)
     speed_m_s = sound_speed_m_s(settings.air)
     is_plane = settings.processing.wavefront == "plane"
     chosen = np.unique(np.linspace(0, len(spectrum.power) - 1, _WAVES).astype(np.intp))

@@ -63,6 +63,8 @@ class StreamBeamform:
         Ranges of the focal zones.
     n_phases : int
         Number of phases of the analytic signals.
+    last_sample : int, optional
+        As for `ertis_numba.stages.beamform.beamform`.
 
     Attributes
     ----------
@@ -81,10 +83,13 @@ class StreamBeamform:
         zones: Sequence[tuple[int, int]],
         *,
         n_phases: int,
+        last_sample: int | None = None,
     ) -> None:
         self._kernels, self._memory = kernels, memory
         whole = [WholeWeights(stream.tables, stream.nodes) for stream in tables]
-        width = kernels.tile_ranges + max(each.last_sample for each in whole) + 1
+        if last_sample is None:
+            last_sample = max(each.last_sample for each in whole)
+        width = kernels.tile_ranges + last_sample + 1
         starts: list[int] = []
         self._zones: list[_Zone] = []
         for k, (first, stop) in enumerate(zones):

@@ -1,5 +1,6 @@
 """Processing of a measurement while its words arrive."""
 
+import math
 import threading
 from collections.abc import Callable
 from time import perf_counter
@@ -22,6 +23,9 @@ _SHARE: Final = 0.75
 _TIMED: Final = 2  # The first image also touches new memory.
 _TIMED_AT_MOST: Final = 20
 _TIMED_S: Final = 0.05
+
+
+NewImage = Callable[[MeasurementBuffers, NDArray[np.float32], int], None]
 
 
 class WordStream:
@@ -55,10 +59,13 @@ class WordStream:
         """Return True if it demodulates with a stage, or does nothing."""
         return self._image is None or self._image.demodulate is demodulate
 
-    def process(self, words: NDArray[Any], out: NDArray[np.float32], *, threads: int) -> bool:
-        """Fill ``out`` with the image of a measurement; return False if it begins with other words than were added."""
+    def process(self, words: NDArray[Any], out: NDArray[np.float32], image: NewImage, *, threads: int) -> bool:
+        """Fill ``out`` with the image of a measurement; return False if it begins with other words than were added.
+
+        ``image`` computes the image from signals, as that of `StreamedImage` does.
+        """
         with self._lock:
-            return self._image is not None and self._image.complete(words, out, threads)
+            return self._image is not None and self._image.complete(words, out, image, threads)
 
 
 def foreign_stream() -> ArgumentError:
@@ -73,7 +80,7 @@ class StreamedImage:
     ----------
     demodulate : DemodulatePdm
     image : callable
-        Computes an image from the signals in buffers: buffers, array for the image, and threads.
+        Function that computes an image from the signals in buffers: buffers, array for the image, and threads.
     kernels : KernelSet
     buffers : MeasurementBuffers
         Buffers that nothing else uses.
@@ -81,23 +88,27 @@ class StreamedImage:
         Array for a whole measurement.
     amplitude : (direction, range) float32
         Array for an image.
+    is_turned : bool
+        True if the directions of the image are known only when the measurement is complete.
     """
 
     def __init__(
         self,
         demodulate: DemodulatePdm,
-        image: Callable[[MeasurementBuffers, NDArray[np.float32], int], None],
+        image: NewImage,
         kernels: KernelSet,
         buffers: MeasurementBuffers,
         words: NDArray[Any],
         amplitude: NDArray[np.float32],
+        *,
+        is_turned: bool = False,
     ) -> None:
         self.demodulate, self._image, self._kernels = demodulate, image, kernels
         self._buffers, self._words, self._amplitude = buffers, words, amplitude
         self._part = np.empty((demodulate.shape[0], _STEP), np.float32)
         self._n_words = self._n_first = self._n_done = 0
         self._is_done = False
-        self._begun_s, self._image_s = 0.0, self._time_s()
+        self._begun_s, self._image_s = 0.0, math.inf if is_turned else self._time_s()
 
     def add(self, first: int, words: NDArray[Any]) -> None:
         """Copy words, and compute signals that depend on no later ones.
@@ -120,7 +131,8 @@ class StreamedImage:
         with self._kernels.threads(1):  # The words arrive more slowly than one thread processes them.
             self._go_on(n_ready)
             if n_ready == self.demodulate.n_signals and self._image_s < _SHARE * self._left_s():
-                self._finish(self._amplitude, 1)
+                self._go_on(self.demodulate.shape[1])
+                self._image(self._buffers, self._amplitude, 1)
                 self._is_done = True
 
     def _left_s(self) -> float:
@@ -140,7 +152,7 @@ class StreamedImage:
                 times_s.append(perf_counter() - begun_s)
         return min(times_s)
 
-    def complete(self, words: NDArray[Any], out: NDArray[np.float32], threads: int) -> bool:
+    def complete(self, words: NDArray[Any], out: NDArray[np.float32], image: NewImage, threads: int) -> bool:
         """Fill ``out`` with the image of a whole measurement; return False if it begins with other words."""
         n_words, self._n_words = self._n_words, -1  # Only a new beginning can follow.
         if n_words <= 0 or not np.array_equal(words[:n_words], self._words[:n_words]):
@@ -150,12 +162,9 @@ class StreamedImage:
             return True
         self._words[n_words:] = words[n_words:]
         with self._kernels.threads(threads):
-            self._finish(out, threads)
+            self._go_on(self.demodulate.shape[1])
+            image(self._buffers, out, threads)
         return True
-
-    def _finish(self, out: NDArray[np.float32], threads: int) -> None:
-        self._go_on(self.demodulate.shape[1])
-        self._image(self._buffers, out, threads)
 
     def _go_on(self, stop: int) -> None:
         """Compute signal samples up to one, in equal steps except at the end."""

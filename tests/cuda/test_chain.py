@@ -29,6 +29,20 @@ def test_gpu_image_equals_cpu_image(pair):
     assert np.array_equal(*images) or reference.error_db(*images) < bound_db
 
 
+@pytest.mark.parametrize("plan", [plan for plan in PLANS if plan != "delay matrix"])  # It cannot be turned.
+def test_gpu_image_in_level_directions_equals_cpu_image(plan):
+    """The GPU gets other tables for each image."""
+    settings, bound_db = PLANS[plan]
+    settings = settings.replace(**{"processing.level_directions": True})
+    measurement, turn = noise(settings), np.array([0.3, -0.4, 0.1, 1.0])
+    turn /= np.linalg.norm(turn)
+    with Pipeline(settings, device="cpu") as cpu, Pipeline(settings, device="cuda") as cuda:
+        plain = cuda.process(measurement, attitude_xyzw=(0.0, 0.0, 0.0, 1.0)).amplitude
+        images = [pipeline.process(measurement, attitude_xyzw=turn).amplitude for pipeline in (cpu, cuda)]
+    assert not np.array_equal(plain, images[1])
+    assert np.array_equal(*images) or reference.error_db(*images) < bound_db
+
+
 @pytest.fixture(scope="module")
 def cuda():
     with Pipeline(PLANS["float32"][0], device="cuda") as pipeline:
