@@ -207,6 +207,19 @@ def test_velocity_is_assumed_to_continue_for_at_most_a_second():
     assert np.sqrt(pose.covariance[0, 0]) > 0.5 * 59.9
 
 
+@pytest.mark.parametrize(("n_measured", "first_m_s", "later_m_s"), [(1, 0.5, 0.5), (3, 0.14, 0.28)])
+def test_assumed_velocity_becomes_less_certain_with_time(n_measured, first_m_s, later_m_s):
+    """Groups are 0.1 s apart. After one group, no velocity has been measured yet."""
+    odometry = ertis.Odometry(MOUNTINGS)
+    for pulse in range(n_measured):
+        odometry.add([seen_from((0.05 * pulse, 0, 0), places_m(), pulse, (0.5, 0.0, 0.0))])
+    for pulse in range(n_measured, n_measured + 2):
+        odometry.add([seen_from((0, 0, 0), np.empty((0, 3)), pulse)])
+    assert [pose.is_measured for pose in odometry.poses] == [True] * n_measured + [False] * 2
+    variances = np.diff([pose.covariance[0, 0] for pose in odometry.poses[-3:]])
+    assert variances == pytest.approx([(0.1 * first_m_s) ** 2, (0.1 * later_m_s) ** 2], rel=0.05)
+
+
 AHEAD = (0.0, 0.0, 0.0, 1.0)
 
 

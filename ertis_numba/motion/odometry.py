@@ -28,7 +28,11 @@ _FEW_MATCHES: Final = 12
 _DOUBTFUL_SHARE: Final = 0.25
 _KEYFRAME_SHARE: Final = 0.5  # Share of the matches of the last two groups that a keyframe still has.
 _PLANAR: Final = 0, 1, 5  # of x, y, z, and the rotations about them
-_UNKNOWN_VARIANCE: Final = np.diag([0.5, 0.5, 1.0]) ** 2  # of the assumed velocity; times time² for the pose
+# Standard deviations of an assumed velocity, x, y and yaw per second. They grow with the time since the last measured
+# velocity, up to a limit. The example parameters of Nav2 for mobile robots permit accelerations of 2.5 m/s² and
+# 3.2 rad/s². If all up to these are equally likely, the standard deviations are 1.4 m/s² and 1.8 rad/s².
+_UNKNOWN_SD: Final = np.array([0.5, 0.5, 1.0])
+_ACCELERATION_SD: Final = np.array([1.4, 1.4, 1.8])
 
 
 class PlanarPose(NamedTuple):
@@ -120,6 +124,7 @@ class Odometry:
         self._last: _View | None = None
         self._keyframe: _View | None = None
         self._twist = np.zeros(3)
+        self._twist_ns: int | None = None  # Time of the last measured twist.
         self._path: list[PlanarPose] = []
 
     @property
@@ -221,12 +226,13 @@ class Odometry:
         time_s = (timestamp_ns - self._path[-1].timestamp_ns) / 1e9
         found = self._since_last(echoes, time_s) if time_s <= MAX_TIME_S else None
         if found is None:
-            unknown = _UNKNOWN_VARIANCE * time_s**2
+            age_s = math.inf if self._twist_ns is None else (timestamp_ns - self._twist_ns) / 1e9
+            unknown = np.diag(np.minimum(_UNKNOWN_SD, _ACCELERATION_SD * age_s) * time_s) ** 2
             assumed = _displacement(self._twist, min(time_s, MAX_TIME_S))
             self._path.append(self._path[-1].moved(assumed, unknown, timestamp_ns, is_measured=False))
             self._begin(echoes)
             return None
-        self._twist = twist_of(found.displacement, time_s)
+        self._twist, self._twist_ns = twist_of(found.displacement, time_s), timestamp_ns
         self._locate(echoes, found, self._twist, timestamp_ns)
         self._last = _View(echoes, self._path[-1], self._twist)
         return velocity_of(found, timestamp_ns, time_s) if found.is_certain else None
