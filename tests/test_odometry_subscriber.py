@@ -75,8 +75,11 @@ class MountedPublisher(Publisher):
         return super()._describe(item, key, peer)
 
 
-def received(sent, last, *, publisher_type=Publisher, notes=None, **options):
-    """Return arrivals until that of a SYNC pulse, by count, and the trajectory; each pulse waits for the one before."""
+def received(sent, last, *, publisher_type=Publisher, notes=None, patience_s=PATIENCE_S, **options):
+    """Return arrivals until that of a SYNC pulse, by count, and the trajectory; each pulse waits for the one before.
+
+    A pulse without an image of a sensor is returned after ``patience_s``.
+    """
     found, used = {}, threading.Semaphore(0)
 
     def one_by_one():
@@ -90,12 +93,14 @@ def received(sent, last, *, publisher_type=Publisher, notes=None, **options):
             used.release()
 
     with (
+        pytest.MonkeyPatch.context() as patch,
         publisher_type() as publisher,
         publisher.playing(one_by_one()),
         OdometrySubscriber(publisher.address, **{"mountings": MOUNTINGS, "on_note": note} | options) as subscriber,
     ):
+        patch.setattr("ertis_numba.network.pulse_receiver._PATIENCE_S", patience_s)
         while last not in found:
-            arrival = subscriber.receive(PATIENCE_S)
+            arrival = subscriber.receive(2 * PATIENCE_S)
             assert arrival is not None
             found[arrival.sync_count] = arrival
             used.release()
@@ -120,7 +125,7 @@ def test_poses_and_velocities_are_those_of_the_platform():
 
 
 def test_missing_sensor_is_named_and_the_others_determine_the_motion():
-    found, _ = received(pulses(0, 1, 2, 3, absent={(number, "back") for number in (1, 2, 3)}), 3)
+    found, _ = received(pulses(0, 1, 2, 3, absent={(number, "back") for number in (1, 2, 3)}), 3, patience_s=1.0)
     assert (found[3].sensors, found[3].missing) == (("front",), ("back",))
     assert found[3].pose.is_measured
     assert_at_step(found[3].pose, 3)
@@ -162,7 +167,7 @@ def test_pulse_after_a_long_gap_has_no_velocity():
 
 def test_sensor_that_joins_with_a_mounting_of_the_central_node_is_used():
     sent = pulses(*range(6), absent={(0, "back"), (1, "back")})
-    found, _ = received(sent, 5, publisher_type=MountedPublisher, mountings=None)
+    found, _ = received(sent, 5, publisher_type=MountedPublisher, mountings=None, patience_s=1.0)
     assert set(found[5].sensors) == {"front", "back"}
     assert [arrival.sensors for arrival in found.values()][:2] == [("front",), ("front",)]
     assert found[5].velocity.n_matches > 8  # The front sensor has six reflectors.
@@ -182,7 +187,7 @@ def test_pulse_of_a_clock_that_was_set_back_is_left_out_and_noted():
 def test_path_begins_with_the_first_pulse_of_all_sensors():
     """An application that connects during a pulse misses the images that were sent before."""
     sent = [[seen(0, "back")], *pulses(1, 2)]
-    found, trajectory = received(sent, 2)
+    found, trajectory = received(sent, 2, patience_s=1.0)
     assert [found[count].sensors for count in (0, 1)] == [("back",), ("front", "back")]
     assert len(trajectory) == 2
     assert found[2].pose.is_measured
