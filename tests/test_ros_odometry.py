@@ -16,7 +16,7 @@ from ertis_numba.motion.live import LiveOdometry
 from ertis_numba.ros import Participant, PublishingSettings, RosPublisher
 from ertis_numba.settings import Settings
 from ertis_numba.storage import write_energyscapes
-from tests.publishing import Publisher
+from tests.publishing import Publisher, end_when, results_of
 from tests.ros_topics import DOMAIN, await_subscribers, subscribed
 from tests.test_odometry_subscriber import MOUNTING_FILE, images
 
@@ -140,7 +140,13 @@ def test_command_publishes_the_odometry_of_a_file(tmp_path, mounting):
     assert end["messages"]["/odom"] == end["messages"]["/tf"] == 5 - end["skipped"]
 
 
-def test_command_publishes_the_odometry_of_a_central_node(mounting):
+def test_command_publishes_the_odometry_of_a_central_node(mounting, monkeypatch):
+    made = results_of(monkeypatch, RosPublisher, "__enter__")
+    end_when(
+        monkeypatch,
+        "ertis_cli.ros",
+        lambda: made and all(name in made[0].topics for name in ("/odom", "/tf", "/front/points")),
+    )
     arguments = ["--odometry", "--topic", "points", "--domain", str(DOMAIN), "--duration", "4", "--json"]
     with Publisher() as publisher, publisher.playing(images(*range(4))):
         done = CliRunner().invoke(cli, ["ros", publisher.address, "--mounting", str(mounting), *arguments])
