@@ -32,7 +32,9 @@ def coarsen_image(
     filled = np.flatnonzero(np.diff(first.astype(np.int64)) > 0)
     power[:, filled] = np.maximum.reduceat(amplitude, first[filled].astype(np.int64), axis=1).astype(out.dtype) ** 2
     power[:, is_deaf] = 0
-    floor[:] = np.maximum(side_lobes * power.max(axis=0), least)
+    top = power.max(axis=0)
+    around = np.maximum(top, np.maximum(np.append(0, top[:-1]), np.append(top[1:], 0)))
+    floor[:] = np.maximum(side_lobes * around, least)
     np.maximum(power - floor, 0, out=out)
     wide = power.copy()
     np.maximum(wide[:, 1:], power[:, :-1], out=wide[:, 1:])

@@ -31,8 +31,12 @@ def coarsen_image(amplitude, first, is_deaf, close, side_lobes, least, floor, hi
                     top = max(top, amplitude[d, r])
                 power[d, s] = top * top
                 floor[s] = max(floor[s], power[d, s])
+    before = _ZERO
     for s in range(n_steps):
-        floor[s] = max(side_lobes * floor[s], least)
+        here = floor[s]
+        around = max(before, here, floor[min(s + 1, n_steps - 1)])
+        floor[s] = max(side_lobes * around, least)
+        before = here
     wide = np.empty((n_directions, n_steps), np.float32)
     for d in range(n_directions):
         for s in range(n_steps):
