@@ -44,11 +44,14 @@ class Attributed(NamedTuple):
     shares : Shares
     unheard : frozenset of int
         Emitters whose calls no other sensor hears, although it should.
+    bound : (cell,) float32
+        Highest reflectivity that all pairs allow; infinite where none can see the cell.
     """
 
     reflectivity: Singles
     shares: Shares
     unheard: frozenset[int]
+    bound: Singles
 
 
 class _Evidence(NamedTuple):
@@ -156,7 +159,7 @@ class Attribution:
                 reflectivity = np.minimum(reflectivity, bound)
             shares = self._all_shares(images, reflectivity, confirmed, suppression)
             reflectivity = self._mean(own, images, shares)
-        return Attributed(np.minimum(self._mean(evidence, images, shares), bound), shares, self._unheard)
+        return Attributed(np.minimum(self._mean(evidence, images, shares), bound), shares, self._unheard, bound)
 
     def single(self, images: Mapping[int, CoarseImage]) -> Singles:
         """Return the mean reflectivity if each sensor takes all echoes for its own: (cell,) float32.

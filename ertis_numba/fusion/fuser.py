@@ -160,7 +160,7 @@ class Fuser:
             sensors=tuple(self._mountings[number].name for number in group),
             missing=tuple(sensor.name for number, sensor in enumerate(self._mountings) if number not in group),
             unheard=tuple(self._mountings[number].name for number in sorted(found.unheard)),
-            _locate=lambda: tables.points(group, found.shares, image),
+            _locate=lambda: tables.points(group, found, image),
         )
 
     def has_tables(self, images: Iterable[Energyscape]) -> bool:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.fusion.attribution import Attribution, Rivalries, Shares
+from ertis_numba.fusion.attribution import Attributed, Attribution, Rivalries
 from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
 from ertis_numba.fusion.points import PointFuser, joined
 from ertis_numba.fusion.polar_grid import PolarGrid
@@ -58,6 +58,7 @@ class FusionTables:
         self._hypotheses: dict[int, list[Hypothesis]] = {}
         self._settings: dict[int, Settings] = {}
         self._late_m: dict[int, dict[int, float]] = {}  # by receiver and emitter
+        self._emitters: dict[int, Emitters] = {}
         self._known: dict[tuple[tuple[int, ...], frozenset[int]], Attribution] = {}
         self._rivalries: Rivalries = {}
         self._points: dict[int, PointFuser] = {}
@@ -118,12 +119,12 @@ class FusionTables:
             stamp=replace(first.stamp, sensor=PLATFORM),
         )
 
-    def points(self, group: Mapping[int, Energyscape], shares: Shares, image: Energyscape) -> PointCloud:
+    def points(self, group: Mapping[int, Energyscape], attributed: Attributed, image: Energyscape) -> PointCloud:
         """Return the points of a group."""
-        found = []
-        for number, each in group.items():
-            found += self._points[number].observations(each, shares, self._late_m[number])
-        return joined(found, self._sensors, image, self.grid)
+        found = [
+            self._points[number].echoes(each, attributed.shares, self._late_m[number]) for number, each in group.items()
+        ]
+        return joined(found, self._sensors, self._receivers, self._emitters, image, self.grid, attributed.bound)
 
     def _same_call(self, emitter: int, number: int) -> bool:
         """Return True unless the calls are known to differ, so that the matched filter suppresses the foreign one."""
@@ -138,7 +139,7 @@ class FusionTables:
             emitter: (self._start_s[emitter] - self._start_s[number]) * speed_m_s for emitter in self._emitting
         }
         deaf = self._deaf[number] = self._direct_sound(number, receiver, late_m)
-        emitters = Emitters(settings, self._diameter_m)
+        emitters = self._emitters[number] = Emitters(settings, self._diameter_m)
         common = self._sensors, emitters, receiver
         pairs = [
             pair_of(

@@ -1,0 +1,338 @@
+"""Association of the echoes of all sensors with the reflectors that cause them."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import kernels
+from ertis_numba.fusion.polar_grid import PolarGrid
+from ertis_numba.fusion.receivers import Receiver
+from ertis_numba.fusion.rig import Emitters, MountedSensor
+
+__all__ = ["Echoes", "Reflectors", "tangents"]
+
+Floats = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+_MIN_SHARE: Final = 0.5
+_GATE: Final = 16.0  # Squared Mahalanobis distance; four standard deviations along one axis.
+_SAME_M: Final = 0.015  # Distance of a lone echo from a reflector that may cause it, in addition to uncertainties.
+_REFINED_M: Final = 0.005  # Path that overlapping echoes add to the uncertainty of a located reflector.
+_ALIKE: Final = 10.0  # Ratio of reflectivities that two echoes of a reflector may show.
+_AUDIBLE: Final = 10 ** (-25.0 / 10)  # Radiated power that causes audible echoes.
+_MIN_SCORE: Final = 0.75  # Sum of the fits of two echoes halfway to the limit of the gate, one of them attributed.
+_N_CONFIRMING: Final = 3  # Echoes that show a reflector which the attribution of the images does not show.
+_EXCESS: Final = 4.0  # Reflectivity relative to the bound of a cell, above which missing echoes exclude a candidate.
+_TINY: Final = 1e-30
+_ROUNDS: Final = 8
+_OUTLIER: Final = 2.0  # Residual, in standard deviations, that has half of the weight.
+_NEAREST_M: Final = 0.05
+_VERTICAL: Final = 1e-6
+# Between emitter and receiver, the path does not depend on the position, which may then be anywhere within 10 m.
+_LEAST_INFORMATION_1_M2: Final = 1 / 10.0**2
+
+
+class Echoes(NamedTuple):
+    """Echoes in the image of one sensor.
+
+    Attributes
+    ----------
+    receiver : int
+    emitters : (emitter,) int64
+        Sensors whose calls may have caused the echoes.
+    direction : (echo, axis) float64
+        Unit vectors from the receiver, in the frame of the platform.
+    path_m : (echo, emitter) float64
+        Path of the sound if it is a call of the emitter.
+    path_sd_m, angle_sd_rad : (echo,) float64
+        Standard deviations of path and direction.
+    power : (echo,) float64
+    share : (echo, emitter) float64
+        Share of each emitter according to the attribution of the images.
+    """
+
+    receiver: int
+    emitters: Numbers
+    direction: Floats
+    path_m: Floats
+    path_sd_m: Floats
+    angle_sd_rad: Floats
+    power: Floats
+    share: Floats
+
+
+class _Candidates(NamedTuple):
+    """Places of reflectors according to single echoes, each of one emitter.
+
+    Attributes
+    ----------
+    echo, emitter : (candidate,) int64
+    place_m : (candidate, axis) float64
+    across : (candidate, axis) float64
+        Horizontal vector of one standard deviation across.
+    reflectivity : (candidate,) float64
+    """
+
+    echo: Numbers
+    emitter: Numbers
+    place_m: Floats
+    across: Floats
+    reflectivity: Floats
+
+    def only(self, number: int) -> "_Candidates":
+        """Return one of the candidates."""
+        one = slice(number, number + 1)
+        return _Candidates(
+            self.echo[one], self.emitter[one], self.place_m[one], self.across[one], self.reflectivity[one]
+        )
+
+
+class Reflectors:
+    """Reflectors that explain echoes jointly, each at the position that fits all of its echoes best.
+
+    An echo may be the call of any sensor, and a flat array cannot tell whether it comes from behind. Each explanation
+    of each echo is a candidate: the place of a reflector, which predicts path and direction of the echoes of all other
+    pairs. The candidate that fits most echoes explains them, and the next one must fit the remaining ones (a greedy
+    solution of the set cover problem). An own echo that nothing else confirms is a reflector if the attribution of
+    the images agrees. A foreign echo alone has several explanations, and is left out.
+
+    Parameters
+    ----------
+    echoes : sequence of Echoes
+        Echoes of each receiver.
+    sensors : sequence of MountedSensor
+    receivers : mapping of int to Receiver
+    emitters : mapping of int to Emitters
+        Model of the emitters in the air of each receiver.
+    grid : PolarGrid
+    bound : (cell,) float32
+        Highest reflectivity of each cell of the grid that the images allow.
+
+    Attributes
+    ----------
+    position_m : (reflector, axis) float64
+    covariance_m2 : (reflector, axis, axis) float64
+    """
+
+    def __init__(
+        self,
+        echoes: Sequence[Echoes],
+        sensors: Sequence[MountedSensor],
+        receivers: Mapping[int, Receiver],
+        emitters: Mapping[int, Emitters],
+        grid: PolarGrid,
+        bound: NDArray[np.float32],
+    ) -> None:
+        self._grid, self._bound = grid, bound
+        self._locate = kernels.load_fusion().locate_reflector
+        self._sensor_m = np.array([each.translation_m for each in sensors])
+        self._ahead = np.array([each.rotation[:, 0] for each in sensors])
+        self._sensors, self._receivers, self._emitters = sensors, receivers, emitters
+        self._receiver = np.concatenate([np.full(len(each.power), each.receiver) for each in echoes])
+        n_echoes, n_sensors = len(self._receiver), len(sensors)
+        self._path_m, self._share = np.full((n_echoes, n_sensors), np.nan), np.zeros((n_echoes, n_sensors))
+        begin = 0
+        for each in echoes:
+            rows = slice(begin, begin := begin + len(each.power))
+            self._path_m[rows, each.emitters], self._share[rows, each.emitters] = each.path_m, each.share
+        self._direction = np.concatenate([each.direction for each in echoes]).reshape(-1, 3)
+        self._path_sd_m = np.concatenate([each.path_sd_m for each in echoes])
+        self._angle_sd_rad = np.concatenate([each.angle_sd_rad for each in echoes])
+        self._power = np.concatenate([each.power for each in echoes])
+        self._rows = {number: np.flatnonzero(self._receiver == number) for number in receivers}
+        self._is_free = np.ones(n_echoes, dtype=np.bool_)
+        found = self._confirmed()
+        self._add_lone(found)
+        self.position_m = np.array([each[0] for each in found]).reshape(-1, 3)
+        self.covariance_m2 = np.array([each[1] for each in found]).reshape(-1, 3, 3)
+
+    def _candidates(self) -> _Candidates:
+        """Return the places that all echoes lead to, where an emitter radiates audibly."""
+        echo, emitter = np.nonzero(np.isfinite(self._path_m))
+        receiver, path_m, direction = self._receiver[echo], self._path_m[echo, emitter], self._direction[echo]
+        offset_m = self._sensor_m[emitter] - self._sensor_m[receiver]
+        beyond = path_m**2 - np.einsum("ci,ci->c", offset_m, offset_m)
+        to_m = beyond / np.maximum(2 * (path_m - np.einsum("ci,ci->c", direction, offset_m)), 1e-6)
+        place_m = self._sensor_m[receiver] + to_m[:, None] * direction
+        gain = self._gains(place_m)[np.arange(len(place_m)), receiver, emitter]
+        reflectivity = np.divide(self._power[echo], gain, out=np.full(len(gain), np.inf), where=gain > 0)
+        is_possible = (gain > 0) & (reflectivity <= self._limit(place_m))
+        kept = np.flatnonzero((beyond > 0) & (to_m > _NEAREST_M) & is_possible)
+        sideways = np.stack([-direction[kept, 1], direction[kept, 0], np.zeros(len(kept))], axis=1)
+        across = sideways * (to_m[kept] * self._angle_sd_rad[echo[kept]])[:, None]
+        return _Candidates(echo[kept], emitter[kept], place_m[kept], across, reflectivity[kept])
+
+    def _limit(self, place_m: Floats) -> Floats:
+        """Return the highest reflectivity that the images allow at places: 0 outside of the grid."""
+        cell = self._grid.cell_of(place_m)
+        return np.where(cell >= 0, _EXCESS * self._bound[cell.clip(0)].astype(np.float64), 0.0)
+
+    def _gains(self, place_m: Floats) -> Floats:
+        """Return the power of echoes relative to those at 1 m ahead, or 0 where they are not audible.
+
+        Its shape is (place, receiver, emitter).
+        """
+        away_m = place_m[:, None] - self._sensor_m
+        apart_m = np.linalg.norm(away_m, axis=2)
+        cosine = np.einsum("psi,si->ps", away_m, self._ahead) / np.maximum(apart_m, _NEAREST_M)
+        gain = np.zeros((len(place_m), len(self._sensors), len(self._sensors)))
+        for number, model in self._emitters.items():
+            radiated = model.power(cosine)
+            spreading = model.spreading(apart_m, apart_m[:, number, None])
+            gain[:, number] = np.where(radiated > _AUDIBLE, radiated, 0) * spreading
+        return gain
+
+    def _fits(self, candidates: _Candidates, extra_m: float) -> tuple[Numbers, Numbers, Numbers, Floats]:
+        """Return the free echoes that candidates predict: candidate, echo, emitter and squared distance."""
+        away_m = candidates.place_m[:, None] - self._sensor_m
+        apart_m = np.maximum(np.linalg.norm(away_m, axis=2), _NEAREST_M)
+        toward = away_m / apart_m[..., None]
+        depth = np.einsum("csi,si->cs", toward, self._ahead)
+        seen = toward - 2 * np.minimum(depth, 0.0)[..., None] * self._ahead
+        across_rad2 = np.einsum("ci,ci->c", candidates.across, candidates.across)[:, None] / apart_m**2
+        which, echo, turned = self._in_direction(seen, depth, across_rad2)
+        receiver = self._receiver[echo]
+        slope = np.einsum("csi,ci->cs", toward, candidates.across)
+        slope = slope[which] + slope[which, receiver][:, None]
+        late_m = self._path_m[echo] - apart_m[which] - apart_m[which, receiver][:, None]
+        distance = turned[:, None] + late_m**2 / (slope**2 + self._path_sd_m[echo, None] ** 2 + extra_m**2)
+        # Echoes of a reflector show about the same reflectivity; those from behind may be weaker.
+        expected = candidates.reflectivity[which, None] * self._gains(candidates.place_m)[which, receiver]
+        power, is_behind = self._power[echo, None], depth[which, receiver][:, None] < 0
+        is_alike = (power < _ALIKE * expected) & (is_behind | (_ALIKE * power > expected))
+        entry, emitter = np.nonzero((distance < _GATE) & is_alike)  # False for NaN, where there is no path.
+        return which[entry], echo[entry], emitter, distance[entry, emitter]
+
+    def _in_direction(self, seen: Floats, depth: Floats, across_rad2: Floats) -> tuple[Numbers, Numbers, Floats]:
+        """Return the free echoes in the directions of candidates: candidate, echo and squared distance."""
+        found = []
+        for number, rows in self._rows.items():
+            free = rows[self._is_free[rows]]
+            # The chord is the angle, as it is small.
+            angle_rad2 = np.maximum(0.0, 2 - 2 * seen[:, number] @ self._direction[free].T)
+            angle_rad2 /= across_rad2[:, number, None] + self._angle_sd_rad[free] ** 2
+            is_near = angle_rad2 < _GATE
+            if not self._receivers[number].is_flat:
+                is_near &= depth[:, number, None] >= 0
+            which, echo = np.nonzero(is_near)
+            found.append((which, free[echo], angle_rad2[which, echo]))
+        which, echo, distance = (np.concatenate(each) for each in zip(*found, strict=True))
+        return which, echo, distance
+
+    def _confirmed(self) -> list[tuple[Floats, Floats]]:
+        """Return the reflectors that several echoes confirm, and take these echoes."""
+        candidates = self._candidates()
+        which, echo, emitter, distance = self._fits(candidates, 0.0)
+        n_candidates, n_echoes = len(candidates.echo), len(self._receiver)
+        # An echo confirms a candidate once, by the emitter that fits best.
+        fit = (1 - distance / _GATE) * (1 + self._share[echo, emitter]) / 2
+        order = np.lexsort((-fit, echo, which))
+        key = which[order] * n_echoes + echo[order]
+        order = order[np.diff(key, prepend=-1) > 0]
+        score = np.bincount(which[order], fit[order], minlength=n_candidates)
+        by_echo = order[np.argsort(echo[order], kind="stable")]
+        bounds = np.searchsorted(echo[by_echo], np.arange(n_echoes + 1))
+        found = []
+        while n_candidates:
+            best = int(np.argmax(score))
+            if score[best] <= _MIN_SCORE:
+                break
+            taken = np.empty(0, np.int64)
+            if self._is_free[candidates.echo[best]]:
+                reflector, taken = self._accepted(candidates, best)
+                if reflector is not None:
+                    found.append(reflector)
+            score[best] = -1.0
+            for each in taken[self._is_free[taken]]:
+                self._is_free[each] = False
+                entries = by_echo[bounds[each] : bounds[each + 1]]
+                np.subtract.at(score, which[entries], fit[entries])
+        return found
+
+    def _accepted(self, candidates: _Candidates, best: int) -> tuple[tuple[Floats, Floats] | None, Numbers]:
+        """Return the reflector at a candidate if enough echoes confirm it, and all echoes that it explains."""
+        here = candidates.only(best)
+        extra_m, covariance_m2, echo = 0.0, np.empty((3, 3)), np.empty(0, np.int64)
+        for _ in range(2):
+            _, echo, emitters, distance = self._fits(here, extra_m)
+            members, emitter = self._members(echo, emitters, distance)
+            is_own = self._receiver[members] == emitter
+            is_likely = np.any(is_own & (self._share[members, emitter] > _MIN_SHARE))
+            if len(members) < (2 if is_likely else _N_CONFIRMING):
+                return None, np.empty(0, np.int64)
+            place_m, covariance_m2 = self._located(members, emitter, here.place_m[0])
+            gain = self._gains(place_m[None])[0, self._receiver[members], emitter]
+            reflectivity = np.median(self._power[members] / np.maximum(gain, _TINY))
+            here = _Candidates(here.echo, here.emitter, place_m[None], np.zeros((1, 3)), np.array([reflectivity]))
+            extra_m = _REFINED_M
+        return (here.place_m[0], covariance_m2), np.unique(echo)
+
+    def _members(self, echo: Numbers, emitter: Numbers, distance: Floats) -> tuple[Numbers, Numbers]:
+        """Return the best echo of each pair, and its emitter; no echo twice."""
+        taken: set[int | tuple[int, int]] = set()
+        found = []
+        for entry in np.argsort(distance, kind="stable").tolist():
+            one = int(echo[entry])
+            pair = int(emitter[entry]), int(self._receiver[one])
+            if one not in taken and pair not in taken:
+                taken |= {one, pair}
+                found.append(entry)
+        return echo[found], emitter[found]
+
+    def _add_lone(self, found: list[tuple[Floats, Floats]]) -> None:
+        """Add the reflectors that a single own echo shows, and that the attribution does not explain otherwise."""
+        own = self._share[np.arange(len(self._receiver)), self._receiver]
+        kept = self._is_free & (self._share.sum(axis=1) > _MIN_SHARE) & (own >= self._share.max(axis=1)) & (own > 0)
+        for echo in np.flatnonzero(kept)[np.argsort(-self._power[kept], kind="stable")]:
+            sensor = self._receiver[echo : echo + 1]
+            place_m = self._sensor_m[sensor[0]] + self._path_m[echo, sensor[0]] / 2 * self._direction[echo]
+            _, covariance_m2 = self._located(np.array([echo]), sensor, place_m)
+            if _is_apart(place_m, covariance_m2, found):
+                found.append((place_m, covariance_m2))
+
+    def _located(self, members: Numbers, emitter: Numbers, place_m: Floats) -> tuple[Floats, Floats]:
+        """Return the position of a reflector and its covariance: (axis,) and (axis, axis) float64."""
+        receiver, direction = self._receiver[members], self._direction[members]
+        ahead = self._ahead[receiver]
+        depth = np.einsum("ei,ei->e", place_m - self._sensor_m[receiver], ahead)
+        back = 2 * np.where(depth < 0, np.einsum("ei,ei->e", direction, ahead), 0.0)
+        direction = direction - back[:, None] * ahead
+        position_m, covariance_m2 = place_m.copy(), np.empty((3, 3))
+        is_alone = len(members) == 1
+        self._locate(
+            self._sensor_m[emitter],
+            self._sensor_m[receiver],
+            self._path_m[members, emitter],
+            np.array([[each, *tangents(each)] for each in direction]),
+            np.stack([self._path_sd_m[members], self._angle_sd_rad[members]], axis=1),
+            _LEAST_INFORMATION_1_M2,
+            _NEAREST_M,
+            math.inf if is_alone else _OUTLIER,
+            1 if is_alone else _ROUNDS,
+            position_m,
+            covariance_m2,
+        )
+        return position_m, covariance_m2
+
+
+def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[tuple[Floats, Floats]]) -> bool:
+    """Return True if no reflector is at a place: another echo there is a shoulder, or overlaps with other echoes."""
+    if not found:
+        return True
+    offset_m = place_m - np.array([each[0] for each in found])
+    spread_m2 = np.array([each[1] for each in found]) + covariance_m2 + _SAME_M**2 * np.eye(3)
+    distance = np.einsum("ri,ri->r", offset_m, np.linalg.solve(spread_m2, offset_m[..., None])[..., 0])
+    return bool(distance.min() >= _GATE)
+
+
+def tangents(direction: Floats) -> Floats:
+    """Return two unit vectors across a direction: (2, axis) float64."""
+    x, y, z = direction.tolist()
+    level = math.hypot(x, y)
+    # Straight up, any horizontal direction will do.
+    left = np.array([-y / level, x / level, 0.0]) if level > _VERTICAL else np.array([0.0, 1.0, 0.0])
+    up = np.array([-z * left[1], z * left[0], x * left[1] - y * left[0]])
+    return np.stack([left, up])
