@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.fusion.association import Echoes, Reflectors
+from ertis_numba.fusion.association import Reflectors, SensorEchoes
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.rig import Emitters, mounted_sensors
 
@@ -56,7 +56,7 @@ def echoes_of(places_m, pairs=None, share=0.0, draws=None, *, is_flat=True):
                 power.append(MODEL.spreading(from_m, to_m))
         count = len(path_m)
         found.append(
-            Echoes(
+            SensorEchoes(
                 receiver=number,
                 emitters=np.arange(N_SENSORS),
                 direction=np.array(direction).reshape(-1, 3),

@@ -12,7 +12,7 @@ from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
 
-__all__ = ["Echoes", "Reflectors", "tangents"]
+__all__ = ["Reflectors", "SensorEchoes", "tangents"]
 
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -35,7 +35,7 @@ _VERTICAL: Final = 1e-6
 _LEAST_INFORMATION_1_M2: Final = 1 / 10.0**2
 
 
-class Echoes(NamedTuple):
+class SensorEchoes(NamedTuple):
     """Echoes in the image of one sensor.
 
     Attributes
@@ -101,7 +101,7 @@ class Reflectors:
 
     Parameters
     ----------
-    echoes : sequence of Echoes
+    echoes : sequence of SensorEchoes
         Echoes of each receiver.
     sensors : sequence of MountedSensor
     receivers : mapping of int to Receiver
@@ -119,7 +119,7 @@ class Reflectors:
 
     def __init__(
         self,
-        echoes: Sequence[Echoes],
+        echoes: Sequence[SensorEchoes],
         sensors: Sequence[MountedSensor],
         receivers: Mapping[int, Receiver],
         emitters: Mapping[int, Emitters],

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.fusion.association import Echoes, Reflectors, tangents
+from ertis_numba.fusion.association import Reflectors, SensorEchoes, tangents
 from ertis_numba.fusion.attribution import Shares
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
@@ -56,7 +56,7 @@ class PointFuser:
         self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
         self._extract = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP)
 
-    def echoes(self, image: Energyscape, shares: Shares, late_m: Mapping[int, float]) -> Echoes:
+    def echoes(self, image: Energyscape, shares: Shares, late_m: Mapping[int, float]) -> SensorEchoes:
         """Return the echoes of an image, strongest first.
 
         Parameters
@@ -73,7 +73,7 @@ class PointFuser:
         range_m = np.linalg.norm(place_m, axis=1)
         emitters = [emitter for emitter, number in shares if number == self._number]
         direction = place_m / range_m[:, None]
-        return Echoes(
+        return SensorEchoes(
             receiver=self._number,
             emitters=np.array(emitters, dtype=np.int64),
             direction=direction @ self._mounting.rotation.T,
@@ -97,7 +97,7 @@ class PointFuser:
 
 
 def joined(
-    echoes: Sequence[Echoes],
+    echoes: Sequence[SensorEchoes],
     sensors: Sequence[MountedSensor],
     receivers: Mapping[int, Receiver],
     emitters: Mapping[int, Emitters],
