@@ -13,7 +13,7 @@ import pytest
 import threadpoolctl
 
 # The load of a machine must not decide whether a law holds.
-hypothesis.settings.register_profile("any_load", deadline=None)
+hypothesis.settings.register_profile("any_load", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
 hypothesis.settings.load_profile("any_load")
 
 

@@ -19,7 +19,7 @@ from tests.campaigns import ended, names_in, outcomes, run_here, write_recording
 from tests.files import line, noise
 
 PATIENCE_S = 60.0
-LONG = 20  # measurements; without compiled kernels, a recording of so many takes a while to process
+LONG = 60  # measurements; without compiled kernels, a recording of so many takes a while to process
 FEW_MICS = line(8, 8)
 
 

@@ -5,7 +5,7 @@ import random
 import msgspec
 import pytest
 from ertis_cli._product_printer import PRINTERS
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import given, settings, strategies as st
 
 from ertis_numba.errors import DataError, FormatVersionError
 from ertis_numba.network import messages
@@ -182,7 +182,7 @@ def test_value_beyond_its_limits_is_refused(field, value):
         decode(header)
 
 
-@settings(max_examples=100, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=100)
 @given(
     st.recursive(
         st.none() | st.booleans() | INT64 | st.floats() | st.text(max_size=20) | st.binary(max_size=20),

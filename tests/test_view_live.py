@@ -26,7 +26,7 @@ def test_latest_of_each_sensor_is_shown_and_the_rest_counted():
         ]
         assert (live.skipped, live.dropped, live.take()) == (8, 0, [])
         assert shown[0].pose.translation_m == Publisher.translation_m
-        assert live.latency_s(shown) == pytest.approx(time.time() - 1_700_000_000.4, abs=5)
+        assert live.latency_s(shown) == pytest.approx(time.time() - 1_700_000_000.4, abs=60)
 
 
 def view_of(source, **choices):
@@ -39,7 +39,7 @@ def test_unset_clock_gives_no_age():
     with Live("tcp://127.0.0.1:1") as live:
         assert live.latency_s([unset]) is None
         assert live.latency_s([]) is None
-        assert live.latency_s([unset, timed]) == pytest.approx(time.time() - 1_700_000_000, abs=5)
+        assert live.latency_s([unset, timed]) == pytest.approx(time.time() - 1_700_000_000, abs=60)
 
 
 def test_fading_points_are_redrawn_without_new_images():

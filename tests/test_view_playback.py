@@ -60,9 +60,8 @@ def test_playback_plays_pauses_and_steps(tmp_path):
         playback.seek(2)
         (shown,) = wait_for(playback.take)
         assert (shown.image.stamp.sequence, playback.shown, playback.playing) == (2, 2, False)
+        seen, begun_s = [shown], time.monotonic()
         playback.play(playing=True)
-        seen = [shown]
-        begun_s = time.monotonic()
         while playback.playing or seen[-1].image.stamp.sequence != 3:
             seen += playback.take()
             assert time.monotonic() - begun_s < PATIENCE_S

@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, event, given, settings, strategies as st
+from hypothesis import Phase, event, given, settings, strategies as st
 
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
@@ -175,7 +175,6 @@ def words_for(pipeline, kind, seed):
     deadline=None,
     derandomize=True,
     phases=[Phase.generate],  # shrinking a failing example takes minutes
-    suppress_health_check=[HealthCheck.too_slow],
 )
 @given(
     made=any_settings(), kind=st.sampled_from(DATA), seed=st.integers(0, 99), device=st.sampled_from(["cpu", "numpy"])
