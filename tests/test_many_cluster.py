@@ -214,7 +214,8 @@ def test_missing_scheduler_is_reported(monkeypatch, runs, tmp_path):
 
 
 def test_missing_workers_are_reported(monkeypatch, runs, tmp_path):
-    monkeypatch.setattr(dask_workers, "_CONNECT_S", 1.0)
+    require = cluster.require_workers
+    monkeypatch.setattr(cluster, "require_workers", lambda *given, **_: require(*given, timeout_s=0.1))
     with (
         cluster_of_threads(0) as address,
         pytest.raises(NetworkError, match=r"has no workers; start some with 'dask worker tcp://"),
