@@ -257,7 +257,7 @@ def test_uncertain_poses_make_maps_less_certain():
 
 
 @pytest.mark.parametrize("n_dimensions", [2, 3])
-@pytest.mark.parametrize("strength", [1.0, 0.01])
+@pytest.mark.parametrize("strength", [1.0, 0.6])
 def test_uncertain_pose_spreads_the_evidence_of_an_echo(monkeypatch, n_dimensions, strength):
     """Its sum remains, and its spread is that of position, and of heading times range."""
     monkeypatch.setattr(sensor_model, "_FREE", 0.0)
@@ -313,6 +313,15 @@ def everywhere(n_dimensions=2, reach_m=3.0, step_m=0.05):
     return Coverage(grid, np.ones((grid.n_directions, grid.n_ranges)))
 
 
+def limit_nothing(monkeypatch, **trust):
+    """Let an echo add all of its evidence."""
+    free = {
+        number: each._replace(**{"clear": 30.0, "cell": 1e6, "missed": 0.0, **trust})
+        for number, each in sensor_model.TRUST.items()
+    }
+    monkeypatch.setattr(sensor_model, "TRUST", free)
+
+
 def axes_m(window):
     """Centres of the cells along x, y and z, which broadcast against the log-odds."""
     z_m, y_m, x_m = (
@@ -326,13 +335,13 @@ def axes_m(window):
 def test_evidence_of_a_point_is_that_of_its_ellipse(monkeypatch, n_dimensions):
     """The sum over all cells is that of one echo, and its spread that of the point's uncertainty."""
     monkeypatch.setattr(sensor_model, "_FREE", 0.0)
-    monkeypatch.setattr(sensor_model, "_MOST", math.inf)
+    limit_nothing(monkeypatch)
     monkeypatch.setattr(sensor_model, "MAX_LOG_ODDS", math.inf)
     echoes = echoes_of(np.array([[1.0, 0.0, 0.0]]), np.array([[0.05, 0.1]]), np.ones(1))
     window = CellGrid(0.02, n_dimensions).window(np.zeros(3), 1.5)
     add_evidence(window, ORIGIN, echoes, everywhere(n_dimensions), near_m=0.0)
     total = float(window.log_odds.sum())
-    assert total == pytest.approx(5.0, rel=0.02)
+    assert total == pytest.approx(sensor_model.TRUST[n_dimensions].total, rel=0.02)
     spread = [
         math.sqrt(float((window.log_odds * (offset_m - middle_m) ** 2).sum()) / total)
         for offset_m, middle_m in zip(axes_m(window)[:n_dimensions], (1.0, 0.0, 0.0)[:n_dimensions], strict=True)
@@ -341,22 +350,48 @@ def test_evidence_of_a_point_is_that_of_its_ellipse(monkeypatch, n_dimensions):
     assert spread == pytest.approx([along_m, across_m, across_m][:n_dimensions], rel=0.05)
 
 
-@pytest.mark.parametrize("n_dimensions", [2, 3])
-def test_two_pulses_make_a_cell_occupied_but_not_one(n_dimensions):
-    grid = CellGrid(0.05, n_dimensions)
-    echoes = echoes_of(np.array([[2.0, 0.0, 0.0]]), np.zeros((1, 2)), np.ones(1))
+@pytest.mark.parametrize(
+    ("n_dimensions", "strength", "weight", "n_pulses"),
+    [(2, 0.99, 1.0, 1), (2, 0.9, 1.0, 2), (3, 0.9, 1.0, 1), (3, 0.9, 0.2, 3)],
+)
+def test_doubtful_echoes_must_repeat_until_a_cell_is_occupied(n_dimensions, strength, weight, n_pulses):
+    """Doubtful echoes are weak in a plane, and beside the sensors in space."""
+    grid, coverage = CellGrid(0.05, n_dimensions), everywhere(n_dimensions)
+    coverage = coverage._replace(weight=weight * coverage.weight)
+    echoes = echoes_of(np.array([[2.0, 0.0, 0.0]]), np.zeros((1, 2)), np.full(1, strength), n_dimensions)
     found = []
-    for _ in range(2):
+    for _ in range(n_pulses):
         window = grid.window(np.zeros(3), 3.0)
-        add_evidence(window, ORIGIN, echoes, everywhere(n_dimensions), near_m=0.0)
+        add_evidence(window, ORIGIN, echoes, coverage, near_m=0.0)
         found.append(ertis.OccupancyMap(window.log_odds, (0.0, 0.0, 0.0), 0.05).is_occupied.any())
-    assert found == [False, True]
+    assert found == [False] * (n_pulses - 1) + [True]
 
 
-def share_behind(monkeypatch, obstacle_m, known, n_dimensions=2):
+@pytest.mark.parametrize("n_dimensions", [2, 3])
+def test_cells_lose_evidence_in_pulses_without_their_echo(n_dimensions):
+    """They become unknown again, and not free. Hidden cells and those at unknown poses keep their evidence."""
+    no_echo, far_m, hidden_m = echoes_of(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros(0)), 2.0, 2.5
+    window = CellGrid(0.05, n_dimensions).window(np.zeros(3), 3.0)
+    x_m, y_m, z_m = axes_m(window)
+    is_near = np.hypot(y_m, z_m) < 0.2
+    for place_m, log_odds in ((far_m, 1.0), (far_m + 0.1, 4.0), (hidden_m, 1.0)):
+        window.log_odds[is_near & (np.abs(x_m - place_m) < 0.05)] = log_odds
+
+    def after(n_pulses, view):
+        for _ in range(n_pulses):
+            add_evidence(window, view, no_echo, everywhere(n_dimensions), near_m=0.0)
+        return [float(window.log_odds[is_near & (np.abs(x_m - place_m) < 0.05)].max()) for place_m in (far_m, hidden_m)]
+
+    lost = sensor_model.TRUST[n_dimensions].missed
+    assert after(1, ORIGIN._replace(covariance=covariance_of(100.0, 0.0))) == pytest.approx([1.0, 1.0], abs=1e-6)
+    assert after(2, ORIGIN) == pytest.approx([1.0 - 2 * lost, 1.0], abs=1e-6)
+    assert after(math.ceil(1.0 / lost), ORIGIN) == [0.0, 1.0]
+
+
+def share_behind(monkeypatch, obstacle_m, known, n_dimensions=2, **trust):
     """Evidence for an echo at 2 m, in a map and with an echo of an obstacle, relative to that without them."""
     monkeypatch.setattr(sensor_model, "_FREE", 0.0)
-    monkeypatch.setattr(sensor_model, "_MOST", math.inf)
+    limit_nothing(monkeypatch, **trust)
     monkeypatch.setattr(sensor_model, "MAX_LOG_ODDS", math.inf)
     found = []
     for places_m in ([obstacle_m, (2.0, 0.0)], [(2.0, 0.0)]):
@@ -384,7 +419,9 @@ def test_post_in_free_space_hides_the_directions_that_it_covers(monkeypatch):
     def known(x_m, y_m):
         return np.where((np.abs(x_m - 1.0) < 0.05) & (np.abs(y_m - 0.1) < 0.05), 4.0, -2.0)
 
-    assert share_behind(monkeypatch, (1.0, 0.1), known) == pytest.approx((8 / 11) ** 2)
+    # With so much evidence, all cells of an echo have the largest one, which is proportional to the log-odds.
+    share = share_behind(monkeypatch, (1.0, 0.1), known, clear=10.0, strength=0.0, hidden=4.0, cell=1.0, total=1e9)
+    assert share == pytest.approx(1 - 0.4 * (1 - (8 / 11) ** 2))
 
 
 def test_mapped_wall_hides_echoes_behind_it_but_not_its_own(monkeypatch):
@@ -398,7 +435,7 @@ def test_mapped_wall_hides_echoes_behind_it_but_not_its_own(monkeypatch):
 
 
 def test_strength_of_points_grows_with_their_amplitude_relative_to_the_usual_one():
-    strength = UsualAmplitude().strength(np.array([0.0, 0.2, 1.0, 1.0, 1.0], np.float32))
+    strength = UsualAmplitude().strength(np.array([0.0, 0.08, 1.0, 1.0, 1.0], np.float32))
     assert strength[:2] == pytest.approx([0.0, 0.5], abs=1e-6)
     assert strength[2] > 0.95
 

@@ -44,7 +44,7 @@ def test_evidence_is_that_of_the_direction_and_range_of_each_cell(n_elevations):
     draws = np.random.default_rng(3)
     cells = CELLS if n_elevations > 1 else (1, *CELLS[1:])
     occupied = np.maximum(draws.normal(size=cells), 0).astype(np.float32)
-    free = draws.uniform(0.0, 1.0, (n_elevations, 24, 14)).astype(np.float32)
+    free = draws.uniform(-0.5, 1.0, (n_elevations, 24, 14)).astype(np.float32)
     turn = Rotation.from_euler("zyx", [40.0, 20.0, 10.0] if n_elevations > 1 else [40.0, 0.0, 0.0], degrees=True)
     place = np.array([5.2, 4.1, 3.3 if n_elevations > 1 else 0.0])
     numbers = np.float32(0.1), np.float32(0.6), free, place, turn.as_matrix(), 0.5, 1.3, np.float32(0.5), np.float32(2)

@@ -61,6 +61,7 @@ def add_evidence(
     local = np.stack(np.broadcast_arrays(x, y, z), axis=-1) @ rotation
     away = np.linalg.norm(local, axis=-1)
     shown = np.where(away < near, near_free, _at(free, local, away / step))
+    shown = np.where(shown < 0, np.minimum(-shown, np.maximum(out, 0)), shown)
     shown[occupied > touched] = 0
     out[:] = np.where(evidence - shown != 0, (out + evidence - shown).clip(-limit, limit), out)
 

@@ -12,12 +12,13 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 _USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that defines the usual one.
-# Amplitude, relative to the usual one, at which one half of the points are ghosts, as measured in simulated places.
-_GHOST: Final = 0.2
+# Amplitude, relative to the usual one, at which one half of the points would be ghosts, from a logistic regression of
+# points in simulated places without obstacles in front of them.
+_GHOST: Final = 0.08
 _SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.
 # Errors of positions that noise does not explain: overlapping echoes of rough walls, mountings and poses.
 _RANGE_SD_M: Final = 0.01
-_ANGLE_SD_RAD: Final = math.radians(0.3)
+_ANGLE_SD_RAD: Final = {2: math.radians(0.3), 3: math.radians(0.7)}  # By number of dimensions.
 _NEAREST_M: Final = 0.01  # Range below which directions have no meaning.
 
 
@@ -125,7 +126,7 @@ class UsualAmplitude:
         return np.asarray(power / (power + _GHOST**2))
 
 
-def echoes_of(offset_m: Floats, uncertainty_m: Floats, strength: Floats) -> LocatedEchoes:
+def echoes_of(offset_m: Floats, uncertainty_m: Floats, strength: Floats, n_dimensions: int = 2) -> LocatedEchoes:
     """Return points as echoes, whose uncertainties include errors that noise does not explain.
 
     Parameters
@@ -135,7 +136,10 @@ def echoes_of(offset_m: Floats, uncertainty_m: Floats, strength: Floats) -> Loca
     uncertainty_m : (point, 2) float64
         Standard deviations along and across the direction.
     strength : (point,) float64
+    n_dimensions : int
+        Number of dimensions of the map.
     """
     range_m = np.linalg.norm(offset_m, axis=1)
-    sd_m = np.hypot(uncertainty_m, np.stack([np.full(len(range_m), _RANGE_SD_M), _ANGLE_SD_RAD * range_m], axis=1))
+    added_m = np.stack([np.full(len(range_m), _RANGE_SD_M), _ANGLE_SD_RAD[n_dimensions] * range_m], axis=1)
+    sd_m = np.hypot(uncertainty_m, added_m)
     return LocatedEchoes(offset_m, sd_m, strength)

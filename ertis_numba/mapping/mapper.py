@@ -212,7 +212,7 @@ class Mapper:
             offset_m[:, 2] = 0.0
         uncertainty_m = np.zeros((len(points), 2)) if points.uncertainty_m is None else points.uncertainty_m
         strength = self._usual.strength(points.amplitude[kept])
-        return echoes_of(offset_m, np.asarray(uncertainty_m, np.float64)[kept], strength)
+        return echoes_of(offset_m, np.asarray(uncertainty_m, np.float64)[kept], strength, self._dimensions)
 
 
 def _at_rest(points: PointCloud, trajectory: Trajectory, rotation: Floats) -> PointCloud:

@@ -4,17 +4,18 @@ The same code serves planes and spaces: a plane has one layer of cells and one r
 """
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit, logit
 
 from ertis_numba import kernels
 from ertis_numba.mapping.cell_grid import Window
 from ertis_numba.mapping.coverage import Coverage
 from ertis_numba.mapping.echoes import LocatedEchoes, View
 
-__all__ = ["MAX_LOG_ODDS", "add_evidence"]
+__all__ = ["MAX_LOG_ODDS", "TRUST", "Trust", "add_evidence"]
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -22,23 +23,70 @@ Singles = NDArray[np.float32]
 
 MAX_LOG_ODDS: Final = 4.0
 """Limit of log-odds, which keeps the map able to change (K. M. Wurm et al., OctoMap, 2010)."""
-_OCCUPIED: Final = 5.0  # Log-odds of a clear echo, shared among the cells that may contain it.
-_MOST: Final = 0.6  # Log-odds of a cell from one pulse; ghosts seldom repeat, so that a single one is not enough.
 _FREE: Final = 0.6  # Log-odds of a cell in front of the first clear echo, near the platform.
 _FREE_M: Final = 1.0  # Free range in directions without any clear echo.
 _IN_FRONT_M: Final = 0.05  # Space in front of an echo that is not free yet.
 _BEHIND_M: Final = 0.3  # Distance behind an obstacle within the beam from which it hides echoes.
-_DEPTH_M: Final = 0.1  # The same for a wall of the map in the direction of the echo: the thickness of its cells.
+_DEPTH_M: Final = 0.05  # The same for a wall of the map in the direction of the echo: the thickness of its cells.
 _WALL: Final = 1.5  # Log-odds from which a cell hides those behind it.
 _OPEN: Final = -0.5  # Log-odds below which a cell lets sound pass.
-_CLEAR: Final = 0.6  # Weight of a clear echo.
+_CLEAR: Final = 0.9  # Probability of a clear echo.
+_CERTAIN: Final = 0.9975  # Highest probability; so many of the strongest points are reflectors.
 # Angles between the middles of directions; the quarters of a degree make room for rounding.
 _HALF_BEAM_RAD: Final = math.radians(5.25)  # Directions beside an echo in which it may hide others.
 _HALF_RAY_RAD: Final = math.radians(1.25)  # The same beside a wall of the map, whose directions are known.
-_DISTRUST: Final = 0.25  # Exponent of the coverage in the weight of echoes, of which more are ghosts at the edges.
 _REACH_SD: Final = 3.0  # Standard deviations within which an echo counts.
 _POSE_SD: Final = 2.0  # Distance of free space from echoes, in standard deviations of the pose.
-_TOUCHED: Final = 0.02  # Probability of an echo in a cell from which the cell is not free.
+_TOUCHED: Final = 0.1  # Evidence of an echo from which a cell is not free.
+
+
+class Trust(NamedTuple):
+    """Trust in echoes, from a logistic regression of simulated reflectors and ghosts.
+
+    Attributes
+    ----------
+    clear : float
+        Log-odds of an open echo ahead of a sensor, in addition to those of its amplitude.
+    strength : float
+        Factor of the log-odds of the amplitude.
+    hidden : float
+        Loss behind obstacles.
+    beside : float
+        Loss for each unit of coverage below 0.4.
+    cell : float
+        Log-odds of a cell relative to those of the echo in it. Reflectors often repeat, and ghosts seldom do.
+    total : float
+        Log-odds of a certain echo, shared among the cells that may contain it.
+    missed : float
+        Log-odds that an occupied cell ahead of a sensor loses in a pulse without an echo there.
+    """
+
+    clear: float
+    strength: float
+    hidden: float
+    beside: float
+    cell: float
+    total: float
+    missed: float
+
+    @property
+    def most(self) -> float:
+        """Log-odds of a cell with a certain echo."""
+        return self.cell * float(self.log_odds(*np.ones((3, 1)))[0])
+
+    def log_odds(self, strength: Floats, visible: Floats, coverage: Floats) -> Floats:
+        """Return the log-odds of echoes, negative infinity for those that no sensor can hear: (point,) float64."""
+        found = self.clear + self.strength * logit(np.clip(strength, 1 - _CERTAIN, _CERTAIN))
+        found -= self.hidden * (1 - visible) + self.beside * np.maximum(_AHEAD - coverage, 0.0)
+        return np.asarray(np.where((coverage > 0) & (visible > 0), found, -np.inf))
+
+
+TRUST: Final = {
+    2: Trust(clear=0.0, strength=1.0, hidden=3.7, beside=0.0, cell=0.19, total=10.0, missed=0.1),
+    3: Trust(clear=1.5, strength=0.0, hidden=1.6, beside=5.6, cell=0.6, total=15.0, missed=0.03),
+}
+"""Trust in echoes by number of dimensions. Those in space overlap more often, so their amplitude shows little."""
+_AHEAD: Final = 0.4  # Coverage from which echoes are equally good.
 
 
 def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Coverage, *, near_m: float) -> None:
@@ -63,15 +111,20 @@ def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Co
     seen_m = np.where(np.isfinite(first_m), first_m, _FREE_M + _IN_FRONT_M)
     is_open = _log_odds(window, view, ahead * seen_m[:, None]) < _OPEN
     hiding_m = np.minimum(np.where(is_open, np.inf, first_m), wall_m)
-    trusted = echoes.strength * coverage.at(echoes.offset_m) ** _DISTRUST
-    trusted *= _visible(echoes, cosine, np.cos(grid.elevations_rad), hiding_m, wall_m)
+    visible = _visible(echoes, cosine, np.cos(grid.elevations_rad), hiding_m, wall_m)
+    trust = TRUST[2 if window.is_planar else 3]
+    log_odds = trust.log_odds(echoes.strength, visible, coverage.at(echoes.offset_m))
     position_sd_m, rotation_sd_rad = view.sd
     end_m = np.minimum(_end_m(echoes, cosine, first_m, position_sd_m, rotation_sd_rad), wall_m)
-    free = np.where(grid.range_m < end_m[:, None], _FREE * coverage.weight, 0.0).astype(np.float32)
+    is_free = grid.range_m < end_m[:, None]
+    is_ahead = grid.range_m < (hiding_m + _BEHIND_M)[:, None]
+    # With an uncertain pose, the echo of a cell may be in another one.
+    missed = trust.missed / (1 + (position_sd_m**2 + (rotation_sd_rad * grid.range_m) ** 2) / window.cell_m**2)
+    free = (coverage.weight * np.where(is_free, _FREE, np.where(is_ahead, -missed, 0.0))).astype(np.float32)
     kernel.add_evidence(
-        _occupied(window, view, echoes._replace(strength=trusted)),
-        np.float32(_OCCUPIED * _TOUCHED),
-        np.float32(_MOST),
+        _occupied(window, view, echoes, log_odds, trust),
+        np.float32(_TOUCHED),
+        np.float32(trust.most),
         free.reshape(-1, grid.n_azimuths, grid.n_ranges),
         window.cells_of(view.place_m),
         np.ascontiguousarray(view.rotation),
@@ -165,7 +218,7 @@ def _log_odds(window: Window, view: View, offset_m: Floats) -> Singles:
     return np.asarray(window.log_odds[tuple(cells.clip(0, np.array(window.log_odds.shape) - 1).T)])
 
 
-def _occupied(window: Window, view: View, echoes: LocatedEchoes) -> Singles:
+def _occupied(window: Window, view: View, echoes: LocatedEchoes, log_odds: Floats, trust: Trust) -> Singles:
     """Return the evidence for occupied cells: (layer, row, column) float32.
 
     Each echo is normally distributed, and the evidence of a cell is proportional to the density at its middle. An
@@ -185,8 +238,8 @@ def _occupied(window: Window, view: View, echoes: LocatedEchoes) -> Singles:
         window.cells_of(view.place_m + offset_m),
         np.asarray(np.linalg.inv(covariance), np.float64),
         _REACH_SD * np.sqrt(np.einsum("pii->pi", covariance)),
-        _OCCUPIED * echoes.strength * (2 * math.pi) ** (-n_axes / 2) / volume,
-        _MOST * np.sqrt(np.linalg.det(sharp)) / volume,
+        trust.total * expit(log_odds) * (2 * math.pi) ** (-n_axes / 2) / volume,
+        trust.cell * np.maximum(log_odds, 0.0) * np.sqrt(np.linalg.det(sharp)) / volume,
         found,
     )
     return found

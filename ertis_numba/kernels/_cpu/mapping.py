@@ -80,9 +80,12 @@ def add_evidence(occupied, touched, most, free, place, rotation, step, near, nea
                         up = r[0, 2] * x + r[1, 2] * y + r[2, 2] * z
                         s = int(away / step)
                         if s < n_steps:
-                            evidence -= free[
+                            shown = free[
                                 _elevation(ahead, left, up, free.shape[0]), _azimuth(ahead, left, free.shape[1]), s
                             ]
+                            if shown < _ZERO:
+                                shown = min(-shown, max(out[layer, row, column], _ZERO))
+                            evidence -= shown
                 if evidence != _ZERO:
                     out[layer, row, column] = min(max(out[layer, row, column] + evidence, -limit), limit)
 
@@ -94,7 +97,7 @@ def _farthest(free):
     for elevation in range(free.shape[0]):
         for azimuth in range(free.shape[1]):
             for s in range(free.shape[2] - 1, last - 1, -1):
-                if free[elevation, azimuth, s] > _ZERO:
+                if free[elevation, azimuth, s] != _ZERO:
                     last = s + 1
                     break
     return last
