@@ -215,19 +215,31 @@ class PipelinesBySensor:
     ) -> None:
         self._changed, self._stack, self._quiet, self._device = changed, stack, quiet, device
         self._made: dict[str, tuple[Settings, Pipeline]] = {}
+        self._is_checked = False
 
     def settings(self, reader: "RecordingReader") -> "Settings":
         """Return the settings in use for a sensor."""
         return self._changed(reader.settings)
 
     def image(self, measurement: "Measurement | Energyscape") -> "Energyscape":
-        """Return the image of a measurement, or an image of a file itself.
+        """Return the image of a measurement, or an image of a file itself, and warn once of a coarse grid.
 
         Raises
         ------
         UsageError
             Settings are given for an image of a file.
         """
+        from ertis_numba.analysis.direction_spacing import spacing_warning
+
+        image = self._image(measurement)
+        if not self._is_checked:
+            self._is_checked = True
+            text = spacing_warning(image)
+            if text is not None:
+                click.echo(f"ertis: warning: {text}", err=True)
+        return image
+
+    def _image(self, measurement: "Measurement | Energyscape") -> "Energyscape":
         from ertis_numba.frames import Energyscape
 
         if isinstance(measurement, Energyscape):

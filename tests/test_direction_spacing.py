@@ -1,0 +1,36 @@
+"""Warning of directions that are too far apart for the main lobe of the array."""
+
+import numpy as np
+import pytest
+
+import ertis_numba as ertis
+from ertis_numba.analysis.direction_spacing import spacing_warning
+from ertis_numba.frames import Energyscape, Stamp
+from ertis_numba.geometry import direction_grid
+from ertis_numba.settings import Processing
+
+
+def blank(directions):
+    processing = Processing(directions=directions)
+    grid = direction_grid(processing)
+    return Energyscape(
+        np.zeros((len(grid), 2), np.float32),
+        grid.azimuth_rad,
+        grid.elevation_rad,
+        np.array([1.0, 1.01]),
+        ertis.Settings(processing=processing),
+        Stamp(sensor="sensor", sequence=0, sync_count=0, timestamp_ns=0),
+    )
+
+
+@pytest.mark.parametrize("directions", ["2d:30", "90", "1850", "3d:1000", ((0.0, 0.0),)])
+def test_fine_grids_cause_no_warning(directions):
+    assert spacing_warning(blank(directions)) is None
+
+
+@pytest.mark.parametrize(("directions", "spacing"), [("2d:20", "9.5"), ("3d:400", "7.1")])
+def test_coarse_grids_cause_a_warning_with_a_grid_that_is_fine(directions, spacing):
+    text = spacing_warning(blank(directions))
+    assert text.startswith(f"directions are {spacing}° apart")
+    finer = text.removesuffix(" directions").split()[-1]
+    assert spacing_warning(blank(finer)) is None
