@@ -123,8 +123,8 @@ def form(report: dict[str, Any]) -> str:
             f" Odometry over {hall['length_m']:.0f} m of a hall at 1 m/s, {hall['n_groups']} groups: "
             f"{hall['end_m']:.2f} m off at the end, {hall['end_m'] / hall['length_m']:.1%} of the path (predicted "
             f"{hall['predicted_m']:.2f} m), and {hall['largest_m']:.2f} m at most. Yaw is "
-            f"{abs(hall['yaw_deg']):.1f}° off at the end, and "
-            f"{hall['unmeasured']} groups have too few matches. Over the path, the RMS error of the position is "
+            f"{abs(hall['yaw_deg']):.1f}° off at the end. Groups with too few matches: {hall['unmeasured']}. "
+            f"Over the path, the RMS error of the position is "
             f"{hall['ratio']:.2f} of the predicted one. The mean normalised squared error of position and yaw is "
             f"{hall['normalised']:.2f} of its expectation."
         )
