@@ -1,38 +1,16 @@
-"""Base classes of subscribers: the loop over received items, and over results computed from them."""
+"""Base class of subscribers to results that are computed from received items."""
 
 import time
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from typing import Generic, Protocol, Self, TypeVar
+from abc import abstractmethod
+from typing import Generic, Protocol, TypeVar
 
 from ertis_numba.network._subscription import SubscriberCounts
+from ertis_numba.network.receiving_loop import ReceivingLoop
 
-__all__ = ["ReceivingLoop", "ResultSubscriber"]
+__all__ = ["ResultSubscriber"]
 
 Item_co = TypeVar("Item_co", covariant=True)
 Received = TypeVar("Received")
-
-
-class ReceivingLoop(ABC, Generic[Item_co]):
-    """Receiver for use in a ``with`` statement and a loop; the loop ends when `close` is called."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __iter__(self) -> Iterator[Item_co]:
-        while (item := self.receive()) is not None:
-            yield item
-
-    @abstractmethod
-    def receive(self, timeout_s: float | None = None) -> Item_co | None:
-        """Return the next item; None after ``timeout_s``, or once the receiver is closed."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """End the loop."""
 
 
 class _Source(Protocol[Item_co]):

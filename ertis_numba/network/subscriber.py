@@ -16,7 +16,7 @@ from ertis_numba.network._subscription import SubscriberCounts, Subscription
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import PRODUCTS, Group, Product
 from ertis_numba.network.products import Arrival, trace
-from ertis_numba.network.result_subscriber import ReceivingLoop
+from ertis_numba.network.receiving_loop import ReceivingLoop
 from ertis_numba.network.wakeup_socket import WakeupSocket
 
 if TYPE_CHECKING:
