@@ -195,10 +195,14 @@ def test_streamed_measurement_has_the_same_level_image(method):
             other.process(measurement, stream=stream, attitude_xyzw=turns[0])
 
 
-def test_level_directions_refuse_a_recorded_graph():
+def test_pipeline_refuses_graphs_that_it_cannot_record():
     settings = levelled(heard(0.0, 0.0, directions="90"))
-    with pytest.raises(ertis.ArgumentError, match=r"graphs is True, but with processing\.level_directions"):
-        ertis.Pipeline(settings, "cpu", graphs=True)
+    for wrong, message in (
+        (True, r"^graphs is True, but with processing\.level_directions"),
+        ("yes", "^graphs is 'yes'; give True or False, or leave it out$"),
+    ):
+        with pytest.raises(ertis.ArgumentError, match=message):
+            ertis.Pipeline(settings, "cpu", graphs=wrong)
 
 
 angles_deg = st.floats(-80.0, 80.0)
@@ -259,7 +263,10 @@ def test_pipeline_refuses_attitudes_that_cannot_be_used():
         pipeline.process(measurement, attitude_xyzw=UNTURNED)
     with ertis.Pipeline(levelled(measurement), "cpu", predict=False) as pipeline:
         for wrong, message in (
-            ((0, 0, 0, 2), "attitude"),
+            ((0, 0, 0, 2), "^attitude_xyzw has length 2; give a unit quaternion$"),
+            ((0, 0, 1), r"^attitude_xyzw has shape \(3,\); give shape \(4,\)$"),
+            ((0, 0, 0, np.nan), r"^attitude_xyzw holds nan at \[3\]; give finite numbers$"),
+            ("level", "^attitude_xyzw is not made of numbers"),
             (attitude(0.0, 90.0).as_quat(), "looks straight up or down, so its images have no level"),
         ):
             with pytest.raises(ertis.ArgumentError, match=message):

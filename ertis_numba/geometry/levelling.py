@@ -1,14 +1,12 @@
 """Directions relative to the horizontal plane, for a sensor that is tilted."""
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry.delays import unit_vectors
 from ertis_numba.geometry.grids import Grid
-from ertis_numba.geometry.mountings import mounting
+from ertis_numba.geometry.mountings import require_unit_quaternion
 
 __all__ = ["levelled_grid"]
 
@@ -57,8 +55,14 @@ def levelled_grid(grid: Grid, attitude_xyzw: ArrayLike) -> tuple[Grid, NDArray[n
     """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  importing it takes longer than this package
 
-    given_xyzw: Any = np.asarray(attitude_xyzw)
-    rotation = Rotation.from_quat(mounting("attitude", None, given_xyzw)["rotation_xyzw"]).as_matrix()
+    try:
+        given_xyzw = np.asarray(attitude_xyzw, np.float64)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(
+            f"attitude_xyzw is not made of numbers ({error}); give a unit quaternion x, y, z, w"
+        ) from error
+    require_unit_quaternion("attitude_xyzw", given_xyzw)
+    rotation = Rotation.from_quat(given_xyzw).as_matrix()
     forward = rotation[:, 0]
     if np.hypot(*forward[:2]) < _MIN_HORIZONTAL:
         raise ArgumentError(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["mounting"]
+__all__ = ["mounting", "require_unit_quaternion"]
 
 _ORIGIN, _UNTURNED = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 _UNIT = 1e-6  # deviation from length 1 due to rounding to six digits
@@ -59,10 +59,23 @@ def mounting(
             f"mounting of sensor {sensor} is not made of numbers ({error}); give x, y, z in metres, and a unit "
             "quaternion x, y, z, w"
         ) from error
-    for (name, values), size in zip(made.items(), (3, 4), strict=True):
-        checks.shape(f"{name} of sensor {sensor}", values.shape, (size,))
-        checks.finite_array(f"{name} of sensor {sensor}", values)
-    length = float(np.linalg.norm(made["rotation_xyzw"]))
-    if abs(length - 1) > _UNIT:
-        raise ArgumentError(f"rotation_xyzw of sensor {sensor} has length {length:g}; give a unit quaternion")
+    name = f"translation_m of sensor {sensor}"
+    checks.shape(name, made["translation_m"].shape, (3,))
+    checks.finite_array(name, made["translation_m"])
+    require_unit_quaternion(f"rotation_xyzw of sensor {sensor}", made["rotation_xyzw"])
     return made
+
+
+def require_unit_quaternion(name: str, rotation_xyzw: NDArray[np.float64]) -> None:
+    """Refuse an array that is no unit quaternion.
+
+    Raises
+    ------
+    ArgumentError
+        It does not have four finite numbers, or its length is not 1.
+    """
+    checks.shape(name, rotation_xyzw.shape, (4,))
+    checks.finite_array(name, rotation_xyzw)
+    length = float(np.linalg.norm(rotation_xyzw))
+    if abs(length - 1) > _UNIT:
+        raise ArgumentError(f"{name} has length {length:g}; give a unit quaternion")
