@@ -2,14 +2,19 @@
 
 import json
 import shutil
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.journal import Journal, JournalPose
+from ertis_numba.journal import Journal, JournalPose, PosesAround
+from ertis_numba.journal._database import Database
+from ertis_numba.journal._poses import pose_blocks, trajectory_through
 from ertis_numba.storage.sealing import seal
+from ertis_numba.storage.verify import verify as verified
 from tests.journals import create, entries
 from tests.test_journal_damage import spoil
 
@@ -67,6 +72,89 @@ def test_recover_reports_damaged_poses(tmp_path):
     assert f"4 measurements, 0 missing, 1 pose is damaged; the journal is kept as {path}.damaged" in done.stderr
     (report,) = json.loads(done.stdout)["journals"]
     assert report["pose_damage"] == "1 pose is damaged"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_verify_reports_damaged_poses(tmp_path, count):
+    path, _ = journal_with_poses(tmp_path)
+    assert all(report.is_intact for report in verified(path))
+    spoil(path, f"UPDATE poses SET x_m = 7 WHERE id <= {count}")
+    (report,) = verified(path)
+    assert report.remark == ("1 pose is damaged" if count == 1 else "2 poses are damaged")
+    assert not report.is_intact
+    done = CliRunner().invoke(cli, ["verify", str(path)])
+    assert done.exit_code == 3
+    assert f"4 measurements, {report.remark}" in done.stdout
+
+
+def test_verify_and_recovery_report_bytes_that_changed_in_a_pose(tmp_path):
+    path, _ = journal_with_poses(tmp_path)
+    with Journal.open(path) as journal:
+        journal.free_log()
+    content = bytearray(path.read_bytes())
+    place = content.rindex(b"odometry")
+    content[place] ^= 0x20
+    path.write_bytes(content)
+    assert [report.remark for report in verified(path)] == ["1 pose is damaged"]
+    assert seal(path).pose_damage == "1 pose is damaged"
+
+
+def test_verify_and_recovery_report_poses_that_were_cut_off(tmp_path):
+    """The last page of the file holds the end of the table of poses."""
+    given = entries(4)
+    with create(tmp_path, given) as journal:
+        journal.append_poses(poses_at(given) * 100)
+        journal.free_log()
+    content = journal.path.read_bytes()
+    journal.path.write_bytes(content[:-4096] + bytes(4096))
+    (report,) = verified(journal.path)
+    assert "poses cannot be read" in report.remark or "poses are damaged" in report.remark
+    sealed = seal(journal.path)
+    assert sealed.measurements == 4
+    assert sealed.pose_damage
+
+
+@pytest.mark.parametrize("with_covariance", [True, False])
+def test_poses_around_times_interpolate_as_all_poses_do(with_covariance):
+    """Poses arrive in blocks, not always in order, with repeated times and a gap; some times are those of poses."""
+    draws = np.random.default_rng(1)
+    times_ns = np.concatenate([draws.integers(0, 3 * 10**9, 900), draws.integers(5 * 10**9, 7 * 10**9, 900)])
+    rotations = draws.normal(size=(1800, 4))
+    rotations /= np.linalg.norm(rotations, axis=1)[:, None]
+    poses = [
+        JournalPose(
+            ("left",),
+            int(time_ns),
+            tuple(draws.normal(size=3)),
+            tuple(rotation),
+            (np.eye(6) * draws.uniform(1, 2)).tobytes() if with_covariance else b"",
+            "odometry",
+        )
+        for time_ns, rotation in zip(times_ns, rotations, strict=True)
+    ]
+    poses += [replace(pose, position_m=(9.0, 9.0, 9.0)) for pose in poses[:5]]
+    wanted_ns = np.sort(np.concatenate([draws.integers(-(10**8), 7 * 10**9, 40), times_ns[::400]]))
+    around, everything = PosesAround(wanted_ns, max_gap_s=1.0), trajectory_through(poses, max_gap_s=1.0)
+    for first in range(0, len(poses), 50):
+        around.add(poses[first : first + 50])
+    found = around.trajectory()
+    assert len(found) < 2 * len(wanted_ns) + 3
+    is_covered = everything.covers(wanted_ns)
+    assert 0 < is_covered.sum() < len(wanted_ns)
+    assert np.array_equal(found.covers(wanted_ns), is_covered)
+    one, other = found.at(wanted_ns[is_covered]), everything.at(wanted_ns[is_covered])
+    for name in ("position_m", "rotation_xyzw", "covariance", "source"):
+        assert np.array_equal(getattr(one, name), getattr(other, name)), name
+
+
+def test_poses_are_read_in_blocks(tmp_path):
+    path, given = journal_with_poses(tmp_path)
+    spoil(path, "UPDATE poses SET x_m = 7 WHERE id = 2")
+    database = Database(path, empty=False)
+    blocks = list(pose_blocks(database, path, n_max=3))
+    database.close()
+    assert [(len(poses), n_damaged) for poses, n_damaged in blocks] == [(2, 1), (1, 0)]
+    assert [pose for poses, _ in blocks for pose in poses] == [poses_at(given)[number] for number in (0, 2, 3)]
 
 
 def test_damaged_poses_of_a_damaged_log_are_reported(tmp_path):

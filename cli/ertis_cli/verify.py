@@ -25,8 +25,9 @@ _FAILED, _INCOMPLETE = 1, 3
 def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json: bool) -> None:
     """Check the measurements of a file, and list gaps and damage.
 
-    The command compares each measurement of recordings and journals with its checksum. The exit code is 0 if all
-    measurements are present and intact, 3 if some are missing, damaged or out of order, and 1 if a file cannot be read.
+    The command compares each measurement of recordings and journals, and each pose of journals, with its checksum. The
+    exit code is 0 if all measurements are present and everything is intact, 3 if some are missing, damaged or out of
+    order, and 1 if a file cannot be read.
     """
     from ertis_numba.errors import ErtisError
     from ertis_numba.storage.verify import verify as verified

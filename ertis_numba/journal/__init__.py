@@ -2,7 +2,7 @@
 
 from ertis_numba.journal._entries import JournalEntry, JournalKey, JournalSensor, require_same_settings
 from ertis_numba.journal._journal import SUFFIX, Journal
-from ertis_numba.journal._poses import JournalPose, trajectory_through
+from ertis_numba.journal._poses import JournalPose, PosesAround
 from ertis_numba.journal._recovery import LOST
 from ertis_numba.journal._tables import TABLES, VERSION, Column
 from ertis_numba.journal._tally import TALLY
@@ -20,9 +20,9 @@ __all__ = [
     "JournalKey",
     "JournalPose",
     "JournalSensor",
+    "PosesAround",
     "SealingResult",
     "require_same_settings",
     "seal_in_subprocess",
     "sessions_in_recordings",
-    "trajectory_through",
 ]

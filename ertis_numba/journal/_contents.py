@@ -12,7 +12,7 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import JournalEntry, JournalKey, JournalSensor, verified_values
-from ertis_numba.journal._poses import JournalPose, read_poses
+from ertis_numba.journal._poses import JournalPose, pose_blocks, read_poses
 from ertis_numba.journal._tables import COMPLETE_VERSION, POSES, select_statement
 
 __all__ = ["SUFFIX", "ReadableJournal"]
@@ -139,6 +139,29 @@ class ReadableJournal:
         """
         with self._lock:
             return read_poses(self._database, self.path)
+
+    def pose_blocks(self) -> Iterator[tuple[list[JournalPose], int]]:
+        """Yield blocks of poses as `read_poses` returns all, each read when it is requested."""
+        blocks = pose_blocks(self._database, self.path)
+        while True:
+            with self._lock:
+                block = next(blocks, None)
+            if block is None:
+                return
+            yield block
+
+    def times_ns(self, sensor: str) -> list[int]:
+        """Return the times of the measurements of a sensor in any order, without checking them.
+
+        Raises
+        ------
+        DamagedError
+            The table of measurements is damaged.
+        """
+        number = self._ids[self._sensor(sensor).name]
+        with self._lock:
+            rows = self._database.execute("SELECT timestamp_ns FROM measurements WHERE sensor = ?", (number,))
+        return [time_ns for (time_ns,) in rows if isinstance(time_ns, int)]
 
     def index(self, sensor: str | None = None) -> list[JournalKey]:
         """Return the keys of measurements of one sensor or of all, in order of arrival, without reading them."""

@@ -1,11 +1,13 @@
 """Poses of platforms in a journal."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ertis_numba.errors import DamagedError
 from ertis_numba.frames import Trajectory
@@ -13,10 +15,11 @@ from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import verified_values
 from ertis_numba.journal._tables import POSES, select_statement
 
-__all__ = ["JournalPose", "read_poses", "trajectory_through"]
+__all__ = ["JournalPose", "PosesAround", "pose_blocks", "read_poses", "trajectory_through"]
 
 _SEPARATOR: Final = ","  # Names of sensors contain none.
 _MAX_SOURCE_BYTES: Final = 1024  # Limit of a recording.
+_BLOCK: Final = 10_000  # Rows that are read at a time; they take some 10 MB.
 _ROW_BYTES: Final = 100  # Numbers, checksum and index of a row: 91 to 102 bytes were measured.
 
 
@@ -74,8 +77,10 @@ class JournalPose:
         return cls(tuple(names.split(_SEPARATOR)), time_ns, tuple(numbers[:3]), tuple(numbers[3:]), covariance, source)
 
 
-def read_poses(database: Database, path: Path, *, after: int = 0) -> tuple[list[JournalPose], int]:
-    """Return the undamaged poses of a journal in order of arrival, and the number of damaged ones.
+def pose_blocks(
+    database: Database, path: Path, *, after: int = 0, n_max: int = _BLOCK
+) -> Iterator[tuple[list[JournalPose], int]]:
+    """Yield blocks of poses in order of arrival: the undamaged ones, and the number of damaged ones.
 
     Parameters
     ----------
@@ -85,21 +90,32 @@ def read_poses(database: Database, path: Path, *, after: int = 0) -> tuple[list[
         Path of the journal.
     after : int
         Number of the last row to leave out.
+    n_max : int
+        Largest number of rows in a block.
 
     Raises
     ------
     DamagedError
         The table is damaged.
     """
-    poses: list[JournalPose] = []
-    n_damaged = 0
-    if database.has_table(POSES):
-        for row in database.execute(select_statement(POSES, "WHERE id > ? ORDER BY id"), (after,)):
-            try:
+    if not database.has_table(POSES):
+        return
+    statement = select_statement(POSES, "WHERE id > ? ORDER BY id LIMIT ?")
+    while rows := database.execute(statement, (after, n_max)):
+        if rows[-1][0] <= after:
+            raise DamagedError(f"{path} has poses out of order: it is damaged; copy it again if you can")
+        after = rows[-1][0]
+        poses = []
+        for row in rows:
+            with suppress(DamagedError):
                 poses.append(JournalPose.from_row(path, row))
-            except DamagedError:
-                n_damaged += 1
-    return poses, n_damaged
+        yield poses, len(rows) - len(poses)
+
+
+def read_poses(database: Database, path: Path, *, after: int = 0) -> tuple[list[JournalPose], int]:
+    """Return all undamaged poses and the number of damaged ones; parameters and errors as for `pose_blocks`."""
+    blocks = list(pose_blocks(database, path, after=after))
+    return [pose for poses, _ in blocks for pose in poses], sum(n_damaged for _, n_damaged in blocks)
 
 
 def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Trajectory:
@@ -128,6 +144,77 @@ def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Tra
         np.array([pose.position_m for pose in kept]),
         np.array([pose.rotation_xyzw for pose in kept]),
         covariances.reshape(len(kept), 6, 6) if is_known else None,
-        ", ".join(dict.fromkeys(pose.source for pose in kept)).encode()[:_MAX_SOURCE_BYTES].decode(errors="ignore"),
+        _joined(pose.source for pose in kept),
         max_gap_s,
     )
+
+
+class PosesAround:
+    """Poses around given times, chosen from any number of poses; memory is bounded by the number of times.
+
+    Between two times, a trajectory needs only the first and the last pose.
+
+    Parameters
+    ----------
+    time_ns : array_like of int
+        Times in any order, in nanoseconds.
+    max_gap_s : float
+        Longest interval of the trajectory between poses.
+    """
+
+    def __init__(self, time_ns: ArrayLike, *, max_gap_s: float) -> None:
+        self._wanted_ns = np.unique(np.asarray(time_ns, np.int64))
+        self._max_gap_s = max_gap_s
+        self._kept: Trajectory | None = None
+        self._waiting: list[Trajectory] = []
+        self._n_waiting = 0
+        self._sources: dict[str, None] = {}
+
+    def add(self, poses: Sequence[JournalPose]) -> None:
+        """Add poses in any order; of several poses at one time, the first counts.
+
+        Raises
+        ------
+        ArgumentError, ValueError
+            A number or a covariance cannot be that of a pose.
+        """
+        if not poses:
+            return
+        self._waiting.append(trajectory_through(poses, max_gap_s=self._max_gap_s))
+        self._n_waiting += len(poses)
+        if sum(map(len, self._sources)) < _MAX_SOURCE_BYTES:
+            self._sources |= dict.fromkeys(pose.source for pose in poses)
+        if self._n_waiting > (0 if self._kept is None else len(self._kept)):  # Each pose is then sorted a few times.
+            self._choose()
+
+    def trajectory(self) -> Trajectory | None:
+        """Return the trajectory through the poses around the times; None without poses."""
+        self._choose()
+        return None if self._kept is None else self._kept.replace(source=_joined(self._sources))
+
+    def _choose(self) -> None:
+        """Keep the poses before and after each time, and those at both ends."""
+        parts = [*([] if self._kept is None else [self._kept]), *self._waiting]
+        if not parts:
+            return
+        self._waiting, self._n_waiting = [], 0
+        time_ns, first = np.unique(np.concatenate([part.time_ns for part in parts]), return_index=True)
+        after = np.searchsorted(self._wanted_ns, time_ns)  # Number of times before each pose.
+        is_empty = after[1:] == np.searchsorted(self._wanted_ns, time_ns[:-1])
+        is_kept = np.ones(len(time_ns), np.bool_)
+        is_kept[1:-1] = ~(is_empty[:-1] & is_empty[1:])
+        chosen = first[is_kept]
+        covariances = [part.covariance for part in parts if part.covariance is not None]
+        self._kept = Trajectory(
+            time_ns[is_kept],
+            np.concatenate([part.position_m for part in parts])[chosen],
+            np.concatenate([part.rotation_xyzw for part in parts])[chosen],
+            np.concatenate(covariances)[chosen] if len(covariances) == len(parts) else None,
+            "",
+            self._max_gap_s,
+        )
+
+
+def _joined(sources: Iterable[str]) -> str:
+    """Return the names of several sources as one."""
+    return ", ".join(dict.fromkeys(sources)).encode()[:_MAX_SOURCE_BYTES].decode(errors="ignore")

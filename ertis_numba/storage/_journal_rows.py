@@ -8,7 +8,7 @@ from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.storage._gaps import SensorSequences
 
-__all__ = ["DamagedMeasurement", "JournalRows"]
+__all__ = ["DamagedMeasurement", "JournalRows", "damaged_poses"]
 
 _DAMAGED = "damaged in the journal"
 
@@ -20,6 +20,11 @@ class DamagedMeasurement:
     index: int
     sequence: int
     reason: str
+
+
+def damaged_poses(count: int) -> str:
+    """Return a line about damaged poses; empty if there are none."""
+    return "" if not count else "1 pose is damaged" if count == 1 else f"{count} poses are damaged"
 
 
 class JournalRows:

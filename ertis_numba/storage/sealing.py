@@ -25,12 +25,11 @@ from ertis_numba.journal import (
     LOST,
     SUFFIX,
     Journal,
-    JournalPose,
     JournalSensor,
+    PosesAround,
     SealingResult,
-    trajectory_through,
 )
-from ertis_numba.storage._journal_rows import JournalRows
+from ertis_numba.storage._journal_rows import JournalRows, damaged_poses
 from ertis_numba.storage._poses import MAX_GAP_S
 from ertis_numba.storage._reader import sensor_names
 from ertis_numba.storage.recording import (
@@ -250,25 +249,28 @@ def _write(
 
 def _poses(journal: Journal) -> tuple[dict[str, Trajectory], str]:
     """Return the trajectory of the platform of each sensor that has one, and a line about damage to poses."""
-    by_platform: dict[tuple[str, ...], list[JournalPose]] = {}
-    made: dict[tuple[tuple[str, ...], ...], Trajectory] = {}
-    trajectories: dict[str, Trajectory] = {}
+    around: dict[str, PosesAround] = {}
+    n_damaged = 0
     try:
-        found, n_damaged = journal.read_poses()
-        for pose in found:
-            by_platform.setdefault(pose.sensors, []).append(pose)
-        for name in journal.sensors:
-            key = tuple(sensors for sensors in by_platform if name in sensors)
-            if key and key not in made:  # Sensors of a platform share their trajectory.
-                poses = [pose for sensors in key for pose in by_platform[sensors]]
-                made[key] = trajectory_through(poses, max_gap_s=MAX_GAP_S)
-            if key:
-                trajectories[name] = made[key]
+        for poses, n_more in journal.pose_blocks():
+            n_damaged += n_more
+            for name in {name for pose in poses for name in pose.sensors}.intersection(journal.sensors):
+                if name not in around:
+                    around[name] = PosesAround(_times_ns(journal, name), max_gap_s=MAX_GAP_S)
+                around[name].add([pose for pose in poses if name in pose.sensors])
+        made = {name: each.trajectory() for name, each in around.items()}
+        trajectories = {name: trajectory for name, trajectory in made.items() if trajectory is not None}
     except (DamagedError, ValueError) as error:  # Measurements are sealed without poses.
         return {}, f"poses were left out: {' '.join(str(error).split())}"
-    if not n_damaged:
-        return trajectories, ""
-    return trajectories, "1 pose is damaged" if n_damaged == 1 else f"{n_damaged} poses are damaged"
+    return trajectories, damaged_poses(n_damaged)
+
+
+def _times_ns(journal: Journal, sensor: str) -> list[int]:
+    """Return the times of the measurements of a sensor."""
+    try:
+        return journal.times_ns(sensor)
+    except DamagedError:  # Measurements beside the damage can still be read.
+        return [entry.measurement.stamp.timestamp_ns for entry in JournalRows(journal, sensor)]
 
 
 def _history_of_lost_sensors(rows: dict[str, JournalRows]) -> Iterator[str]:

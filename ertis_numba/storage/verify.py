@@ -8,7 +8,7 @@ from ertis_numba.errors import ArgumentError, DamagedError, DataError, ForeignDa
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import Journal
 from ertis_numba.storage._axes_check import find_damage
-from ertis_numba.storage._journal_rows import DamagedMeasurement, JournalRows
+from ertis_numba.storage._journal_rows import DamagedMeasurement, JournalRows, damaged_poses
 from ertis_numba.storage._reader import sensor_names
 from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingReader, open_recording
 
@@ -36,7 +36,8 @@ class SensorReport:
     fault : str
         Reason why nothing of this sensor can be read; otherwise empty.
     remark : str
-        Damage to the file, or losses from its journal that no gap covers, of any sensor; empty if there are none.
+        Damage to the file, damaged poses, or losses from its journal that no gap covers, of any sensor; empty if there
+        are none.
     """
 
     sensor: str
@@ -62,7 +63,7 @@ def verify(path: str | Path) -> list[SensorReport]:
     """Read a whole recording or journal, and return missing and damaged measurements for each sensor.
 
     For a recording, this checks the hash over the content of each sensor, the CRC-32 of each measurement, and the order
-    of the sequence numbers. For a journal, it checks the CRC-32 of each record and each measurement.
+    of the sequence numbers. For a journal, it checks the CRC-32 of each record, each measurement and each pose.
 
     Raises
     ------
@@ -77,7 +78,8 @@ def verify(path: str | Path) -> list[SensorReport]:
                     f"{path} has lost measurements, because its log was damaged ({journal.damage}); copy journal and "
                     "log again"
                 )
-            reports = [_of_journal(journal, name) for name in journal.sensors]
+            remark = "; ".join(filter(None, (_lost(journal), _pose_damage(journal))))
+            reports = [_of_journal(journal, name, remark) for name in journal.sensors]
             reports += [
                 SensorReport(sensor=name, measurements=count, fault=reason)
                 for name, (reason, count) in journal.unusable.items()
@@ -142,7 +144,22 @@ def _out_of_order(numbers: Iterable[tuple[int, int]]) -> tuple[int, ...]:
     return tuple(found)
 
 
-def _of_journal(journal: Journal, sensor: str) -> SensorReport:
+def _lost(journal: Journal) -> str:
+    return f"lost in a damaged journal: {journal.damage}" if journal.damage else ""
+
+
+def _pose_damage(journal: Journal) -> str:
+    """Return a line about damaged poses of any sensor."""
+    n_damaged = 0
+    try:
+        for _, n_more in journal.pose_blocks():
+            n_damaged += n_more
+    except DamagedError as error:
+        return f"poses cannot be read: {error}"
+    return damaged_poses(n_damaged)
+
+
+def _of_journal(journal: Journal, sensor: str, remark: str) -> SensorReport:
     rows = JournalRows(journal, sensor)
     for _ in rows:
         pass
@@ -152,5 +169,5 @@ def _of_journal(journal: Journal, sensor: str) -> SensorReport:
         gaps=tuple(rows.missing),
         damaged=tuple(rows.damaged),
         out_of_order=_out_of_order((key.session_id, key.sequence) for key in rows.keys),
-        remark=f"lost in a damaged journal: {journal.damage}" if journal.damage else "",
+        remark=remark,
     )
