@@ -2,10 +2,11 @@
 
 import contextlib
 import socket
+from collections.abc import Iterator
 
 
 @contextlib.contextmanager
-def reserved_address():
+def reserved_address() -> Iterator[str]:
     """Yield an address at which only servers of this test listen: a bound socket keeps others from its port."""
     with socket.socket() as held:
         held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

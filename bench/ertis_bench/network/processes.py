@@ -5,7 +5,6 @@ import json
 import os
 import secrets
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -17,7 +16,7 @@ from typing import Any, Final, Self
 
 from ertis_numba.errors import DataError
 
-__all__ = ["ERTIS", "JsonLinesProcess", "ask", "central", "free_address", "survivors", "until"]
+__all__ = ["ERTIS", "JsonLinesProcess", "ask", "central", "survivors", "until"]
 
 ERTIS: Final = (sys.executable, "-m", "ertis_cli")
 _WAIT_S: Final = 60.0  # time limit for events that need no further action
@@ -216,12 +215,6 @@ def central(
     """
     line = [*ertis, command, "--listen", listen, *options, "--json", "--quiet"]
     return JsonLinesProcess(line, stated=folder / "central.txt", mark=mark)
-
-
-def free_address() -> str:
-    """Return a free address of this machine, for nodes that are restarted at the same address."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return f"tcp://127.0.0.1:{server.getsockname()[1]}"
 
 
 def ask(*arguments: str, timeout_s: float = 600.0) -> "subprocess.CompletedProcess[str]":

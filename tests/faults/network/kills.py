@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_bench.network.oracle import judged, read_diaries
-from ertis_bench.network.processes import ERTIS, JsonLinesProcess, central, free_address, survivors, until
+from ertis_bench.network.processes import ERTIS, JsonLinesProcess, central, survivors, until
 from ertis_bench.network.sender import SenderJob
 
 from ertis_numba.errors import DataError
 from tests.faults.network.self_kill import in_trap
 from tests.faults.network.sender_thread import SenderThread
+from tests.ports import reserved_address
 
 __all__ = ["RestartedRecorder", "centrals", "nodes", "sealings"]
 
@@ -58,7 +59,8 @@ class RestartedRecorder:
         self.folder, self._options = folder, options
         self.archive = archive or folder / "recordings"
         self.archive.mkdir(exist_ok=True)
-        self.address, self.mark = free_address(), secrets.token_hex(8)
+        self._reserved = reserved_address()  # until this object is deleted
+        self.address, self.mark = self._reserved.__enter__(), secrets.token_hex(8)
 
     def start(self, ertis: Sequence[str] = ERTIS) -> JsonLinesProcess:
         """Start the command, or a variant of it, without waiting until it listens."""

@@ -11,12 +11,13 @@ from typing import Any, Final
 
 from ertis_bench.network.diary import DiaryKey, Row
 from ertis_bench.network.oracle import Sent, note
-from ertis_bench.network.processes import ERTIS, JsonLinesProcess, free_address
+from ertis_bench.network.processes import ERTIS, JsonLinesProcess
 from ertis_bench.network.sender import SenderJob
 
 from ertis_numba.errors import DataError
 from tests.faults import captures
 from tests.faults.powercuts.log import DiskOperation, DiskRecord, environment
+from tests.ports import reserved_address
 
 __all__ = ["AcknowledgedState", "Fail", "Setting", "Trace", "capture", "central", "journal", "spool"]
 
@@ -144,16 +145,15 @@ def _process(setting: Setting, command: list[str], name: str = "said") -> JsonLi
 def central(setting: Setting, command: str) -> Trace:
     """Run ``ertis record`` or ``ertis serve --record`` while two sensors send to it."""
     setting.disk.mkdir()
-    address = free_address()
     diary = setting.folder / "sender.ndjson"
     option = "-o" if command == "record" else "--record"
-    line = [*ERTIS, command, "--listen", address, option, str(setting.disk / "recordings"), "--rotate-size", "4"]
+    listen = "tcp://127.0.0.1:*"
+    line = [*ERTIS, command, "--listen", listen, option, str(setting.disk / "recordings"), "--rotate-size", "4"]
     if command == "serve":
-        line += ["--publish", "tcp://127.0.0.1:*", "--workers", "1"]
+        line += ["--publish", listen, "--workers", "1"]
     line = setting.preloaded([*line, "--json", "--quiet"], acks=setting.folder / "none", fail=setting.fail)
-    job = _job(setting, address, diary, sensors=("left", "right"))
     with _process(setting, line, "central") as node:
-        node.wait_for("listening")
+        job = _job(setting, node.wait_for("listening")["address"], diary, sensors=("left", "right"))
         with _process(setting, setting.preloaded(job.command(), acks=diary), "sender") as sender:
             flushed = sender.wait_for("sent")["flushed"]
             sender.wait()
@@ -173,7 +173,12 @@ def _job(setting: Setting, address: str, diary: Path, **options: Any) -> SenderJ
 def spool(setting: Setting) -> Trace:
     """Run a sensor node with a spool, first without a central node and then with one."""
     setting.disk.mkdir()
-    address = free_address()
+    with reserved_address() as address:
+        _spool_at(setting, address)
+    return Trace(setting=setting)
+
+
+def _spool_at(setting: Setting, address: str) -> None:
     diary = setting.folder / "sender.ndjson"
     job = _job(setting, address, diary, spool=str(setting.disk / "spool"))
     recordings = setting.folder / "recordings"
@@ -186,4 +191,3 @@ def spool(setting: Setting) -> Trace:
             sender.wait()
             node.signal(signal.SIGTERM)
             node.wait()
-    return Trace(setting=setting)
