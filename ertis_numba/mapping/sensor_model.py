@@ -82,7 +82,7 @@ class Trust(NamedTuple):
 
 
 TRUST: Final = {
-    2: Trust(clear=0.0, strength=1.0, hidden=3.7, beside=0.0, cell=0.19, total=10.0, missed=0.1),
+    2: Trust(clear=0.0, strength=1.0, hidden=3.7, beside=0.0, cell=0.18, total=10.0, missed=0.14),
     3: Trust(clear=1.5, strength=0.0, hidden=1.6, beside=5.6, cell=0.6, total=15.0, missed=0.03),
 }
 """Trust in echoes by number of dimensions. Those in space overlap more often, so their amplitude shows little."""
