@@ -25,6 +25,8 @@ __all__ = [
 ]
 
 _TIMEOUT_MARGIN_S: Final = 0.5  # after the timeout of dask, whose error names the cause
+_RESTARTED_S: Final = 600.0
+"""Time until dask gives up a worker that has ended. Its default of 15 s is too short to start one on a busy machine."""
 
 # The annotations of dask are partial.
 Client = Any
@@ -180,8 +182,12 @@ def local_cluster(n_workers: int, *, n_threads: int = 1) -> Iterator[str]:
         dask.distributed is not installed.
     """
     with extra("cluster", "a cluster on this machine needs dask.distributed", DeviceError):
-        from distributed import LocalCluster  # noqa: PLC0415  as above
+        import dask  # noqa: PLC0415  as above
+        from distributed import LocalCluster  # noqa: PLC0415
     ports = {"dashboard_address": ":0", "worker_dashboard_address": ":0"}
     make: Any = LocalCluster
-    with make(n_workers=n_workers, threads_per_worker=n_threads, silence_logs=50, **ports) as cluster:
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": _RESTARTED_S}),
+        make(n_workers=n_workers, threads_per_worker=n_threads, silence_logs=50, **ports) as cluster,
+    ):
         yield str(cluster.scheduler_address)
