@@ -154,7 +154,7 @@ def test_browser_does_not_end_the_recording_of_another(tmp_path):
             view._orders.put(ControlRequest(name, client=client))  # noqa: SLF001  as a browser does
 
         press(one)
-        run_once(view)
+        wait_for(lambda: run_once(view) or view.shown)
         press(other)
         press(one)
         run_once(view, html=tmp_path / "ours.html")
