@@ -248,7 +248,8 @@ def test_sync_capture_accepts_pulses_before_the_first_sensors(captures):
     assert capture.session.complete >= 4
 
 
-@pytest.mark.parametrize("trigger", ["command", pytest.param("sync", marks=pytest.mark.alone)])
+@pytest.mark.alone
+@pytest.mark.parametrize("trigger", ["command", "sync"])
 def test_capture_resumes_when_unplugged_sensor_returns(captures, words, trigger):
     capture = captures(trigger=trigger, rate_hz=20.0)
     runner = threading.Thread(target=capture.session.run, args=(capture.journal,))
@@ -266,7 +267,7 @@ def test_capture_resumes_when_unplugged_sensor_returns(captures, words, trigger)
         runner.join()
     assert capture.session.counts["one"].unplugged == 1
     (away_s,) = [what for _, what in capture.notes if isinstance(what, float)]
-    assert 0 < away_s < 60
+    assert 0 < away_s < 3
     with capture.recording() as recording:
         sequences = [stamp.sequence for stamp in recording.stamps()]
         assert sequences == sorted(set(sequences))

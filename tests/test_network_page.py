@@ -144,6 +144,7 @@ def test_network_page_on_one_machine_runs(place, ports, platform):
     assert {name for path in recordings for name in sensor_names(path)} == set(SENSORS)
 
 
+@pytest.mark.alone
 @pytest.mark.usefixtures("emulators")
 def test_network_page_on_several_machines_runs(place, ports, monkeypatch):
     lines = lines_of(PAGE, "(?:central|sensor)")
@@ -157,8 +158,7 @@ def test_network_page_on_several_machines_runs(place, ports, monkeypatch):
     events = [json.loads(line) for line in reported.splitlines()]
     acked = [each for each in events if each["event"] == "acked_through"]
     assert {each["sensor"]: each["acked_through"] for each in acked} == dict.fromkeys(SENSORS, 4)
-    reasons = {reason for each in acked for _, reason in each["dropped"]}
-    assert reasons <= {"the workers were getting ready"}  # on a busy machine
+    assert not any(each["dropped"] for each in acked)
 
 
 @pytest.mark.usefixtures("emulators")
