@@ -7,8 +7,9 @@ from scipy.signal import csd
 import ertis_numba as ertis
 from ertis_numba.air import transmission_loss_db
 from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.frames import is_passive
 from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
-from ertis_numba.passive import AcousticCamera, find_bearings, is_passive, octave_bands
+from ertis_numba.passive import AcousticCamera, find_bearings, octave_bands
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.settings import MAP_METHODS, Settings
 from tests.on_device import KERNELS

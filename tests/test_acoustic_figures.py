@@ -14,11 +14,14 @@ from scipy.signal import welch
 import ertis_numba as ertis
 from ertis_numba import figures
 from ertis_numba.air import absorption_db_m, transmission_loss_db
+from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.figures import _acoustic_signals
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
-from ertis_numba.settings import Settings
+from ertis_numba.method_titles import METHOD_TITLES
+from ertis_numba.settings import MAP_METHODS, Settings
+from tests.publishing import image
 from tests.test_acoustic_camera import settings_of, sound
 
 BANDS_HZ = np.array([[20e3, 25e3], [25e3, 31.5e3]])
@@ -291,7 +294,7 @@ def test_spectrum_and_spectrogram_show_a_source():
     ("method", "name"),
     [
         ("delay_and_sum", "delay-and-sum"),
-        ("functional", "functional"),
+        ("functional", "functional beamforming"),
         ("capon", "Capon"),
         ("music", "MUSIC"),
         ("clean_sc", "CLEAN-SC"),
@@ -300,6 +303,23 @@ def test_spectrum_and_spectrogram_show_a_source():
 )
 def test_captions_name_methods_as_the_field_does(method, name):
     assert f"method {name}" in texts(figures.acoustic_map(acoustic_map(method=method)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"beamformer": "dmas"}, "method fast, DMAS"),
+        ({"beamformer": "capon", "weighting": "coherence_factor"}, "method fast, Capon, coherence factor"),
+    ],
+)
+def test_captions_of_images_name_beamformers_as_the_field_does(changes, name):
+    found = image(1)
+    processing = found.settings.processing.replace(**changes)
+    assert name in texts(figures.polar(found.replace(settings=found.settings.replace(processing=processing))))
+
+
+def test_every_method_has_a_title():
+    assert METHOD_TITLES.keys() == {*BEAMFORMERS, *WEIGHTINGS, *MAP_METHODS}
 
 
 @pytest.mark.parametrize(("behaviour", "is_named"), [("passive", False), ("active", True), ("unknown", True)])

@@ -140,7 +140,8 @@ def listen_to_bearings(measurements, *arguments):
 def test_listen_prints_bearings():
     (heard,) = heard_leak("3d:1000")
     settings, shown = heard.settings, listen_to_bearings([heard], "-q", "--json")
-    found, summary = map(json.loads, shown.stdout.splitlines())
+    first, found, summary = map(json.loads, shown.stdout.splitlines())
+    assert (first["event"], first["sensors"], first["products"]) == ("subscribed", None, ["raw"])
     assert (summary["received"], found["averages"], found["sensor"]) == (1, 1, "inspector")
     (leak,) = found["bearings"]
     assert (leak["azimuth_deg"], leak["elevation_deg"]) == (pytest.approx(28, abs=0.5), pytest.approx(12, abs=0.5))
@@ -157,9 +158,17 @@ def test_listen_states_once_that_one_elevation_is_assumed():
     assert len(lines) >= 2
     assert all(line.split("kHz")[1].count("unknown") == 1 for line in lines)
     shown = listen_to_bearings(heard[:1], "--json")
-    found = json.loads(shown.stdout.splitlines()[0])["bearings"]
+    found = json.loads(shown.stdout.splitlines()[1])["bearings"]
     assert found
     assert all(each["upwards_deg"] is None and each["sideways_deg"] > 0 for each in found)
+
+
+def test_listen_searches_given_directions():
+    heard = heard_leak("2d:61")
+    shown = listen_to_bearings(heard, "--json", "--directions", "3d:1000")
+    assert "searches one elevation" not in shown.stderr
+    (leak,) = json.loads(shown.stdout.splitlines()[1])["bearings"]
+    assert (leak["azimuth_deg"], leak["elevation_deg"]) == (pytest.approx(28, abs=0.5), pytest.approx(12, abs=0.5))
 
 
 @pytest.mark.parametrize("as_json", [True, False])
@@ -193,6 +202,7 @@ def test_unknown_direction_is_printed_as_such(capsys, as_json):
         (["--bearings", "--product", "raw"], "--product applies only without --bearings"),
         (["--bearings", "--fuse"], "exclude each other"),
         (["--average", "3"], "--average applies only with --bearings"),
+        (["--fuse", "--directions", "90"], "--directions applies only with --bearings"),
     ],
 )
 def test_listen_refuses_options_that_do_not_fit_bearings(arguments, message):

@@ -150,7 +150,8 @@ def test_listen_prints_fused_pulses(tmp_path):
     with Publisher() as publisher, publisher.playing(pulses(count=6)):
         shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments, "--json"])
     assert shown.exit_code == 0, shown.output
-    fused, summary = map(json.loads, shown.stdout.splitlines())
+    subscribed, fused, summary = map(json.loads, shown.stdout.splitlines())
+    assert (subscribed["event"], subscribed["products"]) == ("subscribed", ["energyscape"])
     assert fused["sensors"] == ["front", "back"]
     assert fused["nearest_m"][0] == pytest.approx(-1.14, abs=0.02)
     assert (summary["received"], summary["dropped"]) == (1, 0)

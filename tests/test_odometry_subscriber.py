@@ -244,7 +244,8 @@ def test_listen_prints_poses_and_writes_the_trajectory(tmp_path, mounting):
     with Publisher() as publisher, publisher.playing(images(*range(6))):
         shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments, "--json"])
     assert shown.exit_code == 0, shown.output
-    first, second, summary = map(json.loads, shown.stdout.splitlines())
+    subscribed, first, second, summary = map(json.loads, shown.stdout.splitlines())
+    assert (subscribed["event"], subscribed["products"]) == ("subscribed", ["energyscape"])
     assert (first["event"], first["x_m"], first["velocity_m_s"], first["measured"]) == ("odometry", 0.0, None, True)
     assert math.hypot(*second["velocity_m_s"]) == pytest.approx(np.hypot(*STEP_M) / 0.1, abs=0.02)
     assert second["yaw_rate_deg_s"] == pytest.approx(10.0, abs=1.0)
@@ -280,7 +281,7 @@ def test_ctrl_c_ends_listen_and_writes_the_trajectory(tmp_path, mounting):
         with subprocess.Popen(
             [*command, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(tmp_path)
         ) as process:
-            first = json.loads(process.stdout.readline())
+            _, first = (json.loads(process.stdout.readline()) for _ in range(2))
             process.send_signal(signal.SIGINT)
             rest, errors = process.communicate()
     assert process.returncode == 0, errors
@@ -313,7 +314,8 @@ def test_failure_of_listen_keeps_earlier_poses(tmp_path):
                 env=environment(tmp_path),
             ) as process,
         ):
-            process.stdout.readline()
+            _, event = (json.loads(process.stdout.readline())["event"] for _ in range(2))
+            assert event == "odometry"
             came.set()
             _, errors = process.communicate()
     assert (process.returncode, "the mounting of sensor 'back' is unknown" in errors) == (1, True), errors

@@ -110,7 +110,7 @@ def with_map_options(settings: "Settings", given: "Mapping[str, Any]") -> "Setti
 
 def are_wanted(path: Path, sensors: "Sequence[str]", changed: _Changed) -> bool:
     """Return True if all measurements of the sensors become acoustic maps."""
-    from ertis_numba.passive import is_passive
+    from ertis_numba.frames import is_passive
     from ertis_numba.storage import open_recording
 
     for name in sensors:

@@ -66,7 +66,7 @@ def plot_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def is_acoustic(path: Path, sensor: str | None, index: int) -> bool:
     """Return True for a file of acoustic maps, and for a passive measurement; False for files that cannot be read."""
     from ertis_numba.errors import ErtisError
-    from ertis_numba.passive import is_passive
+    from ertis_numba.frames import is_passive
     from ertis_numba.storage import file_kind, open_recording
 
     with suppress(ErtisError):

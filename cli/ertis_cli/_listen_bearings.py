@@ -25,6 +25,7 @@ def listen_bearings(
     *,
     sensors: Sequence[str],
     average: int | None,
+    directions: str | None,
     keys: "ClientKeys | None",
     n: int | None,
     duration: float | None,
@@ -38,7 +39,8 @@ def listen_bearings(
     level: set[str] = set()
 
     def connect(on_note: Callable[[str], None]) -> AcousticMapSubscriber:
-        changes = {} if average is None else {"passive.averages": average}
+        wanted = {"passive.averages": average, "processing.directions": directions}
+        changes = {name: value for name, value in wanted.items() if value is not None}
         subscribers.append(
             AcousticMapSubscriber(
                 address, sensors=sensors or None, changes=changes, false_alarm=1e-3, keys=keys, on_note=on_note
@@ -52,8 +54,7 @@ def listen_bearings(
             level.add(sensor)
             options.say(
                 f"note: sensor {sensor} searches one elevation, {elevation_deg[0]:g}°; a source above or below has a "
-                "wrong azimuth; use directions in space, such as processing.directions 3d:2000, in the settings of the "
-                "sensor",
+                "wrong azimuth; give directions in space, such as --directions 3d:2000",
                 quiet=quiet,
             )
         _show(found, subscribers[0].bearings, _age_ms(subscribers[0]), as_json=as_json)

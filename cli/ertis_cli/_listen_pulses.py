@@ -87,7 +87,7 @@ def listen_pulses(
             while received != n and not signals.came and time.monotonic() < end_s:
                 arrival = subscriber.receive(_POLL_INTERVAL_S)
                 if subscriber.connected:
-                    heard.connected(sensors)
+                    heard.subscribed(address, tuple(sensors), (product,))
                     heard.silent(address, (product,), subscriber.counts.received)
                 else:
                     heard.unanswered(address, time.monotonic() - begun_s)

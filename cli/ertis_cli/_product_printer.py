@@ -3,7 +3,7 @@
 import functools
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -49,7 +49,7 @@ class MicrophoneTable:
             click.echo(_HEAD)
 
     def subscribed(self, address: str, sensors: tuple[str, ...], products: tuple[str, ...]) -> None:
-        """Report once that a publisher answers."""
+        """Report once that a publisher answers, and note the requested sensors for `silent`."""
         if self._as_json and not self._reported_names:
             options.print_json(
                 {
@@ -59,10 +59,6 @@ class MicrophoneTable:
                     "products": list(products),
                 }
             )
-        self.connected(sensors)
-
-    def connected(self, sensors: Sequence[str]) -> None:
-        """Note the first answer of a publisher, and the requested sensors, for `silent`."""
         if not self._reported_names:
             self._subscribed_s, self._of_sensors = time.monotonic(), f" of {', '.join(sensors)}" if sensors else ""
         self._reported_names = True

@@ -277,7 +277,7 @@ def _with_call(reader: "RecordingReader | EnergyscapeReader", chosen: range) -> 
         All are passive.
     """
     from ertis_numba.errors import DataError
-    from ertis_numba.passive import is_passive
+    from ertis_numba.frames import is_passive
 
     stamps = list(reader.stamps())
     found = [place for place in chosen if not is_passive(reader.settings, stamps[place])]

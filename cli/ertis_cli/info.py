@@ -271,6 +271,7 @@ def _report_health(path: Path, *, as_json: bool) -> None:
 def _health(report: "Health") -> dict[str, Any]:
     return {
         "examined": report.measurements,
+        "has_call": report.has_call,
         "faults": report.faults,
         "noise_dbfs": _rounded(report.noise_dbfs, 2),
         "dynamic_range_db": _rounded(report.dynamic_range_db, 2),
@@ -293,10 +294,9 @@ def _health_lines(section: dict[str, Any]) -> Iterator[str]:
     """Yield the properties of an array."""
     yield f"sensor         {section['sensor']}"
     yield f"measurements   {section['measurements']}, of which {section['examined']} examined"
-    without_call = any("no call" in text for text in section["not_observable"])
-    band = "bands of acoustic maps" if without_call else "call's band"
+    band = "call's band" if section["has_call"] else "bands of acoustic maps"
     yield f"noise          {_cell(section['noise_dbfs'], 1)} dBFS in the {band}"
-    if not without_call:
+    if section["has_call"]:
         yield f"dynamic range  {_cell(section['dynamic_range_db'], 1)} dB"
     if section["tones_hz"]:
         yield f"common tones   {', '.join(f'{tone_hz / 1000:.1f}' for tone_hz in section['tones_hz'])} kHz"

@@ -64,6 +64,12 @@ _POLL_INTERVAL_S = 0.1
     help="With --bearings: number of measurements of each sensor to average; that of its settings by default.",
 )
 @click.option(
+    "--directions",
+    metavar="GRID",
+    help="With --bearings: directions to search, 90, 1850, 3000, 2d:N or 3d:N; those of the sensor's settings by "
+    "default.",
+)
+@click.option(
     "--output",
     "-o",
     "trajectory",
@@ -89,6 +95,7 @@ def listen(
     odometry: bool,
     bearings: bool,
     average: int | None,
+    directions: str | None,
     trajectory: Path | None,
     mounting: Path | None,
     key: str | None,
@@ -103,7 +110,8 @@ def listen(
     reflector, the time since the emission, and the time spent in the central node. The central node drops and
     counts products that this command receives too slowly. With --save, the energyscapes, or with --product raw the
     measurements, are saved to a file that appears complete at the end. If the central node disappears, the command
-    waits for it. With --json, there is one line per event; the first one reports the connection.
+    waits for it. With --json, there is one line per event; the event 'subscribed' reports
+    the connection.
 
     With --fuse, this command fuses the images of all sensors. With --odometry, it computes the path of their platform,
     which starts at the origin and lies in the plane; -o writes the path when the command ends, also by Ctrl-C. The
@@ -118,6 +126,7 @@ def listen(
             address,
             name="bearings" if bearings else "odometry" if odometry else "fused",
             average=average,
+            directions=directions,
             trajectory=trajectory,
             mounting=mounting,
             force=force,
@@ -179,6 +188,7 @@ def _listen_specially(
     *,
     name: str,
     average: int | None,
+    directions: str | None,
     trajectory: Path | None,
     mounting: Path | None,
     force: bool,
@@ -187,7 +197,7 @@ def _listen_specially(
     """Print bearings, odometry or fused images, which this command computes itself."""
     _network.require_duration(common["duration"])
     if name == "bearings":
-        _listen_bearings.listen_bearings(address, average=average, **common)
+        _listen_bearings.listen_bearings(address, average=average, directions=directions, **common)
         return
     common["mountings"] = _mountings.mountings(mounting, common["sensors"] or None)
     if name == "odometry":
@@ -212,8 +222,9 @@ def _require_options_of(outputs: dict[str, bool]) -> None:
             raise click.UsageError(f"{option} applies only without {chosen[0]}", context)
     if typed("mounting") and chosen not in (["--fuse"], ["--odometry"]):
         raise click.UsageError("--mounting applies only with --fuse or --odometry", context)
-    if typed("average") and chosen != ["--bearings"]:
-        raise click.UsageError("--average applies only with --bearings", context)
+    for name in ("average", "directions"):
+        if typed(name) and chosen != ["--bearings"]:
+            raise click.UsageError(f"--{name} applies only with --bearings", context)
     if typed("trajectory") and chosen != ["--odometry"]:
         raise click.UsageError("-o applies only with --odometry; --save FILE.h5 saves products", context)
 

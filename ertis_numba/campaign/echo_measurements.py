@@ -6,8 +6,7 @@ from typing import overload
 
 from ertis_numba.campaign.attitudes import Attitudes
 from ertis_numba.errors import DataError
-from ertis_numba.frames import Behaviour, Measurement, Stamp
-from ertis_numba.passive import is_passive
+from ertis_numba.frames import Behaviour, Measurement, Stamp, is_passive
 from ertis_numba.settings import Settings
 from ertis_numba.storage import RecordingReader
 from ertis_numba.storage.recording import Mounting

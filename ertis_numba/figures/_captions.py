@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.figures.style import angle, minus
 from ertis_numba.frames import AcousticMap, Energyscape, Stamp
 from ertis_numba.geometry import microphones
+from ertis_numba.method_titles import METHOD_TITLES
 from ertis_numba.settings import Settings
 
 __all__ = [
@@ -25,14 +26,6 @@ __all__ = [
     "unknown_levels",
 ]
 
-
-_METHODS = {
-    "delay_and_sum": "delay-and-sum",
-    "capon": "Capon",
-    "music": "MUSIC",
-    "clean_sc": "CLEAN-SC",
-    "hr_clean_sc": "HR-CLEAN-SC",
-}
 
 _FAINT_DB = -100.0
 """Of full scale: about what the noise of one-bit conversion alone has; bits that never change stay below it."""
@@ -57,7 +50,7 @@ def of_image(image: Energyscape) -> Heading:
         directions = f"{len(image.azimuth_rad)} directions"
     level = ("directions relative to the horizontal",) if processing.level_directions else ()
     parts = (processing.beamformer, "delay_and_sum"), (processing.weighting, "none")
-    adaptive = "".join(f", {name.replace('_', ' ')}" for name, usual in parts if name != usual)
+    adaptive = "".join(f", {METHOD_TITLES[name]}" for name, usual in parts if name != usual)
     budget_db = settings.accuracy.max_error_db
     return Heading(
         ("Energyscape", image.stamp.sensor, f"measurement {image.stamp.sequence}", *_if_faint(image.amplitude)),
@@ -115,7 +108,7 @@ def of_acoustic_map(title: str, found: AcousticMap, *parts: str) -> Heading:
         (
             settings.array.layout,
             *parts,
-            f"method {_METHODS.get(passive.method, passive.method)}",
+            f"method {METHOD_TITLES[passive.method]}",
             *((f"mean of {count} measurements",) if count > 1 else ()),
             *(() if passive.focus_m is None else (f"focus at {passive.focus_m:g} m",)),
             *left_out(found.masked_s),

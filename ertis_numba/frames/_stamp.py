@@ -85,7 +85,7 @@ def is_passive(settings: Settings, stamp: Stamp) -> bool:
     Examples
     --------
     >>> from ertis_numba import Settings, Stamp
-    >>> from ertis_numba.passive import is_passive
+    >>> from ertis_numba.frames import is_passive
     >>> is_passive(Settings(), Stamp(behaviour="passive")), is_passive(Settings(), Stamp())
     (True, False)
     """

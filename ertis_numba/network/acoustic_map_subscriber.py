@@ -5,11 +5,11 @@ from typing import Any, Final, NamedTuple
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import AcousticMap, Bearing, Measurement
+from ertis_numba.frames import AcousticMap, Bearing, Measurement, is_passive
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.result_subscriber import ResultSubscriber
 from ertis_numba.network.subscriber import Arrival, Subscriber
-from ertis_numba.passive import AcousticCamera, BearingFinder, is_passive
+from ertis_numba.passive import AcousticCamera, BearingFinder
 from ertis_numba.settings import Settings
 
 __all__ = ["AcousticMapSubscriber"]

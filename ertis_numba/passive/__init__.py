@@ -1,6 +1,5 @@
 """Passive listening: maps, bearings and signals of sound that the sensor did not emit."""
 
-from ertis_numba.frames import is_passive
 from ertis_numba.passive.bands import band_edges, octave_bands
 from ertis_numba.passive.beam_sound import BeamSound, heterodyned, listen_to, time_expanded
 from ertis_numba.passive.bearing_tracker import BearingTracker
@@ -21,7 +20,6 @@ __all__ = [
     "band_edges",
     "find_bearings",
     "heterodyned",
-    "is_passive",
     "listen_to",
     "octave_bands",
     "time_differences",

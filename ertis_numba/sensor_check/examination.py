@@ -156,17 +156,17 @@ def _check_sensor(
         intact = [index for index in range(len(recording)) if index not in damaged]
         stamps = recording.stamps()
         with_call = [index for index in intact if stamps[index].behaviour != "passive"]
-        has_call = bool(with_call) or not intact
         examined = _spread(with_call or intact, _MAX_EXAMINED)
         words = find_lost_words(((index, recording[index]) for index in _spread(intact, _MAX_BITS_EXAMINED)), used)
         heard = [_with_settings(recording[index], used) for index in examined]
         clock = check_clock(stamps, used.recording.duration_s, nominal_rate_hz)
     report = merge([health(measurement) for measurement in heard]) if heard else None
+    has_call = report is None or report.has_call
     match = _best_call_match(heard) if has_call else None
     residuals, why = _calibration_residuals(heard, report) if has_call else (None, items.NO_CALL)
     layout = microphones(used.array)
     found: dict[str, items.CheckResult] = {
-        items.MICROPHONES: items.of_microphones(report, has_call=has_call),
+        items.MICROPHONES: items.of_microphones(report),
         items.NOISE: items.of_noise(report, used),
         items.SAMPLES: items.of_samples(report, words),
         items.MEASUREMENTS: items.of_storage(stored),

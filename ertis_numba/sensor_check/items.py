@@ -81,13 +81,13 @@ def _result_of(faults: Sequence[CheckFault], detail: str) -> CheckResult:
     return CheckResult("fault" if faults else "ok", texts or detail, tuple(faults))
 
 
-def of_microphones(report: Health | None, *, has_call: bool) -> CheckResult:
+def of_microphones(report: Health | None) -> CheckResult:
     """Return the result for the microphones; with a call, it is a fault if dead microphones cannot be detected."""
     if report is None:
         return _NOTHING
     count = len(report.channels)
     faults = microphone_faults(report)
-    if report.unknown and not faults and has_call:
+    if report.unknown and not faults and report.has_call:
         if count == 1:
             return CheckResult("not known", report.unknown[0])
         text = f"faulty microphones cannot be detected ({report.unknown[0]})"

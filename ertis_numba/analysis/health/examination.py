@@ -84,7 +84,9 @@ def health(measurement: Measurement) -> Health:
     words = sample_format(settings).validated(measurement.data, any_length=True)[:MAX_SAMPLES]
     if len(words) < MIN_SAMPLES:
         too_short = f"the state of any microphone: the record has {len(words)} samples, fewer than {MIN_SAMPLES}"
-        return Health(channels=tuple(ChannelHealth(channel=int(i)) for i in enabled), unknown=(too_short,))
+        return Health(
+            channels=tuple(ChannelHealth(channel=int(i)) for i in enabled), unknown=(too_short,), has_call=has_call
+        )
     signal_of: Callable[[int], NDArray[np.float32]]
     columns: Callable[[int], NDArray[Any]]
     if settings.recording.is_pdm:
@@ -124,6 +126,7 @@ def health(measurement: Measurement) -> Health:
         unknown=unknown,
         findings=tuple(findings),
         not_observable=not_observable,
+        has_call=has_call,
     )
     if not noise:
         return report

@@ -114,6 +114,8 @@ class Health:
         All faults of channels and of the record, with measured values and limits.
     not_observable : tuple of str
         Faults that the scene cannot reveal, with the reason, such as the order of channels without a compact arrival.
+    has_call : bool
+        True if the sensor emitted its call in any examined measurement.
     """
 
     channels: tuple[ChannelHealth, ...]
@@ -124,6 +126,7 @@ class Health:
     unknown: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     not_observable: tuple[str, ...] = ()
+    has_call: bool = True
 
     @property
     def record_faults(self) -> tuple[Finding, ...]:
@@ -178,6 +181,7 @@ def merge(reports: Sequence[Health]) -> Health:
         not_observable=tuple(
             text for text in reports[0].not_observable if all(text in report.not_observable for report in reports)
         ),
+        has_call=any(report.has_call for report in reports),
     )
 
 
