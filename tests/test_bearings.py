@@ -9,7 +9,7 @@ import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.passive import AcousticCamera, BearingFinder, find_bearings
-from ertis_numba.passive.detection_law import exceedance, independent_samples
+from ertis_numba.passive.detection_law import LAGS, exceedance, independent_samples
 from ertis_numba.passive.likelihood import BandLikelihood, moved
 from ertis_numba.passive.noise_model import NoiseModel
 from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
@@ -27,6 +27,25 @@ def test_independent_samples_are_those_of_the_variance_of_powers():
     blocks = np.lib.stride_tricks.sliding_window_view(noise, 64, axis=1)[:, ::32]
     powers = (np.abs(np.fft.rfft(blocks * window)[:, :, 10:15]) ** 2 @ shares).mean(axis=1)
     assert powers.mean() ** 2 / powers.var() == pytest.approx(independent_samples(shares, n_blocks), rel=0.08)
+
+
+def test_independent_samples_are_those_of_beams_that_turn_from_bin_to_bin():
+    """Sound from the side crosses this array in a quarter of a block, so the beams of neighbouring bins differ."""
+    random, n_block, n_blocks, n_mics = np.random.default_rng(6), 64, 9, 5
+    window = scipy.signal.get_window("hann", n_block)
+    delay_s = np.linspace(-12, 12, n_mics) / n_block  # relative to the duration of a block
+    beams = np.exp(2j * np.pi * np.arange(10, 15)[:, None] * delay_s) / n_mics
+    noise = random.standard_normal((3000, n_mics, n_block // 2 * (n_blocks + 1)))
+    blocks = np.lib.stride_tricks.sliding_window_view(noise, n_block, axis=2)[:, :, :: n_block // 2]
+    spectra = np.fft.rfft(blocks * window)[..., 10:15]
+    powers = (np.abs(np.einsum("nmbk,km->nbk", spectra, beams)) ** 2).sum(axis=2).mean(axis=1)
+    directions = unit_vectors(np.radians([0.0]), np.radians([0.0]))
+    alike = ScanMesh(directions, delay_s[None]).alike(2 * np.pi * 10, 2 * np.pi, LAGS + 1)
+    assert alike[0] == pytest.approx(1)
+    assert alike[1] < 0.9
+    expected = independent_samples(np.ones(5), n_blocks, alike)
+    assert expected > 1.1 * independent_samples(np.ones(5), n_blocks)
+    assert powers.mean() ** 2 / powers.var() == pytest.approx(expected, rel=0.08)
 
 
 def test_exceedance_is_that_of_random_vectors():

@@ -12,7 +12,8 @@ import sys
 import numpy as np
 import pytest
 from ertis_bench import passive
-from ertis_bench.passive import agreement, separation, times
+from ertis_bench.passive import agreement, false_alarms, separation, times
+from ertis_bench.passive_bearings import plane_wave_settings
 
 from ertis_numba.errors import DataError
 
@@ -58,7 +59,7 @@ def test_report_without_acoular_has_times_of_this_package(monkeypatch):
     monkeypatch.setattr("ertis_bench.passive.table.PACKAGE", "no_such_package")
     monkeypatch.setattr(times, "DIRECTIONS", "90")
     monkeypatch.setattr(times, "_OURS", 2)
-    report = passive.run(count=1, seeds=2, bearings=0, seed=0, say=lambda _: None)
+    report = passive.run(count=1, seeds=2, bearings=0, trials=0, seed=0, say=lambda _: None)
     assert report["differences"] == []
     assert [row["name"] for row in report["times"]] == list(times.TIMED)
     assert all(row["ours"]["processor_ms"] > 0 and "acoular" not in row for row in report["times"])
@@ -70,6 +71,37 @@ def test_report_without_acoular_has_times_of_this_package(monkeypatch):
     assert shares["clean_sc", 10.0, 0.0] == [1.0, 1.0]
     assert "| 5° and 10 dB apart |" in text
     assert "| music | 100% / 100% |" in text
+
+
+def test_noise_has_the_asked_coherence_and_continues_across_measurements():
+    settings = plane_wave_settings()
+    case = false_alarms.NoiseCase("both", 0.5, 4)
+    heard = np.concatenate([each.data for each in false_alarms.measurements(settings, case, seed=(0, 1))])
+    assert heard.shape == (4 * settings.recording.n_samples, 32)
+    spectra = np.fft.rfft(heard.T)[:, 11 * 480 : 13 * 480]  # bins of 6.9 Hz, at 36 to 43 kHz
+    found = np.corrcoef(spectra)
+    frequency_hz = np.fft.rfftfreq(len(heard), 1 / settings.recording.sample_rate_hz)[11 * 480 : 13 * 480 : 16]
+    expected = false_alarms.coherence(settings, frequency_hz, 0.5).mean(axis=0)
+    assert np.abs(found - expected).max() < 0.15
+    assert np.abs((found - expected).real).mean() < 0.02
+
+
+def test_false_alarms_are_counted_in_order_of_their_rates():
+    counts = false_alarms.alarms(false_alarms.CASES[0], seed=0, first=0, count=6)
+    assert 6 > counts[0] >= counts[1] >= counts[2]
+    assert false_alarms.interval(5, 100) == pytest.approx((0.0164, 0.1128), abs=1e-4)
+    assert false_alarms.interval(0, 20) == pytest.approx((0.0, 0.1684), abs=1e-4)
+
+
+def test_false_alarms_alone_have_a_table(monkeypatch):
+    rates = [{"asked": asked, "alarms": 3, "interval": (0.01, 0.2)} for asked in false_alarms.ASKED]
+    found = {"trials": 30, "band_hz": (35e3, 45e3), "cases": [{**false_alarms.CASES[1]._asdict(), "rates": rates}]}
+    monkeypatch.setattr(false_alarms, "measure", lambda **_: found)
+    text = passive.form(
+        passive.run(count=1, seeds=1, bearings=1, trials=30, seed=0, only=passive.PARTS, say=lambda _: None)
+    )
+    assert "| noise of | averages | 0.01 requested | 0.1 requested | 0.3 requested |" in text
+    assert "| surroundings | 1 | 0.1000 (0.0100–0.2000) |" in text
 
 
 def test_sources_are_separated_by_two_maxima_near_them():

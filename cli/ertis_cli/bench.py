@@ -346,6 +346,20 @@ def mapping(**given: Any) -> None:
 @click.option(
     "--bearings", type=click.IntRange(min=0), default=20, show_default=True, metavar="N", help="Trials of bearings."
 )
+@click.option(
+    "--trials",
+    type=click.IntRange(min=1),
+    default=1000,
+    show_default=True,
+    metavar="N",
+    help="Maps of each kind of noise in which false alarms are counted.",
+)
+@click.option(
+    "--only",
+    multiple=True,
+    type=click.Choice(["false-alarms"]),
+    help="Count only false alarms of bearings, which takes a few minutes.",
+)
 @_seed("Seed of the signals, and of the first trial.")
 @_update
 @options.quiet

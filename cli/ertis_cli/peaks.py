@@ -1,4 +1,4 @@
-"""``ertis peaks``: reflectors in an energyscape file, or the loudest directions of acoustic maps."""
+"""``ertis peaks``: reflectors in an energyscape file, or sources in acoustic maps."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -29,11 +29,11 @@ _ERROR_COLUMNS: dict[str, _tables.Side] = {
     "level_error_db": "right",
     "reflector": "left",
 }
-_LOUDEST_COLUMNS: dict[str, _tables.Side] = {
+_SOURCE_COLUMNS: dict[str, _tables.Side] = {
     "sensor": "left",
     **dict.fromkeys(("map", "band_khz", "azimuth_deg", "elevation_deg"), "right"),
 }
-_OF_IMAGES = ("top", "min_level", "detector", "false_alarm", "everything", "truth")
+_OF_IMAGES = ("detector", "false_alarm", "everything", "truth")
 _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "level_db": 4, "level_dbfs": 4}
 
 
@@ -41,13 +41,17 @@ _DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "
 @options.input_file("IMG.h5|MAPS.h5")
 @options.sensor("List this sensor only; all sensors by default.")
 @click.option(
-    "--top", type=int, metavar="N", help=f"Largest number per measurement; {_TOP} by default, all with --truth."
+    "--top",
+    type=int,
+    metavar="N",
+    help=f"Largest number per measurement, or per band of a map; {_TOP} by default, all with --truth.",
 )
 @click.option(
     "--min-level",
     type=float,
     metavar="DB",
-    help=f"Lowest level relative to the strongest peak; {_MIN_LEVEL_DB:g} by default, no limit with cfar.",
+    help=f"Lowest level relative to the strongest peak; {_MIN_LEVEL_DB:g} by default, no limit with cfar. In acoustic "
+    "maps, -10 by default, and -20 with CLEAN-SC.",
 )
 @options.measurement("One measurement, or map of a file of acoustic maps, counted from 0; all by default.")
 @click.option(
@@ -81,7 +85,7 @@ def peaks(
 ) -> None:
     """List the reflectors in an energyscape file.
 
-    In a file of acoustic maps, list the loudest direction of each band.
+    In a file of acoustic maps, list the sources of sound.
 
     There is one entry per reflector, the strongest of each measurement first. level_db is relative to the strongest
     peak, and level_dbfs to a full-scale echo in every microphone. Maxima that noise alone may cause in
@@ -96,11 +100,14 @@ def peaks(
     'ertis compare --help'). In JSON, "truth" of each peak is its true reflector or null, "spurious" is true or
     false, and "missed" lists missed reflectors.
 
-    For a file of acoustic maps, there is one entry per map and band: the loudest direction. level_dbfs is its
-    mean square, where a full-scale tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones.
-    source_level_db, in dB re 20 µPa at 1 m from the source, also needs the distance of the source (process --focus).
-    Maps of the method music have no levels. Maps are counted from 0, regardless of the number of measurements that
-    they average. Of the options, only --sensor, --measurement, which chooses a map, and --json apply to maps.
+    For a file of acoustic maps, there is one entry per source, the strongest of each map and band first. Maps of
+    CLEAN-SC and HR-CLEAN-SC yield their components. Other maps yield local maxima, interpolated between directions of
+    the grid, without the floor of the map and the side lobes of delay-and-sum. The loudest direction of each band is
+    listed in any case. level_dbfs is the mean square, where a full-scale tone has -3. level_db, in dB re 20 µPa, needs
+    the sensitivity of the microphones. source_level_db, in dB re 20 µPa at 1 m from the source, also needs the distance
+    of the source (process --focus). Maps of the method music have no levels. Maps are counted from 0, regardless of the
+    number of measurements that they average. --measurement chooses a map. Of the other options, --sensor, --top,
+    --min-level and --json apply to maps.
     """
     from ertis_numba.storage import file_kind
 
@@ -123,7 +130,7 @@ def peaks(
         )
     sensors = options.sensors_of(path, sensor)
     if file_kind(path) == "acoustic_map":
-        _list_loudest(path, sensors, measurement, as_json=as_json)
+        _list_sources(path, sensors, measurement, _TOP if top is None else top, min_level, as_json=as_json)
         return
     options.note_unlisted_directions(path, sensors)
     if truth:
@@ -155,8 +162,17 @@ def peaks(
     table.print()
 
 
-def _list_loudest(path: Path, sensors: tuple[str, ...], measurement: int | None, *, as_json: bool) -> None:
-    """Print the loudest direction of each band of acoustic maps."""
+def _list_sources(
+    path: Path,
+    sensors: tuple[str, ...],
+    measurement: int | None,
+    top: int,
+    min_level_db: float | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Print the sources in each band of acoustic maps."""
+    from ertis_numba.passive import find_sound_sources
     from ertis_numba.storage import open_acoustic_maps
 
     for name in _OF_IMAGES:
@@ -169,19 +185,18 @@ def _list_loudest(path: Path, sensors: tuple[str, ...], measurement: int | None,
     for name in sensors:
         with open_acoustic_maps(path, sensor=name) as maps:
             for index in options.places(measurement, len(maps)):
-                found = maps[index]
-                place = {"sensor": name, "map": index}
-                rows += [place | each.as_dict() for each in found.loudest()]
+                found = find_sound_sources(maps[index], top=top, min_level_db=min_level_db)
+                rows += [{"sensor": name, "map": index, **each.as_dict()} for each in found]
     if as_json:
-        options.print_json({"loudest": rows})
+        options.print_json({"sources": rows})
         return
     optional = [name for name in ("level_db", "source_level_db") if any(row[name] is not None for row in rows)]
     levels = ("level_dbfs", *optional)
-    columns: dict[str, _tables.Side] = {**_LOUDEST_COLUMNS, **dict.fromkeys(levels, "right")}
-    _tables.TextTable(columns, [_loudest_cells(row, levels) for row in rows]).print()
+    columns: dict[str, _tables.Side] = {**_SOURCE_COLUMNS, **dict.fromkeys(levels, "right")}
+    _tables.TextTable(columns, [_source_cells(row, levels) for row in rows]).print()
 
 
-def _loudest_cells(row: dict[str, Any], levels: tuple[str, ...]) -> tuple[str, ...]:
+def _source_cells(row: dict[str, Any], levels: tuple[str, ...]) -> tuple[str, ...]:
     band = "–".join(f"{edge_hz / 1e3:.1f}" for edge_hz in row["band_hz"])
     angles = (f"{row[name]:+.2f}" for name in ("azimuth_deg", "elevation_deg"))
     shown = ("-" if row[name] is None else f"{row[name]:.1f}" for name in levels)

@@ -12,7 +12,7 @@ from ertis_numba.frames import Energyscape
 from ertis_numba.settings import Settings
 from ertis_numba.stages.plan_response import deviation_of
 
-__all__ = ["PeakInterpolator", "Tops"]
+__all__ = ["PeakInterpolator", "QuadricFits", "Tops"]
 
 _ONE_SIDED = 0.25  # Mean offset of neighbours relative to their distance; above it, a direction is at the grid's edge.
 _LINE = 0.2  # Ratio of the widths of a direction's neighbours, below which they lie on a line.
@@ -74,7 +74,7 @@ class PeakInterpolator:
         wanted = np.arange(len(directions)) if only is None else np.unique(only)
         self._row = np.zeros(len(directions), dtype=np.int64)
         self._row[wanted] = np.arange(len(wanted))
-        self._fits = _Fits.of(directions, neighbours, wanted)
+        self._fits = QuadricFits.of(directions, neighbours, wanted)
         self._point_spread = PointSpread(settings) if settings.processing.method == "fast" else None
         self._deviation = deviation_of(settings, directions)
 
@@ -197,7 +197,7 @@ def _bins(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fits:
+class QuadricFits:
     """Fit of a quadric to each direction and its neighbours, over the plane or the line that contains them.
 
     Attributes
@@ -219,8 +219,23 @@ class _Fits:
     reach: NDArray[np.float64]
 
     @classmethod
-    def of(cls, directions: NDArray[np.float64], neighbours: NDArray[np.int64], wanted: NDArray[np.int64]) -> "_Fits":
-        """Return the fits of some directions of a grid."""
+    def of(
+        cls,
+        directions: NDArray[np.float64],
+        neighbours: NDArray[np.int64],
+        wanted: NDArray[np.int64],
+        weights: NDArray[np.float64] | None = None,
+    ) -> "QuadricFits":
+        """Return the fits of some directions of a grid.
+
+        Parameters
+        ----------
+        directions : (direction, axis) float64
+        neighbours : (direction, neighbour) int64
+        wanted : (place,) int64
+        weights : (place, neighbour) float64, optional
+            Weights of the neighbours' squared errors; equal by default.
+        """
         n_directions, n_samples = len(wanted), neighbours.shape[1]
         if n_samples < 3:
             return cls(
@@ -237,7 +252,12 @@ class _Fits:
         is_plane = sizes[:, 1] > _LINE * sizes[:, 0]
         x, y = np.moveaxis(offsets @ axes.transpose(0, 2, 1), 2, 0)
         y = np.where(is_plane[:, None], y, 0.0)
-        inverse = np.linalg.pinv(np.stack([x, y, x * x, x * y, y * y], axis=2))
+        terms = np.stack([x, y, x * x, x * y, y * y], axis=2)
+        if weights is None:
+            inverse = np.linalg.pinv(terms)
+        else:
+            roots = np.sqrt(weights)
+            inverse = np.linalg.pinv(terms * roots[:, :, None]) * roots[:, None]
         usable = n_samples > np.where(is_plane, 5, 2)
         return cls(axes, inverse, is_plane, np.where(usable & ~one_sided, reach, 0.0))
 

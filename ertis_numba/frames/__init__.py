@@ -1,6 +1,6 @@
 """Data that flow through the system, such as measurements, signals, beams, energyscapes and point clouds."""
 
-from ertis_numba.frames._acoustic_map import AcousticMap, Loudest
+from ertis_numba.frames._acoustic_map import AcousticMap, SoundDirection
 from ertis_numba.frames._beams import Beams
 from ertis_numba.frames._bearings import Bearing
 from ertis_numba.frames._energyscape import Energyscape
@@ -28,7 +28,6 @@ __all__ = [
     "Energyscape",
     "LevelReference",
     "LevelUnit",
-    "Loudest",
     "Measurement",
     "MicrophoneSignals",
     "OccupancyMap",
@@ -36,6 +35,7 @@ __all__ = [
     "PointCloud",
     "Reflector",
     "SequenceGap",
+    "SoundDirection",
     "SoundEvent",
     "Stamp",
     "Trajectory",

@@ -15,11 +15,11 @@ from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames._stamp import Stamp
 from ertis_numba.settings import Settings
 
-__all__ = ["AcousticMap", "Loudest"]
+__all__ = ["AcousticMap", "SoundDirection"]
 
 
-class Loudest(NamedTuple):
-    """Loudest direction of a band.
+class SoundDirection(NamedTuple):
+    """Direction of sound in a band, with its level.
 
     Attributes
     ----------
@@ -42,6 +42,27 @@ class Loudest(NamedTuple):
     level_dbfs: float | None
     level_db: float | None
     source_level_db: float | None
+
+    @classmethod
+    def of(cls, found: "AcousticMap", band: int, azimuth_rad: float, elevation_rad: float, *, power: float) -> Self:
+        """Return a direction of a map, with all known levels of a power.
+
+        Parameters
+        ----------
+        found : AcousticMap
+        band : int
+            Number of the band.
+        azimuth_rad, elevation_rad : float
+        power : float
+            Mean square of the sound at the array.
+        """
+        level_dbfs = 10 * math.log10(power) if power else -math.inf
+        levels: dict[str, float | None] = dict.fromkeys(LEVEL_UNITS)
+        for name, unit in LEVEL_UNITS.items() if found.has_level else ():
+            offset_db = level_offset_db(found.settings, found.centre_hz[band : band + 1], unit)
+            levels[name] = None if offset_db is None or np.isnan(offset_db[0]) else level_dbfs + float(offset_db[0])
+        low_hz, high_hz = found.band_hz[band].tolist()
+        return cls((low_hz, high_hz), azimuth_rad, elevation_rad, **levels)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the direction in degrees and the levels for JSON; levels are null if they are unknown or infinite."""
@@ -190,24 +211,22 @@ class AcousticMap(DegreesFromRadians):
             )
         return np.asarray(self.power[:, chosen].sum(axis=1), np.float32)
 
-    def loudest(self) -> list[Loudest]:
-        """Return the loudest direction of each band.
+    def loudest(self) -> list[SoundDirection]:
+        """Return the loudest direction of the grid in each band; `find_sound_sources` interpolates, and returns all.
 
         Returns
         -------
-        list of Loudest
+        list of SoundDirection
         """
-        levels = [getattr(self, name) if self.has_level else None for name in reversed(LEVEL_UNITS)]
         return [
-            Loudest(
-                (float(low_hz), float(high_hz)),
+            SoundDirection.of(
+                self,
+                band,
                 float(self.azimuth_rad[place]),
                 float(self.elevation_rad[place]),
-                *(None if each is None or np.isnan(each[place, band]) else float(each[place, band]) for each in levels),
+                power=float(self.power[place, band]),
             )
-            for band, (place, (low_hz, high_hz)) in enumerate(
-                zip(np.argmax(self.power, axis=0), self.band_hz, strict=True)
-            )
+            for band, place in enumerate(np.argmax(self.power, axis=0))
         ]
 
     def replace(self, **changes: Any) -> Self:

@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 
 from ertis_numba.passive.scan_extent import ScanExtent
 
-__all__ = ["exceedance", "independent_samples"]
+__all__ = ["LAGS", "exceedance", "independent_samples"]
 
+_CELL_RAD: Final = math.pi / 2
+_ROUNDING: Final = 1e-12
 _SAMPLES: Final = 512  # of a block from which correlations are computed
-_LAGS: Final = 4  # Bins beyond which the spectra of Hann windows are uncorrelated.
+LAGS: Final = 4
+"""Distance of bins beyond which the spectra of Hann windows are uncorrelated."""
 
 
 def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: ScanExtent) -> float:
@@ -21,14 +24,16 @@ def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: Sca
 
     In white noise of unknown power, the share R of one direction in the power of D dimensions has the Beta distribution
     ``R ~ Beta(K, K (D − 1))``, where K is the number of independent samples. For many dimensions, this is nearly a
-    Gamma distribution. The largest share of a connected set of directions exceeds R with the probability
+    Gamma distribution. The expected Euler characteristic of the directions of a connected set that exceed R is
 
-    ``P(R) + L₁ g / √(2πn) + L₂ g′ / (2πn)`` with ``n = 2K (D − 1)``,
+    ``E = P(R) + L₁ g / √(2πn) + L₂ g′ / (2πn)`` with ``n = 2K (D − 1)``
 
-    the expected Euler characteristic of the directions that exceed R (K. J. Worsley, Local maxima and the expected
-    Euler characteristic of excursion sets of χ², F and t fields, 1994). Here g is the density of
-    ``φ = arccos √R``, ``g′`` its derivative, and L₁ and L₂ are the length and the area of the set in units of the
-    array's resolution: see `ScanMesh.extent`.
+    (K. J. Worsley, Local maxima and the expected Euler characteristic of excursion sets of χ², F and t fields, 1994).
+    Here g is the density of ``φ = arccos √R``, ``g′`` its derivative, and L₁ and L₂ are the length and the area of the
+    set in units of the array's resolution: see `ScanMesh.extent`. At high levels, this is the expected number of
+    places that exceed R. These are rare and independent in cells as large as the distance π/2 of orthogonal waves (D.
+    J. Aldous, Probability approximations via the Poisson clumping heuristic, 1989). With N cells, the probability of
+    any is therefore ``1 − (1 − E / N)^N``.
 
     Parameters
     ----------
@@ -64,10 +69,14 @@ def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: Sca
     slope = density * ((2 * rest - 1) * ratio - (2 * n_samples - 1) / ratio)
     scale = 4 * math.pi * rest
     expected = extent.n_parts * float(law.sf(share)) + extent.length * density / math.sqrt(scale)
-    return min(1.0, expected + extent.area * slope / scale)
+    expected += extent.area * slope / scale
+    n_cells = extent.n_parts + extent.length / _CELL_RAD + extent.area / _CELL_RAD**2
+    return -math.expm1(n_cells * math.log1p(-min(expected / n_cells, 1 - _ROUNDING)))
 
 
-def independent_samples(shares: NDArray[np.floating], n_blocks: int) -> float:
+def independent_samples(
+    shares: NDArray[np.floating], n_blocks: int, alike: NDArray[np.floating] | None = None
+) -> float:
     """Return the number of independent samples with the same variance of their mean power as bins of blocks.
 
     Hann windows that overlap by half leave 0.47 independent samples of each bin and block: neighbouring bins and blocks
@@ -79,6 +88,9 @@ def independent_samples(shares: NDArray[np.floating], n_blocks: int) -> float:
         Weights of neighbouring bins.
     n_blocks : int
         Number of blocks, of which each shares half of its samples with the next one.
+    alike : (LAGS + 1,) float, optional
+        Squared cosine of the angle between the beams of bins at each distance, from 0 bins on, by which the powers of
+        beams are less correlated: see `ScanMesh.alike`. 1 by default, as for a microphone.
 
     Returns
     -------
@@ -92,8 +104,10 @@ def independent_samples(shares: NDArray[np.floating], n_blocks: int) -> float:
     0.474
     """
     same, next_one = _correlations()
-    products = np.correlate(shares, shares, "full")[len(shares) - 1 :][: _LAGS + 1].astype(np.float64)
+    products = np.correlate(shares, shares, "full")[len(shares) - 1 :][: LAGS + 1].astype(np.float64)
     products[1:] *= 2
+    if alike is not None:
+        products *= alike[: len(products)]
     variance = products @ (n_blocks * same + 2 * (n_blocks - 1) * next_one)[: len(products)]
     return float((n_blocks * shares.sum(dtype=np.float64)) ** 2 / variance)
 
@@ -102,7 +116,7 @@ def independent_samples(shares: NDArray[np.floating], n_blocks: int) -> float:
 def _correlations() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the squared correlations of bins at each distance, within a block and from one block to the next."""
     window = scipy.signal.get_window("hann", _SAMPLES)
-    turns = np.exp(2j * np.pi * np.outer(np.arange(_LAGS + 1), np.arange(_SAMPLES)) / _SAMPLES)
+    turns = np.exp(2j * np.pi * np.outer(np.arange(LAGS + 1), np.arange(_SAMPLES)) / _SAMPLES)
     half = _SAMPLES // 2
     within = np.abs(turns @ window**2) ** 2
     across = np.abs(turns[:, half:] @ (window[half:] * window[:half])) ** 2

@@ -96,6 +96,29 @@ class ScanMesh:
             length += float(np.sqrt(np.maximum(metric[:, 0, 0], 0)).sum())
         return ScanExtent(self._n_parts, length / 2 if len(self._triangles) else length, area)
 
+    def alike(self, omega_rad_s: float, spacing_rad_s: float, n: int, whitening: Floats | None = None) -> Floats:
+        """Return the mean similarity of the waves of a direction at frequencies with equal spacing: (n,) float64.
+
+        The similarity of the whitened waves u at the first frequency and v at another is the squared cosine of their
+        angle, ``|u^H v|² / (u^H u · v^H v)``. It is less than 1 for directions whose sound takes a considerable time to
+        cross the array.
+
+        Parameters
+        ----------
+        omega_rad_s : float
+            First angular frequency.
+        spacing_rad_s : float
+        n : int
+        whitening : (mode, mic) float64
+            None if noise is white.
+        """
+        waves = np.exp(-1j * (omega_rad_s + spacing_rad_s * np.arange(n)[:, None, None]) * self._delay_s)
+        if whitening is not None:
+            waves = waves @ whitening.T
+        size = (np.abs(waves) ** 2).sum(axis=2)
+        products = np.abs((waves[0].conj() * waves).sum(axis=2)) ** 2
+        return np.asarray((products / (size[0] * size)).mean(axis=1))
+
     def _metric(self, corners: Places, omega_rad_s: float, whitening: Floats | None) -> Floats:
         """Return the products of the changes from the first corner to the others: (piece, other, other)."""
         delay_s = self._delay_s[corners]

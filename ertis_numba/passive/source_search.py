@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.passive.detection_law import exceedance, independent_samples
+from ertis_numba.passive.detection_law import LAGS, exceedance, independent_samples
 from ertis_numba.passive.likelihood import BandLikelihood, Delays
 from ertis_numba.passive.noise_model import NoiseModel
 from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
@@ -93,7 +93,7 @@ class BandSearch:
         self._scan, self._noise, self._delays, self._steer = scan, noise, delays, steer
         self._shares, self._weights = shares, shares / shares.sum()
         self._omega = 2 * np.pi * frequency_hz
-        self._extents: dict[int, ScanExtent] = {}
+        self._laws: dict[int, tuple[ScanExtent, NDArray[np.float64]]] = {}
 
     def __call__(
         self, matrix: Matrices, n_blocks: int, *, false_alarm: float, top: int, least: float
@@ -121,7 +121,9 @@ class BandSearch:
         places = np.zeros((0, 3))
         likelihood, share = self._likelihood(scaled, places)
         while len(places) < min(top, matrix.shape[1] - 1):
-            law = functools.partial(exceedance, n_samples=n_samples, extent=self._extent(share))
+            extent, alike = self._of_noise(share)
+            n_beam_samples = independent_samples(self._shares, n_blocks, alike)
+            law = functools.partial(exceedance, n_samples=n_beam_samples, extent=extent)
             place = self._next(likelihood, places, law, false_alarm=false_alarm, least=least)
             if place is None:
                 break
@@ -145,15 +147,19 @@ class BandSearch:
         is_source = chance <= false_alarm and power >= least * strongest and size >= _BLIND * whole
         return place if is_source else None
 
-    def _extent(self, share: float) -> ScanExtent:
-        """Return the extent of the scan in noise with a diffuse share, at the mean square frequency of the band."""
+    def _of_noise(self, share: float) -> tuple[ScanExtent, Floats]:
+        """Return the extent of the scan, and the similarity of the beams of neighbouring bins.
+
+        Both are those of noise with a diffuse share, at the mean square frequency of the band.
+        """
         step = round(-_SHARE_STEPS * math.log10(1 - share))
-        if step not in self._extents:
+        if step not in self._laws:
             omega = math.sqrt(float(self._weights @ self._omega**2))
             nearest = int(np.abs(self._omega - omega).argmin())
             whitening = self._noise.whitening(1 - 10 ** (-step / _SHARE_STEPS))[nearest] if step else None
-            self._extents[step] = self._scan.mesh.extent(omega, whitening)
-        return self._extents[step]
+            mesh, spacing = self._scan.mesh, float(self._omega[1] - self._omega[0]) if len(self._omega) > 1 else 0.0
+            self._laws[step] = mesh.extent(omega, whitening), mesh.alike(omega, spacing, LAGS + 1, whitening)
+        return self._laws[step]
 
     def _likelihood(self, matrix: Matrices, places: Floats) -> tuple[BandLikelihood, float]:
         """Return the likelihood of sources in noise, and the diffuse share of the noise."""

@@ -1,5 +1,5 @@
 """Acoustic maps: differences from Acoular, times, and the separation of two sources."""
 
-from ertis_bench.passive.table import form, run
+from ertis_bench.passive.table import PARTS, form, run
 
-__all__ = ["form", "run"]
+__all__ = ["PARTS", "form", "run"]

@@ -2,19 +2,32 @@
 
 import importlib.metadata
 import importlib.util
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Final
 
 from ertis_bench import machine, passive_bearings
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_bench.passive import agreement, separation, times
+from ertis_bench.passive import agreement, false_alarms, separation, times
 from ertis_bench.passive._acoular import PACKAGE
 
-__all__ = ["form", "run"]
+__all__ = ["PARTS", "form", "run"]
 
 
-def run(*, count: int, seeds: int, bearings: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+PARTS: Final = ("false-alarms",)
+"""Parts that can be measured alone."""
+
+
+def run(
+    *,
+    count: int,
+    seeds: int,
+    bearings: int,
+    trials: int,
+    seed: int,
+    only: Sequence[str] = (),
+    say: Callable[[str], None],
+) -> dict[str, Any]:
     """Compare acoustic maps with those of Acoular, time both, and measure their errors.
 
     Parameters
@@ -25,8 +38,12 @@ def run(*, count: int, seeds: int, bearings: int, seed: int, say: Callable[[str]
         Pairs of sources that shall be separated, for each angle; 0 leaves them out.
     bearings : int
         Trials of each error of bearings; 0 leaves them out.
+    trials : int
+        Maps of each kind of noise in which false alarms are counted; 0 leaves them out.
     seed : int
         Seed of the signals, and of the first trial.
+    only : sequence of str
+        Names of ``PARTS`` to measure; all by default.
     say : callable
         Function that reports progress.
 
@@ -35,11 +52,17 @@ def run(*, count: int, seeds: int, bearings: int, seed: int, say: Callable[[str]
     DataError
         A map differs from that of Acoular.
     """
+    described: dict[str, Any] = {
+        "machine": machine.describe(),
+        "seed": seed,
+        "false_alarms": false_alarms.measure(trials=trials, seed=seed, say=say) if trials else None,
+    }
+    if only:
+        return described
     installed = importlib.util.find_spec(PACKAGE) is not None
     return {
-        "machine": machine.describe(),
+        **described,
         "count": count,
-        "seed": seed,
         "acoular": importlib.metadata.version(PACKAGE) if installed else None,
         "differences": agreement.compare(seed=seed, say=say) if installed else [],
         "times": times.measure(count=count, seed=seed, with_acoular=installed, say=say),
@@ -52,11 +75,15 @@ def run(*, count: int, seeds: int, bearings: int, seed: int, say: Callable[[str]
 
 def form(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
+    if "differences" not in report:
+        return f"{_false_alarms(report)}\n\nMeasured on {sentence(report['machine'])}"
     parts = [_differences(report), _times(report), _parts(report)]
     if report["separation"]:
         parts.append(_separation(report))
     if report["bearings"]:
         parts.append(_bearings(report["bearings"]))
+    if report["false_alarms"]:
+        parts.append(_false_alarms(report))
     return "\n\n".join([*parts, f"Measured on {sentence(report['machine'])}"])
 
 
@@ -151,6 +178,27 @@ def _bearings(found: dict[str, Any]) -> str:
         f"{table(head, rows)}\n\nErrors of the bearing of one source of plane waves, in the band "
         f"{low_hz / 1e3:g}–{high_hz / 1e3:g} kHz of one measurement. The SNR is that of a microphone in this band.\n\n"
         f"A leak 10 dB below the ambient noise in the band, after ten averaged measurements: found within 2° in "
-        f"{leak['found']} of {leak['trials']} trials. False alarms without the leak: {leak['false_alarms']} of "
-        f"{leak['trials']}, at a requested rate of {leak['asked_rate']:g} per map."
+        f"{leak['found']} of {leak['trials']} trials, at a requested rate of {leak['asked_rate']:g} false alarms per "
+        "map."
+    )
+
+
+def _false_alarms(report: dict[str, Any]) -> str:
+    found = report["false_alarms"]
+    trials, (low_hz, high_hz) = found["trials"], found["band_hz"]
+    rows = []
+    for case in found["cases"]:
+        cells = [case["name"], str(case["averages"])]
+        for rate in sorted(case["rates"], key=lambda each: float(each["asked"])):
+            low, high = rate["interval"]
+            cells.append(f"{rate['alarms'] / trials:.4f} ({low:.4f}–{high:.4f})")
+        rows.append(cells)
+    asked = sorted(rate["asked"] for rate in found["cases"][0]["rates"])
+    head = ["noise of", "averages", *(f"{each:g} requested" for each in asked)]
+    return (
+        f"{table(head, rows)}\n\nShare of {trials:,} maps of noise without sources that yield a bearing, with its "
+        f"{false_alarms.CONFIDENCE:.0%} confidence interval (Clopper–Pearson), at each requested rate (seed "
+        f"{report['seed']}). Maps have the band {low_hz / 1e3:g}–{high_hz / 1e3:g} kHz of float32 signals of 32 "
+        "microphones, in which 36.4 ms are a measurement, and 3000 directions. The noise of the surroundings is "
+        "diffuse and 30 dB above that of the microphones."
     )
