@@ -324,7 +324,7 @@ def test_failure_of_listen_keeps_earlier_poses(tmp_path):
 
 def test_listen_without_pulses_writes_no_trajectory(tmp_path, monkeypatch):
     target = tmp_path / "path.tum"
-    connected = results_of(monkeypatch, MicrophoneTable, "connected")
+    connected = results_of(monkeypatch, MicrophoneTable, "subscribed")
     end_when(monkeypatch, "ertis_cli._listen_pulses", lambda: connected)
     with Publisher() as publisher, publisher.playing([]):
         arguments = ["--odometry", "-o", str(target), "--duration", "0.3"]
