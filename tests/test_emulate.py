@@ -13,7 +13,7 @@ import pytest
 import serial
 from click.testing import CliRunner
 from ertis_cli._emulation import SceneRenderer
-from ertis_cli.emulate import _get_ready, _render_all
+from ertis_cli.emulate import _Estimate, _get_ready, _render_all
 from ertis_cli.main import cli
 
 from ertis_numba.devices.driver import SonarDriver
@@ -326,6 +326,21 @@ def test_rendering_in_advance_leaves_nothing_to_render(silent, monkeypatch):
     words = {active: renderer.of("only", active=active) for active in (True, False)}
     assert [np.array_equal(words[True][index], words[False][index]) for index in range(scene.count)] == [silent] * 2
     assert len(rendered) == scene.count * (1 if silent else 2)
+
+
+@pytest.mark.parametrize(
+    ("n_steps", "reported"),
+    [
+        (200_000, ["rendering takes about 833 min and 800.0 GB of memory; a smaller --count takes less"]),
+        (200, ["rendering takes about 48 s and 800 MB of memory; a smaller --count takes less"]),
+        (40, []),
+    ],
+)
+def test_emulate_estimates_a_long_rendering(n_steps, reported):
+    """Each measurement takes 0.25 s, and the first of two sensors 30 s."""
+    elapsed_s = iter([30.0, 60.0, *(60.0 + 0.25 * step for step in range(1, n_steps))])
+    estimate = _Estimate(n_steps, n_first=2, clock=lambda: next(elapsed_s))
+    assert list(filter(None, (estimate.after(4_000_000) for _ in range(n_steps)))) == reported
 
 
 def test_passive_capture_of_a_scene_loses_no_measurement(emulate, tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
+from ertis_cli._central_watch import size
 from ertis_cli._stop_signals import broken_off_by_signals, stopped_by_signals
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["emulate"]
 
+_TIMED_S = 1.0  # time of rendering from which the rest is estimated
+_LONG_S = 10.0  # estimated time that is reported
 _POLL_INTERVAL_S = 0.5  # interval between checks of the devices
 
 
@@ -220,9 +223,47 @@ def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: boo
     measurements = options.counted(renderer.count * len(names), "measurement")
     with_call = "with a call, and as many without" if renderer.emits else "without a call"
     options.say(f"rendering {measurements} {with_call} ...", quiet=quiet)
+    estimate = _Estimate(len(todo), n_first=len(names))
     with options.progress(todo, length=len(todo), label="rendering", quiet=quiet) as shown:
         for name, index, active in shown:
-            renderer.words(name, index, active=active)
+            text = estimate.after(renderer.words(name, index, active=active).nbytes)
+            if text:
+                options.say(text, quiet=quiet)
+
+
+class _Estimate:
+    """Estimate of the time and the memory of a long task, reported once, from its first steps.
+
+    Parameters
+    ----------
+    n_steps : int
+        Number of all steps.
+    n_first : int
+        Number of steps that also prepare the following ones, so that their time does not count.
+    clock : callable
+        Clock in seconds; a monotonic one by default.
+    """
+
+    def __init__(self, n_steps: int, *, n_first: int, clock: "Callable[[], float]" = time.monotonic) -> None:
+        self._n_steps, self._n_first, self._clock = n_steps, n_first, clock
+        self._n_done = self._n_bytes = 0
+        self._begun_s, self._is_reported = 0.0, False
+
+    def after(self, n_bytes: int) -> str:
+        """Return the line about a long task after a step that made some bytes; otherwise an empty text."""
+        self._n_done, self._n_bytes = self._n_done + 1, self._n_bytes + n_bytes
+        n_timed, now_s = self._n_done - self._n_first, self._clock()
+        if n_timed <= 0:
+            self._begun_s = now_s
+        if n_timed <= 0 or self._is_reported or now_s - self._begun_s < _TIMED_S:
+            return ""
+        self._is_reported = True
+        left_s = (now_s - self._begun_s) / n_timed * (self._n_steps - self._n_done)
+        if left_s < _LONG_S:
+            return ""
+        left = f"{left_s / 60:.0f} min" if left_s >= 90 else f"{left_s:.0f} s"
+        room = size(self._n_bytes / self._n_done * self._n_steps)
+        return f"rendering takes about {left} and {room} of memory; a smaller --count takes less"
 
 
 def _rendered(renderer: "SceneRenderer", names: "Sequence[str]") -> "Given":
