@@ -60,7 +60,8 @@ def add_evidence(occupied, touched, most, free, place, rotation, step, near, nea
     """Add the evidence of one pulse to a map."""
     n_layers, n_rows, n_columns = out.shape
     n_steps = free.shape[2]
-    far = max(_farthest(free) * step, near)
+    n_free, n_used = _farthest(free)
+    far_free, far = max(n_free * step, near), max(n_used * step, near)
     r = rotation
     for layer in range(n_layers):
         z = layer - place[2]
@@ -70,7 +71,8 @@ def add_evidence(occupied, touched, most, free, place, rotation, step, near, nea
                 evidence = min(occupied[layer, row, column], most)
                 x = column - place[0]
                 away = math.sqrt(x * x + y * y + z * z)
-                if evidence <= touched and away < far:
+                # Beyond the free ranges, only occupied cells can lose evidence.
+                if evidence <= touched and away < (far if out[layer, row, column] > _ZERO else far_free):
                     if away < near:
                         evidence -= near_free
                     else:
@@ -92,15 +94,17 @@ def add_evidence(occupied, touched, most, free, place, rotation, step, near, nea
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _farthest(free):
-    """Return the number of ranges up to the last one with evidence."""
-    last = 0
+    """Return the number of ranges up to the last free one, and up to the last one with evidence."""
+    n_free = n_used = 0
     for elevation in range(free.shape[0]):
         for azimuth in range(free.shape[1]):
-            for s in range(free.shape[2] - 1, last - 1, -1):
+            for s in range(free.shape[2] - 1, n_free - 1, -1):
                 if free[elevation, azimuth, s] != _ZERO:
-                    last = s + 1
+                    n_used = max(n_used, s + 1)
+                if free[elevation, azimuth, s] > _ZERO:
+                    n_free = s + 1
                     break
-    return last
+    return n_free, n_used
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
