@@ -31,7 +31,7 @@ from ertis_numba.stages.stream_plan import StreamPlanner
 from ertis_numba.stages.stream_recipe import LINEAR, recipe_of, uses_streams
 from ertis_numba.stages.time_window import TimeWindow
 
-__all__ = ["BeamTables"]
+__all__ = ["BeamTables", "PlanStreams"]
 
 _Edges = list[tuple[int, int, float]]
 
