@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 
 import h5py
+import numba
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -19,9 +20,11 @@ from ertis_numba.network.processing.shared_pipeline import SharedPipeline
 from ertis_numba.passive import AcousticCamera
 from ertis_numba.settings import Accuracy, Processing
 from ertis_numba.simulation import Electronics, Point, Scene, Sensor
+from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.stages.memory import require_images
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
 from ertis_numba.storage.schema import to_python
+from tests.publishing import results_of
 
 TILTS_DEG = ((25.0, 0.0), (0.0, -15.0), (-20.0, 18.0))  # roll, pitch
 YAW_DEG = 70.0
@@ -193,6 +196,39 @@ def test_streamed_measurement_has_the_same_level_image(method):
             pytest.raises(ertis.ArgumentError, match="stream belongs to another pipeline"),
         ):
             other.process(measurement, stream=stream, attitude_xyzw=turns[0])
+
+
+def test_words_that_differ_from_a_stream_cause_no_second_computation_of_tables(monkeypatch):
+    measurement = heard(*TILTS_DEG[2], directions="3d:300")
+    turn = attitude(*TILTS_DEG[0]).as_quat()
+    with ertis.Pipeline(levelled(measurement), "cpu", predict=False) as pipeline:
+        wanted = pipeline.process(measurement, attitude_xyzw=turn)
+        stream, turned = pipeline.stream(), results_of(monkeypatch, FastChain, "_turned")
+        stream.add(0, ~measurement.data[:20_000])
+        image = pipeline.process(measurement, stream=stream, attitude_xyzw=turn)
+    assert np.array_equal(image.amplitude, wanted.amplitude)
+    assert len(turned) == 1
+
+
+@pytest.mark.parametrize(("device", "chosen"), [("numpy", "numpy"), ("cpu", "auto")])
+def test_tables_are_computed_by_the_kernels_and_threads_of_the_pipeline(device, chosen, monkeypatch):
+    """Compiled kernels outside of this limit would meet those of other threads, which Numba's workqueue refuses."""
+    measurement, used = heard(*TILTS_DEG[2], directions="3d:300"), []
+
+    def load(name="auto"):
+        steering = kernels.load_steering(name)
+
+        def sum_polynomials(places, coefficients, out):
+            used.append((name, numba.get_num_threads() if name == "auto" else 1))
+            steering.sum_polynomials(places, coefficients, out)
+
+        return replace(steering, sum_polynomials=sum_polynomials)
+
+    monkeypatch.setattr("ertis_numba.stages.fast_chain.load_steering", load)
+    settings = levelled(measurement).replace("processing.range_m", (1.4, 1.75))
+    with ertis.Pipeline(settings, device, predict=False) as pipeline:
+        pipeline.process(measurement, attitude_xyzw=attitude(*TILTS_DEG[0]).as_quat(), threads=1)
+    assert set(used) == {(chosen, 1)}
 
 
 def test_pipeline_refuses_graphs_that_it_cannot_record():

@@ -3,6 +3,7 @@
 from numpy.polynomial import chebyshev
 
 from ertis_numba.kernels._contract.steering import Doubles, SteeringKernels
+from ertis_numba.kernels._numpy import threads
 
 __all__ = ["KERNELS"]
 
@@ -20,4 +21,4 @@ def sum_polynomials(places: Doubles, coefficients: Doubles, out: Doubles) -> Non
         out[first : first + _AT_A_TIME] = (along[:, :, None] * across[:, None, :]).reshape(len(x), -1) @ flat
 
 
-KERNELS = SteeringKernels(sum_polynomials=sum_polynomials)
+KERNELS = SteeringKernels(sum_polynomials=sum_polynomials, threads=threads)

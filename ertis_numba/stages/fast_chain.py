@@ -74,8 +74,10 @@ class FastChain(KernelChain):
         self._linear_filter = None if streams is None or streams.linear is None else advanced(streams.linear_gains)
         self._beamform = self._new_beamform(tables)
 
-    def _turned(self, grid: Grid) -> Beamform | PhaseShifts:
-        return self._new_beamform(self._tables.turned(grid, load_steering()))
+    def _turned(self, grid: Grid, threads: int) -> Beamform | PhaseShifts:
+        steering = load_steering("numpy" if self._kernels.device == "numpy" else "auto")
+        with steering.threads(threads):
+            return self._new_beamform(self._tables.turned(grid, steering))
 
     def _new_beamform(self, tables: BeamTables) -> Beamform | PhaseShifts:
         return tables.beamform(self._kernels, self._memory, self._window, self._matched_filter)

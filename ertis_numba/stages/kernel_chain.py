@@ -94,7 +94,7 @@ class KernelChain(ABC):
         """Create the axes and the stages."""
 
     @abstractmethod
-    def _turned(self, grid: Grid) -> Beamform | PhaseShifts:
+    def _turned(self, grid: Grid, threads: int) -> Beamform | PhaseShifts:
         """Return the beamformer for as many other directions, which shares all buffers."""
 
     def process(
@@ -113,8 +113,8 @@ class KernelChain(ABC):
     def _beamform_for(self, grid: Grid | None, threads: int) -> Beamform | PhaseShifts:
         if grid is None:
             return self._beamform
-        with one_thread(), self._kernels.threads(threads):
-            return self._turned(grid)
+        with one_thread():
+            return self._turned(grid, threads)
 
     def stream(self, words: NDArray[np.unsignedinteger[Any]]) -> WordStream:
         """Return a stream of words; ``words`` is an array for a whole measurement, (sample, word)."""
@@ -147,11 +147,9 @@ class KernelChain(ABC):
         threads = self._threads if threads is None else threads
         with self._kernels.threads(threads):  # An image that is complete already would need none.
             pass
-        image = (
-            self._image if grid is None else functools.partial(self._image, beamform=self._beamform_for(grid, threads))
-        )
-        if not stream.process(words, out, image, threads=threads):
-            self.process(words, out, threads=threads, grid=grid)
+        beamform = self._beamform_for(grid, threads)
+        if not stream.process(words, out, functools.partial(self._image, beamform=beamform), threads=threads):
+            self._finish(self._begin(words, out, threads, beamform))
 
     def process_batch(
         self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]

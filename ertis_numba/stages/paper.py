@@ -74,7 +74,7 @@ class PaperChain(KernelChain):
         self._new_beamform = turned
         self._beamform = turned(self.grid)
 
-    def _turned(self, grid: Grid) -> "_DelayAndSum":
+    def _turned(self, grid: Grid, threads: int) -> "_DelayAndSum":  # noqa: ARG002  NumPy computes its tables.
         return self._new_beamform(grid)
 
 

@@ -6,6 +6,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.kernels._device_protocols import Threads
+
 __all__ = ["Doubles", "SteeringKernels"]
 
 Doubles = NDArray[np.float64]
@@ -34,6 +36,9 @@ class SteeringKernels:
     ----------
     sum_polynomials : callable
         See `SumPolynomials`.
+    threads : callable
+        Context manager that limits the number of threads, see `Threads`. Kernels run within it.
     """
 
     sum_polynomials: SumPolynomials
+    threads: Threads

@@ -5,6 +5,7 @@ import numpy as np
 from numba import njit, prange
 
 from ertis_numba.kernels._contract.steering import SteeringKernels
+from ertis_numba.kernels._cpu import threads
 
 __all__ = ["KERNELS"]
 
@@ -48,4 +49,4 @@ def _polynomials(places, count):
     return found
 
 
-KERNELS = SteeringKernels(sum_polynomials=sum_polynomials)
+KERNELS = SteeringKernels(sum_polynomials=sum_polynomials, threads=threads)
