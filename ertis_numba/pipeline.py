@@ -4,7 +4,7 @@ import functools
 import itertools
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -213,11 +213,12 @@ class Pipeline:
                 "level_directions"
             )
         words, exponent = self._words_of(measurement)
-        grid = is_behind = None
+        grid = heard = None
         if attitude_xyzw is None:
             self.settings.processing.require_sensor_frame(_NO_ATTITUDE)
         else:
             grid, is_behind = levelled_grid(self.grid, attitude_xyzw)
+            heard = _Heard(grid, ~is_behind)
         amplitude = self._chain.new_image() if out is None else self._checked_out(out)
         if stream is not None and isinstance(self._chain, KernelChain):
             self._chain.process_streamed(stream, words, amplitude, threads=threads, grid=grid)
@@ -225,9 +226,9 @@ class Pipeline:
             self._chain.process(words, amplitude, threads=threads, grid=grid)
         else:
             raise foreign_stream()
-        if is_behind is not None:
-            amplitude[is_behind] = 0.0
-        return self._checked_image(rescaled(amplitude, exponent), measurement, clean=clean)
+        if heard is not None:
+            amplitude[~heard.is_ahead] = 0.0
+        return self._checked_image(rescaled(amplitude, exponent), measurement, clean=clean, heard=heard)
 
     def stream(self) -> WordStream:
         """Return a stream that demodulates words while they arrive from a sensor; it has buffers of its own.
@@ -506,7 +507,14 @@ class Pipeline:
         if self._closed:
             raise ArgumentError("the pipeline is closed; create another one")
 
-    def _checked_image(self, amplitude: NDArray[np.float32], measurement: Measurement, *, clean: bool) -> Energyscape:
+    def _checked_image(
+        self,
+        amplitude: NDArray[np.float32],
+        measurement: Measurement,
+        *,
+        clean: bool,
+        heard: "_Heard | None" = None,
+    ) -> Energyscape:
         """Return an image, cleaned after all checks, because predictions need all amplitudes."""
         image = Energyscape(
             amplitude=amplitude,
@@ -516,8 +524,8 @@ class Pipeline:
             settings=self._uncleaned_settings,
             stamp=measurement.stamp,
         )
-        if self._image_checks is not None:
-            self._image_checks.check(image, measurement)
+        if self._image_checks is not None and (heard is None or heard.is_ahead.any()):
+            self._image_checks.check(image if heard is None else heard.of(image), measurement)
         processing = self.settings.processing
         if not clean or not processing.is_cleaned:
             return image
@@ -534,6 +542,28 @@ class Pipeline:
         if out.dtype != np.float32 or out.shape != wanted or not out.flags.c_contiguous or not out.flags.writeable:
             raise ArgumentError(f"out is {out.dtype} of shape {out.shape}; give contiguous float32 of shape {wanted}")
         return out
+
+
+class _Heard(NamedTuple):
+    """Directions of a level image in the sensor frame, for comparison with exact images.
+
+    Attributes
+    ----------
+    grid : Grid
+    is_ahead : (direction,) bool
+        False for directions behind the sensor, whose amplitude is 0.
+    """
+
+    grid: Grid
+    is_ahead: NDArray[np.bool_]
+
+    def of(self, image: Energyscape) -> Energyscape:
+        """Return the part of an image that is ahead, with its directions in the sensor frame."""
+        return image.replace(
+            amplitude=image.amplitude[self.is_ahead],
+            azimuth_rad=self.grid.azimuth_rad[self.is_ahead],
+            elevation_rad=self.grid.elevation_rad[self.is_ahead],
+        )
 
 
 def _without_cleaning(settings: Settings) -> Settings:

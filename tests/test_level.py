@@ -2,6 +2,7 @@
 
 import json
 import re
+import warnings
 from dataclasses import replace
 
 import h5py
@@ -229,6 +230,20 @@ def test_tables_are_computed_by_the_kernels_and_threads_of_the_pipeline(device, 
     with ertis.Pipeline(settings, device, predict=False) as pipeline:
         pipeline.process(measurement, attitude_xyzw=attitude(*TILTS_DEG[0]).as_quat(), threads=1)
     assert set(used) == {(chosen, 1)}
+
+
+@pytest.mark.parametrize("tilt_deg", [TILTS_DEG[2], (30.0, 60.0)])
+@pytest.mark.parametrize("method", ["16 bits", "Capon", "coherence factor"])
+def test_error_of_a_level_image_is_predicted_for_its_directions_in_the_sensor_frame(method, tilt_deg):
+    """Errors relative to level directions, or at directions behind the sensor, would cause a false warning."""
+    measurement = heard(*TILTS_DEG[2], directions="3d:300")
+    settings = levelled(measurement).replace("processing.range_m", (1.4, 1.75)).replace(**METHODS[method])
+    settings = settings.replace("processing.azimuth_limits_deg", (-90.0, 90.0))
+    with ertis.Pipeline(settings, "cpu") as pipeline, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pipeline.process(measurement, attitude_xyzw=attitude(*tilt_deg).as_quat())
+        prediction = pipeline.prediction
+    assert prediction.predicted_error_db < settings.accuracy.max_error_db
 
 
 def test_pipeline_refuses_graphs_that_it_cannot_record():
