@@ -9,6 +9,7 @@ import scipy.stats
 from ertis_bench.furnished_rooms import PlatformImager, mountings, random_motion, random_room
 
 import ertis_numba as ertis
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.fusion.rig import mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor
@@ -136,6 +137,29 @@ def test_echoes_of_calls_of_other_sensors_are_left_out(receiver, settings, n_for
     kept_m = echoes.range_m[echoes.sensor == list(given).index(receiver)]
     assert kept_m[:8] == pytest.approx(np.linalg.norm(own_m, axis=1), abs=1e-6)
     assert len(kept_m) == 8 + 12 - n_foreign
+
+
+@pytest.mark.parametrize(
+    ("call", "late_s", "n_kept"),
+    [({"delay_s": 2e-3}, 0.0, 12), ({"delay_s": 2e-3}, 2e-3, 0), ({"stop_frequency_hz": 40e3}, 0.0, 12)],
+    ids=["as if calls began together", "later call", "different call"],
+)
+def test_echoes_of_later_calls_are_left_out_at_their_ranges(call, late_s, n_kept):
+    """An echo of a call that begins later seems farther away, by half of the way of the sound meanwhile."""
+    given = mountings(["front", "right"])
+    sensors = {sensor.name: sensor for sensor in mounted_sensors(given)}
+    angle_rad = np.radians(np.linspace(42.0, 44.0, 12))  # Ahead of the front sensor, too.
+    local_m = np.linspace(2.5, 4.0, 12)[:, None] * np.column_stack([np.cos(angle_rad), np.sin(angle_rad), np.zeros(12)])
+    right, front = sensors["right"], sensors["front"]
+    foreign_m = heard_m(front, right, local_m @ right.rotation.T + right.translation_m)
+    settings = ertis.Settings()
+    late_m = late_s * sound_speed_m_s(settings.air) / 2
+    foreign_m *= 1 + late_m / np.linalg.norm(foreign_m, axis=1)[:, None]
+    other = settings.replace(call=settings.call.replace(**call))
+    echoes = EchoExtractor(mounted_sensors(given))(
+        {"right": cloud_of("right", local_m, other), "front": cloud_of("front", foreign_m)}
+    )
+    assert np.sum(echoes.sensor == list(given).index("front")) == n_kept
 
 
 def test_ego_velocity_in_a_furnished_room():

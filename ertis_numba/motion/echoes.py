@@ -89,9 +89,10 @@ class EchoExtractor:
         parts = [self._echoes(item) for item in group.values()]
         echoes = GroupEchoes(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         is_foreign = np.zeros(len(echoes.level), dtype=np.bool_)
+        calls = {self._sensors[item.stamp.sensor][0]: item.settings.call for item in group.values()}
         for item in group.values():
             number, _ = self._sensors[item.stamp.sensor]
-            is_foreign |= _foreign(echoes, number, self._mounted, is_flat=_is_flat(item.settings.array))
+            is_foreign |= _foreign(echoes, number, self._mounted, calls, is_flat=_is_flat(item.settings.array))
         return GroupEchoes._make(column[~is_foreign] for column in echoes)
 
     def _echoes(self, item: Energyscape | PointCloud) -> GroupEchoes:
@@ -142,12 +143,18 @@ def _is_flat(array: Array) -> bool:
 
 
 def _foreign(
-    echoes: GroupEchoes, number: int, sensors: tuple[MountedSensor, ...], *, is_flat: bool
+    echoes: GroupEchoes,
+    number: int,
+    sensors: tuple[MountedSensor, ...],
+    calls: Mapping[int, Call],
+    *,
+    is_flat: bool,
 ) -> NDArray[np.bool_]:
     """Return True for the echoes of a sensor that the calls of other sensors explain.
 
     The other sensors show the reflectors, nearer to their axes. Their calls return to this sensor after the mean of
-    both distances, as a range. Reflectors behind a flat array appear ahead of it.
+    both distances, as a range, plus half of the way that sound travels between the beginnings of both calls. The
+    matched filter suppresses other calls than its own. Reflectors behind a flat array appear ahead of it.
 
     Parameters
     ----------
@@ -155,6 +162,8 @@ def _foreign(
     number : int
         Index of the sensor.
     sensors : tuple of MountedSensor
+    calls : mapping of int to Call
+        Calls of the sensors with echoes.
     is_flat : bool
 
     Returns
@@ -167,8 +176,12 @@ def _foreign(
     distance_m = np.linalg.norm(local_m, axis=1)
     cosine = np.sum((echoes.position_m - places_m) * axes, axis=1) / echoes.range_m
     is_own = echoes.sensor == number
-    is_source = ~is_own & (local_m[:, 0] < cosine * distance_m) & (is_flat | (local_m[:, 0] > 0))
-    range_m = (echoes.range_m[is_source] + distance_m[is_source]) / 2
+    alike = [other for other, call in calls.items() if other != number and call.sounds_like(calls[number])]
+    is_source = np.isin(echoes.sensor, alike) & (local_m[:, 0] < cosine * distance_m) & (is_flat | (local_m[:, 0] > 0))
+    late_s = np.zeros(len(sensors))
+    late_s[alike] = [calls[other].start_s - calls[number].start_s for other in alike]
+    late_m = late_s[echoes.sensor] * echoes.sound_speed_m_s
+    range_m = (echoes.range_m + distance_m + late_m)[is_source] / 2
     ahead_m = np.column_stack([np.abs(local_m[:, 0]), local_m[:, 1:]])[is_source] @ sensors[number].rotation.T
     turn_rad = echoes.azimuth_rad[is_own][:, None] - np.arctan2(ahead_m[:, 1], ahead_m[:, 0])
     agrees = np.abs(echoes.range_m[is_own][:, None] - range_m) < _FOREIGN_M
