@@ -106,7 +106,9 @@ def test_noise_has_only_its_loudest_direction():
 def test_silence_has_no_level(method):
     with camera_of(method, "3d:400") as camera:
         found = camera.process(noise(camera.settings, [], own_rms=0.0, seed=0))
-    assert all(each.level_dbfs < -250 for each in ertis.find_sound_sources(found))
+    sources = ertis.find_sound_sources(found)
+    assert [each.band_hz for each in sources] == [tuple(each) for each in BANDS_HZ]
+    assert all(each.level_dbfs < -250 for each in sources)
 
 
 def test_arguments_of_sources_are_checked():
