@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.fusion.pairs import AUDIBLE
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
@@ -22,7 +23,6 @@ _GATE: Final = 16.0  # Squared Mahalanobis distance; four standard deviations al
 _SAME_M: Final = 0.015  # Distance of a lone echo from a reflector that may cause it, in addition to uncertainties.
 _REFINED_M: Final = 0.005  # Path that overlapping echoes add to the uncertainty of a located reflector.
 _ALIKE: Final = 10.0  # Ratio of reflectivities that two echoes of a reflector may show.
-_AUDIBLE: Final = 10 ** (-25.0 / 10)  # Radiated power that causes audible echoes.
 _MIN_SCORE: Final = 0.75  # Sum of the fits of two echoes halfway to the limit of the gate, one of them attributed.
 _N_CONFIRMING: Final = 3  # Echoes that show a reflector which the attribution of the images does not show.
 _EXCESS: Final = 4.0  # Reflectivity relative to the bound of a cell, above which missing echoes exclude a candidate.
@@ -182,7 +182,7 @@ class Reflectors:
         for number, model in self._emitters.items():
             radiated = model.power(cosine)
             spreading = model.spreading(apart_m, apart_m[:, number, None])
-            gain[:, number] = np.where(radiated > _AUDIBLE, radiated, 0) * spreading
+            gain[:, number] = np.where(radiated > AUDIBLE, radiated, 0) * spreading
         return gain
 
     def _fits(self, candidates: _Candidates, extra_m: float) -> tuple[Numbers, Numbers, Numbers, Floats]:

@@ -301,7 +301,7 @@ class BeamGrid:
 
     def _place(self, directions: NDArray[np.float64], kernels: SteeringKernels) -> None:
         """Compute the grid points of directions, and their weights."""
-        lowest = np.floor(directions / self._spacing).astype(np.int64) - (self._n_taps // 2 - 1)
+        lowest = replace(self._aperture, directions=directions).fewest_grid_points(self._spacing, self._n_taps)
         first = lowest.min(axis=0)
         strides = np.concatenate([[1], np.cumprod(lowest.max(axis=0) - first + self._n_taps)])
         numbers = (lowest - first) @ strides[:-1]
