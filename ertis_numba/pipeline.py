@@ -577,8 +577,8 @@ def _chain(settings: Settings, kernel_set: kernels.KernelSet, threads: int, *, g
     if settings.processing.level_directions:
         if graphs:
             raise ArgumentError(
-                "graphs is True, but with processing.level_directions each image has tables of its own, which no graph "
-                "can replace; leave graphs out"
+                "graphs is True, but with processing.level_directions each image needs other tables, which a CUDA "
+                "graph cannot replace; leave graphs out"
             )
         graphs = False
     if settings.processing.method == "fast":

@@ -1,4 +1,4 @@
-"""Ports for servers that start later, or again."""
+"""Addresses of servers that start late or restart."""
 
 import contextlib
 import socket
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def reserved_address() -> Iterator[str]:
-    """Yield an address at which only servers of this test listen: a bound socket keeps others from its port."""
+    """Yield an address at which only servers of this test listen: a bound socket reserves its port."""
     with socket.socket() as held:
         held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         held.bind(("127.0.0.1", 0))

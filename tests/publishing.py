@@ -246,7 +246,7 @@ def results_of(monkeypatch, owner, name):
 
 
 def end_when(monkeypatch, module, is_over):
-    """Let the duration of a command in a module be over once a condition holds, even on a slow machine."""
+    """End the duration of the command in a module once a condition holds, even on a slow machine."""
     clock = types.SimpleNamespace(monotonic=lambda: 1e6 if is_over() else 0.0)
     monkeypatch.setattr(f"{module}.time", clock)
 

@@ -19,7 +19,7 @@ WAIT_S = 60.0
 
 
 def own_domain():
-    """Domain that no other running test uses: its file is locked until this process ends."""
+    """Return a domain that no other running test uses: its file is locked until this process ends."""
     for domain in range(1, N_DOMAINS):
         path = Path(tempfile.gettempdir()) / f"ertis-test-domain-{os.getuid()}-{domain}.lock"
         lock = os.open(path, os.O_CREAT | os.O_RDWR, 0o600)
@@ -46,7 +46,7 @@ class Subscriber:
         self._process.send_signal(signal.SIGSTOP)
 
     def take_after(self, time_ns):
-        """Bytes of the next message that has arrived after a time."""
+        """Return the bytes of the next message that arrives after a time."""
         while (line := json.loads(self._process.stdout.readline()))["received_ns"] < time_ns:
             pass
         return base64.b64decode(line["cdr"])

@@ -17,7 +17,7 @@ SOON_S = 60.0
 
 @pytest.fixture
 def impatient(monkeypatch):
-    """Shorten all intervals to fractions of a second; a busy machine is not taken for a silent central node."""
+    """Shorten all intervals to fractions of a second, but do not mistake a busy machine for a silent central node."""
     for module, name, value in (
         (connection, "PING_INTERVAL_S", 0.05),
         (link, "SILENCE_LIMIT_S", SOON_S),
@@ -35,7 +35,7 @@ IMPATIENT = pytest.mark.usefixtures("impatient")
 
 @contextlib.contextmanager
 def silent(central, node):
-    """Let a stand-in be silent until the node has noticed it, and in the block."""
+    """Silence a stand-in during the block, which begins once the node has noticed the silence."""
     central.silent = True
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(link, "SILENCE_LIMIT_S", 0.5)

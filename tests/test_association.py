@@ -35,7 +35,7 @@ def random_places(seed, count=6):
 
 
 def echoes_of(places_m, pairs=None, share=0.0, draws=None, *, is_flat=True):
-    """Echoes of reflectors of strength 1 at all pairs, from behind in the mirrored direction, with noise of `draws`."""
+    """Return echoes of reflectors of strength 1 at all pairs, mirrored from behind, with noise from `draws`."""
     mounted, found = sensors(), []
     for number, sensor in enumerate(mounted):
         path_m, direction, power = [], [], []
@@ -84,7 +84,7 @@ def errors_m(found, places_m):
 @pytest.mark.parametrize("is_flat", [True, False])
 @pytest.mark.parametrize("seed", range(8))
 def test_reflectors_explain_all_echoes_without_the_help_of_an_attribution(seed, is_flat):
-    """Of the 16 echoes of each reflector, 12 are foreign ones, and flat arrays show those from behind in front."""
+    """Of the 16 echoes of each reflector, 12 are foreign, and flat arrays show echoes from behind as if from ahead."""
     places_m = random_places(seed)
     found = reflectors(echoes_of(places_m, is_flat=is_flat), is_flat=is_flat)
     assert len(found.position_m) == len(places_m)
@@ -134,7 +134,7 @@ def test_missing_echoes_exclude_reflectors():
     assert not len(reflectors(echoes, bound=0.1).position_m)
 
 
-def test_no_echoes_are_no_reflectors():
+def test_no_echoes_yield_no_reflectors():
     found = reflectors(echoes_of(np.empty((0, 3))))
     assert found.position_m.shape == (0, 3)
     assert found.covariance_m2.shape == (0, 3, 3)

@@ -20,7 +20,7 @@ MOUNTINGS = {"front": ((0.2, 0.0, 0.0), AHEAD), "back": ((-0.2, 0.0, 0.0), BEHIN
 
 @pytest.fixture(autouse=True)
 def _patient(monkeypatch):
-    """Let no pulse be returned without an image that a busy machine sends late."""
+    """Delay each pulse until images that a busy machine sends late have arrived."""
     monkeypatch.setattr("ertis_numba.network.pulse_receiver._PATIENCE_S", PATIENCE_S)
 
 

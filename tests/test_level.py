@@ -141,10 +141,10 @@ def turned_directions(grid, attitude_xyzw):
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("method", METHODS)
-def test_one_pipeline_levels_as_one_per_attitude_does(method, device):
-    """The obvious way makes all tables anew from the turned directions; both stay within the error budget.
+def test_one_pipeline_levels_images_as_one_pipeline_per_attitude(method, device):
+    """The reference computes all tables from the turned directions; both images stay within the error budget.
 
-    The attitudes alternate, so that nothing remains of another one.
+    The attitudes alternate, so that tables left over from another attitude would change the image.
     """
     measurement = heard(*TILTS_DEG[2], directions="3d:300")
     settings = levelled(measurement).replace("processing.range_m", (1.4, 1.75)).replace(**METHODS[method])
@@ -159,8 +159,8 @@ def test_one_pipeline_levels_as_one_per_attitude_does(method, device):
     listed = settings.replace(
         **{"processing.level_directions": False, "processing.directions": turned_directions(grid, turn)}
     )
-    with ertis.Pipeline(listed, device, predict=False) as obvious:
-        wanted = obvious.process(measurement).amplitude
+    with ertis.Pipeline(listed, device, predict=False) as reference:
+        wanted = reference.process(measurement).amplitude
     tolerance = 1e-5 if method == "paper" else 10 ** (budget_db / 20)
     assert np.linalg.norm(image - wanted) < tolerance * np.linalg.norm(wanted)
 

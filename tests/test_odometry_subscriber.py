@@ -76,7 +76,7 @@ class MountedPublisher(Publisher):
 
 
 def received(sent, last, *, publisher_type=Publisher, notes=None, patience_s=PATIENCE_S, **options):
-    """Return arrivals until that of a SYNC pulse, by count, and the trajectory; each pulse waits for the one before.
+    """Return arrivals up to a SYNC pulse, by count, and the trajectory; each pulse waits for the previous one.
 
     A pulse without an image of a sensor is returned after ``patience_s``.
     """

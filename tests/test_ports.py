@@ -136,7 +136,7 @@ def test_missing_port_is_refused(monkeypatch):
 
 
 class PatientDriver(SonarDriver):
-    """Driver that waits longer than usual, unless the device is silent: on a busy machine, answers take time."""
+    """Driver that waits longer than usual for answers of a busy machine, unless the device is silent."""
 
     begin = staticmethod(lambda: None)
 

@@ -102,7 +102,7 @@ def test_overlong_frame_closes_only_its_connection(tmp_path):
 
 @contextlib.contextmanager
 def _slow_connections(door):
-    """Yield connections that begin a handshake and do not end it."""
+    """Yield connections that begin a handshake and never complete it."""
     handshakes = [raw.create_connection(("127.0.0.1", door.port)) for _ in range(200)]
     try:
         for number, stranger in enumerate(handshakes):

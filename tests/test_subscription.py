@@ -43,7 +43,7 @@ def publisher():
 
 @pytest.fixture
 def hasty(monkeypatch):
-    """Shorten the waiting times, but do not take a busy machine for a silent publisher."""
+    """Shorten the waiting times, but do not mistake a busy machine for a silent publisher."""
     monkeypatch.setattr(connection, "PING_INTERVAL_S", 0.1)
     for name, time_s in {"SILENCE_LIMIT_S": WAIT_S, "_AGAIN_S": 0.1, "_UNMADE_S": 1.0}.items():
         monkeypatch.setattr(_subscription, name, time_s)
@@ -90,7 +90,7 @@ def test_silence_ends_a_connection(monkeypatch):
 
 @pytest.mark.usefixtures("hasty")
 def test_answering_publisher_without_images_is_not_silent(publisher, monkeypatch):
-    """The time passes by 0.4 s after each answer, and silence is noticed after 0.5 s."""
+    """The clock advances by 0.4 s after each answer; the limit of silence is 0.5 s."""
     clock = SimpleNamespace(now_s=1.0, monotonic=lambda: clock.now_s, monotonic_ns=time.monotonic_ns)
     for module in (connection, _subscription, subscriber_module):
         monkeypatch.setattr(module, "time", clock)
@@ -104,7 +104,7 @@ def test_answering_publisher_without_images_is_not_silent(publisher, monkeypatch
 
 
 def _heard_s(subscriber):
-    """Time of the last answer by the clock of a subscriber."""
+    """Return the time of the last answer on the clock of a subscriber."""
     made = subscriber._subscription._connection  # noqa: SLF001
     return None if made is None else made.heard_s
 

@@ -72,7 +72,7 @@ def test_invalid_pulse_rate_is_refused():
 
 
 class ReadDevice:
-    """Device of a chain that waits with each pulse until its measurement of the one before was read."""
+    """Device of a chain that delays each pulse until the host has read the previous measurement."""
 
     def __init__(self, device):
         self._device = device

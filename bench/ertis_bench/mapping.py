@@ -254,8 +254,8 @@ def form(report: dict[str, Any]) -> str:
         f"{table(head, rows)}\n\n{places} Poses and velocities are exact, and cells are 5 cm wide. A {kind} cell is "
         "found if the centre of an occupied cell is within 5 cm of its own. An occupied cell is false if its centre is "
         f"more than 7.5 cm away from all {kind}s, posts and boxes, so that no part of it is within 5 cm; the share "
-        "beyond 5 cm is in brackets. Times are medians of the processor time of each pulse, without and (in brackets) "
-        "with fusion. "
+        "beyond 5 cm is in brackets. Times are medians of the processor time per pulse, without fusion and (in "
+        "brackets) with it. "
         f"{sentence(report['machine'])}"
     )
 

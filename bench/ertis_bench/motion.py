@@ -125,7 +125,7 @@ def form(report: dict[str, Any]) -> str:
             f"{hall['predicted_m']:.2f} m), and {hall['largest_m']:.2f} m at most. Yaw is "
             f"{abs(hall['yaw_deg']):.1f}° off at the end. Groups with too few matches: {hall['unmeasured']}. "
             f"Over the path, the RMS error of the position is "
-            f"{hall['ratio']:.2f} of the predicted one. The mean normalised squared error of position and yaw is "
-            f"{hall['normalised']:.2f} of its expectation."
+            f"{hall['ratio']:.2f} times the predicted one. The mean normalised squared error of position and yaw is "
+            f"{hall['normalised']:.2f} times its expectation."
         )
     return f"{text} {sentence(report['machine'])}"

@@ -222,7 +222,7 @@ class PipelinesBySensor:
         return self._changed(reader.settings)
 
     def image(self, measurement: "Measurement | Energyscape") -> "Energyscape":
-        """Return the image of a measurement, or an image of a file itself, and warn once of a coarse grid.
+        """Return the image of a measurement, or the given image, and warn once if its directions are too far apart.
 
         Raises
         ------

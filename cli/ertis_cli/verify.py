@@ -26,8 +26,8 @@ def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json:
     """Check the measurements of a file, and list gaps and damage.
 
     The command compares each measurement of recordings and journals, and each pose of journals, with its checksum. The
-    exit code is 0 if all measurements are present and everything is intact, 3 if some are missing, damaged or out of
-    order, and 1 if a file cannot be read.
+    exit code is 0 if all measurements are present, and all measurements and poses are intact. It is 3 if measurements
+    are missing or out of order, or if measurements or poses are damaged, and 1 if a file cannot be read.
     """
     from ertis_numba.errors import ErtisError
     from ertis_numba.storage.verify import verify as verified

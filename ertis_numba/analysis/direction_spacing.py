@@ -1,4 +1,4 @@
-"""Check of the spacing of directions against the main lobe of the array."""
+"""Comparison of the spacing of directions with the main lobe of the array."""
 
 import math
 from typing import Final
@@ -13,9 +13,9 @@ from ertis_numba.settings import Settings
 
 __all__ = ["spacing_warning"]
 
-_LOSS: Final = math.sqrt(0.5)  # Amplitude of a reflector between directions, relative to one in a direction.
+_MIN_AMPLITUDE: Final = math.sqrt(0.5)  # Relative to a reflector in a direction.
 _N_TURNS: Final = 16  # Orientations of the line between two directions.
-_FINER: Final = 0.97
+_FINER: Final = 0.97  # Factor by which each attempt reduces the spacing.
 
 
 def spacing_warning(image: Energyscape) -> str | None:
@@ -42,22 +42,22 @@ def spacing_warning(image: Energyscape) -> str | None:
     spacing_rad = float(np.median(spacing_of(directions, neighbours_of(directions))))
     if not math.isfinite(spacing_rad):
         return None
-    level = _level_between(image.settings, spacing_rad, is_planar=image.is_planar)
-    if level >= _LOSS:
+    amplitude = _amplitude_between(image.settings, spacing_rad, is_planar=image.is_planar)
+    if amplitude >= _MIN_AMPLITUDE:
         return None
     finer = _FINER
-    while _level_between(image.settings, finer * spacing_rad, is_planar=image.is_planar) < _LOSS:
+    while _amplitude_between(image.settings, finer * spacing_rad, is_planar=image.is_planar) < _MIN_AMPLITUDE:
         finer *= _FINER
     kind, n_dimensions = ("2d", 1) if image.is_planar else ("3d", 2)
     n_directions = 10 * math.ceil(len(directions) / finer**n_dimensions / 10)
     return (
-        f"directions are {math.degrees(spacing_rad):.1f}° apart, so a reflector between them loses up to "
-        f"{-20 * math.log10(level):.0f} dB; process with at least {kind}:{n_directions} directions"
+        f"directions are {math.degrees(spacing_rad):.1f}° apart, so a reflector between them appears up to "
+        f"{-20 * math.log10(amplitude):.0f} dB too weak; process with at least {kind}:{n_directions} directions"
     )
 
 
-def _level_between(settings: Settings, spacing_rad: float, *, is_planar: bool) -> float:
-    """Return the least amplitude of a reflector ahead in the middle between directions."""
+def _amplitude_between(settings: Settings, spacing_rad: float, *, is_planar: bool) -> float:
+    """Return the lowest relative amplitude of a reflector ahead of the array, midway between directions."""
     turn_rad = np.zeros(1) if is_planar else np.arange(_N_TURNS) * (math.pi / _N_TURNS)
     # The middle of a square is farther from its corners than that of a line from its ends.
     away_rad = spacing_rad / 2 * (1.0 if is_planar else math.sqrt(2))

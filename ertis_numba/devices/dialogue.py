@@ -176,7 +176,7 @@ class Dialogue(SerialLine):
         data = b""
         latest, is_late = time.monotonic(), False
         while len(data) < count * _ANSWER_BYTES and not is_late:
-            is_late = time.monotonic() - latest > self._timeout_s  # Answers that have come meanwhile are still read.
+            is_late = time.monotonic() - latest > self._timeout_s  # Answers that arrived meanwhile are still read.
             piece, _ = self.receive(count * _ANSWER_BYTES - len(data))
             if piece:
                 data, latest, is_late = data + piece, time.monotonic(), False

@@ -234,7 +234,7 @@ class SonarDriver:
         latest = ends + setup.n_bytes / _SLOWEST_BYTES_PER_S
         is_late = False
         while not is_late:
-            is_late = time.monotonic() > ends  # Bytes that came while this process was suspended are still read.
+            is_late = time.monotonic() > ends  # Bytes that arrived while this process was suspended are still read.
             data, arrived = self._line.receive(receiver.missing)
             read += len(data)
             if data and read < setup.n_bytes + FRAME_BYTES:

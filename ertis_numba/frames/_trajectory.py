@@ -173,7 +173,7 @@ class Trajectory:
 
         At a pose, the difference spans the poses before and after it; between poses, velocities are interpolated
         linearly. At both ends, and beside an interval longer than `max_gap_s`, the difference is one-sided. Differences
-        span no such interval, so the velocity at a pose alone between two of them is unknown.
+        span no such interval, so the velocity at a pose between two of them is unknown.
 
         Parameters
         ----------
@@ -217,7 +217,7 @@ class Trajectory:
         linear_m_s = (self.position_m[after] - self.position_m[before]) / duration_s
         turns = Rotation.from_quat(self.rotation_xyzw[after]) * Rotation.from_quat(self.rotation_xyzw[before]).inv()
         index, fraction = self._brackets(wanted)
-        # Within a long interval, only times next to a pose are covered. Its velocity applies.
+        # Within a long interval, only times next to a pose are covered, and the velocity of that pose applies.
         is_next = is_gap[index] & (fraction > 0.5)
         index, fraction = index + is_next, np.where(is_gap[index], 0.0, fraction)
         return _linear(linear_m_s, index, fraction), _linear(turns.as_rotvec() / duration_s, index, fraction)
@@ -326,7 +326,7 @@ def _linear(values: NDArray[np.float64], index: NDArray[np.intp], fraction: NDAr
     weight = fraction.reshape(-1, *[1] * (values.ndim - 1))
     following = np.minimum(index + 1, len(values) - 1)
     linear = values[index] * (1 - weight) + values[following] * weight
-    return np.where(weight == 0, values[index], linear)  # An unknown value, NaN, has no part in its neighbour.
+    return np.where(weight == 0, values[index], linear)  # Otherwise, 0 × NaN would make a neighbour unknown.
 
 
 def _seconds(time_ns: np.int64) -> str:

@@ -18,17 +18,17 @@ __all__ = ["Reflectors", "SensorEchoes", "tangents"]
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
-_MIN_SHARE: Final = 0.5
+_MIN_SHARE: Final = 0.5  # Share from which the attribution of the images supports an explanation.
 _GATE: Final = 16.0  # Squared Mahalanobis distance; four standard deviations along one axis.
-_SAME_M: Final = 0.015  # Distance of a lone echo from a reflector that may cause it, in addition to uncertainties.
-_REFINED_M: Final = 0.005  # Path that overlapping echoes add to the uncertainty of a located reflector.
-_ALIKE: Final = 10.0  # Ratio of reflectivities that two echoes of a reflector may show.
+_SAME_M: Final = 0.015  # Distance within which a reflector explains a lone echo, in addition to uncertainties.
+_REFINED_M: Final = 0.005  # Standard deviation that overlapping echoes add to paths, once a reflector is located.
+_ALIKE: Final = 10.0  # Largest ratio of reflectivities between two echoes of a reflector.
 _MIN_SCORE: Final = 0.75  # Sum of the fits of two echoes halfway to the limit of the gate, one of them attributed.
-_N_CONFIRMING: Final = 3  # Echoes that show a reflector which the attribution of the images does not show.
+_N_CONFIRMING: Final = 3  # Echoes required for a reflector that the attribution of the images does not support.
 _EXCESS: Final = 4.0  # Reflectivity relative to the bound of a cell, above which missing echoes exclude a candidate.
 _TINY: Final = 1e-30
 _ROUNDS: Final = 8
-_OUTLIER: Final = 2.0  # Residual, in standard deviations, that has half of the weight.
+_OUTLIER: Final = 2.0  # Residual with half weight, in standard deviations.
 _NEAREST_M: Final = 0.05
 _VERTICAL: Final = 1e-6
 # Between emitter and receiver, the path does not depend on the position, which may then be anywhere within 10 m.
@@ -46,7 +46,7 @@ class SensorEchoes(NamedTuple):
     direction : (echo, axis) float64
         Unit vectors from the receiver, in the frame of the platform.
     path_m : (echo, emitter) float64
-        Path of the sound if it is a call of the emitter.
+        Length of the path of the sound if the emitter's call caused the echo.
     path_sd_m, angle_sd_rad : (echo,) float64
         Standard deviations of path and direction.
     power : (echo,) float64
@@ -65,14 +65,14 @@ class SensorEchoes(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Places of reflectors according to single echoes, each of one emitter.
+    """Possible reflectors, each derived from one echo and one emitter.
 
     Attributes
     ----------
     echo, emitter : (candidate,) int64
     place_m : (candidate, axis) float64
     across : (candidate, axis) float64
-        Horizontal vector of one standard deviation across.
+        Horizontal vector across the direction, as long as one standard deviation.
     reflectivity : (candidate,) float64
     """
 
@@ -93,11 +93,12 @@ class _Candidates(NamedTuple):
 class Reflectors:
     """Reflectors that explain echoes jointly, each at the position that fits all of its echoes best.
 
-    An echo may be the call of any sensor, and a flat array cannot tell whether it comes from behind. Each explanation
-    of each echo is a candidate: the place of a reflector, which predicts path and direction of the echoes of all other
-    pairs. The candidate that fits most echoes explains them, and the next one must fit the remaining ones (a greedy
-    solution of the set cover problem). An own echo that nothing else confirms is a reflector if the attribution of
-    the images agrees. A foreign echo alone has several explanations, and is left out.
+    The call of any sensor may have caused an echo, and a flat array does not distinguish front and back. Each possible
+    emitter of an echo yields a candidate: the place of a reflector. It predicts the paths and directions of the echoes
+    at all other pairs of emitter and receiver. The candidate that fits the most echoes is accepted first and explains
+    them; the next one must fit the remaining echoes. This is a greedy solution of the set cover problem. An own echo
+    without confirmation is a reflector if the attribution of the images agrees. A foreign echo without confirmation has
+    several explanations, and is discarded.
 
     Parameters
     ----------
@@ -150,7 +151,7 @@ class Reflectors:
         self.covariance_m2 = np.array([each[1] for each in found]).reshape(-1, 3, 3)
 
     def _candidates(self) -> _Candidates:
-        """Return the places that all echoes lead to, where an emitter radiates audibly."""
+        """Return the candidates of all echoes, where their emitter is audible."""
         echo, emitter = np.nonzero(np.isfinite(self._path_m))
         receiver, path_m, direction = self._receiver[echo], self._path_m[echo, emitter], self._direction[echo]
         offset_m = self._sensor_m[emitter] - self._sensor_m[receiver]
@@ -166,15 +167,12 @@ class Reflectors:
         return _Candidates(echo[kept], emitter[kept], place_m[kept], across, reflectivity[kept])
 
     def _limit(self, place_m: Floats) -> Floats:
-        """Return the highest reflectivity that the images allow at places: 0 outside of the grid."""
+        """Return the highest reflectivity that the images allow at places, 0 outside the grid."""
         cell = self._grid.cell_of(place_m)
         return np.where(cell >= 0, _EXCESS * self._bound[cell.clip(0)].astype(np.float64), 0.0)
 
     def _gains(self, place_m: Floats) -> Floats:
-        """Return the power of echoes relative to those at 1 m ahead, or 0 where they are not audible.
-
-        Its shape is (place, receiver, emitter).
-        """
+        """Return the power of echoes relative to 1 m ahead, 0 where they are inaudible: (place, receiver, emitter)."""
         away_m = place_m[:, None] - self._sensor_m
         apart_m = np.linalg.norm(away_m, axis=2)
         cosine = np.einsum("psi,si->ps", away_m, self._ahead) / np.maximum(apart_m, _NEAREST_M)
@@ -211,7 +209,7 @@ class Reflectors:
         found = []
         for number, rows in self._rows.items():
             free = rows[self._is_free[rows]]
-            # The chord is the angle, as it is small.
+            # For small angles, the chord equals the angle.
             angle_rad2 = np.maximum(0.0, 2 - 2 * seen[:, number] @ self._direction[free].T)
             angle_rad2 /= across_rad2[:, number, None] + self._angle_sd_rad[free] ** 2
             is_near = angle_rad2 < _GATE
@@ -223,7 +221,7 @@ class Reflectors:
         return which, echo, distance
 
     def _confirmed(self) -> list[tuple[Floats, Floats]]:
-        """Return the reflectors that several echoes confirm, and take these echoes."""
+        """Return the reflectors that several echoes confirm, and mark these echoes as explained."""
         candidates = self._candidates()
         which, echo, emitter, distance = self._fits(candidates, 0.0)
         n_candidates, n_echoes = len(candidates.echo), len(self._receiver)
@@ -271,7 +269,7 @@ class Reflectors:
         return (here.place_m[0], covariance_m2), np.unique(echo)
 
     def _members(self, echo: Numbers, emitter: Numbers, distance: Floats) -> tuple[Numbers, Numbers]:
-        """Return the best echo of each pair, and its emitter; no echo twice."""
+        """Return the best echo of each pair, and its emitter; each echo at most once."""
         taken: set[int | tuple[int, int]] = set()
         found = []
         for entry in np.argsort(distance, kind="stable").tolist():
@@ -283,7 +281,7 @@ class Reflectors:
         return echo[found], emitter[found]
 
     def _add_lone(self, found: list[tuple[Floats, Floats]]) -> None:
-        """Add the reflectors that a single own echo shows, and that the attribution does not explain otherwise."""
+        """Add reflectors that a single own echo shows, unless the attribution explains it otherwise."""
         own = self._share[np.arange(len(self._receiver)), self._receiver]
         kept = self._is_free & (self._share.sum(axis=1) > _MIN_SHARE) & (own >= self._share.max(axis=1)) & (own > 0)
         for echo in np.flatnonzero(kept)[np.argsort(-self._power[kept], kind="stable")]:
@@ -319,7 +317,10 @@ class Reflectors:
 
 
 def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[tuple[Floats, Floats]]) -> bool:
-    """Return True if no reflector is at a place: another echo there is a shoulder, or overlaps with other echoes."""
+    """Return True if no reflector is at a place.
+
+    Another echo at a reflector is a shoulder of its main lobe, or overlaps with other echoes.
+    """
     if not found:
         return True
     offset_m = place_m - np.array([each[0] for each in found])

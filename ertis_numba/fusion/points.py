@@ -85,7 +85,7 @@ class PointFuser:
         )
 
     def _shares(self, direction: Floats, range_m: Floats, shares: Sequence[NDArray[np.float32]]) -> Floats:
-        """Return the highest share of each emitter at the step of each echo and beside it: (echo, emitter)."""
+        """Return the highest share of each emitter within one step of each echo: (echo, emitter)."""
         receiver = self._receiver
         row = np.argmax(direction @ receiver.directions.T, axis=1)[:, None] * receiver.n_steps
         step = (range_m / receiver.step_m).astype(np.int64)[:, None] + np.arange(-1, 2)

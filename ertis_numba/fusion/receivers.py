@@ -20,7 +20,7 @@ Singles = NDArray[np.float32]
 Places = NDArray[np.int64]
 
 _NOISE_FACTOR: Final = 10 ** (9.0 / 10)  # Power of a pixel that noise hardly reaches, relative to its mean.
-_SIDE_LOBES: Final = 10 ** (-13.0 / 10)  # Power of side lobes relative to the strongest direction within a step.
+_SIDE_LOBES: Final = 10 ** (-13.0 / 10)  # Power of side lobes relative to the strongest pixel within one step of range.
 _LEAST_POWER: Final = 1e-16  # Keeps squares of ratios within single precision.
 _BEAM_RAD: Final = math.radians(5.0)  # Half of the width of the main lobe near its top.
 _CLOSE_RAD: Final = math.radians(3.0)  # Error of a direction in a search for a confirming echo.

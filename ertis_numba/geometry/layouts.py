@@ -121,7 +121,7 @@ class Layout:
 
     @property
     def is_flat(self) -> bool:
-        """True if the enabled microphones lie in a plane across x, so that they do not distinguish front and back."""
+        """True if the enabled microphones lie in a plane perpendicular to x, and cannot distinguish front and back."""
         return bool(np.ptp(self.enabled_positions_m[:, 0]) < _FLAT_M)
 
     def to_array(self) -> Array:

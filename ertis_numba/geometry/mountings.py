@@ -67,7 +67,7 @@ def mounting(
 
 
 def require_unit_quaternion(name: str, rotation_xyzw: NDArray[np.float64]) -> None:
-    """Refuse an array that is no unit quaternion.
+    """Raise an error if an array is not a unit quaternion.
 
     Raises
     ------

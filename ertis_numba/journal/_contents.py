@@ -141,7 +141,7 @@ class ReadableJournal:
             return read_poses(self._database, self.path)
 
     def pose_blocks(self) -> Iterator[tuple[list[JournalPose], int]]:
-        """Yield blocks of poses as `read_poses` returns all, each read when it is requested."""
+        """Yield the result of `read_poses` in blocks, which are read on request."""
         blocks = pose_blocks(self._database, self.path)
         while True:
             with self._lock:

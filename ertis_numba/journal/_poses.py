@@ -19,7 +19,7 @@ __all__ = ["JournalPose", "PosesAround", "pose_blocks", "read_poses", "trajector
 
 _SEPARATOR: Final = ","  # Names of sensors contain none.
 _MAX_SOURCE_BYTES: Final = 1024  # Limit of a recording.
-_BLOCK: Final = 10_000  # Rows that are read at a time; they take some 10 MB.
+_BLOCK: Final = 10_000  # Number of rows read at a time, which take some 10 MB.
 _ROW_BYTES: Final = 100  # Numbers, checksum and index of a row: 91 to 102 bytes were measured.
 
 
@@ -103,7 +103,7 @@ def pose_blocks(
     statement = select_statement(POSES, "WHERE id > ? ORDER BY id LIMIT ?")
     while rows := database.execute(statement, (after, n_max)):
         if rows[-1][0] <= after:
-            raise DamagedError(f"{path} has poses out of order: it is damaged; copy it again if you can")
+            raise DamagedError(f"{path} is damaged: its poses are out of order; copy it again if you can")
         after = rows[-1][0]
         poses = []
         for row in rows:
@@ -150,9 +150,10 @@ def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Tra
 
 
 class PosesAround:
-    """Poses around given times, chosen from any number of poses; memory is bounded by the number of times.
+    """Poses next to given times, selected from any number of poses.
 
-    Between two times, a trajectory needs only the first and the last pose.
+    Memory depends on the number of times only, since a trajectory needs only the first and the last pose between two
+    times.
 
     Parameters
     ----------
@@ -171,7 +172,7 @@ class PosesAround:
         self._sources: dict[str, None] = {}
 
     def add(self, poses: Sequence[JournalPose]) -> None:
-        """Add poses in any order; of several poses at one time, the first counts.
+        """Add poses in any order; the first of several poses at one time counts.
 
         Raises
         ------
@@ -184,7 +185,7 @@ class PosesAround:
         self._n_waiting += len(poses)
         if sum(map(len, self._sources)) < _MAX_SOURCE_BYTES:
             self._sources |= dict.fromkeys(pose.source for pose in poses)
-        if self._n_waiting > (0 if self._kept is None else len(self._kept)):  # Each pose is then sorted a few times.
+        if self._n_waiting > (0 if self._kept is None else len(self._kept)):  # Each pose is sorted only a few times.
             self._choose()
 
     def trajectory(self) -> Trajectory | None:

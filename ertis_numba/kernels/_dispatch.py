@@ -118,8 +118,8 @@ def load_steering(device: str = "auto") -> SteeringKernels:
     Parameters
     ----------
     device : {"auto", "numpy"}
-        ``numpy`` is plain NumPy. ``auto``, the default, has compiled kernels, or those of NumPy if none can be compiled
-        on this machine.
+        ``auto``, the default, selects compiled kernels, or those of NumPy if none can be compiled on this machine.
+        ``numpy`` always selects those of NumPy.
 
     Returns
     -------

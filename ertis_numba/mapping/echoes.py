@@ -12,8 +12,8 @@ Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 
 _USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that defines the usual one.
-# Amplitude, relative to the usual one, at which one half of the points would be ghosts, from a logistic regression of
-# points in simulated places without obstacles in front of them.
+# Amplitude at which half of the points are ghosts, relative to the usual amplitude. It comes from a logistic regression
+# of points in simulated places, without obstacles in front of them.
 _GHOST: Final = 0.08
 _SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.
 # Errors of positions that noise does not explain: overlapping echoes of rough walls, mountings and poses.

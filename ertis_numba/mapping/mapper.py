@@ -36,10 +36,10 @@ class Mapper:
     """Occupancy map that grows with the images of a platform at known poses.
 
     Echoes are fused (`Fuser`) and located. Each point adds evidence to the cells of its uncertainty ellipse, or in a
-    map of three dimensions, of its ellipsoid. Occupied cells lose evidence in pulses without their echo. Cells in front
-    of the first clear echo of a direction become free, but less so at larger distances. A smooth wall that the sound
-    meets obliquely returns no echo, so silence alone shows free space near the platform only. Uncertain poses spread
-    the evidence of echoes, and shorten free space.
+    map of three dimensions, of its ellipsoid. Occupied cells lose evidence in pulses that do not return their echo.
+    Cells in front of the first clear echo of a direction become free, but less so at larger distances. A smooth wall
+    that the sound meets obliquely returns no echo, so silence alone shows free space near the platform only. Uncertain
+    poses spread the evidence of echoes, and shorten free space.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ class Mapper:
 
 
 def _at_rest(points: PointCloud, trajectory: Trajectory, rotation: Floats) -> PointCloud:
-    """Return points compensated for the velocity of a trajectory, if that is known."""
+    """Return points, compensated for the velocity of a trajectory if it is known."""
     if len(trajectory) == 1:
         return points
     linear_m_s, angular_rad_s = (each[0] @ rotation for each in trajectory.velocity_at([points.stamp.timestamp_ns]))

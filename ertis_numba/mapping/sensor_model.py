@@ -31,13 +31,13 @@ _DEPTH_M: Final = 0.05  # The same for a wall of the map in the direction of the
 _WALL: Final = 1.5  # Log-odds from which a cell hides those behind it.
 _OPEN: Final = -0.5  # Log-odds below which a cell lets sound pass.
 _CLEAR: Final = 0.9  # Probability of a clear echo.
-_CERTAIN: Final = 0.9975  # Highest probability; so many of the strongest points are reflectors.
+_CERTAIN: Final = 0.9975  # Highest probability, which is the share of reflectors among the strongest points.
 # Angles between the middles of directions; the quarters of a degree make room for rounding.
 _HALF_BEAM_RAD: Final = math.radians(5.25)  # Directions beside an echo in which it may hide others.
 _HALF_RAY_RAD: Final = math.radians(1.25)  # The same beside a wall of the map, whose directions are known.
 _REACH_SD: Final = 3.0  # Standard deviations within which an echo counts.
 _POSE_SD: Final = 2.0  # Distance of free space from echoes, in standard deviations of the pose.
-_TOUCHED: Final = 0.1  # Evidence of an echo from which a cell is not free.
+_TOUCHED: Final = 0.1  # Evidence of an echo above which a cell does not become free.
 
 
 class Trust(NamedTuple):
@@ -46,13 +46,13 @@ class Trust(NamedTuple):
     Attributes
     ----------
     clear : float
-        Log-odds of an open echo ahead of a sensor, in addition to those of its amplitude.
+        Log-odds of an unobstructed echo ahead of a sensor, in addition to those of its amplitude.
     strength : float
         Factor of the log-odds of the amplitude.
     hidden : float
-        Loss behind obstacles.
+        Reduction of the log-odds, multiplied by the hidden share of an echo.
     beside : float
-        Loss for each unit of coverage below 0.4.
+        Reduction of the log-odds for each unit of coverage below 0.4.
     cell : float
         Log-odds of a cell relative to those of the echo in it. Reflectors often repeat, and ghosts seldom do.
     total : float
@@ -71,7 +71,7 @@ class Trust(NamedTuple):
 
     @property
     def most(self) -> float:
-        """Log-odds of a cell with a certain echo."""
+        """Largest log-odds that one echo adds to a cell."""
         return self.cell * float(self.log_odds(*np.ones((3, 1)))[0])
 
     def log_odds(self, strength: Floats, visible: Floats, coverage: Floats) -> Floats:
@@ -85,8 +85,8 @@ TRUST: Final = {
     2: Trust(clear=0.0, strength=1.0, hidden=3.7, beside=0.0, cell=0.18, total=10.0, missed=0.14),
     3: Trust(clear=1.5, strength=0.0, hidden=1.6, beside=5.6, cell=0.6, total=15.0, missed=0.03),
 }
-"""Trust in echoes by number of dimensions. Those in space overlap more often, so their amplitude shows little."""
-_AHEAD: Final = 0.4  # Coverage from which echoes are equally good.
+"""Trust in echoes by number of dimensions. Echoes in space overlap more often, so their amplitude does not count."""
+_AHEAD: Final = 0.4  # Coverage above which echoes are equally reliable.
 
 
 def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Coverage, *, near_m: float) -> None:
@@ -118,7 +118,7 @@ def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Co
     end_m = np.minimum(_end_m(echoes, cosine, first_m, position_sd_m, rotation_sd_rad), wall_m)
     is_free = grid.range_m < end_m[:, None]
     is_ahead = grid.range_m < (hiding_m + _BEHIND_M)[:, None]
-    # With an uncertain pose, the echo of a cell may be in another one.
+    # If the pose is uncertain, the echo of a cell may appear in another cell.
     missed = trust.missed / (1 + (position_sd_m**2 + (rotation_sd_rad * grid.range_m) ** 2) / window.cell_m**2)
     free = (coverage.weight * np.where(is_free, _FREE, np.where(is_ahead, -missed, 0.0))).astype(np.float32)
     kernel.add_evidence(

@@ -28,8 +28,8 @@ _ANGLE_SD_RAD: Final = math.radians(0.25)
 # A flat array hardly resolves directions along its plane, and maxima at the edge of a grid move with the sensor.
 _MAX_OFF_AXIS_RAD: Final = math.radians(55.0)
 _NEAREST_M: Final = 0.05
-# Largest differences between an echo of another sensor's call and its prediction. In simulated halls, most are within
-# 6 mm and 2°. There, 6 % to 15 % of the own echoes agree with a prediction by accident.
+# Largest differences between an echo of another sensor's call and its prediction. In simulated halls, most differences
+# are below 6 mm and 2°, and 6 % to 15 % of the own echoes match a prediction by chance.
 _FOREIGN_M: Final = 0.01
 _FOREIGN_RAD: Final = math.radians(2.5)
 _FOREIGN_LEVEL: Final = math.log(2.0)  # 6 dB
@@ -69,9 +69,9 @@ class GroupEchoes(NamedTuple):
 class EchoExtractor:
     """Extractor of the echoes of images or point clouds, with tables computed once for each sensor.
 
-    Echoes of the calls of other sensors are left out if those sensors show the reflectors. Such echoes move in their
-    own way: the emitter is elsewhere, and a flat array hears reflectors behind it as if they were ahead. They may be
-    as many as half of all echoes.
+    Echoes of other sensors' calls are discarded if those sensors show the reflectors. Such echoes move differently from
+    own echoes: their emitter is elsewhere, and a flat array shows reflectors behind it as if they were ahead. They may
+    be half of all echoes.
 
     Parameters
     ----------
@@ -152,9 +152,10 @@ def _foreign(
 ) -> NDArray[np.bool_]:
     """Return True for the echoes of a sensor that the calls of other sensors explain.
 
-    The other sensors show the reflectors, nearer to their axes. Their calls return to this sensor after the mean of
-    both distances, as a range, plus half of the way that sound travels between the beginnings of both calls. The
-    matched filter suppresses other calls than its own. Reflectors behind a flat array appear ahead of it.
+    The other sensors show the reflectors closer to their own axes. At this sensor, the range of an echo of their calls
+    is the mean of the distances of the reflector from both sensors. If their calls begin later, half of the way that
+    sound travels meanwhile is added. Calls that differ do not count, since the matched filter suppresses them.
+    Reflectors behind a flat array appear ahead of it.
 
     Parameters
     ----------

@@ -309,7 +309,7 @@ def _starts(flow: _Flow, pairs: _EchoPairs, centre: Floats, limit: Floats) -> Fl
     strong = (_rank(flow.before)[pairs.before] < _STRONGEST) & (_rank(flow.after)[pairs.after] < _STRONGEST)
     pairs = _EchoPairs(pairs.before[strong], pairs.after[strong])
     step = np.array([2 * most / (n - 1) for most, n in zip(limit, counts, strict=True)])
-    # Displacements between two points of the grid must not escape.
+    # The search must not miss displacements between two points of the grid.
     sd = np.maximum(_SEARCH_SD, step[1:] / 2)[:, None]
     residual, slopes = flow.linear(centre, pairs)
     residual, slopes = residual / sd, slopes / sd[:, :, None]

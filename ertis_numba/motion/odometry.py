@@ -28,9 +28,10 @@ _FEW_MATCHES: Final = 12
 _DOUBTFUL_SHARE: Final = 0.25
 _KEYFRAME_SHARE: Final = 0.5  # Share of the matches of the last two groups that a keyframe still has.
 _PLANAR: Final = 0, 1, 5  # of x, y, z, and the rotations about them
-# Standard deviations of an assumed velocity, x, y and yaw per second. They grow with the time since the last measured
+# Standard deviations of an assumed velocity: x, y and yaw per second. They grow with the time since the last measured
 # velocity, up to a limit. The example parameters of Nav2 for mobile robots permit accelerations of 2.5 m/s² and
-# 3.2 rad/s². If all up to these are equally likely, the standard deviations are 1.4 m/s² and 1.8 rad/s².
+# 3.2 rad/s². If all accelerations within these limits are equally likely, their standard deviations are 1.4 m/s² and
+# 1.8 rad/s².
 _UNKNOWN_SD: Final = np.array([0.5, 0.5, 1.0])
 _ACCELERATION_SD: Final = np.array([1.4, 1.4, 1.8])
 
@@ -94,7 +95,7 @@ class Odometry:
     yields the pose. Errors of the pose thus grow with the number of keyframes rather than of groups.
 
     The covariance of a pose assumes that the errors of these comparisons are independent. It does not include errors of
-    the mountings and of the temperature, of which 1 K changes distances by 0.17 %.
+    the mountings and of the temperature. An error of 1 K changes distances by 0.17 %.
 
     Parameters
     ----------

@@ -64,7 +64,7 @@ class AdaptiveBeamform:
         self._weights = memory.table(scaled.astype(np.complex64 if single else np.complex128))
 
     def new_buffers(self) -> Buffers:
-        """Return no work arrays, since the kernels need none."""
+        """Return an empty tuple, since the kernels need no work arrays."""
         return ()
 
     def __call__(

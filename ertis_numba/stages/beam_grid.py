@@ -79,7 +79,7 @@ class Aperture:
         return replace(self, directions=directions @ self.axes.T)
 
     def largest_delay_s(self, reach: float, own_s: NDArray[np.float64], *, sound_speed_m_s: float) -> float:
-        """Return a limit on the delays of all points within a distance from the centre, in seconds.
+        """Return an upper limit on the delays of all points within a distance from the centre, in seconds.
 
         Parameters
         ----------
@@ -89,8 +89,8 @@ class Aperture:
             Delay of each microphone, in seconds.
         sound_speed_m_s : float
         """
-        # The difference of distances, r − √(r² − 2 r u·p + p²), is largest where the root vanishes, and at most p for
-        # directions, whose magnitude u is 1.
+        # The difference of distances, r − √(r² − 2 r u·p + p²), is largest where the root vanishes. For directions,
+        # whose magnitude u is 1, it is at most p.
         farthest = reach + math.sqrt(reach**2 - 1)
         return float(np.max(np.abs(own_s) + farthest * np.sqrt(self.square_m2) / sound_speed_m_s))
 
@@ -208,7 +208,7 @@ class BeamGrid:
     weights : (direction, pair, 2) float64
         Weights of each pair, in the order of ``rows``.
     reach : float
-        Limit on the distance of grid points from the centre, for any directions.
+        Upper limit on the distance of grid points from the centre, for any directions.
     frequency_hz, errors : (wave,) float64
         Frequencies in hertz, and the error power relative to the beam, averaged over uncorrelated microphones and over
         directions. The errors exist for estimates only.
@@ -430,10 +430,10 @@ def _mics_and_waves(n_mics: int, n_waves: int, *, estimate: bool) -> tuple[NDArr
 
 
 def _evenly(count: int, n_axes: int) -> NDArray[np.float64]:
-    """Return places spread evenly over a cell, (place, axis) from 0 to 1, as an additive sequence.
+    """Return places that an additive sequence spreads evenly over a cell: (place, axis) from 0 to 1.
 
-    M. Roberts, The unreasonable effectiveness of quasirandom sequences (2018): the powers of the inverse of a root of
-    ``x^(n + 1) = x + 1`` are the steps along the axes.
+    The steps along the n axes are powers of 1 / x, for the positive root x of ``x^(n + 1) = x + 1`` (M. Roberts, The
+    unreasonable effectiveness of quasirandom sequences, 2018).
     """
     root = {1: (1 + math.sqrt(5)) / 2, 2: 1.324717957244746}[n_axes]
     steps = root ** -np.arange(1.0, n_axes + 1)

@@ -56,7 +56,7 @@ class BeamTables:
     streams : PlanStreams or None
         Streams, if the beamformer is computed from them.
     largest_delay_s : float
-        Limit on the delays, in seconds: those of these directions, or of any directions if a sensor may be tilted.
+        Upper limit on the delays, in seconds: for these directions, or for any directions if the sensor may be tilted.
     margin_s : float
         Time by which the delay interpolation extends beyond a delay, in seconds.
     """
@@ -87,7 +87,7 @@ class BeamTables:
         self.largest_delay_s = self._largest_delay_s()
 
     def turned(self, grid: Grid, steering: SteeringKernels) -> Self:
-        """Return the tables for as many other directions; only settings with level directions have room for them."""
+        """Return the tables for the same number of other directions; the settings must have level directions."""
         directions = self.aperture.turned(unit_vectors(grid.azimuth_rad, grid.elevation_rad)).directions
         other = copy.copy(self)
         other._directions, other._steering = directions, steering  # noqa: SLF001  of the same class
@@ -108,7 +108,7 @@ class BeamTables:
     ) -> Beamform | PhaseShifts:
         """Return the beamformer; the gains of the matched filter include `gains`."""
         plan, n_phases = self._settings.accuracy, self._settings.accuracy.oversampling or 1
-        # Buffers have room for any directions of a tilted sensor.
+        # Buffers must have room for any directions of a tilted sensor.
         last_sample = 2 * window.lead if self.aperture.is_turned else None
         points = self._points[0]
         delayed = (
@@ -181,7 +181,7 @@ class PlanStreams:
     linear : int or None
         Index of the stream of the signals themselves.
     reach : float
-        Limit on the distance of points from the centre, relative to the unit circle, for any directions.
+        Upper limit on the distance of points from the centre, relative to the unit circle, for any directions.
     """
 
     def __init__(self, settings: Settings, spectrum: Spectrum, aperture: Aperture, speed_m_s: float) -> None:

@@ -65,8 +65,7 @@ def beamform(
     n_phases : int
         Number of phases of the analytic signals.
     last_sample : int, optional
-        Limit on the index of samples at the first range, for tiles with room for other tables; by default, that of
-        these tables.
+        Largest index of samples at the first range for which tiles have room; by default, that of these tables.
     """
     if precision == "float32":
         return BeamformFloat32(kernels, memory, window, zones, nodes, threads=threads)

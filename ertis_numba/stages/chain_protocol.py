@@ -43,8 +43,8 @@ class Chain(Protocol):
         threads : int, optional
             Number of threads; by default, that of the chain.
         grid : Grid, optional
-            Directions in the sensor frame, as many as those of the chain, for settings with level directions; by
-            default, those of the chain.
+            Directions in the sensor frame, if the settings have level directions; as many as those of the chain, which
+            are the default.
         """
         ...
 

@@ -47,7 +47,7 @@ WAVES = 40
 _TURNS = 12  # Number of iterations; further ones reduce the error by less than 0.1 dB.
 _MIN_POWER = 1e-14  # Regularisation relative to the power of the taps. It keeps weights small if taps are nearly equal.
 _IMAGES = (-2, -1, 1, 2)  # The nearest images hold nearly all of the error.
-_MIN_COEFFICIENT = 1e-9  # Relative to the largest one; rounding to single precision adds more.
+_MIN_COEFFICIENT = 1e-9  # Relative to the largest one; rounding to single precision causes larger errors.
 _TARGETS = 65  # Number of targets over one step of the stored samples.
 
 
@@ -166,7 +166,7 @@ def weights_of(
 
 
 def without_small(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return coefficients of polynomials, (degree, degree, value), without the highest degrees if these are small."""
+    """Return coefficients of polynomials, (degree, degree, value), without negligible ones of the highest degrees."""
     largest = np.abs(coefficients).max(axis=2)
     is_kept = largest > _MIN_COEFFICIENT * largest.max()
     rows, columns = (int(np.flatnonzero(is_kept.any(axis=axis))[-1]) + 1 for axis in (1, 0))
@@ -174,7 +174,7 @@ def without_small(coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def two_columns(places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return places with one or two coordinates, (place, axis), as (place, 2); the second one is 0 if it is missing."""
+    """Return places with one or two coordinates, (place, axis), as (place, 2); a missing second coordinate is 0."""
     found = np.zeros((len(places), 2))
     found[:, : places.shape[1]] = places
     return found
@@ -262,7 +262,7 @@ class DelayFit:
     def weights(self, fractions: NDArray[np.float64], kernels: SteeringKernels | None = None) -> NDArray[np.complex128]:
         """Return the weights of the taps: (..., tap) complex128, for fractions as `split` returns them.
 
-        The kernels, if given, compute the same on all cores.
+        With kernels, the computation uses all cores.
         """
         places = 2 * (fractions - self._middle)
         if kernels is None:

@@ -95,7 +95,7 @@ class KernelChain(ABC):
 
     @abstractmethod
     def _turned(self, grid: Grid, threads: int) -> Beamform | PhaseShifts:
-        """Return the beamformer for as many other directions, which shares all buffers."""
+        """Return a beamformer for the same number of other directions; it uses the same buffers."""
 
     def process(
         self,
@@ -108,7 +108,7 @@ class KernelChain(ABC):
         """Compute the image of one measurement; parameters as for `Chain.process`."""
         threads = self._threads if threads is None else threads
         beamform = self._beamform_for(grid, threads)
-        self._finish(self._begin(words, out, threads, beamform))  # Its tables stay in memory until then.
+        self._finish(self._begin(words, out, threads, beamform))  # `beamform` keeps its tables in memory until then.
 
     def _beamform_for(self, grid: Grid | None, threads: int) -> Beamform | PhaseShifts:
         if grid is None:

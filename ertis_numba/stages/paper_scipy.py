@@ -139,7 +139,7 @@ def whole_delays(settings: Settings, grid: Grid) -> NDArray[np.int64]:
 
 
 def largest_delay(settings: Settings, delays: NDArray[np.int64]) -> int:
-    """Return the largest magnitude of delays in signal samples, or its limit if directions are level ones."""
+    """Return the largest magnitude of delays in signal samples, or its upper limit for level directions."""
     if not settings.processing.level_directions:
         return int(np.max(np.abs(delays)))
     layout = microphones(settings.array)

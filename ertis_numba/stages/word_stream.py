@@ -62,7 +62,7 @@ class WordStream:
     def process(self, words: NDArray[Any], out: NDArray[np.float32], image: NewImage, *, threads: int) -> bool:
         """Fill ``out`` with the image of a measurement; return False if it begins with other words than were added.
 
-        ``image`` computes the image from signals, as that of `StreamedImage` does.
+        The function ``image`` computes the image from signals, as for `StreamedImage`.
         """
         with self._lock:
             return self._image is not None and self._image.complete(words, out, image, threads)

@@ -23,7 +23,7 @@ class DamagedMeasurement:
 
 
 def damaged_poses(count: int) -> str:
-    """Return a line about damaged poses; empty if there are none."""
+    """Return a message about damaged poses; empty if there are none."""
     return "" if not count else "1 pose is damaged" if count == 1 else f"{count} poses are damaged"
 
 

@@ -269,7 +269,7 @@ def _times_ns(journal: Journal, sensor: str) -> list[int]:
     """Return the times of the measurements of a sensor."""
     try:
         return journal.times_ns(sensor)
-    except DamagedError:  # Measurements beside the damage can still be read.
+    except DamagedError:  # Measurements outside the damaged part can still be read.
         return [entry.measurement.stamp.timestamp_ns for entry in JournalRows(journal, sensor)]
 
 

@@ -36,7 +36,7 @@ class SensorReport:
     fault : str
         Reason why nothing of this sensor can be read; otherwise empty.
     remark : str
-        Damage to the file, damaged poses, or losses from its journal that no gap covers, of any sensor; empty if there
+        Damage to the file or to poses, and losses from its journal that no gap covers, for all sensors; empty if there
         are none.
     """
 
@@ -149,7 +149,7 @@ def _lost(journal: Journal) -> str:
 
 
 def _pose_damage(journal: Journal) -> str:
-    """Return a line about damaged poses of any sensor."""
+    """Return a message about damaged poses of any sensor; empty if there are none."""
     n_damaged = 0
     try:
         for _, n_more in journal.pose_blocks():

@@ -32,8 +32,8 @@ class CoarsenImage(Protocol):
     close : (direction, neighbour) uint32
         Directions within the error of a direction.
     side_lobes : float32
-        Power of side lobes relative to the strongest direction of a step and of those beside it, because a pulse covers
-        several steps.
+        Power of side lobes, relative to the strongest direction of a step and of both adjacent steps, because a pulse
+        covers several steps.
     least : float32
         Least floor.
     floor : (step,) float32

@@ -89,7 +89,8 @@ class AddEvidence(Protocol):
     most : float32
         Limit of the evidence for occupied cells.
     free : (elevation, azimuth, range) float32
-        Evidence for free cells. A cell with a negative value loses its magnitude, but at most its log-odds above 0.
+        Evidence for free cells, which lowers their log-odds. The magnitude of a negative value lowers the log-odds of
+        occupied cells, but not below 0.
     place : (axis,) float64
         Centre of the polar grid.
     rotation : (axis, axis) float64

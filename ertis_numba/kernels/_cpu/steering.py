@@ -9,7 +9,7 @@ from ertis_numba.kernels._cpu import threads
 
 __all__ = ["KERNELS"]
 
-_PLACES = 64  # in a block of one thread; the innermost loops run over them
+_PLACES = 64  # Number of places in a block of one thread; the innermost loops run over them.
 
 
 @njit(parallel=True, nogil=True, cache=True, error_model="numpy")
@@ -39,7 +39,7 @@ def sum_polynomials(places, coefficients, out):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _polynomials(places, count):
-    """Return the polynomials of some places: (degree, place), with zeros where there are no places."""
+    """Return the polynomials at some places: (degree, place), padded with zeros."""
     found = np.zeros((count, _PLACES))
     for p in range(len(places)):
         before, here = places[p], 1.0
