@@ -26,7 +26,7 @@ __all__ = [
 
 _TIMEOUT_MARGIN_S: Final = 0.5  # after the timeout of dask, whose error names the cause
 _RESTARTED_S: Final = 600.0
-"""Time until dask gives up a worker that has ended. Its default of 15 s is too short to start one on a busy machine."""
+"""Time after which dask gives up on a lost worker; its default of 15 s is too short for a start on a busy machine."""
 
 # The annotations of dask are partial.
 Client = Any

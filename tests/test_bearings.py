@@ -40,10 +40,10 @@ def test_independent_samples_are_those_of_beams_that_turn_from_bin_to_bin():
     spectra = np.fft.rfft(blocks * window)[..., 10:15]
     powers = (np.abs(np.einsum("nmbk,km->nbk", spectra, beams)) ** 2).sum(axis=2).mean(axis=1)
     directions = unit_vectors(np.radians([0.0]), np.radians([0.0]))
-    alike = ScanMesh(directions, delay_s[None]).alike(2 * np.pi * 10, 2 * np.pi, LAGS + 1)
-    assert alike[0] == pytest.approx(1)
-    assert alike[1] < 0.9
-    expected = independent_samples(np.ones(5), n_blocks, alike)
+    similarity = ScanMesh(directions, delay_s[None]).similarity(2 * np.pi * 10, 2 * np.pi, LAGS + 1)
+    assert similarity[0] == pytest.approx(1)
+    assert similarity[1] < 0.9
+    expected = independent_samples(np.ones(5), n_blocks, similarity)
     assert expected > 1.1 * independent_samples(np.ones(5), n_blocks)
     assert powers.mean() ** 2 / powers.var() == pytest.approx(expected, rel=0.08)
 

@@ -1,4 +1,4 @@
-"""Sources in acoustic maps: all of them, where they are, and with their levels."""
+"""Sources in acoustic maps: number, directions and levels."""
 
 import numpy as np
 import pytest
@@ -86,9 +86,8 @@ def test_all_sources_are_listed_strongest_first(method):
     sources = [each for each in ertis.find_sound_sources(found) if each.band_hz == tuple(BANDS_HZ[1])]
     assert np.degrees([each.azimuth_rad for each in sources[:3]]) == pytest.approx([-35, -5, 20], abs=SPACING_DEG)
     steps_db = np.diff([each.level_dbfs for each in sources[:3]])
-    assert steps_db == pytest.approx(
-        [-3.5, -2.5], abs=2
-    )  # The level of a noise of 36 ms has a standard deviation of 0.4 dB.
+    # The level of a noise of 36 ms has a standard deviation of 0.4 dB.
+    assert steps_db == pytest.approx([-3.5, -2.5], abs=2)
     assert all(each.level_dbfs < sources[2].level_dbfs for each in sources[3:])
     assert ertis.find_sound_sources(found, top=1) == [
         next(each for each in ertis.find_sound_sources(found) if each.band_hz == tuple(band)) for band in BANDS_HZ

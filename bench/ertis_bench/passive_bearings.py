@@ -176,7 +176,7 @@ def leak_scene(direction: Floats, *, seed: int) -> Scene:
 
 
 def _leaks(*, seeds: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return how often a leak is found in diffuse noise through PDM."""
+    """Count the trials in which a leak is found in diffuse noise, with PDM signals."""
     counts = {"found": 0, "beside": 0}
     settings = leak_scene(np.array([1.0, 0.0, 0.0]), seed=0).sensors[0].settings()
     settings = settings.replace(

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = ["emulate"]
 
-_TIMED_S = 1.0  # time of rendering from which the rest is estimated
-_LONG_S = 10.0  # estimated time that is reported
+_TIMED_S = 1.0  # rendering time after which the rest is estimated
+_LONG_S = 10.0  # estimated time from which it is reported
 _POLL_INTERVAL_S = 0.5  # interval between checks of the devices
 
 
@@ -232,14 +232,14 @@ def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: boo
 
 
 class _Estimate:
-    """Estimate of the time and the memory of a long task, reported once, from its first steps.
+    """Estimate of the time and the memory of a long task, derived from its first steps and reported once.
 
     Parameters
     ----------
     n_steps : int
         Number of all steps.
     n_first : int
-        Number of steps that also prepare the following ones, so that their time does not count.
+        Number of first steps whose time does not count, because they also prepare the following ones.
     clock : callable
         Clock in seconds; a monotonic one by default.
     """
@@ -250,7 +250,7 @@ class _Estimate:
         self._begun_s, self._is_reported = 0.0, False
 
     def after(self, n_bytes: int) -> str:
-        """Return the line about a long task after a step that made some bytes; otherwise an empty text."""
+        """Count a step that produced some bytes; return a message once if the task is long, otherwise an empty string."""
         self._n_done, self._n_bytes = self._n_done + 1, self._n_bytes + n_bytes
         n_timed, now_s = self._n_done - self._n_first, self._clock()
         if n_timed <= 0:

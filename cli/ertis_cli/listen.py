@@ -66,7 +66,7 @@ _POLL_INTERVAL_S = 0.1
 @click.option(
     "--directions",
     metavar="GRID",
-    help="With --bearings: directions to search, 90, 1850, 3000, 2d:N or 3d:N; those of the sensor's settings by "
+    help="With --bearings: directions to search (90, 1850, 3000, 2d:N or 3d:N); those of the sensor's settings by "
     "default.",
 )
 @click.option(
@@ -110,8 +110,7 @@ def listen(
     reflector, the time since the emission, and the time spent in the central node. The central node drops and
     counts products that this command receives too slowly. With --save, the energyscapes, or with --product raw the
     measurements, are saved to a file that appears complete at the end. If the central node disappears, the command
-    waits for it. With --json, there is one line per event; the event 'subscribed' reports
-    the connection.
+    waits for it. With --json, there is one line per event; the event 'subscribed' reports the connection.
 
     With --fuse, this command fuses the images of all sensors. With --odometry, it computes the path of their platform,
     which starts at the origin and lies in the plane; -o writes the path when the command ends, also by Ctrl-C. The

@@ -51,7 +51,7 @@ class SoundDirection(NamedTuple):
         ----------
         found : AcousticMap
         band : int
-            Number of the band.
+            Index of the band.
         azimuth_rad, elevation_rad : float
         power : float
             Mean square of the sound at the array.
@@ -212,7 +212,9 @@ class AcousticMap(DegreesFromRadians):
         return np.asarray(self.power[:, chosen].sum(axis=1), np.float32)
 
     def loudest(self) -> list[SoundDirection]:
-        """Return the loudest direction of the grid in each band; `find_sound_sources` interpolates, and returns all.
+        """Return the loudest direction of the grid in each band.
+
+        `find_sound_sources` returns all sources, with interpolated directions.
 
         Returns
         -------

@@ -33,7 +33,7 @@ def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: Sca
     set in units of the array's resolution: see `ScanMesh.extent`. At high levels, this is the expected number of
     places that exceed R. These are rare and independent in cells as large as the distance π/2 of orthogonal waves (D.
     J. Aldous, Probability approximations via the Poisson clumping heuristic, 1989). With N cells, the probability of
-    any is therefore ``1 − (1 − E / N)^N``.
+    at least one place is therefore ``1 − (1 − E / N)^N``.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: Sca
 
 
 def independent_samples(
-    shares: NDArray[np.floating], n_blocks: int, alike: NDArray[np.floating] | None = None
+    shares: NDArray[np.floating], n_blocks: int, similarity: NDArray[np.floating] | None = None
 ) -> float:
     """Return the number of independent samples with the same variance of their mean power as bins of blocks.
 
@@ -88,9 +88,9 @@ def independent_samples(
         Weights of neighbouring bins.
     n_blocks : int
         Number of blocks, of which each shares half of its samples with the next one.
-    alike : (LAGS + 1,) float, optional
-        Squared cosine of the angle between the beams of bins at each distance, from 0 bins on, by which the powers of
-        beams are less correlated: see `ScanMesh.alike`. 1 by default, as for a microphone.
+    similarity : (LAGS + 1,) float, optional
+        Squared cosine of the angle between the beams of two bins, for distances from 0 bins on. It reduces the
+        correlation of their powers; see `ScanMesh.similarity`. 1 by default, as for a microphone.
 
     Returns
     -------
@@ -106,8 +106,8 @@ def independent_samples(
     same, next_one = _correlations()
     products = np.correlate(shares, shares, "full")[len(shares) - 1 :][: LAGS + 1].astype(np.float64)
     products[1:] *= 2
-    if alike is not None:
-        products *= alike[: len(products)]
+    if similarity is not None:
+        products *= similarity[: len(products)]
     variance = products @ (n_blocks * same + 2 * (n_blocks - 1) * next_one)[: len(products)]
     return float((n_blocks * shares.sum(dtype=np.float64)) ** 2 / variance)
 

@@ -96,7 +96,7 @@ class ScanMesh:
             length += float(np.sqrt(np.maximum(metric[:, 0, 0], 0)).sum())
         return ScanExtent(self._n_parts, length / 2 if len(self._triangles) else length, area)
 
-    def alike(self, omega_rad_s: float, spacing_rad_s: float, n: int, whitening: Floats | None = None) -> Floats:
+    def similarity(self, omega_rad_s: float, spacing_rad_s: float, n: int, whitening: Floats | None = None) -> Floats:
         """Return the mean similarity of the waves of a direction at frequencies with equal spacing: (n,) float64.
 
         The similarity of the whitened waves u at the first frequency and v at another is the squared cosine of their

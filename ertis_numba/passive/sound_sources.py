@@ -1,4 +1,4 @@
-"""Sources of sound in acoustic maps: all of them, with directions and levels between those of the grid."""
+"""Sources of sound in acoustic maps, with directions and levels interpolated between those of the grid."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -23,9 +23,9 @@ _COMPONENTS: Final = frozenset({"clean_sc", "hr_clean_sc"})  # Their maps hold t
 _INVERSE: Final = frozenset({"capon", "music"})  # The inverses of their powers are quadratic forms, and thus smooth.
 _MIN_LEVEL_DB: Final = -10.0  # Side lobes of most arrays are lower.
 _MIN_COMPONENT_DB: Final = -20.0  # CLEAN-SC removes side lobes, but 1 % of a source may remain.
-_FLOOR: Final = 2.0  # Least power of a maximum relative to the median over directions; that of noise varies less.
-_SIDE_LOBES: Final = 2.0  # Least power of a maximum relative to predicted side lobes.
-_FREQUENCIES: Final = 9  # of a band at which side lobes are predicted
+_FLOOR: Final = 2.0  # Lowest power of a maximum relative to the median over directions; that of noise varies less.
+_SIDE_LOBES: Final = 2.0  # Lowest power of a maximum relative to predicted side lobes.
+_FREQUENCIES: Final = 9  # Frequencies of a band at which side lobes are predicted.
 _TINY: Final = 1e-300
 
 
@@ -41,17 +41,17 @@ def find_sound_sources(
 ) -> list[SoundDirection]:
     """Return the sources of sound in an acoustic map, band by band, strongest first.
 
-    Maps of CLEAN-SC and HR-CLEAN-SC hold the powers of sources. In different bins, these lie at neighbouring directions
-    of the grid. A source is therefore the sum over a direction and its neighbours, at the mean of their directions,
+    Maps of CLEAN-SC and HR-CLEAN-SC hold the powers of sources. The bins of a source may lie at neighbouring directions
+    of the grid. Its power is therefore the sum over a direction and its neighbours, and its direction their mean,
     weighted by power.
 
     In other maps, a source is a local maximum. A quadric through the neighbouring directions interpolates its direction
-    and its level: of the logarithm of the power, or for Capon and MUSIC of the inverse. Maxima below twice the median
-    over all directions are the floor of the map, and those of delay-and-sum below twice the side lobes of stronger
-    sources are left out. The strongest direction of each band is listed in any case.
+    and its level. It fits the logarithm of the power, or for Capon and MUSIC its inverse. Maxima below twice the median
+    over all directions belong to the floor of the map, and are left out. With delay-and-sum, so are maxima below twice
+    the side lobes of stronger sources. The strongest direction of each band is always returned.
 
-    Errors are small if the main lobe is at least two spacings of the grid wide. The peaks of Capon are often narrower:
-    their levels are then too low. CLEAN-SC yields directions of the grid, and levels there.
+    Errors are small if the main lobe is at least two spacings of the grid wide. The peaks of Capon are often narrower;
+    their levels are then too low. CLEAN-SC searches directions of the grid only, and yields the levels there.
 
     Parameters
     ----------
@@ -59,8 +59,8 @@ def find_sound_sources(
     top : int, optional
         Largest number of sources in a band; 10 by default, None for all.
     min_level_db : float, optional
-        Least level relative to the strongest source of the band; -10 dB by default, below which side lobes lie, and -20
-        dB for CLEAN-SC and HR-CLEAN-SC.
+        Lowest level relative to the strongest source of the band; by default -10 dB, below which side lobes lie, and
+        -20 dB for CLEAN-SC and HR-CLEAN-SC.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def _without_side_lobes(tops: list[_Top], delays: WaveDelays, band_hz: Floats, *
 
 
 def _components(power: Floats, directions: Floats, neighbours: NDArray[np.int64], _: Passive) -> Iterator[_Top]:
-    """Yield the sums of the powers of directions and their neighbours, from the largest power on."""
+    """Yield sums of powers over a direction and its neighbours, from the strongest direction on."""
     left = power.copy()
     for place in np.argsort(-power, kind="stable"):
         if not power[place]:
@@ -146,7 +146,7 @@ def _maxima(power: Floats, directions: Floats, neighbours: NDArray[np.int64], pa
     weights = None
     if is_inverse:
         values = -1 / np.maximum(power, _TINY)
-    else:  # Beyond the main lobe, the logarithm falls to that of zeros.
+    else:  # Beyond the main lobe, the logarithm falls steeply, so weights are small there.
         values = np.log(np.maximum(power, _TINY))
         weights = np.maximum(power[around] / np.maximum(power[places, None], _TINY), _TINY) ** (1 / order)
     fits = QuadricFits.of(directions, neighbours, places, weights)

@@ -121,8 +121,8 @@ class BandSearch:
         places = np.zeros((0, 3))
         likelihood, share = self._likelihood(scaled, places)
         while len(places) < min(top, matrix.shape[1] - 1):
-            extent, alike = self._of_noise(share)
-            n_beam_samples = independent_samples(self._shares, n_blocks, alike)
+            extent, similarity = self._of_noise(share)
+            n_beam_samples = independent_samples(self._shares, n_blocks, similarity)
             law = functools.partial(exceedance, n_samples=n_beam_samples, extent=extent)
             place = self._next(likelihood, places, law, false_alarm=false_alarm, least=least)
             if place is None:
@@ -158,7 +158,7 @@ class BandSearch:
             nearest = int(np.abs(self._omega - omega).argmin())
             whitening = self._noise.whitening(1 - 10 ** (-step / _SHARE_STEPS))[nearest] if step else None
             mesh, spacing = self._scan.mesh, float(self._omega[1] - self._omega[0]) if len(self._omega) > 1 else 0.0
-            self._laws[step] = mesh.extent(omega, whitening), mesh.alike(omega, spacing, LAGS + 1, whitening)
+            self._laws[step] = mesh.extent(omega, whitening), mesh.similarity(omega, spacing, LAGS + 1, whitening)
         return self._laws[step]
 
     def _likelihood(self, matrix: Matrices, places: Floats) -> tuple[BandLikelihood, float]:

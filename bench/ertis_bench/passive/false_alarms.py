@@ -1,7 +1,7 @@
 """False alarms of bearings in noise without sources, relative to the requested rates.
 
-The noise is drawn as long float32 records, which are cut into measurements: through one-bit microphones, a trial would
-take ten times as long. The noise of these microphones is white in the band, as is that of the records.
+The noise is drawn as long float32 records, which are cut into measurements. With one-bit microphones, whose noise is
+also white in the band, a trial would take ten times as long.
 """
 
 import concurrent.futures
@@ -69,7 +69,7 @@ _CHUNK: Final = 50  # Trials of a worker process in one piece.
 
 
 def measure(*, trials: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return how often noise without sources yields a bearing.
+    """Count the maps of noise without sources that yield a bearing.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def alarms(case: NoiseCase, seed: int, first: int, count: int) -> list[int]:
 
 
 def measurements(settings: Settings, case: NoiseCase, *, seed: tuple[int, ...]) -> Iterator[Measurement]:
-    """Yield the measurements of a map: parts of one record of noise, whose microphones are coherent as asked.
+    """Yield the measurements of a map: parts of one record of noise with the requested coherence.
 
     Parameters
     ----------

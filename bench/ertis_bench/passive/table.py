@@ -196,9 +196,9 @@ def _false_alarms(report: dict[str, Any]) -> str:
     asked = sorted(rate["asked"] for rate in found["cases"][0]["rates"])
     head = ["noise of", "averages", *(f"{each:g} requested" for each in asked)]
     return (
-        f"{table(head, rows)}\n\nShare of {trials:,} maps of noise without sources that yield a bearing, with its "
-        f"{false_alarms.CONFIDENCE:.0%} confidence interval (Clopper–Pearson), at each requested rate (seed "
-        f"{report['seed']}). Maps have the band {low_hz / 1e3:g}–{high_hz / 1e3:g} kHz of float32 signals of 32 "
-        "microphones, in which 36.4 ms are a measurement, and 3000 directions. The noise of the surroundings is "
-        "diffuse and 30 dB above that of the microphones."
+        f"{table(head, rows)}\n\nShare of maps that yield a bearing, of {trials:,} maps of noise without sources, with "
+        f"its {false_alarms.CONFIDENCE:.0%} confidence interval (Clopper–Pearson), at each requested rate (seed "
+        f"{report['seed']}). Maps have 3000 directions and the band {low_hz / 1e3:g}–{high_hz / 1e3:g} kHz. "
+        "Measurements are float32 signals of 32 microphones, 36.4 ms long. The noise of the surroundings is diffuse "
+        "and 30 dB above that of the microphones."
     )
