@@ -213,7 +213,7 @@ def test_words_that_differ_from_a_stream_cause_no_second_computation_of_tables(m
 
 @pytest.mark.parametrize(("device", "chosen"), [("numpy", "numpy"), ("cpu", "auto")])
 def test_tables_are_computed_by_the_kernels_and_threads_of_the_pipeline(device, chosen, monkeypatch):
-    """Compiled kernels outside of this limit would meet those of other threads, which Numba's workqueue refuses."""
+    """Without this limit, kernels could run in several threads at once, which Numba's workqueue refuses."""
     measurement, used = heard(*TILTS_DEG[2], directions="3d:300"), []
 
     def load(name="auto"):

@@ -113,7 +113,7 @@ def load_mapping() -> MappingKernels:
 
 @functools.cache
 def load_steering(device: str = "auto") -> SteeringKernels:
-    """Return the kernels of steering, which compute tables on the host also for a GPU.
+    """Return the kernels of steering, which compute tables on the host, also for a GPU.
 
     Parameters
     ----------

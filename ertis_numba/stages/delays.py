@@ -53,7 +53,7 @@ class DelayTable:
         fit : DelayFit
             Fractional-delay filters.
         steering : SteeringKernels, optional
-            Kernels that compute the weights on all cores.
+            Kernels that compute the weights on several threads.
         n_phases : int
             Number of phases of the analytic signals.
         lead : int

@@ -262,7 +262,7 @@ class DelayFit:
     def weights(self, fractions: NDArray[np.float64], kernels: SteeringKernels | None = None) -> NDArray[np.complex128]:
         """Return the weights of the taps: (..., tap) complex128, for fractions as `split` returns them.
 
-        With kernels, the computation uses all cores.
+        With kernels, several threads share the computation.
         """
         places = 2 * (fractions - self._middle)
         if kernels is None:

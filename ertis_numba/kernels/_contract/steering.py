@@ -37,7 +37,7 @@ class SteeringKernels:
     sum_polynomials : callable
         See `SumPolynomials`.
     threads : callable
-        Context manager that limits the number of threads, see `Threads`. Kernels run within it.
+        Context manager that limits the number of threads; see `Threads`. Kernels run within it.
     """
 
     sum_polynomials: SumPolynomials
