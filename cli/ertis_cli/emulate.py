@@ -250,7 +250,7 @@ class _Estimate:
         self._begun_s, self._is_reported = 0.0, False
 
     def after(self, n_bytes: int) -> str:
-        """Count a step that produced some bytes; return a message once if the task is long, otherwise an empty string."""
+        """Count a step that made some bytes; return a message once if the task is long, otherwise an empty string."""
         self._n_done, self._n_bytes = self._n_done + 1, self._n_bytes + n_bytes
         n_timed, now_s = self._n_done - self._n_first, self._clock()
         if n_timed <= 0:
