@@ -144,8 +144,8 @@ def test_echoes_of_calls_of_other_sensors_are_left_out(receiver, settings, n_for
     [({"delay_s": 2e-3}, 0.0, 12), ({"delay_s": 2e-3}, 2e-3, 0), ({"stop_frequency_hz": 40e3}, 0.0, 12)],
     ids=["as if calls began together", "later call", "different call"],
 )
-def test_echoes_of_later_calls_are_left_out_at_their_ranges(call, late_s, n_kept):
-    """An echo of a call that begins later seems farther away, by half of the way of the sound meanwhile."""
+def test_echoes_of_later_calls_are_discarded_at_their_ranges(call, late_s, n_kept):
+    """An echo of a call that begins later appears farther away, by half of the way that sound travels meanwhile."""
     given = mountings(["front", "right"])
     sensors = {sensor.name: sensor for sensor in mounted_sensors(given)}
     angle_rad = np.radians(np.linspace(42.0, 44.0, 12))  # Ahead of the front sensor, too.

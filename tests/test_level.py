@@ -235,7 +235,7 @@ def test_tables_are_computed_by_the_kernels_and_threads_of_the_pipeline(device, 
 @pytest.mark.parametrize("tilt_deg", [TILTS_DEG[2], (30.0, 60.0)])
 @pytest.mark.parametrize("method", ["16 bits", "Capon", "coherence factor"])
 def test_error_of_a_level_image_is_predicted_for_its_directions_in_the_sensor_frame(method, tilt_deg):
-    """Errors relative to level directions, or at directions behind the sensor, would cause a false warning."""
+    """Errors computed for level directions, or for directions behind the sensor, would cause a false warning."""
     measurement = heard(*TILTS_DEG[2], directions="3d:300")
     settings = levelled(measurement).replace("processing.range_m", (1.4, 1.75)).replace(**METHODS[method])
     settings = settings.replace("processing.azimuth_limits_deg", (-90.0, 90.0))

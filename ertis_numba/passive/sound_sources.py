@@ -113,7 +113,7 @@ def _without_side_lobes(tops: list[_Top], delays: WaveDelays, band_hz: Floats, *
     for place, each in enumerate(tops):
         if len(kept) == top:
             break
-        if each.power >= _SIDE_LOBES * explained[place]:  # Equal in silence.
+        if each.power >= _SIDE_LOBES * explained[place]:  # Both are 0 in silence.
             kept.append(place)
             beams = np.exp(1j * omega * (delay_s - delay_s[place])).mean(axis=2)
             explained += each.power * (np.abs(beams) ** 2).mean(axis=0)
