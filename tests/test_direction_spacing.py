@@ -1,7 +1,11 @@
 """Warning of directions that are too far apart for the main lobe of the array."""
 
+from contextlib import ExitStack
+
+import click
 import numpy as np
 import pytest
+from ertis_cli._pulses import PipelinesBySensor
 
 import ertis_numba as ertis
 from ertis_numba.analysis.direction_spacing import spacing_warning
@@ -10,7 +14,7 @@ from ertis_numba.geometry import direction_grid
 from ertis_numba.settings import Processing
 
 
-def blank(directions):
+def blank(directions, sensor="sensor"):
     processing = Processing(directions=directions)
     grid = direction_grid(processing)
     return Energyscape(
@@ -19,7 +23,7 @@ def blank(directions):
         grid.elevation_rad,
         np.array([1.0, 1.01]),
         ertis.Settings(processing=processing),
-        Stamp(sensor="sensor", sequence=0, sync_count=0, timestamp_ns=0),
+        Stamp(sensor=sensor, sequence=0, sync_count=0, timestamp_ns=0),
     )
 
 
@@ -34,3 +38,13 @@ def test_coarse_grids_cause_a_warning_with_a_grid_that_is_fine(directions, spaci
     assert text.startswith(f"directions are {spacing}° apart")
     finer = text.removesuffix(" directions").split()[-1]
     assert spacing_warning(blank(finer)) is None
+
+
+def test_commands_warn_once_of_the_first_sensor_with_a_coarse_grid(capsys):
+    grids = (("front", "2d:30"), ("left", "2d:20"), ("left", "2d:20"), ("right", "3d:400"))
+    with ExitStack() as stack, click.Context(click.Command("map")):
+        pipelines = PipelinesBySensor(lambda settings: settings, stack, quiet=True)
+        for sensor, directions in grids:
+            assert pipelines.image(blank(directions, sensor)).stamp.sensor == sensor
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("ertis: warning: directions are 9.5° apart")

@@ -215,7 +215,8 @@ class PipelinesBySensor:
     ) -> None:
         self._changed, self._stack, self._quiet, self._device = changed, stack, quiet, device
         self._made: dict[str, tuple[Settings, Pipeline]] = {}
-        self._is_checked = False
+        self._checked: set[str] = set()
+        self._warned = False
 
     def settings(self, reader: "RecordingReader") -> "Settings":
         """Return the settings in use for a sensor."""
@@ -232,10 +233,11 @@ class PipelinesBySensor:
         from ertis_numba.analysis.direction_spacing import spacing_warning
 
         image = self._image(measurement)
-        if not self._is_checked:
-            self._is_checked = True
+        if not self._warned and image.stamp.sensor not in self._checked:
+            self._checked.add(image.stamp.sensor)
             text = spacing_warning(image)
             if text is not None:
+                self._warned = True
                 click.echo(f"ertis: warning: {text}", err=True)
         return image
 
