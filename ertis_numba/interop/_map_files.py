@@ -13,7 +13,7 @@ from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target, remedy
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import FREE_BELOW, OCCUPIED_ABOVE, OccupancyMap
-from ertis_numba.interop._mcap import map_mcap
+from ertis_numba.interop._mcap import map_mcap, require_mcap
 from ertis_numba.storage import write_map_file
 
 __all__ = ["MAP_SUFFIXES", "map_files", "write_map"]
@@ -31,7 +31,8 @@ def map_files(path: str | Path, *, n_dimensions: int = 2) -> tuple[Path, ...]:
     Raises
     ------
     ArgumentError
-        The suffix is unknown, or its format does not support the dimensions of the map.
+        The suffix is unknown, its format does not support the dimensions of the map, or the packages for MCAP are not
+        installed.
     """
     path = Path(path)
     checks.choice("suffix of the map", path.suffix.lower(), MAP_SUFFIXES)
@@ -39,6 +40,8 @@ def map_files(path: str | Path, *, n_dimensions: int = 2) -> tuple[Path, ...]:
         raise ArgumentError(
             f"{path} would hold a map of two dimensions, but the map has three; give a name that ends in .h5 or .ply"
         )
+    if path.suffix.lower() == ".mcap":
+        require_mcap()
     return (path, path.with_suffix(".yaml")) if path.suffix.lower() == ".pgm" else (path,)
 
 

@@ -27,7 +27,7 @@ from ertis_numba.interop.ros_messages import (
     sonar_image_message,
 )
 
-__all__ = ["map_mcap", "write_mcap"]
+__all__ = ["map_mcap", "require_mcap", "write_mcap"]
 
 _STATIC, _STATIC_TYPE = "/tf_static", "tf2_msgs/msg/TFMessage"
 _PROFILE = """- history: 1
@@ -74,12 +74,25 @@ def map_mcap(occupancy: OccupancyMap) -> bytes:
     return file.getvalue()
 
 
+def require_mcap() -> None:
+    """Refuse a missing package.
+
+    Raises
+    ------
+    ArgumentError
+        The packages for MCAP are not installed.
+    """
+    with extra("ros", "format 'mcap' needs mcap and mcap-ros2-support"):
+        import mcap.writer  # noqa: F401, PLC0415  an extra
+        from mcap_ros2 import _dynamic  # noqa: F401, PLC0415  an extra
+
+
 @contextmanager
 def _started(file: IO[bytes]) -> Iterator[Any]:
     """Yield the writer of a file, and finish the file."""
-    with extra("ros", "format 'mcap' needs mcap and mcap-ros2-support"):
-        from mcap.writer import Writer  # noqa: PLC0415  an extra
-        from mcap_ros2 import _dynamic  # noqa: F401, PLC0415  an extra
+    require_mcap()
+    from mcap.writer import Writer  # noqa: PLC0415  an extra
+
     writer: Any = Writer(file)  # The annotations of mcap are partial.
     writer.start(profile="ros2", library="ertis-numba")
     yield writer
