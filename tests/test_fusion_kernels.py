@@ -152,3 +152,18 @@ def test_fusion_without_compiled_kernels_gives_the_same_image(monkeypatch):
     highest = plain.image.amplitude.max()
     np.testing.assert_allclose(compiled.image.amplitude, plain.image.amplitude, rtol=1e-4, atol=1e-4 * highest)
     np.testing.assert_allclose(compiled.points.position_m, plain.points.position_m, atol=1e-4)
+
+
+@pytest.mark.parametrize("load", [kernels.load_fusion, lambda: _numpy_fusion.KERNELS], ids=["compiled", "numpy"])
+def test_side_lobes_are_those_of_the_strongest_step_of_a_pulse(load):
+    """The steps beside the strongest one have its side lobes; those farther away do not."""
+    n_steps, first = 7, np.arange(8, dtype=np.uint32)
+    amplitude = np.full((2, n_steps), 0.1, np.float32)
+    amplitude[0, 3] = 1.0
+    close = np.array([[0], [1]], np.uint32)
+    floor, highest, above = np.empty(n_steps, np.float32), *np.empty((2, 2, n_steps), np.float32)
+    is_deaf, least = np.zeros(n_steps, np.bool_), np.float32(1e-6)
+    load().coarsen_image(amplitude, first, is_deaf, close, np.float32(0.05), least, floor, highest, above)
+    wanted = 0.05 * np.array([0.01, 0.01, 1.0, 1.0, 1.0, 0.01, 0.01])
+    np.testing.assert_allclose(floor, wanted, rtol=1e-5)
+    assert not above[1, 2:5].any()
