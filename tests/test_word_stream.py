@@ -113,9 +113,9 @@ def near(monkeypatch):
         image = chain._image  # noqa: SLF001
         monkeypatch.setattr("ertis_numba.stages.word_stream.perf_counter", clock)
 
-        def timed(*given):
+        def timed(*given, **options):
             images.append(given)
-            image(*given)
+            image(*given, **options)
             clock.now_s += clock.image_s
 
         monkeypatch.setattr(chain, "_image", timed)

@@ -110,9 +110,10 @@ class KernelChain(ABC):
         beamform = self._beamform_for(grid, threads)
         self._finish(self._begin(words, out, threads, beamform))  # `beamform` keeps its tables in memory until then.
 
-    def _beamform_for(self, grid: Grid | None, threads: int) -> Beamform | PhaseShifts:
+    def _beamform_for(self, grid: Grid | None, threads: int) -> Beamform | PhaseShifts | None:
+        """Return a beamformer for other directions; None for those of the chain."""
         if grid is None:
-            return self._beamform
+            return None
         with one_thread():
             return self._turned(grid, threads)
 
