@@ -123,6 +123,15 @@ def test_import_poses_adds_to_all_recordings_of_a_folder_or_none(tmp_path, traje
         assert posed.trajectory is not None
 
 
+def test_import_poses_states_poses_between_distant_ones(recording, tmp_path):
+    """The middle of three measurements of each sensor lies beside a pose; the others lie in intervals above 1 s."""
+    near = drive().at([TIMES_NS[0] - SECOND_NS, TIMES_NS[1], TIMES_NS[-1] + SECOND_NS])
+    done = run("import-poses", recording, write_text(tmp_path / "few.tum", near), "-o", tmp_path / "OUT.h5")
+    assert f"note: 5 of 6 poses interpolated between poses of {tmp_path / 'few.tum'} more than a second" in done.stderr
+    done = run("import-poses", recording, write_text(tmp_path / "all.tum", drive()), "-o", tmp_path / "ALL.h5")
+    assert "note" not in done.stderr
+
+
 def test_import_poses_reads_tables_and_refuses_other_topics(recording, tmp_path):
     table = tmp_path / "TRAJ.csv"
     first_ns, last_ns = TIMES_NS[0] - SECOND_NS, TIMES_NS[-1] + SECOND_NS

@@ -230,6 +230,14 @@ def test_map_leaves_out_pulses_outside_of_the_poses(folder):
     assert json.loads(done.stdout)["left_out"] == 1
 
 
+def test_map_states_pulses_between_distant_poses(folder):
+    few = poses()
+    ertis.write_tum(folder / "few.tum", few.replace(time_ns=2 * few.time_ns))
+    done = run(folder, "both.h5 --poses few.tum -o few.h5")
+    assert "note: 2 of 3 pulses between poses more than a second apart, which are interpolated" in done.stderr
+    assert "note" not in run(folder, "both.h5 --poses poses.tum -o near.h5").stderr
+
+
 def test_map_refuses_poses_at_other_times(folder):
     ertis.write_tum(folder / "other.tum", poses(start_ns=10**12))
     done = run(folder, "both.h5 --poses other.tum -o other.h5", code=1)

@@ -54,12 +54,14 @@ def import_poses(
     """Add the poses of a platform to recordings.
 
     TRAJ is a text file of TUM (.tum, .txt), a table (.csv), or messages of ROS 2 (.mcap). The trajectory is
-    interpolated at the times of the measurements of all sensors, and must cover them. A folder stands for its
-    recordings (*.h5). A recording is replaced only when the new one is complete.
+    interpolated at the times of the measurements of all sensors, and must cover them. A note states the number of
+    poses that were interpolated between poses more than a second apart. A folder stands for its recordings (*.h5). A
+    recording is replaced only when the new one is complete.
     """
     from ertis_numba import checks, read_trajectory
     from ertis_numba.atomic_files import make_folder
     from ertis_numba.storage import add_poses, check_target, recorded_trajectory, require_fitting_poses
+    from ertis_numba.storage.poses import count_in_gaps
 
     checks.between("offset_s", offset_s, -_MAX_OFFSET_S, _MAX_OFFSET_S)
     given = read_trajectory(trajectory_file, topic=topic)
@@ -78,6 +80,10 @@ def import_poses(
         poses = cast("Trajectory", recorded_trajectory(written))
         count = options.counted(len(poses), "pose")
         options.say(f"{written}: {count}, {poses.length_m:.2f} m", quiet=quiet)
+        n_in_gaps = count_in_gaps(shifted, poses.time_ns)
+        if n_in_gaps:
+            between = f"poses of {trajectory_file} more than a second apart"
+            options.say(f"note: {n_in_gaps} of {count} interpolated between {between}", quiet=quiet)
         reports.append({"output": str(written), "poses": len(poses), "path_length_m": round(poses.length_m, 6)})
     if as_json:
         for report in reports:

@@ -113,6 +113,7 @@ def mapping(
         active = _pulses.active_groups(readers, changed, quiet=quiet)
         groups = active.groups
         located = _located(groups, trajectory)
+        _note_gaps(located, trajectory, quiet=quiet)
         by_name = {reader.sensor: reader for reader in readers}
         with options.progress(located, length=len(located), label="mapping", quiet=quiet) as shown:
             for group in shown:
@@ -182,7 +183,7 @@ def _located(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajector
     """
     from ertis_numba.errors import DataError
 
-    times_ns = [min(place.stamp.timestamp_ns for place in group.values()) for group in groups]
+    times_ns = _times_ns(groups)
     located = [group for group, is_covered in zip(groups, trajectory.covers(times_ns), strict=True) if is_covered]
     if not located:
         first_ns, last_ns = trajectory.time_ns[[0, -1]].tolist()
@@ -192,6 +193,20 @@ def _located(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajector
             "these recordings, with times in seconds since 1970-01-01 UTC"
         )
     return located
+
+
+def _times_ns(groups: "Sequence[dict[str, StampedIndex]]") -> list[int]:
+    return [min(place.stamp.timestamp_ns for place in group.values()) for group in groups]
+
+
+def _note_gaps(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajectory", *, quiet: bool) -> None:
+    """State the number of pulses between poses more than a second apart."""
+    from ertis_numba.storage.poses import count_in_gaps
+
+    n_in_gaps = count_in_gaps(trajectory, _times_ns(groups))
+    if n_in_gaps:
+        pulses = f"{n_in_gaps} of {options.counted(len(groups), 'pulse')}"
+        options.say(f"note: {pulses} between poses more than a second apart, which are interpolated", quiet=quiet)
 
 
 def _report(

@@ -10,11 +10,12 @@ from typing import Final
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ertis_numba.atomic_files import atomic_write, check_target, reason, remedy, require_free_space
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Trajectory
-from ertis_numba.storage._poses import checked_poses, remove_poses, require_times, write_poses
+from ertis_numba.storage._poses import MAX_GAP_S, checked_poses, remove_poses, require_times, write_poses
 from ertis_numba.storage._reader import file_kind, sensor_names
 from ertis_numba.storage.acoustic_maps import AcousticMapReader, open_acoustic_maps
 from ertis_numba.storage.energyscape import EnergyscapeReader, open_energyscapes
@@ -31,7 +32,7 @@ from ertis_numba.storage.schema import (
     to_python,
 )
 
-__all__ = ["add_poses", "platform_trajectory", "recorded_trajectory", "require_fitting_poses"]
+__all__ = ["add_poses", "count_in_gaps", "platform_trajectory", "recorded_trajectory", "require_fitting_poses"]
 
 _OPENERS: Final[dict[str, Callable[..., RecordingReader | EnergyscapeReader | AcousticMapReader]]] = {
     "recording": open_recording,
@@ -156,6 +157,23 @@ def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: 
                 "the clock offset"
             )
     return n_measurements
+
+
+def count_in_gaps(trajectory: Trajectory, time_ns: ArrayLike) -> int:
+    """Return the number of times whose poses are interpolated between poses more than a second apart.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    time_ns : (n,) int64
+        Times in nanoseconds since 1970-01-01 UTC.
+
+    Returns
+    -------
+    int
+    """
+    is_near = trajectory.replace(max_gap_s=MAX_GAP_S).covers(time_ns)
+    return int(np.count_nonzero(trajectory.covers(time_ns) & ~is_near))
 
 
 def recorded_trajectory(path: str | Path, *, sensor: str | None = None) -> Trajectory | None:
