@@ -169,7 +169,8 @@ def test_process_reports_direct_sound_and_warns(tmp_path):
     for each, measurement in zip(made.sensors, heard(made, LATE), strict=True):
         paths.append(tmp_path / f"{each.name}.h5")
         write_recording(paths[-1], [measurement], mounting={each.name: (each.position_m, each.quaternion())})
-    done = CliRunner().invoke(cli, ["process", *map(str, paths), "--fuse", "-o", str(tmp_path / "f.h5"), "--json"])
+    line = ["process", *map(str, paths), "--fuse", "--directions", "2d:9", "-o", str(tmp_path / "f.h5"), "--json"]
+    done = CliRunner().invoke(cli, line)
     assert done.exit_code == 0, done.output
     report = json.loads(done.stdout.splitlines()[-1])
     assert {(each["emitter"], each["receiver"]) for each in report["direct_sound"]} == {
@@ -177,8 +178,10 @@ def test_process_reports_direct_sound_and_warns(tmp_path):
         ("left", "front"),
     }
     assert all(90 < abs(each["difference_us"]) < 110 for each in report["direct_sound"])
-    (warning,) = report["warnings"]
-    assert f"ertis: warning: {warning}" in done.stderr
+    clocks, directions = report["warnings"]
+    assert "apart, so a reflector between them appears" in directions
+    for warning in (clocks, directions):
+        assert f"ertis: warning: {warning}" in done.stderr
 
 
 def test_scene_of_nothing_but_sensors_suffices():

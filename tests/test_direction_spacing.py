@@ -48,3 +48,4 @@ def test_commands_warn_once_of_the_first_sensor_with_a_coarse_grid(capsys):
             assert pipelines.image(blank(directions, sensor)).stamp.sensor == sensor
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("ertis: warning: directions are 9.5° apart")
+    assert pipelines.warnings == [line.removeprefix("ertis: warning: ")]

@@ -91,7 +91,8 @@ def write_fused(
             "incomplete": incomplete,
             "left_out": active.n_passive,
         }
-        options.print_json(report | _direct_sound(clocks))
+        warnings = [*clocks.warnings(), *pipelines.warnings]
+        options.print_json(report | {"direct_sound": _direct_sound(clocks), "warnings": warnings})
 
 
 def _clock_check(
@@ -108,20 +109,17 @@ def _clock_check(
     return check
 
 
-def _direct_sound(check: "DirectSoundCheck") -> dict[str, Any]:
-    """Return the fields of a clock check in the JSON report."""
-    return {
-        "direct_sound": [
-            {
-                "emitter": each.emitter,
-                "receiver": each.receiver,
-                "difference_us": round(1e6 * each.difference_s, 3),
-                "uncertainty_us": round(1e6 * each.uncertainty_s, 3),
-            }
-            for each in check.sounds
-        ],
-        "warnings": list(check.warnings()),
-    }
+def _direct_sound(check: "DirectSoundCheck") -> list[dict[str, Any]]:
+    """Return the direct sounds of a clock check for the JSON report."""
+    return [
+        {
+            "emitter": each.emitter,
+            "receiver": each.receiver,
+            "difference_us": round(1e6 * each.difference_s, 3),
+            "uncertainty_us": round(1e6 * each.uncertainty_s, 3),
+        }
+        for each in check.sounds
+    ]
 
 
 def _require_several(readers: "Sequence[RecordingReader]") -> None:

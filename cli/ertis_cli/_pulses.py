@@ -208,7 +208,13 @@ def image_settings(settings_file: "Path | None", preset: str | None) -> "Callabl
 
 
 class PipelinesBySensor:
-    """Pipelines by sensor, for the air of each measurement."""
+    """Pipelines by sensor, for the air of each measurement.
+
+    Attributes
+    ----------
+    warnings : list of str
+        Printed warnings about the images.
+    """
 
     def __init__(
         self, changed: "Callable[[Settings], Settings]", stack: ExitStack, *, quiet: bool, **device: Any
@@ -216,7 +222,7 @@ class PipelinesBySensor:
         self._changed, self._stack, self._quiet, self._device = changed, stack, quiet, device
         self._made: dict[str, tuple[Settings, Pipeline]] = {}
         self._checked: set[str] = set()
-        self._warned = False
+        self.warnings: list[str] = []
 
     def settings(self, reader: "RecordingReader") -> "Settings":
         """Return the settings in use for a sensor."""
@@ -233,11 +239,11 @@ class PipelinesBySensor:
         from ertis_numba.analysis.direction_spacing import spacing_warning
 
         image = self._image(measurement)
-        if not self._warned and image.stamp.sensor not in self._checked:
+        if not self.warnings and image.stamp.sensor not in self._checked:
             self._checked.add(image.stamp.sensor)
             text = spacing_warning(image)
             if text is not None:
-                self._warned = True
+                self.warnings.append(text)
                 click.echo(f"ertis: warning: {text}", err=True)
         return image
 
