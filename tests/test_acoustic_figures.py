@@ -17,6 +17,7 @@ from ertis_numba.air import absorption_db_m, transmission_loss_db
 from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.figures import _acoustic_signals
+from ertis_numba.figures.style import angle
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.method_titles import METHOD_TITLES
@@ -66,6 +67,18 @@ def test_map_shows_the_level_of_a_band_in_each_direction(band_hz, place_deg, lev
     assert bar.get_ylabel() == "dBFS"
     assert "eRTIS-7" in texts(figure)
     assert ("25–31.5 kHz" if band_hz else "20–31.5 kHz") in texts(figure)
+
+
+def test_caption_of_a_map_states_the_source_that_peaks_lists():
+    found = acoustic_map()
+    first = next(each for each in ertis.find_sound_sources(found) if each.band_hz == tuple(BANDS_HZ[0]))
+    azimuth_deg, elevation_deg = np.degrees([first.azimuth_rad, first.elevation_rad])
+    figure = figures.acoustic_map(found, band_hz=(20e3, 25e3))
+    stated = f"loudest at azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}: −{-first.level_dbfs:.1f} dBFS"
+    assert stated in texts(figure)
+    assert (azimuth_deg, elevation_deg) == pytest.approx(LOUD_DEG, abs=0.1)
+    (ring,) = figure.axes[0].lines
+    assert (ring.get_xdata()[0], ring.get_ydata()[0]) == pytest.approx((azimuth_deg, elevation_deg), abs=1e-6)
 
 
 def test_labels_of_maps_keep_clear_of_the_edges():

@@ -59,7 +59,7 @@ def test_maxima_are_interpolated_between_directions(method):
 
 
 @pytest.mark.parametrize("method", ["clean_sc", "hr_clean_sc"])
-def test_components_have_the_direction_of_the_grid_and_the_level_of_the_source(method):
+def test_components_lie_near_the_source_and_have_its_level(method):
     with camera_of(method) as camera:
         angles, levels, _ = errors(camera, PLACES_DEG)
     assert angles.max() < 0.7 * SPACING_DEG

@@ -101,13 +101,13 @@ def peaks(
     false, and "missed" lists missed reflectors.
 
     For a file of acoustic maps, there is one entry per source, the strongest of each map and band first. Maps of
-    CLEAN-SC and HR-CLEAN-SC yield their components. Other maps yield local maxima above the floor of the map,
-    interpolated between directions of the grid; side lobes of delay-and-sum are left out. The loudest direction of each
-    band is always listed. level_dbfs is the mean square, where a full-scale tone has -3. level_db, in dB re 20 µPa,
-    needs the sensitivity of the microphones. source_level_db, in dB re 20 µPa at 1 m from the source, also needs the
-    distance of the source (process --focus). Maps of the method music have no levels. Maps are counted from 0,
-    regardless of the number of measurements that they average. --measurement chooses a map. Of the other options,
-    --sensor, --top, --min-level and --json apply to maps.
+    CLEAN-SC and HR-CLEAN-SC yield their components, summed over neighbouring directions of the grid. Other maps yield
+    local maxima above the floor of the map, interpolated between directions of the grid; side lobes of delay-and-sum
+    are left out. The loudest direction of each band is always listed. level_dbfs is the mean square, where a full-scale
+    tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones. source_level_db, in dB re 20 µPa
+    at 1 m from the source, also needs the distance of the source (process --focus). Maps of the method music have no
+    levels. Maps are counted from 0, regardless of the number of measurements that they average. --measurement chooses a
+    map. Of the other options, --sensor, --top, --min-level and --json apply to maps.
     """
     from ertis_numba.storage import file_kind
 

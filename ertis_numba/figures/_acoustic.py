@@ -18,7 +18,7 @@ from ertis_numba.figures._images import level_map
 from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures._sampling import PIXELS, centres, look_raster
 from ertis_numba.figures.style import angle, minus
-from ertis_numba.frames import AcousticMap, LevelReference
+from ertis_numba.frames import AcousticMap, LevelReference, SoundDirection
 from ertis_numba.geometry import unit_vectors
 
 __all__ = ["draw", "draw_bands", "draw_on_photo"]
@@ -32,11 +32,11 @@ _TICKS_DEG = (-60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60)
 
 def draw(canvas: Canvas, found: AcousticMap, *, band_hz: tuple[float, float] | None) -> Figure:
     """Draw the levels of a band over azimuth and elevation, or as a line over azimuth."""
-    canvas, level_db = _levels(canvas, found, band_hz)
-    heading = _heading(canvas, found, band_hz, level_db)
+    canvas, level_db, loudest = _levels(canvas, found, band_hz)
+    heading = _heading(canvas, found, loudest)
     if np.ptp(found.elevation_rad) > 1e-9:
         panel = level_map(canvas, level_db, found.azimuth_rad, found.elevation_rad)
-        return compose(canvas, heading, [_with_loudest(canvas, found, level_db, panel)])
+        return compose(canvas, heading, [_with_loudest(canvas, loudest, panel)])
     _require_directions(found)
     order = np.argsort(found.azimuth_rad)
     azimuth_deg = np.degrees(found.azimuth_rad[order])
@@ -66,7 +66,7 @@ def draw_on_photo(
             "the directions of the acoustic map have one elevation, which a photo cannot show; process with directions "
             "in space, such as 3000 or 3d:2000"
         )
-    canvas, level_db = _levels(canvas, found, band_hz)
+    canvas, level_db, loudest = _levels(canvas, found, band_hz)
     half_y, half_z = (math.tan(math.radians(each_deg) / 2) for each_deg in fov_deg)
     extent = (half_y, -half_y, -half_z, half_z)
     step = 2 * max(half_y, half_z) / PIXELS
@@ -90,7 +90,7 @@ def draw_on_photo(
 
     ratio = half_z / half_y
     view = f"field of view {fov_deg[0]:g}° × {fov_deg[1]:g}°"
-    heading = _heading(canvas, found, band_hz, level_db, view)
+    heading = _heading(canvas, found, loudest, view)
     return compose(canvas, heading, [Panel(paint, lambda width_pt: ratio * width_pt, box_aspect=ratio)])
 
 
@@ -130,14 +130,20 @@ def draw_bands(canvas: Canvas, found: AcousticMap, *, direction_deg: tuple[float
 
 def _levels(
     canvas: Canvas, found: AcousticMap, band_hz: tuple[float, float] | None
-) -> tuple[Canvas, NDArray[np.float32]]:
-    """Return the levels of a band in all directions, and a canvas with their scale."""
+) -> tuple[Canvas, NDArray[np.float32], SoundDirection]:
+    """Return the levels of a band in all directions, a canvas with their scale, and the loudest source."""
+    from ertis_numba.passive import find_sound_sources  # noqa: PLC0415  few plots need it, and it imports kernels
+
     if band_hz is not None:
         found.in_band(*band_hz)  # raises an error if there is none
         shown = (found.centre_hz >= band_hz[0]) & (found.centre_hz <= band_hz[1])
         found = found.replace(power=found.power[:, shown], band_hz=found.band_hz[shown])
     reference = found.reference
-    return _scaled(canvas, found, reference, _referred(found, reference).sum(axis=1))
+    power = _referred(found, reference).sum(axis=1)
+    limits_hz = np.array([[found.band_hz.min(), found.band_hz.max()]])
+    combined = found.replace(power=power[:, None].astype(np.float32), band_hz=limits_hz)
+    (loudest,) = find_sound_sources(combined, top=1)
+    return *_scaled(canvas, found, reference, power), loudest
 
 
 def _referred(found: AcousticMap, reference: LevelReference) -> NDArray[np.float64]:
@@ -157,40 +163,31 @@ def _scaled(
     return replace(canvas, top_db=top_db, unit=unit), np.asarray(top_db + below_db, np.float32)
 
 
-def _heading(
-    canvas: Canvas,
-    found: AcousticMap,
-    band_hz: tuple[float, float] | None,
-    level_db: NDArray[np.float32],
-    *parts: str,
-) -> _captions.Heading:
-    if band_hz is None:
-        shown_hz = found.band_hz
-    else:
-        shown_hz = found.band_hz[(found.centre_hz >= band_hz[0]) & (found.centre_hz <= band_hz[1])]
-    place = int(np.argmax(level_db))
-    place_deg = np.degrees([found.azimuth_rad[place], found.elevation_rad[place]])
-    level = f": {minus(f'{canvas.top_db:.1f}')} {canvas.unit}" if found.has_level else ""
+def _heading(canvas: Canvas, found: AcousticMap, loudest: SoundDirection, *parts: str) -> _captions.Heading:
+    level_db = loudest.level_dbfs  # relative to the reference of the canvas, as its powers are
+    level = "" if level_db is None or math.isinf(level_db) else f": {minus(f'{level_db:.1f}')} {canvas.unit}"
+    low_khz, high_khz = (_captions.number(edge_hz / 1e3) for edge_hz in loudest.band_hz)
+    towards = f"azimuth {angle(math.degrees(loudest.azimuth_rad))}, elevation "
+    towards += angle(math.degrees(loudest.elevation_rad))
     return _captions.of_acoustic_map(
         "Acoustic map",
         found,
         f"{len(found.azimuth_rad)} directions",
-        f"{_captions.number(shown_hz.min() / 1e3)}–{_captions.number(shown_hz.max() / 1e3)} kHz",
-        f"loudest at azimuth {angle(place_deg[0])}, elevation {angle(place_deg[1])}{level}",
+        f"{low_khz}–{high_khz} kHz",
+        f"loudest at {towards}{level}",
         *parts,
     )
 
 
-def _with_loudest(canvas: Canvas, found: AcousticMap, level_db: NDArray[np.float32], panel: Panel) -> Panel:
-    """Return a map with a ring around its loudest direction."""
-    place = int(np.argmax(level_db))
+def _with_loudest(canvas: Canvas, loudest: SoundDirection, panel: Panel) -> Panel:
+    """Return a map with a ring around its loudest source."""
 
     def finish(axes: Axes) -> None:
         panel.finish(axes)
         east = min(axes.get_xlim())
-        at_deg = east + (math.degrees(found.azimuth_rad[place]) - east) % 360.0
+        at_deg = east + (math.degrees(loudest.azimuth_rad) - east) % 360.0
         ring: dict[str, Any] = {"fillstyle": "none", "markersize": 1.1 * canvas.style.em_pt, "scalex": False}
-        axes.plot(at_deg, math.degrees(found.elevation_rad[place]), "o", color=canvas.style.mark, scaley=False, **ring)
+        axes.plot(at_deg, math.degrees(loudest.elevation_rad), "o", color=canvas.style.mark, scaley=False, **ring)
 
     return replace(panel, finish=finish)
 

@@ -51,7 +51,7 @@ def find_sound_sources(
     the side lobes of stronger sources. The strongest direction of each band is always returned.
 
     Errors are small if the main lobe is at least two spacings of the grid wide. The peaks of Capon are often narrower;
-    their levels are then too low. CLEAN-SC searches directions of the grid only, and yields the levels there.
+    their levels are then too low. CLEAN-SC finds a source in each bin at a direction of the grid, with the level there.
 
     Parameters
     ----------
