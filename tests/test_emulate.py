@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import tracemalloc
 from contextlib import ExitStack
 from types import SimpleNamespace
 
@@ -326,6 +327,22 @@ def test_rendering_in_advance_leaves_nothing_to_render(silent, monkeypatch):
     words = {active: renderer.of("only", active=active) for active in (True, False)}
     assert [np.array_equal(words[True][index], words[False][index]) for index in range(scene.count)] == [silent] * 2
     assert len(rendered) == scene.count * (1 if silent else 2)
+
+
+def test_rendering_begins_without_a_list_of_all_measurements():
+    """The estimate of a long rendering follows the first measurements, so nothing of that length may come before."""
+
+    def words(*_, **__):
+        raise EOFError
+
+    renderer = SimpleNamespace(count=1_000_000, emits=True, words=words)
+    tracemalloc.start()
+    try:
+        with pytest.raises(EOFError):
+            _render_all(renderer, ["only"], quiet=True)
+        assert tracemalloc.get_traced_memory()[1] < 1e6
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(

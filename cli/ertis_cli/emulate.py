@@ -219,12 +219,13 @@ def _renderer(
 def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: bool) -> None:
     """Render the measurements for the scene's call, and those without emission, in advance, so that none is late."""
     behaviours = (True, False) if renderer.emits else (False,)
-    todo = [(name, index, active) for active in behaviours for index in range(renderer.count) for name in names]
+    n_steps = len(behaviours) * renderer.count * len(names)
+    todo = ((name, index, active) for active in behaviours for index in range(renderer.count) for name in names)
     measurements = options.counted(renderer.count * len(names), "measurement")
     with_call = "with a call, and as many without" if renderer.emits else "without a call"
     options.say(f"rendering {measurements} {with_call} ...", quiet=quiet)
-    estimate = _Estimate(len(todo), n_first=len(names))
-    with options.progress(todo, length=len(todo), label="rendering", quiet=quiet) as shown:
+    estimate = _Estimate(n_steps, n_first=len(names))
+    with options.progress(todo, length=n_steps, label="rendering", quiet=quiet) as shown:
         for name, index, active in shown:
             text = estimate.after(renderer.words(name, index, active=active).nbytes)
             if text:
