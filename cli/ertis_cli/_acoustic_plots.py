@@ -14,13 +14,14 @@ if TYPE_CHECKING:
 
     from ertis_numba.frames import AcousticMap, Measurement
 
-__all__ = ["FIELD_OF_VIEW", "KINDS", "draw", "is_acoustic", "plot_options", "row_name"]
+__all__ = ["FIELD_OF_VIEW", "KINDS", "draw", "is_acoustic", "plot_options", "require_fitting", "row_name"]
 
 KINDS = {
     "acoustic_map": "sound power from each direction, chosen for passive measurements and files of acoustic maps",
     "spectrum": "level over frequency of a direction, or of the mean of the microphones",
     "spectrogram": "level over time and frequency of a direction, or of the mean of the microphones",
 }
+_OF_MAPS = ("acoustic_map", "spectrum")
 
 
 class _FieldOfView(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
@@ -77,6 +78,20 @@ def is_acoustic(path: Path, sensor: str | None, index: int) -> bool:
                 return 0 <= index < len(stamps) and is_passive(recording.settings, stamps[index])
         return kind == "acoustic_map"
     return False
+
+
+def require_fitting(kind: str, path: Path) -> None:
+    """Raise an error for a file of acoustic maps and a kind of plot that it does not support."""
+    from ertis_numba.errors import ErtisError
+    from ertis_numba.storage import file_kind
+
+    with suppress(ErtisError):  # Reading the file reports the error.
+        if kind not in _OF_MAPS and file_kind(path) == "acoustic_map":
+            raise click.UsageError(
+                f"--kind {kind} does not support {path}, a file of acoustic maps; give --kind {' or '.join(_OF_MAPS)}, "
+                "or its recording",
+                click.get_current_context(),
+            )
 
 
 def row_name(path: Path) -> str:

@@ -165,7 +165,7 @@ def plot(
     given["dynamic-range"] = dynamic_range if source is click.core.ParameterSource.COMMANDLINE else None
     if not typed("kind"):
         kind = _default_kind(path, sensor, measurement or 0, kind)
-    _require_supported(kind, given)
+    _require_supported(kind, path, given)
     if kind != "array":
         _require_no_array(path)
     if not path.name:  # "." and "/" give no name for the picture
@@ -239,14 +239,15 @@ def _default_kind(path: Path, sensor: str | None, index: int, kind: str) -> str:
     return "acoustic_map" if kind == "image" and _acoustic_plots.is_acoustic(path, sensor, index) else kind
 
 
-def _require_supported(kind: str, given: "Mapping[str, object]") -> None:
-    """Raise an error for a given option that a kind of plot does not support."""
+def _require_supported(kind: str, path: Path, given: "Mapping[str, object]") -> None:
+    """Raise an error for a file or a given option that a kind of plot does not support."""
     for name, value in given.items():
         if value is not None and kind not in _ONLY[name]:
             raise click.UsageError(
                 f"--{name} is for --kind {', '.join(_ONLY[name])}; remove it with {kind}",
                 click.get_current_context(),
             )
+    _acoustic_plots.require_fitting(kind, path)
 
 
 def _calibrated(path: Path, sensor: str | None) -> "tuple[Calibration, Settings]":
