@@ -274,8 +274,10 @@ def test_commands_and_code_of_the_page_run(tmp_path):
             scene_file.write_text(scene_file.read_text("utf-8").replace("count = 6", "count = 2"), "utf-8")
     assert ertis.read_map(tmp_path / "moving_platform.map.h5").n_groups == 2
     assert 'image: "place.pgm"' in (tmp_path / "place.yaml").read_text("utf-8")
-    (code,) = python_in(text)
-    assert "[" in run_code_here(tmp_path, code)
+    mapping, counting = python_in(text)
+    assert "[" in run_code_here(tmp_path, mapping)
+    n_occupied, n_outside = map(int, run_code_here(tmp_path, counting).split())
+    assert 2 * n_outside < n_occupied
 
 
 def test_map_beside_its_recording_is_no_recording(tmp_path):
