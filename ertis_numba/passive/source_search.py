@@ -22,6 +22,7 @@ _BLIND: Final = 0.3  # Size of a wave outside of other sources, relative to its 
 _FLAT: Final = 1e-9  # Information relative to the largest, below which a direction is not resolved.
 _SHARE_STEPS: Final = 10  # Per decade of white noise. Between steps, extents change by a few hundredths.
 _SWEEPS: Final = 2  # Corrections of all sources after each new one.
+_MAX_EXCESS: Final = 10**0.1  # Power of all sources relative to that of the band: 1 dB for errors of estimates.
 
 
 class Scan(NamedTuple):
@@ -127,10 +128,29 @@ class BandSearch:
             place = self._next(likelihood, places, law, false_alarm=false_alarm, least=least)
             if place is None:
                 break
-            places = np.concatenate([places, place[None]])
-            likelihood, share = self._likelihood(scaled, places)
-            places = self._corrected(likelihood, places)
-        return [self._source(likelihood, places, k, level, n_samples) for k in range(len(places))]
+            more = np.concatenate([places, place[None]])
+            next_likelihood, next_share = self._likelihood(scaled, more)
+            more = self._corrected(next_likelihood, more)
+            if not self._is_possible(next_likelihood, more, level, least=least):
+                break
+            places, likelihood, share = more, next_likelihood, next_share
+        sources = [self._source(likelihood, places, k, level, n_samples) for k in range(len(places))]
+        strongest = max((source.power for source in sources), default=0.0)
+        return [source for source in sources if source.power >= least * strongest]
+
+    def _is_possible(self, likelihood: BandLikelihood, places: Floats, level: Floats, *, least: float) -> bool:
+        """Return False if corrected sources lie too close together to be separated, or exceed the sound of the band.
+
+        The last of them, which is new, must also have its least power.
+        """
+        whole = likelihood.beams(places)[1]
+        for k, place in enumerate(places):
+            size = likelihood.beside(np.delete(places, k, axis=0)).beams(place[None])[1][:, 0]
+            if self._weights @ size < _BLIND * (self._weights @ whole[:, k]):
+                return False
+        powers = np.maximum(self._shares @ (likelihood.separated(places)[0] * level[:, None]), 0)
+        is_heard = powers[-1] > 0 and powers[-1] >= least * powers.max()
+        return bool(is_heard and powers.sum() <= _MAX_EXCESS * (self._shares @ level))
 
     def _next(
         self, likelihood: BandLikelihood, places: Floats, law: Callable[..., float], *, false_alarm: float, least: float
