@@ -150,23 +150,23 @@ def test_listen_prints_bearings():
     assert leak["source_level_db"] - leak["level_db"] == pytest.approx(loss_db, abs=0.01)
 
 
-def test_listen_states_once_that_one_elevation_is_assumed():
-    heard = heard_leak("2d:61", n=2)
-    shown = listen_to_bearings(heard)
-    assert shown.stderr.count("sensor inspector searches one elevation") == 1
+def test_listen_warns_once_of_given_directions_at_one_elevation():
+    heard = heard_leak("3d:1000", n=2)
+    shown = listen_to_bearings(heard, "--directions", "2d:61")
+    assert shown.stderr.count("warning: sensor inspector: directions lie at one elevation, 0°") == 1
     lines = [line for line in shown.stdout.splitlines() if "kHz" in line]
     assert len(lines) >= 2
     assert all(line.split("kHz")[1].count("unknown") == 1 for line in lines)
-    shown = listen_to_bearings(heard[:1], "--json")
+    shown = listen_to_bearings(heard[:1], "--directions", "2d:61", "--json")
     found = json.loads(shown.stdout.splitlines()[1])["bearings"]
     assert found
     assert all(each["upwards_deg"] is None and each["sideways_deg"] > 0 for each in found)
 
 
-def test_listen_searches_given_directions():
-    heard = heard_leak("2d:61")
-    shown = listen_to_bearings(heard, "--json", "--directions", "3d:1000")
-    assert "searches one elevation" not in shown.stderr
+@pytest.mark.parametrize("arguments", [(), ("--directions", "3d:1000")])
+def test_listen_searches_a_half_space_by_default_or_given_directions(arguments):
+    shown = listen_to_bearings(heard_leak("2d:61"), "--json", *arguments)
+    assert "warning" not in shown.stderr
     (leak,) = json.loads(shown.stdout.splitlines()[1])["bearings"]
     assert (leak["azimuth_deg"], leak["elevation_deg"]) == (pytest.approx(28, abs=0.5), pytest.approx(12, abs=0.5))
 

@@ -1,5 +1,7 @@
 """Bearings: right laws of noise, and directions as accurate as the signals permit."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy
@@ -9,6 +11,7 @@ import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.passive import AcousticCamera, BearingFinder, find_bearings
+from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.detection_law import LAGS, exceedance, independent_samples
 from ertis_numba.passive.likelihood import BandLikelihood, moved
 from ertis_numba.passive.noise_model import NoiseModel
@@ -263,6 +266,26 @@ def test_array_on_a_line_resolves_one_angle(directions):
 def test_directions_without_information_are_unknown(level):
     n = 1 if level else 2
     np.testing.assert_array_equal(_inverse(np.zeros((n, n))), np.diag([np.inf, np.inf]))
+
+
+@pytest.mark.parametrize("directions", ["2d:90", "3d:10", "3d:30", "3d:1300"])
+def test_levels_never_exceed_the_sound_or_fall_below_the_least_level(directions):
+    """Coarse and planar grids miss the leak; what they find instead must not have impossible levels."""
+    scene = ertis.load_scene(Path(__file__).parents[1] / "data" / "synthetic" / "scenes" / "leak.toml")
+    changes = {"processing.directions": directions, "passive.limits_hz": (28e3, 71e3)}
+    with AcousticCamera(scene.sensors[0].settings().replace(**changes), "cpu") as camera:
+        for number in range(3):
+            heard = ertis.render(scene, number)
+            camera.add(ertis.Measurement(heard.data, camera.settings, heard.stamp))
+        finder, matrix = BearingFinder(camera), camera.cross_spectrum().matrix
+        found = finder.find()
+    power = np.trace(matrix, axis1=1, axis2=2).real / matrix.shape[1]
+    assert found
+    for band_hz, share in zip(camera.band_hz, bin_shares(camera.band_hz, camera.frequency_hz), strict=True):
+        levels = [bearing.level_dbfs for bearing in found if bearing.band_hz == tuple(band_hz)]
+        assert sum(10 ** (level / 10) for level in levels) <= 10**0.1 * (share @ power)
+        assert not levels or min(levels) >= max(levels) - 20
+    assert (finder.warning is None) == (directions == "3d:1300")
 
 
 def test_silence_has_no_bearings():

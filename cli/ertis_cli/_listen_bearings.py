@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 __all__ = ["listen_bearings"]
 
-_LEVEL_DEG = 1e-6
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'band':>15}  {'azimuth':>14}  {'elevation':>14}  {'level':>9}"
 
 
@@ -34,9 +33,10 @@ def listen_bearings(
 ) -> None:
     """Print the bearings of each acoustic map until a signal, a count or a duration ends it."""
     from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
+    from ertis_numba.passive.search_grid import search_warning
 
     subscribers: list[AcousticMapSubscriber] = []
-    level: set[str] = set()
+    checked: set[str] = set()
 
     def connect(on_note: Callable[[str], None]) -> AcousticMapSubscriber:
         wanted = {"passive.averages": average, "processing.directions": directions}
@@ -49,14 +49,11 @@ def listen_bearings(
         return subscribers[0]
 
     def show(found: "AcousticMap") -> None:
-        sensor, elevation_deg = found.stamp.sensor, found.elevation_deg
-        if sensor not in level and elevation_deg.max() - elevation_deg.min() < _LEVEL_DEG:
-            level.add(sensor)
-            options.say(
-                f"note: sensor {sensor} searches one elevation, {elevation_deg[0]:g}°; a source above or below has a "
-                "wrong azimuth; give directions in space, such as --directions 3d:2000",
-                quiet=quiet,
-            )
+        if (sensor := found.stamp.sensor) not in checked:
+            checked.add(sensor)
+            text = search_warning(found.settings)
+            if text is not None:
+                click.echo(f"ertis: warning: sensor {sensor}: {text}", err=True)
         _show(found, subscribers[0].bearings, _age_ms(subscribers[0]), as_json=as_json)
 
     def report_active(subscriber: AcousticMapSubscriber) -> None:

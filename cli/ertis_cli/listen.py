@@ -66,8 +66,8 @@ _POLL_INTERVAL_S = 0.1
 @click.option(
     "--directions",
     metavar="GRID",
-    help="With --bearings: directions to search (90, 1850, 3000, 2d:N or 3d:N); those of the sensor's settings by "
-    "default.",
+    help="With --bearings: directions to search (90, 1850, 3000, 2d:N or 3d:N). By default, those of the sensor's "
+    "settings, or if these are planar or too coarse, a sufficient grid over the half-space ahead.",
 )
 @click.option(
     "--output",

@@ -10,6 +10,7 @@ from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.result_subscriber import ResultSubscriber
 from ertis_numba.network.subscriber import Arrival, Subscriber
 from ertis_numba.passive import AcousticCamera, BearingFinder
+from ertis_numba.passive.search_grid import search_changes
 from ertis_numba.settings import Settings
 
 __all__ = ["AcousticMapSubscriber"]
@@ -32,7 +33,8 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
     changes : mapping of str to value, optional
         Changes of the settings of each sensor, such as ``{"passive.averages": 10, "processing.directions": "3000"}``.
     false_alarm : float, optional
-        Find bearings with each map, with this probability that noise alone yields any; none by default.
+        Find bearings with each map, with this probability that noise alone yields any; none by default. If ``changes``
+        has no directions, those of a sensor are replaced by a grid over the half-space where they are planar or coarse.
     device : {"auto", "cpu", "cuda", "numpy"}
     threads : int, optional
         As for `AcousticCamera`.
@@ -127,8 +129,10 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
         return made
 
     def _hearer_of(self, settings: Settings) -> "_Hearer":
-        camera = AcousticCamera(settings.replace(**self._changes), self._device, self._threads)
-        alarm = self._false_alarm
+        changed, alarm = settings.replace(**self._changes), self._false_alarm
+        if alarm is not None and "processing.directions" not in self._changes:
+            changed = changed.replace(**search_changes(changed))
+        camera = AcousticCamera(changed, self._device, self._threads)
         return _Hearer(settings, camera, None if alarm is None else BearingFinder(camera, false_alarm=alarm))
 
 

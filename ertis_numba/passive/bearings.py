@@ -15,6 +15,7 @@ from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.camera import AcousticCamera
 from ertis_numba.passive.noise_model import NoiseModel
 from ertis_numba.passive.scan_extent import ScanMesh, is_level
+from ertis_numba.passive.search_grid import search_warning
 from ertis_numba.passive.source_search import BandSearch, FoundSource, Scan
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.settings import Settings
@@ -39,8 +40,8 @@ class BearingFinder:
     ----------
     camera : AcousticCamera
         Camera whose measurements are searched, in its directions and bands. Sources in other directions, such as above
-        or below a grid in one plane, yield wrong bearings. A grid coarser than half of the beam's width misses weak
-        sources. The method of its maps has no influence.
+        or below a grid in one plane, yield wrong bearings and levels. So do grids coarser than the beam; see `warning`.
+        The method of its maps has no influence.
     false_alarm : float
         Probability that noise alone yields any bearing, 1e-9 to 0.5; 0.001 by default.
     top : int
@@ -48,6 +49,11 @@ class BearingFinder:
     min_level_db : float
         Least level relative to the loudest source of the band; -20 by default, because errors of the array leave
         remainders of sources.
+
+    Attributes
+    ----------
+    warning : str or None
+        Warning that the camera's directions are planar or too far apart, with a grid that suffices; None if they do.
 
     Raises
     ------
@@ -73,6 +79,7 @@ class BearingFinder:
         self._camera, self._top = camera, checks.integer("top", top, 1)
         self._least = 10 ** (checks.between("min_level_db", min_level_db, -200.0, 0.0) / 10)
         self._false_alarm = 1 - (1 - false_alarm) ** (1 / len(camera.band_hz))
+        self.warning = search_warning(camera.settings)
         directions = unit_vectors(camera.grid.azimuth_rad, camera.grid.elevation_rad)
         reach_rad = _REACH * min(spacing_rad(directions), _MAX_SPACING_RAD)
         delays = WaveDelays(camera.settings)

@@ -1,0 +1,87 @@
+"""Grids of directions in which bearings are found."""
+
+import math
+
+import numpy as np
+import pytest
+
+import ertis_numba as ertis
+from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.passive.search_grid import search_changes, search_warning
+
+LINE_M = [[0.0, y, 0.0] for y in (0, 0.004, 0.011, 0.02, 0.031, 0.04)]
+COLUMN_M = [[0.0, 0.0, y] for _, y, _ in LINE_M]
+
+
+def settings_with(directions, **changes):
+    return ertis.Settings().replace(**{"processing.directions": directions, **changes})
+
+
+def suggested(text):
+    return text.removesuffix(" directions").split()[-1]
+
+
+@pytest.mark.parametrize("directions", ["1850", "3000", "3d:2000"])
+def test_fine_grids_cause_no_warning_and_no_change(directions):
+    settings = settings_with(directions)
+    assert search_warning(settings) is None
+    assert search_changes(settings) == {}
+
+
+@pytest.mark.parametrize("directions", ["90", "2d:1", "2d:3000", ((0.0, 5.0),)])
+def test_one_elevation_causes_a_warning_with_a_grid_that_is_fine(directions):
+    text = search_warning(settings_with(directions))
+    assert text.startswith("directions lie at one elevation")
+    assert search_warning(settings_with(suggested(text))) is None
+
+
+@pytest.mark.parametrize(
+    ("directions", "words"), [("3d:10", "above 8.9 kHz"), ("3d:100", "above 17.8 kHz"), ("3d:1500", "above 70.8 kHz")]
+)
+def test_coarse_grids_cause_a_warning_with_a_grid_that_is_fine(directions, words):
+    text = search_warning(settings_with(directions))
+    assert words in text
+    assert search_warning(settings_with(suggested(text))) is None
+
+
+def test_suggested_grids_lie_within_the_limits():
+    sector = {"processing.azimuth_limits_deg": (-20.0, 20.0), "processing.elevation_limits_deg": (-10.0, 30.0)}
+    text = search_warning(settings_with("3d:20", **sector))
+    assert search_warning(settings_with(suggested(text), **sector)) is None
+    assert int(suggested(text).removeprefix("3d:")) < 400
+
+
+def test_default_grid_covers_the_half_space():
+    sector = {"processing.azimuth_limits_deg": (-20.0, 20.0), "processing.elevation_limits_deg": (0.0, 10.0)}
+    grid = direction_grid(settings_with("2d:90", **sector).replace(**search_changes(settings_with("2d:90"))).processing)
+    assert np.ptp(np.degrees(grid.azimuth_rad)) > 170
+    assert np.ptp(np.degrees(grid.elevation_rad)) > 160
+
+
+def test_sources_between_the_directions_of_a_sufficient_grid_lose_less_than_6_db():
+    """Compute the beams of the nearest directions for sources at random; coarser grids lose more than 6 dB of some."""
+    band_hz = (40e3, 50e3)
+    settings = settings_with("90", **{"passive.bands_hz": (band_hz,)})
+    sufficient = suggested(search_warning(settings))
+    coarser = f"3d:{int(sufficient.removeprefix('3d:')) // 2}"
+    places_m = microphones(settings.array).enabled_positions_m
+    wave_1_m = 2 * math.pi * math.sqrt((band_hz[0] ** 2 + band_hz[0] * band_hz[1] + band_hz[1] ** 2) / 3) / 343.0
+    random = np.random.default_rng(0)
+    sources = unit_vectors(random.uniform(-1, 1, 2000), np.arcsin(random.uniform(-0.8, 0.8, 2000)))
+    least = {}
+    for name in (sufficient, coarser):
+        grid = direction_grid(settings_with(name).processing)
+        offsets = sources[:, None] - unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+        nearest = offsets[np.arange(len(sources)), np.linalg.norm(offsets, axis=2).argmin(axis=1)]
+        least[name] = np.abs(np.exp(1j * wave_1_m * nearest @ places_m.T).mean(axis=1)).min()
+    assert least[sufficient] >= 0.5 > least[coarser]
+
+
+def test_horizontal_line_needs_one_elevation_only():
+    line = {"array.positions_m": LINE_M}
+    assert search_warning(settings_with("2d:181", **line)) is None
+    text = search_warning(settings_with("2d:5", **line))
+    assert search_warning(settings_with(suggested(text), **line)) is None
+    assert search_changes(settings_with("2d:5", **line))["processing.directions"].startswith("2d:")
+    column = settings_with("2d:181", **{"array.positions_m": COLUMN_M})
+    assert search_changes(column)["processing.directions"].startswith("3d:")
