@@ -41,7 +41,10 @@ _TOUCHED: Final = 0.1  # Evidence of an echo above which a cell does not become 
 
 
 class Trust(NamedTuple):
-    """Trust in echoes, from a logistic regression of simulated reflectors and ghosts.
+    """Trust in echoes.
+
+    Log-odds of echoes come from a logistic regression of simulated reflectors and ghosts. ``cell`` and ``missed`` in
+    the plane were chosen to fit maps of simulated places.
 
     Attributes
     ----------

@@ -114,7 +114,7 @@ def alarms(case: NoiseCase, seed: int, first: int, count: int) -> list[int]:
         finders = [BearingFinder(camera, false_alarm=asked, top=1) for asked in ASKED]
         for trial in range(first, first + count):
             camera.reset()
-            for heard in measurements(settings, case, seed=(seed, trial)):
+            for heard in measurements(settings, case, seed=(seed, CASES.index(case), trial)):
                 camera.add(heard)
             for place, finder in enumerate(finders):
                 if not finder.find():  # Lower rates then yield nothing either.
