@@ -44,6 +44,16 @@ def test_coarse_grids_cause_a_warning_with_a_grid_that_is_fine(directions, words
     assert search_warning(settings_with(suggested(text))) is None
 
 
+def test_bands_may_have_any_order():
+    bands_hz = ((60e3, 80e3), (20e3, 30e3), (30e3, 40e3))
+    texts = [
+        search_warning(settings_with("3d:100", **{"passive.bands_hz": each}))
+        for each in (bands_hz, bands_hz[::-1], tuple(sorted(bands_hz)))
+    ]
+    assert "above 20.0 kHz" in texts[0]
+    assert texts == texts[:1] * 3
+
+
 def test_suggested_grids_lie_within_the_limits():
     sector = {"processing.azimuth_limits_deg": (-20.0, 20.0), "processing.elevation_limits_deg": (-10.0, 30.0)}
     text = search_warning(settings_with("3d:20", **sector))

@@ -51,7 +51,7 @@ def search_changes(settings: Settings) -> dict[str, object]:
     if search_warning(settings) is None:
         return {}
     wide = settings.replace(**_HALF_SPACE)
-    return _HALF_SPACE | {"processing.directions": _sufficient(wide, heard_bands(settings))}
+    return _HALF_SPACE | {"processing.directions": _sufficient(wide, _bands_hz(settings))}
 
 
 def search_warning(settings: Settings) -> str | None:
@@ -80,12 +80,12 @@ def search_warning(settings: Settings) -> str | None:
     >>> import ertis_numba as ertis
     >>> from ertis_numba.passive.search_grid import search_warning
     >>> settings = ertis.Settings().replace("passive.bands_hz", ((20e3, 30e3),))
-    >>> search_warning(settings.replace("processing.directions", "3d:100"))
-    'directions are 13.8° apart, too far to find all sources above 20.0 kHz; search at least 3d:200 directions'
+    >>> search_warning(settings.replace("processing.directions", "3d:100")).split("; ")[-1]
+    'search at least 3d:200 directions'
     >>> search_warning(settings.replace("processing.directions", "3d:200")) is None
     True
     """
-    bands_hz = heard_bands(settings)
+    bands_hz = _bands_hz(settings)
     grid = direction_grid(settings.processing)
     directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
     is_planar = is_level(directions)
@@ -99,10 +99,15 @@ def search_warning(settings: Settings) -> str | None:
     for band_hz in bands_hz:
         if apart_rad > _largest_spacing_rad(settings, band_hz, is_planar=is_planar):
             return (
-                f"directions are {math.degrees(apart_rad):.1f}° apart, too far to find all sources above "
-                f"{band_hz[0] / 1e3:.1f} kHz; search at least {_sufficient(settings, bands_hz)} directions"
+                f"directions are {math.degrees(apart_rad):.1f}° apart; above {band_hz[0] / 1e3:.1f} kHz, sources "
+                f"between them may have wrong bearings; search at least {_sufficient(settings, bands_hz)} directions"
             )
     return None
+
+
+def _bands_hz(settings: Settings) -> NDArray[np.float64]:
+    """Return the edges of the bands from low to high frequencies: (band, 2) float64."""
+    return np.sort(heard_bands(settings), axis=0)  # They do not overlap.
 
 
 def _sufficient(settings: Settings, bands_hz: NDArray[np.float64]) -> str:
