@@ -93,7 +93,6 @@ peers: $(VENV)/ready  ## compare with Acoular, PyTorch and JAX; on Linux, PyTorc
 	$(BIN)/python -m pip install --quiet --editable '.[peers]'
 	$(BIN)/ertis bench peers --update docs/reference/benchmarks.md
 	$(BIN)/ertis bench passive --update docs/explanation/acoustic-maps.md
-	$(BIN)/ertis bench passive --only false-alarms --update docs/explanation/acoustic-maps.md
 
 soak: $(VENV)/ready-to-test  ## test faults, kills, full disks and random scenes for hours; SEED=N repeats a run
 	$(BIN)/python -m tests.faults reliability --long $(if $(SEED),--seed $(SEED)) --update docs/explanation/reliability.md
