@@ -286,6 +286,7 @@ def test_slow_emulator_sends_at_its_rate(device, port):
     assert 0.1 < time.monotonic() - began_s - N_SAMPLES / 4.5e6 < 1.0  # 0.131 MB at 1 MB/s
 
 
+@pytest.mark.alone
 def test_emulator_close_does_not_wait_for_a_reader(armed):
     device, _, log = armed
     device.trigger()
@@ -293,5 +294,5 @@ def test_emulator_close_does_not_wait_for_a_reader(armed):
     began_s = time.monotonic()
     device.close()
     device.close()
-    assert time.monotonic() - began_s < TIMEOUT_S
+    assert time.monotonic() - began_s < 1.0
     assert not any(thread.name == "emulated emulated" for thread in threading.enumerate())

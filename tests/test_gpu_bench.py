@@ -192,10 +192,11 @@ def test_tables_show_all_existing_parts(report, results):
     assert tables.gpu(found).startswith("| ms per measurement, median |")
 
 
+@pytest.mark.alone
 def test_hanging_part_is_ended_with_its_children():
     begin_s = time.monotonic()
     done = gpu.execute(["sh", "-c", "echo begun; sleep 100; echo ended"], 3.0)  # A shell begins at once.
-    assert time.monotonic() - begin_s < 60
+    assert time.monotonic() - begin_s < 10
     assert done == gpu.FinishedProcess(None, "begun\n")
 
 

@@ -160,11 +160,11 @@ def test_malformed_zap_requests_are_never_accepted(door):
     assert door.admits(ROBOT).name == "robot"
 
 
-def test_self_test_passes_and_counts_nothing(door, monkeypatch):
-    monkeypatch.setattr("ertis_numba.network.zap_authenticator._SELF_TEST_S", PATIENCE_S)
+@pytest.mark.alone
+def test_self_test_passes_and_counts_nothing(door):
     began_s = time.monotonic()
     door.gate.self_test(door.address)
-    assert time.monotonic() - began_s < 0.5 * PATIENCE_S  # It ends with the refusals, not with its timeout.
+    assert time.monotonic() - began_s < 2.0  # It ends with the refusals, not with its timeout.
     for _ in range(5):
         door.turn()
     assert not door.gate.refused
