@@ -22,6 +22,7 @@ def _short(monkeypatch):
     monkeypatch.setattr(performance, "_WARM_UP_S", 0.4)
 
 
+@pytest.mark.alone  # the limit of the serial line is a wall-clock time
 def test_latency_bench_reports_every_stage_and_updates_the_page(tmp_path):
     target = tmp_path / "page.md"
     target.write_text("<!-- ertis bench latency -->\nold\n<!-- /ertis bench latency -->\n", "utf-8")

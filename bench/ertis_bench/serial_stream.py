@@ -92,6 +92,7 @@ def _received(pipeline: Pipeline, settings: Settings, port: str, expected: list[
 def _send(job: _SenderJob) -> None:
     """Send blocks at the rate of the line, and print the time of the last byte of each.
 
+    That is the time before it is written: on a busy machine, the image can be ready before this process runs again.
     The first block is sent a second after the terminal exists, so that the receiver has opened it.
     """
     words, terminal = np.load(job.words), Terminal()
@@ -107,11 +108,12 @@ def _send(job: _SenderJob) -> None:
             if allowed < 1:
                 time.sleep(2e-4)
                 continue
+            last_ns = time.monotonic_ns()
             n_written = terminal.write(block[n_sent : n_sent + allowed])
             if not n_written:
                 select.select([], [terminal.master], [], 1.0)
             n_sent += n_written
-        _emit_event(event="sent", counter=counter, last_ns=time.monotonic_ns())
+        _emit_event(event="sent", counter=counter, last_ns=last_ns)
     _emit_event(event="done")
     time.sleep(_PATIENCE_S)  # The receiver ends this process; the end of the terminal would unplug the sensor.
 
