@@ -186,7 +186,7 @@ def processing(
         sender.wait_for("sent", timeout_s=duration_s + 60.0)
         sent = read_diaries([warm, diary])
         serve.settle(len(sent.kept))
-        time.sleep(0.5)
+        serve.deliver(images)
         receiver.signal(15)
         receiver.wait()
         received = read_received(images)

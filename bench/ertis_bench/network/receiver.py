@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_bench.network.diary import DiaryKey
-from ertis_bench.network.processes import JsonLinesProcess
+from ertis_bench.network.processes import JsonLinesProcess, until
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.network.keys import ClientKeys, KeyPair
 from ertis_numba.network.messages import Product
@@ -133,7 +133,8 @@ def main(look: ReceiverJob) -> None:
     """Receive until SIGTERM."""
     subscriber = subscriber_of(look, on_note=lambda text: _emit_event(event="note", text=text))
     signal.signal(signal.SIGTERM, lambda *_: subscriber.close())
-    _emit_event(event="subscribed", pid=os.getpid())
+    if until(lambda: subscriber.connected):
+        _emit_event(event="subscribed", pid=os.getpid())
     receive(look, subscriber)
     _emit_event(event="received", **asdict(subscriber.counts))
 

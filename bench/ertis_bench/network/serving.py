@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_bench.network.oracle import Sent
-from ertis_bench.network.processes import JsonLinesProcess, central, survivors
-from ertis_bench.network.receiver import STEP, Received
+from ertis_bench.network.processes import JsonLinesProcess, central, survivors, until
+from ertis_bench.network.receiver import STEP, Received, read_received
 from ertis_numba.frames import Measurement
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair
@@ -120,6 +120,28 @@ class Serve:
             if sum(each.received for each in sensors) >= n_sent and not any(each.in_flight for each in sensors):
                 return True
         return False
+
+    def deliver(self, images: Path, *, timeout_s: float = 60.0) -> bool:
+        """Wait until an application has received all published images, or learned that they were skipped for it.
+
+        Parameters
+        ----------
+        images : Path
+            Diary of the application, which has received images since the start of the central node.
+        timeout_s : float
+
+        Returns
+        -------
+        bool
+            False after a timeout.
+        """
+        published = 0 if self.latest is None else sum(each.published for each in self.latest.sensors.values())
+
+        def is_complete() -> bool:
+            received = read_received(images)
+            return len(received.numbers) + received.dropped >= published
+
+        return until(is_complete, timeout_s=timeout_s)
 
     def processes(self) -> dict[str, list[int]]:
         """Return the processes of the central node."""

@@ -69,7 +69,7 @@ def workers(folder: Path, *, seed: int, count: int) -> Found:
         flushed = sender.wait_for("sent")["flushed"]
         sent = read_diaries([diary])
         acked_through = serve.settle(len(sent.kept))
-        time.sleep(0.5)  # time for the receiver to log the last image
+        serve.deliver(images)
         receiver.stop()
         found = accounts(serve, sent, read_received(images))
         processing = None if serve.latest is None else serve.latest.processing

@@ -4,6 +4,7 @@ import threading
 from types import TracebackType
 from typing import Final, Self
 
+from ertis_bench.network.processes import until
 from ertis_bench.network.receiver import ReceiverJob, receive, subscriber_of
 
 from ertis_numba.errors import DataError
@@ -16,14 +17,24 @@ _WAIT_S: Final = 60.0  # time limit of the end
 class ReceiverThread:
     """Receiver that runs until the end of a ``with`` statement, or until it is stopped.
 
+    Once it is created, it is subscribed: it misses no later image.
+
     Parameters
     ----------
     job : ReceiverJob
+
+    Raises
+    ------
+    DataError
+        No central node answers.
     """
 
     def __init__(self, job: ReceiverJob) -> None:
         self._job = job
         self._subscriber = subscriber_of(job, on_note=lambda _: None)
+        if not until(lambda: self._subscriber.connected):
+            self._subscriber.close()
+            raise DataError(f"no central node answers at {job.address}")
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name=f"receiver {job.diary}", daemon=True)
         self._thread.start()
