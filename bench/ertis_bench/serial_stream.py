@@ -6,9 +6,11 @@ The sender runs in a process of its own, so that it shares no interpreter lock w
 import json
 import os
 import select
+import signal
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -33,6 +35,7 @@ BYTES_PER_S: Final = 20e6
 
 _SKIPPED: Final = 4  # First blocks, whose counters are not known yet.
 _PATIENCE_S: Final = 30.0
+_BEGIN: Final = signal.SIGUSR1
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +58,7 @@ def measure(*, duration_s: float, seed: int, rate_hz: float = 10.0, directions: 
         command = [sys.executable, "-m", "ertis_bench.serial_stream", json.dumps(asdict(job))]
         with JsonLinesProcess(command, stated=Path(place) / "sender.txt") as sender:
             port = sender.wait_for("ready")["port"]
-            ready_ns = _received(pipeline, settings, port, expected, count)
+            ready_ns = _received(pipeline, settings, port, expected, count, begin=lambda: sender.signal(_BEGIN))
             sender.wait_for("done")
             sent_ns = {each["counter"]: each["last_ns"] for each in sender.events if each["event"] == "sent"}
     found: dict[str, Any] = {"bytes_per_s": BYTES_PER_S, "directions": directions, "blocks": len(ready_ns)}
@@ -69,8 +72,10 @@ def measure(*, duration_s: float, seed: int, rate_hz: float = 10.0, directions: 
     return found
 
 
-def _received(pipeline: Pipeline, settings: Settings, port: str, expected: list[Any], count: int) -> dict[int, int]:
-    """Return the time of each image by the counter of its block."""
+def _received(
+    pipeline: Pipeline, settings: Settings, port: str, expected: list[Any], count: int, *, begin: Callable[[], None]
+) -> dict[int, int]:
+    """Return the time of each image by the counter of its block; ``begin`` is called when the port is open."""
     stream, ready_ns, begun = pipeline.stream(), dict[int, int](), [-1]
     image = np.empty_like(expected[0])
 
@@ -81,6 +86,7 @@ def _received(pipeline: Pipeline, settings: Settings, port: str, expected: list[
 
     with SonarDriver.open(port, listen_only=True) as sonar:
         sonar.configure(Setup.of(settings), on_words=on_words)
+        begin()
         for block in sonar.listen(stop=lambda: len(ready_ns) == count, timeout_s=_PATIENCE_S):
             pipeline.process(Measurement(block.data, settings), image, stream=stream)
             ready_ns[block.counter] = time.monotonic_ns()
@@ -93,11 +99,13 @@ def _send(job: _SenderJob) -> None:
     """Send blocks at the rate of the line, and print the time of the last byte of each.
 
     That is the time before it is written: on a busy machine, the image can be ready before this process runs again.
-    The first block is sent a second after the terminal exists, so that the receiver has opened it.
+    The first block is sent after the signal that the receiver has opened the terminal.
     """
+    signal.pthread_sigmask(signal.SIG_BLOCK, {_BEGIN})  # It waits until it is asked for.
     words, terminal = np.load(job.words), Terminal()
     _emit_event(event="ready", port=terminal.port)
-    start_s = time.monotonic() + 1.0
+    signal.sigwait({_BEGIN})
+    start_s = time.monotonic()
     for counter in range(job.count):
         block = memoryview(encode_block(counter, words[counter % len(words)]))
         begin_s = start_s + counter / job.rate_hz

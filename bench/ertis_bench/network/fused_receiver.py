@@ -21,7 +21,7 @@ from ertis_numba.network.keys import ClientKeys, KeyPair
 __all__ = ["SPACINGS", "FusedPulse", "FusedReceiverJob", "checked", "read_fused"]
 
 SPACINGS: Final[Any] = {"spacing_deg": 2.0, "range_step_m": 0.02}
-_CHECKED: Final = 10  # One pulse in so many is kept, and checked at the end.
+_CHECKED: Final = 10  # Of the fused pulses with points, one in so many is kept, and checked at the end.
 
 
 class FusedPulse(NamedTuple):
@@ -80,6 +80,7 @@ def main(job: FusedReceiverJob) -> None:
     keys = ClientKeys(pair=KeyPair.load(Path(job.keys[0])), server=job.keys[1])
     diary = os.open(job.diary, os.O_CREAT | os.O_APPEND | os.O_WRONLY, 0o644)
     kept: list[FusedArrival] = []
+    n_located = 0
     with FusedSubscriber(job.address, keys=keys, **SPACINGS) as subscriber:
         signal.signal(signal.SIGTERM, lambda *_: subscriber.close())
         if until(lambda: subscriber.connected):
@@ -89,8 +90,9 @@ def main(job: FusedReceiverJob) -> None:
             count = arrival.fused.image.stamp.sync_count
             line = FusedPulse(count, len(arrival.images), arrival.first_ns, arrival.ready_ns, time.monotonic_ns())
             os.write(diary, f"{json.dumps(line)}\n".encode())
-            if count % _CHECKED == 0 and n_points:
-                kept.append(arrival)
+            if n_points:
+                kept += [arrival] * (n_located % _CHECKED == 0)
+                n_located += 1
         _emit(event="received", skipped=subscriber.n_skipped, dropped=subscriber.counts.dropped, **checked(job, kept))
     os.close(diary)
 

@@ -82,10 +82,10 @@ def measure(folder: Path, duration_s: float, seed: int) -> Found:
         sender.wait_for("sent", timeout_s=duration_s + 60.0)
         serve.settle(len(read_diaries(diaries[:2]).kept))
         until(lambda: len(read_fused(diaries[2])) >= count, timeout_s=10.0)
-        pulses = read_fused(diaries[2])
-        cpu_percent, cpu_ms = load.percent(), load.rows(max(1, len(pulses)))
+        cpu_percent, cpu_ms = load.percent(), load.rows(max(1, len(read_fused(diaries[2]))))
         receiver.signal(15)
         end = receiver.wait_for("received")
+        pulses = read_fused(diaries[2])
         after = _counts(serve)
         serve.node.stop()
     return _summary(pulses) | {

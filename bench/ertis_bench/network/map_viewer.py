@@ -21,7 +21,7 @@ from ertis_numba.viewer import Live, ReceivedImage, Viewer
 
 __all__ = ["MapViewerJob", "n_wrong"]
 
-_CHECKED: Final = 10  # One measurement in so many is kept, and checked at the end.
+_CHECKED: Final = 10  # One map in so many is kept, and checked at the end.
 _TOLERANCE: Final = 1e-5  # Relative to the largest power.
 
 
@@ -54,11 +54,13 @@ class _KeptMaps(Live):
     """Source of a view that keeps some maps."""
 
     kept: list[AcousticMap]
+    n_taken: int
 
     def take(self) -> list[ReceivedImage[Any]]:
-        """Return new maps, and keep those of some measurements."""
+        """Return new maps, and keep some of them."""
         taken = super().take()
-        self.kept += [each.image for each in taken if each.image.stamp.sequence % _CHECKED == 0]
+        self.kept += [each.image for n, each in enumerate(taken, self.n_taken) if n % _CHECKED == 0]
+        self.n_taken += len(taken)
         return taken
 
 
@@ -66,7 +68,7 @@ def main(job: MapViewerJob) -> None:
     """Show maps until SIGTERM, and check the kept ones."""
     keys = ClientKeys(pair=KeyPair.load(Path(job.keys[0])), server=job.keys[1])
     with _KeptMaps(job.address, keys=keys, acoustic_maps=True) as source, Viewer(source, port=0) as viewer:
-        source.kept = []
+        source.kept, source.n_taken = [], 0
 
         def counts() -> dict[str, int]:
             return {
