@@ -5,7 +5,7 @@ Each wrong key and role is tried at both addresses of a central node, together w
 
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +31,9 @@ __all__ = ["keys", "try_keys"]
 
 _TRIED_S: Final = 2.5  # long enough for several refusals of a wrong key
 _REMOVED_S: Final = 2.0
+_PATIENCE_S: Final = 60.0  # time limit for what must happen, after these times
+_LISTED: Final = "the listed application"
+_REFUSALS: Final = {"unknown key", "no key", "role", "serial"}
 _INTERVAL_S: Final = 0.05
 Found = dict[str, Any]
 
@@ -109,18 +112,18 @@ def try_keys(keyed: KeyedNode, folder: Path, *, seed: int) -> tuple[Found, Path,
             name: _start_client(stack, keyed.address, sensor, given, diaries[name], session_id=seed + number)
             for number, (name, (sensor, given)) in enumerate(cases.items())
         }
-        _send(list(tries.values()), _TRIED_S)
+        _send(list(tries.values()), _TRIED_S, lambda: keyed.status()["refused"].keys() >= _REFUSALS)
         watchers = {
             "no key that subscribes": None,
             "an unknown key that subscribes": keyed.client("stranger"),
             "a sensor that subscribes": keyed.client("front"),
-            "the listed application": keyed.client("viewer"),
+            _LISTED: keyed.client("viewer"),
         }
         let_in = _receivers(keyed.publish, watchers, tries["the listed sensor"])
         removed_s = time.monotonic()
         AllowList.load(keyed.allowed).remove("leaver").save(keyed.allowed)
-        _send([tries["the listed sensor"], tries["a listed sensor, until it is removed"]], _REMOVED_S)
         leaver = tries.pop("a listed sensor, until it is removed")
+        _send([tries["the listed sensor"], leaver], _REMOVED_S, lambda: "removed key" in keyed.status()["refused"])
         after_s = leaver.acked_s - removed_s
         raw = _accepts_without_keys(keyed.address) + _accepts_without_keys(keyed.publish)
         status = keyed.status()
@@ -157,25 +160,28 @@ def _start_client(
     return made
 
 
-def _send(tries: Sequence[_Client], duration_s: float) -> None:
-    """Send measurements of all nodes in turns for some time."""
+def _send(tries: Sequence[_Client], duration_s: float, is_enough: Callable[[], bool]) -> None:
+    """Send measurements of all nodes in turns for some time, and then until a condition holds or patience ends."""
     end_s = time.monotonic() + duration_s
-    while time.monotonic() < end_s:
+    while time.monotonic() < end_s or (time.monotonic() < end_s + _PATIENCE_S and not is_enough()):
         for each in tries:
             each.send()
         time.sleep(_INTERVAL_S * len(tries))
 
 
 def _receivers(address: str, watchers: dict[str, ClientKeys | None], sender: _Client) -> list[str]:
-    """Return the names of receivers that receive anything while the listed sensor sends."""
-    found = set()
+    """Return the names of receivers that receive anything while the listed sensor sends.
+
+    The listed application must receive something.
+    """
+    found = set[str]()
     with ExitStack() as stack:
         subscribers = {
             name: stack.enter_context(Subscriber(address, products=("energyscape",), keys=given))
             for name, given in watchers.items()
         }
         end_s = time.monotonic() + _TRIED_S
-        while time.monotonic() < end_s:
+        while time.monotonic() < end_s or (time.monotonic() < end_s + _PATIENCE_S and _LISTED not in found):
             sender.send()
             for name, subscriber in subscribers.items():
                 with contextlib.suppress(ErtisError):  # The receiver may raise an error for the refusal.

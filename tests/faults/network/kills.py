@@ -153,10 +153,14 @@ def nodes(folder: Path, *, seed: int, count: int) -> Found:
         for number in range((count + 1) // 2):
             with ExitStack() as stack:
                 lines = _some_lines(rng, _LINES_TO_BEGIN, _LINES_OF_A_LIFE) if number % 2 else None
-                n_before = _n_kept(diaries["spool"])
+                n_before = {name: _n_kept(diary) for name, diary in diaries.items()}
                 senders = [stack.enter_context(job.start(in_trap(lines, job.command()))) for job in jobs.values()]
                 if lines is None:
-                    until(lambda n_before=n_before: _n_kept(diaries["spool"]) >= n_before + _N_KEPT)  # type: ignore[misc]
+                    until(
+                        lambda n_before=n_before: all(  # type: ignore[misc]
+                            _n_kept(diaries[name]) >= n + _N_KEPT for name, n in n_before.items()
+                        )
+                    )
                 for sender in rng.sample(senders, 2):
                     if lines is not None:
                         by_line += sender.ends_within(_LIFE_S)

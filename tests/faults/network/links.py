@@ -26,7 +26,10 @@ __all__ = ["away", "disk_fails", "disk_full", "meddled", "state_of"]
 _RING_BYTES: Final = 64_000_000
 _MARGIN_BYTES: Final = 24_000_000  # margin above a full ring, for other memory of a process
 _START_S: Final = 2.0  # time limit until a node listens and sensors are connected to it
-_ACK_DELAY_S: Final = 1.5  # time after which every acknowledgement that was sent has arrived
+_FAULT_S: Final = 1.5  # time in which a node with a failing disk must not acknowledge
+_STEADY_S: Final = 60.0  # time limit until such a node stores nothing more
+_MEDDLED_S: Final = 60.0  # time limit for each effect on acknowledgements to occur
+_ALL_EFFECTS: Final = {"ack lose", "ack repeat", "ack delay"}
 Found = dict[str, Any]
 
 
@@ -67,11 +70,11 @@ def disk_fails(folder: Path, *, seed: int) -> Found:
     The counts are those of `disk_full`.
     """
     record = RestartedRecorder(folder)
-    return _send_through_fault(folder, record, None, seed=seed, count=60)
+    return _send_through_fault(folder, record, None, seed=seed)
 
 
 def _send_through_fault(
-    folder: Path, record: RestartedRecorder, free: Callable[[], None] | None, *, seed: int, count: int
+    folder: Path, record: RestartedRecorder, free: Callable[[], None] | None, *, seed: int, count: int | None = None
 ) -> Found:
     """Send until the disk fails, repair it, and send the remaining measurements.
 
@@ -80,9 +83,12 @@ def _send_through_fault(
     free : callable, optional
         Repairs the disk. By default, a kernel limit makes writes of the process fail beyond about 100 kB of a file, and
         the repair removes the limit.
+    count : int, optional
+        Number of measurements. By default, the sensor measures until the disk is repaired.
     """
     diary = folder / "sender.ndjson"
     job = SenderJob(address=record.address, diary=str(diary), rate_hz=20.0, count=count, seed=seed, patience_s=60.0)
+    job = job.replace(ring_bytes=10 * _RING_BYTES)
     with ExitStack() as stack:
         node = stack.enter_context(record.start())
         node.wait_for("listening")
@@ -92,16 +98,15 @@ def _send_through_fault(
             until(lambda: bool(read_diaries([diary]).acked()))
             _limit(node, 100_000)
         fault = node.wait_for("fault")
-        time.sleep(_ACK_DELAY_S)
-        acked = len(read_diaries([diary]).acked())
-        time.sleep(_ACK_DELAY_S)
-        acked_in_fault = len(read_diaries([diary]).acked()) - acked
-        state = state_of(record.address)["state"]
+        acked, acked_in_fault, state = _acked_in_fault(record.address, job.sensors[0], diary)
+        n_events = len(node.events)
         if free is None:
             _limit(node, resource.RLIM_INFINITY)
         else:
             free()
-        node.wait_for("resumed")
+        node.wait_for("resumed", since=n_events)
+        if count is None:
+            sender.signal(signal.SIGTERM)
         sender.wait_for("sent")
         node.stop()
         ended = record.finish()
@@ -113,6 +118,27 @@ def _send_through_fault(
         **ended,
         **judged(folder, record.archive, [diary]),
     }
+
+
+def _acked_in_fault(address: str, sensor: str, diary: Path) -> tuple[int, int, str]:
+    """Watch a node with a failing disk for a time in which it stores nothing: a nearly full disk may take some more.
+
+    Returns
+    -------
+    before, meanwhile : int
+        Acknowledged measurements: those that were stored before, and others.
+    state : str
+        State of the node at the end.
+    """
+    end_s = time.monotonic() + _STEADY_S
+    status = state_of(address)
+    while True:
+        stored = status["sensors"][sensor]["stored"]
+        until(lambda stored=stored: len(read_diaries([diary]).acked()) >= stored)  # type: ignore[misc]
+        time.sleep(_FAULT_S)
+        status = state_of(address)
+        if status["sensors"][sensor]["stored"] == stored or time.monotonic() > end_s:
+            return stored, len(read_diaries([diary]).acked()) - stored, status["state"]
 
 
 def _limit(process: JsonLinesProcess, max_bytes: int) -> None:
@@ -197,6 +223,7 @@ def meddled(folder: Path, *, seed: int, duration_s: float) -> Found:
             cuts += 1
             time.sleep(min(5.0, duration_s / 4))
             cable.mend()
+        until(lambda: cable.did.keys() >= _ALL_EFFECTS, timeout_s=_MEDDLED_S)
         sender.signal(signal.SIGTERM)
         flushed = sender.wait_for("sent", timeout_s=120.0)["flushed"]
         node.stop()
