@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import threadpoolctl
 from scipy.signal import csd
 
 import ertis_numba as ertis
@@ -11,6 +12,8 @@ from ertis_numba.frames import is_passive
 from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
 from ertis_numba.passive import AcousticCamera, find_bearings, octave_bands
 from ertis_numba.passive.bands import bin_shares
+from ertis_numba.passive.methods import METHODS
+from ertis_numba.passive.parallel_bins import in_parts
 from ertis_numba.settings import MAP_METHODS, Settings
 from tests.on_device import KERNELS
 
@@ -129,6 +132,31 @@ def test_powers_equal_their_equation(method, diagonal_removal):
         expected = reference_powers(camera, camera.cross_spectrum().matrix.astype(complex))
         found = camera.powers()
     assert np.abs(found - expected).max() < 2e-4 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(("n_bins", "threads", "n_parts"), [(0, 2, 1), (15, 2, 1), (16, 4, 2), (92, 3, 3), (92, 1, 1)])
+def test_parts_of_the_bins_yield_the_results_of_all_bins(n_bins, threads, n_parts):
+    numbers, doubled, lengths = np.arange(n_bins), 2 * np.arange(n_bins), []
+
+    def total(some, others):
+        lengths.append(len(some))
+        return some + others
+
+    assert in_parts(total, numbers, doubled, threads=threads).tolist() == list(range(0, 3 * n_bins, 3))
+    assert len(lengths) == n_parts
+
+
+def test_maps_are_computed_with_one_thread_of_blas(monkeypatch):
+    counts, camera = [], AcousticCamera(settings_of(), "numpy")
+
+    def record(spectrum, *_):
+        counts.extend(each["num_threads"] for each in threadpoolctl.threadpool_info() if each["user_api"] == "blas")
+        return np.zeros((len(spectrum.matrix), len(camera.grid)), np.float32)
+
+    monkeypatch.setitem(METHODS, "delay_and_sum", record)
+    with threadpoolctl.threadpool_limits(2, user_api="blas"), camera:
+        camera.process(sound(camera.settings, [(20, 0.1)]))
+    assert set(counts) == {1}
 
 
 @pytest.mark.parametrize("method", MAP_METHODS)

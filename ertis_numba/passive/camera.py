@@ -23,6 +23,7 @@ from ertis_numba.passive.methods import METHODS
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.passive.waves import Waves
 from ertis_numba.settings import Settings
+from ertis_numba.stages.interpolation_fit import one_thread
 
 __all__ = ["AcousticCamera"]
 
@@ -150,7 +151,8 @@ class AcousticCamera:
             There is no measurement, or too few blocks for the method.
         """
         passive = self.settings.passive
-        return METHODS[passive.method](self.cross_spectrum(), self.waves, passive)
+        with one_thread():  # of BLAS: the parts of `in_parts` run on threads of their own
+            return METHODS[passive.method](self.cross_spectrum(), self.waves, passive)
 
     def map(self) -> AcousticMap:
         """Return the map of the measurements since the last `reset`.
@@ -164,7 +166,8 @@ class AcousticCamera:
         DataError
             There is no measurement, or too few blocks for the method.
         """
-        power = (self._shares @ self.powers()).T
+        with one_thread():
+            power = (self._shares @ self.powers()).T
         return AcousticMap(
             np.ascontiguousarray(power),
             self.grid.azimuth_rad,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ertis_numba.errors import DataError
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.high_resolution import HighResolutionClean
+from ertis_numba.passive.parallel_bins import in_parts
 from ertis_numba.passive.waves import Waves
 from ertis_numba.settings import MapMethod, Passive
 
@@ -43,20 +44,27 @@ def _steered(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
 
 def functional(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
     """Return ``(v^H C^(1/ν) v / M)^ν / M`` for the order ν (R. P. Dougherty, 2014)."""
-    values, vectors = _eigen(spectrum)
     order, n_mics = passive.functional_order, spectrum.matrix.shape[1]
-    powers = waves.steer(_matrices(np.maximum(values, 0) ** (1 / order), vectors))
+
+    def roots(matrices: Matrices) -> Matrices:
+        values, vectors = _eigen(matrices)
+        return _matrices(np.maximum(values, 0) ** (1 / order), vectors)
+
+    powers = waves.steer(in_parts(roots, spectrum.matrix, threads=waves.threads))
     return np.asarray(np.maximum(powers / n_mics, 0) ** order / n_mics, np.float32)
 
 
 def capon(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
     """Return ``1 / (v^H (C + loading · mean power)^−1 v)`` (J. Capon, 1969)."""
-    matrix = spectrum.matrix.astype(np.complex128)
-    n_mics = matrix.shape[1]
-    mean = np.maximum(np.trace(matrix, axis1=1, axis2=2).real[:, None] / n_mics, _LEAST)
-    loaded = matrix / mean[:, :, None] + passive.diagonal_loading * np.eye(n_mics)
-    powers = waves.steer(np.linalg.inv(loaded).astype(np.complex64))
-    return np.asarray(mean / np.maximum(powers, _LEAST), np.float32)
+    mean = _mean_powers(spectrum.matrix)
+
+    def inverses(matrices: Matrices, mean: NDArray[np.float64]) -> Matrices:
+        loading = passive.diagonal_loading * np.eye(matrices.shape[1])
+        loaded = matrices.astype(np.complex128) / mean[:, None, None] + loading
+        return np.linalg.inv(loaded).astype(np.complex64)
+
+    powers = waves.steer(in_parts(inverses, spectrum.matrix, mean, threads=waves.threads))
+    return np.asarray(mean[:, None] / np.maximum(powers, _LEAST), np.float32)
 
 
 def music(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
@@ -67,9 +75,12 @@ def music(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
             f"passive.method is 'music' with {n_sources} sources, which needs more than {n_sources} blocks of samples, "
             f"but there are {spectrum.n_blocks}; give a larger passive.averages, or wider bands"
         )
-    _, vectors = _eigen(spectrum)
-    is_noise = np.arange(n_mics) < n_mics - n_sources
-    powers = waves.steer(_matrices(np.broadcast_to(is_noise, vectors.shape[:2]).astype(float), vectors))
+
+    def projections(matrices: Matrices) -> Matrices:
+        values, vectors = _eigen(matrices)
+        return _matrices(np.broadcast_to(np.arange(n_mics) < n_mics - n_sources, values.shape), vectors)
+
+    powers = waves.steer(in_parts(projections, spectrum.matrix, threads=waves.threads))
     return np.asarray(n_mics / np.maximum(powers, 1e-6 * n_mics), np.float32)
 
 
@@ -92,13 +103,19 @@ def _hollow(matrices: Matrices) -> Matrices:
     return out
 
 
-def _eigen(spectrum: CrossSpectrum) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+def _mean_powers(matrices: Matrices) -> NDArray[np.float64]:
+    """Return the mean power of the microphones, (bin,), at least `_LEAST`."""
+    means = np.trace(matrices, axis1=1, axis2=2, dtype=np.complex128).real / matrices.shape[1]
+    return np.asarray(np.maximum(means, _LEAST))
+
+
+def _eigen(matrices: Matrices) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
     """Return eigenvalues in ascending order, (bin, mic), and eigenvectors, (bin, mic, number)."""
-    values, vectors = np.linalg.eigh(spectrum.matrix.astype(np.complex128))
+    values, vectors = np.linalg.eigh(matrices.astype(np.complex128))
     return values, vectors
 
 
-def _matrices(values: NDArray[np.float64], vectors: NDArray[np.complex128]) -> Matrices:
+def _matrices(values: NDArray[Any], vectors: NDArray[np.complex128]) -> Matrices:
     """Return the matrices with given eigenvalues and eigenvectors."""
     product: NDArray[Any] = (vectors * values[:, None, :]) @ vectors.conj().transpose(0, 2, 1)
     return product.astype(np.complex64)

@@ -27,6 +27,11 @@ class Waves:
     spacing_hz : float
     kernels : KernelSet
     threads : int
+
+    Attributes
+    ----------
+    threads : int
+        Number of threads of the host.
     """
 
     def __init__(
@@ -38,7 +43,8 @@ class Waves:
         *,
         threads: int,
     ) -> None:
-        self._kernels, self._threads, self._numbers = kernels, threads, numbers
+        self.threads = threads
+        self._kernels, self._numbers = kernels, numbers
         turns = np.rint(delay_s.T * spacing_hz * _TURN).astype(np.int64).astype(np.uint32)
         self._turns = np.ascontiguousarray(turns)
         self._memory = kernels.memory()
@@ -70,7 +76,7 @@ class Waves:
         """
         out = np.empty((len(matrices), self._turns.shape[1]), np.float32)
         powers = self._powers[: len(matrices)]
-        with self._kernels.threads(self._threads), self._lane.entered():
+        with self._kernels.threads(self.threads), self._lane.entered():
             numbers = self._bins if bins is None else self._lane.send(self._numbers[bins])
             self._kernels.steer_power(self._lane.send(np.ascontiguousarray(matrices)), self._steps, numbers, powers)
             self._lane.fetch(powers, out)
@@ -90,7 +96,7 @@ class Waves:
             Leave out the diagonal of the matrices.
         """
         out: NDArray[Any] = np.empty_like(powers)
-        with self._kernels.threads(self._threads), self._lane.entered():
+        with self._kernels.threads(self.threads), self._lane.entered():
             here = self._lane.send(np.ascontiguousarray(matrices)), self._steps, self._bins, self._lane.send(powers)
             self._lane.run(lambda: self._kernels.clean_sources(*here, hollow, self._powers))
             self._lane.fetch(self._powers, out)
