@@ -231,7 +231,7 @@ def test_array_weights_survive_files_and_the_command_line(tmp_path):
     ("weights", "message"),
     [
         ("han", r"processing.array_weights 'han' is unknown \(did you mean 'hann'\?\)"),
-        ("hann:3", "processing.array_weights is 'hann:3', but the window hann has no parameter; give 'hann'"),
+        ("hann:3", "processing.array_weights is 'hann:3' although the window hann has no parameter; give 'hann'"),
         ("taylor:x", "processing.array_weights is 'taylor:x'; give a number after the colon, such as 'taylor:30'"),
         ("taylor:nan", "parameter of processing.array_weights taylor is nan; give a finite number"),
         ("taylor:90", "parameter of processing.array_weights taylor is 90; give a number from 20 to 80"),

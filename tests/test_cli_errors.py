@@ -93,7 +93,7 @@ CASES = {
         "directions empty.csv does not have two numbers",
     ),
     "missing CSV": ("process rec.h5 -o out.h5 --directions none.csv", 1, "directions none.csv: No such file"),
-    "range outside": ("process rec.h5 -o out.h5 --range 1:50", 1, "processing.range_m ends at 50 m, but the record"),
+    "range outside": ("process rec.h5 -o out.h5 --range 1:50", 1, "--range ends at 50 m, but the record"),
     "range backwards": ("process rec.h5 -o out.h5 --range 3:1", 2, "--range runs from 3 to 1; give the"),
     "range NaN": ("process rec.h5 -o out.h5 --range nan:1", 2, "--range is nan; give a finite number"),
     "no range": ("process rec.h5 -o out.h5 --range 3", 2, "'3' is not an interval; give two numbers, as in 0.5:5"),
@@ -149,7 +149,11 @@ CASES = {
     "output is the input": ("process rec.h5 -o rec.h5 --force", 1, "output rec.h5 is the input itself; give"),
     # views of files
     "no such measurement": ("plot img.h5 -o out.png -m 7", 1, "--measurement is 7; give a whole number from 0 to 0"),
-    "negative measurement": ("peaks img.h5 -m -1", 1, "--measurement is -1; give a whole number from 0 to 0"),
+    "negative measurement": (
+        "peaks img.h5 -m -1",
+        2,
+        "Invalid value for '--measurement' / '-m': -1 is not in the range x>=0",
+    ),
     "no peaks": ("peaks img.h5 --top 0", 2, "--top is 0; give a whole number of at least 1"),
     "peaks above": ("peaks img.h5 --min-level 3", 2, "--min-level is 3; give a number from -1000 to 0"),
     "nothing at that level": ("compare truth.h5 --min-level 3", 2, "--min-level is 3; give a number from -1000 to 0"),

@@ -4,8 +4,9 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.storage import GroundTruth, write_energyscapes, write_recording
+from ertis_numba.storage import GroundTruth, write_acoustic_maps, write_energyscapes, write_recording
 from tests.files import image, noise
+from tests.test_acoustic_map_files import acoustic_map
 
 USAGE = {
     "export i.h5 -o a.csv --top 0": "--top is 0; give a whole number of at least 1",
@@ -23,6 +24,21 @@ USAGE = {
     "plot r.h5 -o a.png --kind signals --microphone -1": "--microphone is -1; give a whole number",
     "simulate s.toml --layout x": "No such option '--layout'",
     "process r.h5 -o a.h5 --max-error 300": "--max-error is 300; give",
+    "process r.h5 -o a.h5 --bands 0:2000": "--bands is 0; give a number from 1 to 1e+09",
+    "process r.h5 -o a.h5 --bands 3000:2000": "--bands runs from 3000 to 2000; give the smaller number first",
+    "process r.h5 -o a.h5 --bands 3000:5000,4000:6000": "--bands has overlapping bands 3000 to 5000 Hz and 4000",
+    "process r.h5 -o a.h5 --directions 2d:9 --azimuth 200:300": "--azimuth is 200; give a number from -180 to 180",
+    "process r.h5 -o a.h5 --directions 3d:9 --elevation 9:0": "--elevation runs from 9 to 0; give the smaller number",
+    "process r.h5 -o a.h5 --array-weights han": "--array-weights 'han' is unknown (did you mean 'hann'?); known are",
+    "process r.h5 -o a.h5 --array-weights hann:3": "--array-weights is 'hann:3' although the window hann has no",
+    "process r.h5 -o a.h5 --array-weights taylor:90": "parameter of --array-weights taylor is 90; give a number from",
+    "process r.h5 -o a.h5 --without -1": (
+        "Invalid value for '--without': '-1' is not a list of channels; give integers from 0 to 1023, as in 5,12"
+    ),
+    "plot m.h5 -o a.png --photo a.jpg --photo-fov 200,40": "--photo-fov is 200; give a number from 1 to 170",
+    "plot m.h5 -o a.png -m -1": "Invalid value for '--measurement' / '-m': -1 is not in the range x>=0",
+    "export i.h5 -o a.csv -m 5:2": "Invalid value for '--measurement' / '-m': '5:2' is not a measurement; give one",
+    "calibrate r.h5 -o a.toml --gain-tolerance nan": "--gain-tolerance is nan; give a finite number",
     "status tcp://127.0.0.1:9 --patience 0": "--patience is 0; give a number above 0",
     "listen localhost": "address 'localhost' cannot be used; give tcp://HOST:PORT",
 }
@@ -37,7 +53,12 @@ FAILURES = {
     "plot r.h5 -o a.png --kind signals --microphone 77": "microphone 77 is none of the 32 enabled ones; give",
     "plot r.h5 -o a.png -m 5": "--measurement is 5; give",
     "process r.h5 -o a.h5 --sensor left": "r.h5 has no sensor 'left'",
-    "process r.h5 -o a.h5 --range 0.5:50": "processing.range_m ends at 50 m, but the record",
+    "process r.h5 -o a.h5 --range 0.5:50": "--range ends at 50 m, but the record",
+    "process r.h5 -o a.h5 --without 99": "--without is 99; give a whole number from 0 to 31",
+    "process r.h5 -o a.h5 --array-weights hann --beamformer capon": (
+        "--array-weights is 'hann', but --beamformer 'capon' supports only 'uniform'; leave --array-weights out, or"
+    ),
+    "plot m.h5 -o a.png -m 5": "--measurement is 5; give a whole number from 0 to 0",
     "process r.h5 -o a.h5 --directions none.csv": "directions none.csv: No such file",
 }
 """Values that do not suit a file or other options."""
@@ -48,6 +69,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("names")
     write_recording(folder / "r.h5", noise())
     write_energyscapes(folder / "i.h5", [image()])
+    write_acoustic_maps(folder / "m.h5", [acoustic_map()])
     truth = GroundTruth(scene="", seed=1, reflectors=((),))
     write_energyscapes(folder / "t.h5", [image()], truth={"sensor": truth})
     return folder

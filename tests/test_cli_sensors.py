@@ -91,7 +91,7 @@ def test_process_prints_a_line_for_each_sensor(recording, tmp_path):
 
 def test_process_rejects_invalid_range_without_writing(recording, tmp_path):
     done = run("process", recording, "-o", tmp_path / "img.h5", "--range", "1:50", code=1)
-    assert "processing.range_m ends at 50 m" in done.stderr
+    assert "--range ends at 50 m" in done.stderr
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 

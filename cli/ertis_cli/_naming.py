@@ -11,19 +11,26 @@ from ertis_cli._config import long_name
 
 __all__ = ["name_options"]
 
-_UNITS: Final = ("", "_bytes", "_c", "_db", "_deg", "_hz", "_m", "_ms", "_s")
+_UNITS: Final = ("", "_bytes", "_c", "_db", "_deg", "_hz", "_limits_deg", "_m", "_ms", "_s")
+_KEY: Final = r"(?P<section>(?:accuracy|air|array|passive|processing)\.)?(?P<name>[a-z_]+)"
 _NAMED: Final = re.compile(
-    r"(?P<before>option )?(?P<quote>'?)(?:(?:accuracy|air|processing)\.)?(?P<name>[a-z_]+)(?P=quote)"
-    r"(?= (?:is|holds|runs from)\b)"
+    rf"(?P<before>option |parameter of )?(?P<quote>'?){_KEY}(?P=quote)(?:\[\d+\])?"
+    r"(?(section)(?= )|(?= (?:is|holds|runs from)\b))"
 )
-_TYPED: Final = re.compile(r"--(?P<name>[a-z-]+) (?:'.*?' cannot\b|(?:is|holds|runs from) [^,;]*; give\b)")
+_AGAIN: Final = re.compile(rf"(?<![\w./-]){_KEY}(?:\[\d+\])?(?![\w./])")
+_KEYS: Final = {"without": "disabled"}
+"""Keys of settings whose option has another name."""
+_TYPED: Final = re.compile(
+    r"(?:parameter of )?--(?P<name>[a-z-]+) "
+    r"(?:'.*?' (?:cannot|is unknown)\b|(?:[a-z]+ )?(?:is|has|holds|lists|runs from) [^,;]*; give\b)"
+)
 """Messages about a value that is wrong by itself: other reasons follow a comma."""
 _QUOTED: Final = re.compile(
     r"(?!sensor ['\"])(?:count of )?(?P<name>[a-z_]+)(?: name)? (?P<quote>['\"])(?P<value>.*?)(?P=quote) "
     r"(?:cannot (?:be used|name)|has no count|is (?:not a grid|unknown|\d+;))"
 )
 """The same for quoted values, such as ``layout 'eRTIS_v9' is unknown``; sensors depend on files."""
-_OF_FILES: Final = frozenset({"--measurement"})
+_OF_FILES: Final = frozenset({"--measurement", "--without"})
 """Options whose limits are those of a file. A value beyond them is no wrong usage."""
 
 
@@ -61,14 +68,26 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _named(message: str, ctx: click.Context) -> str:
-    """Return a message with the leading parameter name replaced by the name of the given option."""
+    """Return a message with the leading parameter name, and then others, replaced by the names of given options."""
     found = _NAMED.match(message)
-    if found is None:
+    names = dict(_names(ctx))
+    if found is None or found["name"] not in names:
         return message
+
+    def again(other: re.Match[str]) -> str:
+        is_key = other["section"] or "_" in other["name"]  # other words are no names
+        return names.get(other["name"], other[0]) if is_key else other[0]
+
+    return f"{found['before'] or ''}{names[found['name']]}{_AGAIN.sub(again, message[found.end() :])}"
+
+
+def _names(ctx: click.Context) -> Iterator[tuple[str, str]]:
+    """Yield each parameter name that may stand for a given option, and the option as typed."""
     for option in _given(ctx):
-        if isinstance(option, click.Option) and found["name"] in {f"{option.name}{unit}" for unit in _UNITS}:
-            return f"{found['before'] or ''}--{long_name(option)}{message[found.end() :]}"
-    return message
+        if isinstance(option, click.Option):
+            name = long_name(option)
+            for each in {str(option.name), name.replace("-", "_"), _KEYS.get(name, name)}:
+                yield from ((f"{each}{unit}", f"--{name}") for unit in _UNITS)
 
 
 def _refused(message: str, ctx: click.Context) -> click.Parameter | None:

@@ -61,7 +61,7 @@ _PLACE = _Place()
 @click.option(
     "--gain-tolerance",
     "gain_db",
-    type=float,
+    type=click.FloatRange(0.01, 60.0),
     default=3.0,
     show_default=True,
     metavar="DB",
@@ -70,7 +70,7 @@ _PLACE = _Place()
 @click.option(
     "--delay-tolerance",
     "delay_us",
-    type=float,
+    type=click.FloatRange(0.001, 1000.0),
     default=5.0,
     show_default=True,
     metavar="US",
@@ -79,7 +79,7 @@ _PLACE = _Place()
 @click.option(
     "--position-tolerance",
     "position_mm",
-    type=float,
+    type=click.FloatRange(0.0, 100.0),
     default=1.0,
     show_default=True,
     metavar="MM",

@@ -32,7 +32,9 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
         first, colon, last = str(value).partition(":")
         with suppress(ValueError):
-            return int(first), int(last if colon else first)
+            places = int(first), int(last if colon else first)
+            if 0 <= places[0] <= places[1]:
+                return places
         return self.fail(f"{value!r} is not a measurement; give one number, or two as in 2:5", param, ctx)
 
 

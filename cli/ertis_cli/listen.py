@@ -59,7 +59,7 @@ _POLL_INTERVAL_S = 0.1
 @click.option("--bearings", is_flag=True, help="Print the bearings of sources of sound that the sensors did not emit.")
 @click.option(
     "--average",
-    type=click.IntRange(min=1),
+    type=click.IntRange(1, 100_000),
     metavar="N",
     help="With --bearings: number of measurements of each sensor to average; that of its settings by default.",
 )

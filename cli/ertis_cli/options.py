@@ -13,6 +13,7 @@ from click.shell_completion import CompletionItem
 
 from ertis_cli import _progress
 from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerOption
+from ertis_numba.constants import MAX_MICROPHONES
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
@@ -90,8 +91,11 @@ class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
         with suppress(ValueError):
-            return tuple(int(channel) for channel in str(value).split(","))
-        return self.fail(f"{value!r} is not a list of channels; give integers, as in 5,12", param, ctx)
+            channels = tuple(int(channel) for channel in str(value).split(","))
+            if all(0 <= channel < MAX_MICROPHONES for channel in channels):
+                return channels
+        wanted = f"integers from 0 to {MAX_MICROPHONES - 1}, as in 5,12"
+        return self.fail(f"{value!r} is not a list of channels; give {wanted}", param, ctx)
 
 
 class _Names(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -266,7 +270,7 @@ def output(text: str) -> Decorator:
 
 def measurement(text: str) -> Decorator:
     """Return the option that chooses one measurement."""
-    return click.option("--measurement", "-m", type=int, metavar="I", help=text)
+    return click.option("--measurement", "-m", type=click.IntRange(min=0), metavar="I", help=text)
 
 
 def min_level(text: str) -> Decorator:

@@ -47,7 +47,8 @@ def parse_window(name: str) -> ArrayWindow:
     if parameter is None:
         if colon:
             raise ArgumentError(
-                f"processing.array_weights is {name[:80]!r}, but the window {window} has no parameter; give {window!r}"
+                f"processing.array_weights is {name[:80]!r} although the window {window} has no parameter; give "
+                f"{window!r}"
             )
         return ArrayWindow(window, 0.0)
     if not colon:

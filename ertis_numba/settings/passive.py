@@ -98,6 +98,6 @@ class Passive(TomlTable, frozen=True, kw_only=True):
         for (low_hz, high_hz), (next_low_hz, next_high_hz) in itertools.pairwise(sorted(given)):
             if next_low_hz < high_hz:  # The sum of all bands would count their frequencies twice.
                 raise ArgumentError(
-                    f"passive.bands_hz has overlapping bands, {low_hz:g} to {high_hz:g} Hz and {next_low_hz:g} to "
+                    f"passive.bands_hz has overlapping bands {low_hz:g} to {high_hz:g} Hz and {next_low_hz:g} to "
                     f"{next_high_hz:g} Hz; give bands that share at most an edge"
                 )
