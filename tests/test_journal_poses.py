@@ -74,6 +74,22 @@ def test_recover_reports_damaged_poses(tmp_path):
     assert report["pose_damage"] == "1 pose is damaged"
 
 
+@pytest.mark.parametrize(("offset_s", "count"), [(0, 0), (2, 2), (1000, 4)])
+def test_recover_counts_measurements_without_a_pose(tmp_path, offset_s, count):
+    """The poses begin at the third measurement, or long after the last."""
+    given = entries(4)
+    times_ns = [entry.measurement.stamp.timestamp_ns for entry in given]
+    step_ns = times_ns[1] - times_ns[0]
+    poses = [replace(pose, timestamp_ns=pose.timestamp_ns + offset_s * step_ns) for pose in poses_at(given)]
+    with create(tmp_path, given) as journal:
+        journal.append_poses(poses)
+    done = CliRunner().invoke(cli, ["recover", str(journal.path), "--json"])
+    assert done.exit_code == 0
+    without = f", {count} without a pose" if count else ""
+    assert done.stderr == f"{tmp_path / 'rec.h5'}: 4 measurements{without}, 0 missing\n"
+    assert json.loads(done.stdout)["journals"][0]["without_pose"] == count
+
+
 @pytest.mark.parametrize("count", [1, 2])
 def test_verify_reports_damaged_poses(tmp_path, count):
     path, _ = journal_with_poses(tmp_path)

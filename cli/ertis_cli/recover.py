@@ -102,7 +102,10 @@ def _reported(report: dict[str, Any]) -> str:
         return f"{report['journal']}: kept as {report['set_aside']}"
     if report["recording"] is None:
         return f"{report['journal']}: no measurement was captured; removed"
-    reported = [options.counted(report["measurements"], "measurement"), f"{report['missing']} missing"]
+    reported = [options.counted(report["measurements"], "measurement")]
+    if report["without_pose"]:
+        reported.append(f"{report['without_pose']} without a pose")
+    reported.append(f"{report['missing']} missing")
     if report["damaged"]:
         reported.append(f"of which {report['damaged']} damaged; the journal is kept as {report['set_aside']}")
     if report["pose_damage"]:

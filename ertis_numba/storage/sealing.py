@@ -9,7 +9,7 @@ run again at any time: the recording is the same.
 """
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from itertools import zip_longest
 from pathlib import Path
 from typing import ClassVar
@@ -117,9 +117,11 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
         n_damaged = sum(len(held.damaged) for held in rows.values())
         if n_damaged or pose_damage or refused:
             aside = journal.set_aside("damaged" if n_damaged or pose_damage else REFUSED_SUFFIX)
-            return _summary(path, target, damaged=n_damaged, set_aside=aside, refused=refused, pose_damage=pose_damage)
+            return _summary(
+                path, target, poses, damaged=n_damaged, set_aside=aside, refused=refused, pose_damage=pose_damage
+            )
         journal.remove()
-    return _summary(path, target)
+    return _summary(path, target, poses)
 
 
 def _require_nothing_lost(journal: Journal) -> None:
@@ -329,13 +331,14 @@ def _equal(one: Measurement, other: Measurement) -> bool:
 def _summary(
     path: Path,
     recording: Path,
+    poses: Container[str] = (),
     *,
     damaged: int = 0,
     set_aside: Path | None = None,
     refused: dict[str, str] | None = None,
     pose_damage: str = "",
 ) -> SealingResult:
-    """Return the result of sealing."""
+    """Return the result of sealing; ``poses`` are the sensors for which the journal has poses."""
     n_measurements = n_missing = n_lost = n_without_pose = 0
     damage = ""
     for name in sensor_names(recording):
@@ -344,6 +347,8 @@ def _summary(
             if reader.trajectory is not None:
                 covered = reader.trajectory.covers([stamp.timestamp_ns for stamp in reader.stamps()])
                 n_without_pose += int(np.count_nonzero(~covered))
+            elif name in poses:  # None of them is near a measurement.
+                n_without_pose += len(reader)
             n_missing += sum(gap.n_missing for gap in reader.gaps)
             n_lost += sum(gap.n_missing for gap in reader.gaps if gap.reason == LOST)
             damage = str(reader.attributes.get(JOURNAL_DAMAGE, ""))
