@@ -182,18 +182,25 @@ range_m = 0.4
     ("options", "code", "message"),
     [
         (["--fault", "lose"], 2, "'lose' is not a fault; give a kind and a probability, as in lose=0.01"),
-        (["--fault", "loose=1"], 1, "kind of fault 'loose' is unknown (did you mean 'lose'?)"),
+        (["--fault", "loose=1"], 2, "--fault: kind of fault 'loose' is unknown (did you mean 'lose'?)"),
         (["--count", "3"], 2, "--count is for scenes; remove it for a recording"),
         (["--link", "here"], 2, "--link is for one device, but rec.h5 has 2 sensors; choose one with --sensor"),
+        (
+            ["--sensor", "left", "--link", "none/here"],
+            1,
+            "link none/here: folder none does not exist; create it or give",
+        ),
         (["--sensor", "middle"], 1, "rec.h5 has no sensor 'middle'; choose one of left, right"),
         (["--sync-rate", "0"], 2, "0.0 is not in the range 0.001<=x<=1000.0"),
         (["--unplug", "3"], 2, "'3' is not an interval"),
     ],
 )
-def test_emulate_rejects_invalid_options(recording, options, code, message):
+def test_emulate_rejects_invalid_options(recording, tmp_path, monkeypatch, options, code, message):
+    monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(cli, ["emulate", str(recording), *options])
     assert (done.exit_code, done.stdout) == (code, "")
     assert message in done.stderr
+    assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
 def test_emulate_rejects_unsupported_measurement_length(tmp_path, monkeypatch):

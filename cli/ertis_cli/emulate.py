@@ -121,9 +121,13 @@ def emulate(
     from ertis_numba.devices.emulator import Emulator, SyncChain
     from ertis_numba.devices.emulator.faults import Faults
     from ertis_numba.devices.links import HeldLink, emulated_folder
+    from ertis_numba.errors import ArgumentError
 
     kinds = dict(faults)
-    Faults(0, kinds)  # refuse before rendering a scene
+    try:
+        Faults(0, kinds)  # refuse before rendering a scene
+    except ArgumentError as error:
+        raise click.UsageError(f"--fault: {error}", ctx=click.get_current_context()) from error
     is_scene = path.suffix.lower() == ".toml"
     if count is not None and not is_scene:
         raise click.UsageError("--count is for scenes; remove it for a recording", ctx=click.get_current_context())
@@ -135,6 +139,8 @@ def emulate(
                 f"--link is for one device, but {path.name} has {len(names)} sensors; choose one with --sensor",
                 ctx=click.get_current_context(),
             )
+        if link is not None and not link.parent.is_dir():
+            raise ArgumentError(f"link {link}: folder {link.parent} does not exist; create it or give another")
         links = {name: link or emulated_folder() / name for name in names}
         for each in links.values():  # refuse a taken link before rendering
             HeldLink(each).release()
