@@ -148,6 +148,8 @@ def test_listen_without_images_writes_no_file(tmp_path, monkeypatch, product):
     reasons = {"raw": "is not written, because no measurement was received"}
     reason = f"none.h5 {reasons.get(product, 'would contain no measurement')}"
     assert reason in done.stderr or reason in str(done.exception)
+    last = json.loads(done.stdout.splitlines()[-1])
+    assert (last["event"], last["received"], last["output"]) == ("listened", 0, None)
     assert not list(tmp_path.iterdir())
 
 

@@ -317,7 +317,8 @@ def test_failure_of_listen_keeps_earlier_poses(tmp_path):
             _, event = (json.loads(process.stdout.readline())["event"] for _ in range(2))
             assert event == "odometry"
             came.set()
-            _, errors = process.communicate()
+            rest, errors = process.communicate()
+    assert json.loads(rest.splitlines()[-1]) == {"event": "listened", "received": 1, "dropped": 0, "skipped": 0}
     assert (process.returncode, "the mounting of sensor 'back' is unknown" in errors) == (1, True), errors
     assert len(ertis.read_trajectory(target).time_ns) == 1
 

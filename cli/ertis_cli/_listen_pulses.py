@@ -5,6 +5,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any, Protocol, Self, TypeVar
 
 import click
@@ -83,7 +84,9 @@ def listen_pulses(
         end_s = math.inf if duration is None else begun_s + duration
         if not as_json:
             click.echo(head)
-        try:
+        with ExitStack() as ended:
+            ended.callback(lambda: _summarise(subscriber, received, of, quiet=quiet, as_json=as_json))
+            ended.callback(at_end, subscriber)
             while received != n and not signals.came and time.monotonic() < end_s:
                 arrival = subscriber.receive(_POLL_INTERVAL_S)
                 if subscriber.connected:
@@ -96,15 +99,19 @@ def listen_pulses(
                 if arrival is not None:
                     received += 1
                     show(arrival)
-        finally:
-            at_end(subscriber)
-        heard.silent(address, (product,), subscriber.counts.received, at_end=True)
-        dropped, skipped = subscriber.counts.dropped, subscriber.n_skipped
-    if as_json:
-        options.print_json({"event": "listened", "received": received, "dropped": dropped, "skipped": skipped})
-    options.say(f"{options.counted(received, of[0])}, {dropped} {of[1]} dropped, {skipped} skipped", quiet=quiet)
+            heard.silent(address, (product,), subscriber.counts.received, at_end=True)
     if signals.came:
         sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
     heard.require_answer(address, time.monotonic() - begun_s)
     if n is not None and received < n:
         raise click.ClickException(f"received {received} of {n} {of[0]}s in {duration:g} s; give a longer --duration")
+
+
+def _summarise(
+    subscriber: _PulseSubscriber[Any], received: int, of: tuple[str, str], *, quiet: bool, as_json: bool
+) -> None:
+    """Print a summary, also after an error."""
+    dropped, skipped = subscriber.counts.dropped, subscriber.n_skipped
+    if as_json:
+        options.print_json({"event": "listened", "received": received, "dropped": dropped, "skipped": skipped})
+    options.say(f"{options.counted(received, of[0])}, {dropped} {of[1]} dropped, {skipped} skipped", quiet=quiet)

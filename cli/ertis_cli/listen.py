@@ -5,6 +5,7 @@ import math
 import sys
 import time
 from collections import deque
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -148,34 +149,38 @@ def listen(
     notes: deque[str] = deque()
     heard = MicrophoneTable(as_json=as_json, quiet=quiet)
     begun_s, failure = time.monotonic(), None
+    written: Path | None = None
     end_s = math.inf if duration is None else begun_s + duration
-    with (
-        stopped_by_signals() as signals,
-        saving(target, products[0], overwrite=force) as save,
-        Subscriber(address, sensors=sensors or None, products=products, keys=keys, on_note=notes.append) as subscriber,
-    ):
-        signals.obey(subscriber.close)
-        heard.head()
-        while subscriber.counts.received != n and not signals.came and time.monotonic() < end_s and failure is None:
-            item = subscriber.receive(_POLL_INTERVAL_S)
-            if subscriber.connected:
-                heard.subscribed(address, sensors, products)
-                heard.silent(address, products, subscriber.counts.received)
-            else:
-                heard.unanswered(address, time.monotonic() - begun_s)
-            while notes:
-                heard.note(notes.popleft())
-            if item is not None and subscriber.latest is not None:
-                failure = _saved(save, subscriber.latest)
-                heard.product(subscriber.latest, subscriber.counts)
-    took_s = time.monotonic() - begun_s
-    heard.silent(address, products, subscriber.counts.received, at_end=True)
-    heard.end(subscriber.counts, target, took_s)
+    with ExitStack() as ended:
+        with (
+            stopped_by_signals() as signals,
+            saving(target, products[0], overwrite=force) as save,
+            Subscriber(
+                address, sensors=sensors or None, products=products, keys=keys, on_note=notes.append
+            ) as subscriber,
+        ):
+            signals.obey(subscriber.close)
+            heard.head()
+            ended.callback(lambda: heard.end(subscriber.counts, written, time.monotonic() - begun_s))
+            while subscriber.counts.received != n and not signals.came and time.monotonic() < end_s and failure is None:
+                item = subscriber.receive(_POLL_INTERVAL_S)
+                if subscriber.connected:
+                    heard.subscribed(address, sensors, products)
+                    heard.silent(address, products, subscriber.counts.received)
+                else:
+                    heard.unanswered(address, time.monotonic() - begun_s)
+                while notes:
+                    heard.note(notes.popleft())
+                if item is not None and subscriber.latest is not None:
+                    failure = _saved(save, subscriber.latest)
+                    heard.product(subscriber.latest, subscriber.counts)
+        written = target
+        heard.silent(address, products, subscriber.counts.received, at_end=True)
     if failure is not None:
         raise failure
     if signals.came:
         sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
-    heard.require_answer(address, took_s)
+    heard.require_answer(address, time.monotonic() - begun_s)
     if n is not None and subscriber.counts.received < n:
         raise click.ClickException(
             f"received {subscriber.counts.received} of {n} products in {duration:g} s; give a longer --duration"
