@@ -33,7 +33,7 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
         first, colon, last = str(value).partition(":")
         with suppress(ValueError):
             places = int(first), int(last if colon else first)
-            if 0 <= places[0] <= places[1]:
+            if min(places) >= 0:
                 return places
         return self.fail(f"{value!r} is not a measurement; give one number, or two as in 2:5", param, ctx)
 
