@@ -110,6 +110,14 @@ def test_kernels_with_twins_have_contracts():
     assert set(CONTRACTS) == (cpu & cuda) - {"__init__", "ceilings"}
 
 
+@pytest.mark.parametrize("array", [np.ones((3, 2)).T, np.ones((3, 4))[:, ::2], np.ones((1, 5)).T, np.float32(3.0)])
+def test_tables_are_in_one_order_for_which_kernels_are_compiled(array):
+    table = kernels.load("cpu").memory().table(np.asarray(array))
+    assert table.flags.c_contiguous
+    assert table.shape == np.shape(array)
+    assert (table == array).all()
+
+
 @pytest.mark.parametrize("name", WORD_NAMES)
 def test_unpack_bits_equals_its_reference(kernel_set, name):
     words, channels = words_of(name)

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -56,8 +56,11 @@ class HostMemory:
         self._images = ImagePool(lambda shape: np.empty(shape, np.float32))
 
     def table(self, array: Array) -> Array:
-        """Return ``array`` on the device. Callers must not modify it afterwards."""
-        return array
+        """Return ``array`` on the device. Callers must not modify it afterwards.
+
+        Its order is that of a GPU's arrays: Numba compiles a kernel again for each other order.
+        """
+        return cast("Array", np.ascontiguousarray(array).reshape(array.shape))
 
     def zeros(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
         """Return a new array of zeros on the device."""
