@@ -8,6 +8,7 @@ WORKERS ?= 3
 unexport PYTHONDONTWRITEBYTECODE  # otherwise, each of hundreds of processes compiles every module again
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 KERNELS := $(patsubst %,tests/test_%.py,kernels passive_kernels fusion_kernels interpolated_beams phase_shifts beamformers modulator)
+COMPILED := $(KERNELS) tests/test_streams.py tests/test_steering_kernels.py
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
 
 .PHONY: demo test test-kernels test-host test-simulator test-ptx test-arm check docs data pictures bench peers soak gpu clean
@@ -30,10 +31,10 @@ test: $(VENV)/ready-to-test
 	$(PYTEST) -m alone $(ELSEWHERE)
 
 test-kernels: $(VENV)/ready-to-test  # compile all kernels in one process, because parallel processes could corrupt the cache
-	$(PYTEST) -m "not alone" $(KERNELS)
+	$(PYTEST) -m "not alone" $(COMPILED)
 
 test-host: test-kernels  # one worker more than two cores, because some tests wait for sockets and disks
-	$(PYTEST) -m "not alone" --numprocesses $(WORKERS) --dist worksteal $(KERNELS:%=--ignore=%) $(ELSEWHERE)
+	$(PYTEST) -m "not alone" --numprocesses $(WORKERS) --dist worksteal $(COMPILED:%=--ignore=%) $(ELSEWHERE)
 
 test-simulator: test-kernels
 	NUMBA_ENABLE_CUDASIM=1 $(PYTEST) tests/cuda $(KERNELS) -k cuda
