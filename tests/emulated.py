@@ -2,6 +2,7 @@
 
 import json
 import queue
+import sys
 
 import numpy as np
 import pytest
@@ -45,13 +46,22 @@ def patient(monkeypatch):
 
 
 PATIENT = pytest.mark.usefixtures("patient")
+PATIENT_ERTIS = (
+    sys.executable,
+    "-c",
+    f"from ertis_numba.devices import driver; driver._MARGIN_S = {TIMEOUT_S}; from ertis_cli.main import main; main()",
+)
+"""Command that runs ``ertis`` with such drivers in its own process."""
 
 
 class PacedChain(SyncChain):
-    """SYNC line whose pulses wait until the hosts have read all measurements, so that none is dropped."""
+    """SYNC line whose pulses wait until the hosts have read all measurements, so that none is dropped.
+
+    The first pulse waits until all devices are armed, so that their counters agree.
+    """
 
     def _pulse(self, due_ns):
-        while any(map(has_unread, self._devices)):
+        while any(map(has_unread, self._devices)) or not (self.pulses or all(map(is_armed, self._devices))):
             if self._stopped.wait(0.001):
                 return
         super()._pulse(due_ns)
@@ -62,6 +72,10 @@ def has_unread(device):
     with device._changed:  # noqa: SLF001  hosts see bytes only
         board, terminal = device._board, device._terminal  # noqa: SLF001
         return terminal is not None and bool(board.due_ns is not None or board.outputs or terminal.unread)
+
+
+def is_armed(device):
+    return bool(device.registers.armed)
 
 
 def opened(device):

@@ -25,11 +25,13 @@ from ertis_numba.simulation.render import render
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
 from ertis_numba.storage.sealing import seal
 from tests.central import running
-from tests.emulated import TIMEOUT_S, WORDS
-from tests.test_capture import ERTIS
+from tests.emulated import PATIENT, PATIENT_ERTIS, TIMEOUT_S, WORDS, patient
 from tests.test_device_commands import device  # noqa: F401  a fixture
 from tests.test_emulate import SHORT
 
+__all__ = ["patient"]  # A fixture, imported for use here.
+
+pytestmark = PATIENT
 GIVEN = ["active", "passive", "unknown"]
 
 
@@ -101,7 +103,7 @@ def test_network_keeps_the_behaviour(measurements, tmp_path):
     with running(archive=Archive(tmp_path)) as central, SensorNode(central.address) as node:
         node.add_sensor("mine", SHORT)
         node.append([JournalEntry(each, monotonic_ns=0) for each in measurements])
-        assert node.flush(30.0)
+        assert node.flush(TIMEOUT_S)
     (path,) = tmp_path.glob("*.h5")
     assert behaviours(path) == GIVEN
 
@@ -155,7 +157,7 @@ def test_measurements_of_another_programs_sensor_have_unknown_behaviour(device):
 @pytest.mark.usefixtures("device")
 def test_behaviour_survives_a_killed_capture(tmp_path):
     (tmp_path / "settings.toml").write_text(SHORT.to_toml())
-    command = [*ERTIS, "capture", "--port", "mine", "--settings", "settings.toml", "-o", "rec.h5", "--passive"]
+    command = [*PATIENT_ERTIS, "capture", "--port", "mine", "--settings", "settings.toml", "-o", "rec.h5", "--passive"]
     command += ["--json", "--quiet", "--no-check-bits"]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
         assert all(process.stdout.readline() for _ in range(3))

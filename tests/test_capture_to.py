@@ -30,7 +30,7 @@ from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.settings import Call, Processing, Recording, Settings
 from ertis_numba.storage import open_recording, sensor_names
 from tests.central import Node, running
-from tests.emulated import N_SAMPLES, PATIENT, patient
+from tests.emulated import N_SAMPLES, PATIENT, PATIENT_ERTIS, patient
 from tests.journals import ENVIRONMENT, TINY, entries
 from tests.stand_in import StandIn
 
@@ -78,7 +78,7 @@ def command(tmp_path, *arguments, ports=("one",)):
 
 def start(tmp_path, *arguments):
     """Start a capture in its own process, which signals may end."""
-    line = [*ERTIS, *command(tmp_path, *arguments)]
+    line = [*PATIENT_ERTIS, *command(tmp_path, *arguments)]
     return subprocess.Popen(
         line, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -28,11 +28,11 @@ from ertis_numba.settings import Air, Processing, Recording, Settings
 from ertis_numba.stages.memory import require_images
 from ertis_numba.storage import open_recording
 from tests.central import Node, running
-from tests.emulated import N_SAMPLES, PATIENT, WORDS, patient
+from tests.emulated import N_SAMPLES, PATIENT, PATIENT_ERTIS, WORDS, patient
 from tests.journals import ENVIRONMENT, TINY, entries
 from tests.pages import page, python_in
 from tests.sending import until
-from tests.test_capture_to import ERTIS, command
+from tests.test_capture_to import command
 from tests.test_central_images import Images
 
 SETTINGS = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.1, 0.5)))
@@ -283,7 +283,7 @@ def sensors(tmp_path, words):
 @contextlib.contextmanager
 def capturing(tmp_path, address, *arguments):
     """Run ``ertis capture`` of both sensors, and yield its process once it stores measurements of both."""
-    line = [*ERTIS, *command(tmp_path, "--to", address, *arguments, ports=("one", "two"))]
+    line = [*PATIENT_ERTIS, *command(tmp_path, "--to", address, *arguments, ports=("one", "two"))]
     with subprocess.Popen(
         line, cwd=tmp_path, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -449,11 +449,10 @@ def test_settings_beyond_the_limit_of_the_central_node_are_refused(tmp_path):
 
 def test_request_without_an_answer_ends_with_its_timeout(tmp_path):
     requests = []
-    with (
-        answering(tmp_path, requests.append) as client,
-        pytest.raises(NetworkError, match=r"sensor node of front did not answer within 1 s, and may"),
-    ):
-        client.configure("front", WARM, 1.0)
+    with answering(tmp_path, requests.append) as client:
+        with pytest.raises(NetworkError, match=r"sensor node of front did not answer within 1 s, and may"):
+            client.configure("front", WARM, 1.0)
+        until(lambda: requests)
     assert len(requests) == 1
 
 

@@ -19,8 +19,12 @@ from ertis_numba.devices.setup import Setup
 from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.settings import Call
 from ertis_numba.storage import open_recording
-from tests.emulated import N_SAMPLES, WORDS
+from tests.emulated import N_SAMPLES, PATIENT, WORDS, patient
 from tests.test_emulate import SHORT
+
+__all__ = ["patient"]  # A fixture, imported for use here.
+
+pytestmark = PATIENT
 
 
 @pytest.fixture

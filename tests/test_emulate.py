@@ -27,9 +27,12 @@ from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.engine import Engine
 from ertis_numba.storage import open_recording, write_recording
 from ertis_numba.waveform import call_samples
-from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, ask, block, is_block
+from tests.emulated import N_SAMPLES, PATIENT, TIMEOUT_S, WORDS, ask, block, is_block, patient
 from tests.files import noise
 
+__all__ = ["patient"]  # A fixture, imported for use here.
+
+pytestmark = PATIENT
 MODULE = [sys.executable, "-m", "ertis_cli", "emulate"]
 SHORT = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.3, 0.5)))
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
