@@ -2,6 +2,7 @@
 
 import pytest
 from click.testing import CliRunner
+from ertis_cli import options
 from ertis_cli.main import cli
 
 from ertis_numba.storage import GroundTruth, write_acoustic_maps, write_energyscapes, write_recording
@@ -38,7 +39,6 @@ USAGE = {
     "plot m.h5 -o a.png --photo a.jpg --photo-fov 200,40": "--photo-fov is 200; give a number from 1 to 170",
     "plot m.h5 -o a.png -m -1": "Invalid value for '--measurement' / '-m': -1 is not in the range x>=0",
     "export i.h5 -o a.csv -m -1": "Invalid value for '--measurement' / '-m': '-1' is not a measurement; give one",
-    "export i.h5 -o a.csv -m 5:2": "--measurement runs from 5 to 2; give the smaller number first",
     "calibrate r.h5 -o a.toml --gain-tolerance nan": "--gain-tolerance is nan; give a finite number",
     "status tcp://127.0.0.1:9 --patience 0": "--patience is 0; give a number above 0",
     "listen localhost": "address 'localhost' cannot be used; give tcp://HOST:PORT",
@@ -80,7 +80,8 @@ def folder(tmp_path_factory):
 def test_errors_name_the_option_as_typed(folder, monkeypatch, line, code):
     monkeypatch.chdir(folder)
     done = CliRunner().invoke(cli, line.split())
-    assert done.stderr.startswith(f"ertis: error: {(USAGE | FAILURES)[line]}"), done.stderr
+    stated = done.stderr.removeprefix(f"{options.PREPARING}\n")  # a slow machine prints this note first
+    assert stated.startswith(f"ertis: error: {(USAGE | FAILURES)[line]}"), done.stderr
     assert done.exit_code == code
     assert ("; see 'ertis " in done.stderr) == (code == 2)
 

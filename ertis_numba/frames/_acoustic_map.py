@@ -214,7 +214,8 @@ class AcousticMap(DegreesFromRadians):
     def loudest(self) -> list[SoundDirection]:
         """Return the loudest direction of the grid in each band.
 
-        `find_sound_sources` returns all sources, with interpolated directions.
+        The true direction may lie between those of the grid, and its level may be higher. `find_sound_sources`
+        interpolates both, and returns all sources.
 
         Returns
         -------
