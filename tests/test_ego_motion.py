@@ -311,6 +311,51 @@ def unrelated(seed, pulse, count):
     )
 
 
+def rigid_motion(before_m, after_m):
+    """Return the motion of the platform that most points share: x, y and yaw.
+
+    Every two points before, and every two after with the same distance, propose a motion. The motion with the most
+    coinciding points is refined by least squares. Points are complex numbers.
+    """
+    first, second = (places[:, 0] + 1j * places[:, 1] for places in (before_m, after_m))
+    n_best, best = 0, (0j, 1 + 0j)
+    for a in range(len(first)):
+        for b in range(a + 1, len(first)):
+            apart = first[b] - first[a]
+            turns = (second[None, :] - second[:, None]) / apart
+            for c, d in np.argwhere(np.abs(np.abs(turns) * abs(apart) - abs(apart)) < 1e-3):
+                turn = turns[c, d] / abs(turns[c, d])
+                moved = turn * (first - first[a]) + second[c]
+                n_near = np.count_nonzero(np.abs(moved[:, None] - second).min(axis=1) < 5e-3)
+                if n_near > n_best:
+                    n_best, best = n_near, (second[c] - turn * first[a], turn)
+    shift, turn = best
+    moved = turn * first + shift
+    nearest = np.abs(moved[:, None] - second).argmin(axis=1)
+    is_near = np.abs(moved - second[nearest]) < 5e-3
+    one, other = first[is_near], second[nearest[is_near]]
+    turn = np.vdot(one - one.mean(), other - other.mean())
+    turn /= abs(turn)
+    # Points that move by `turn` and `shift` are seen from a platform that moves the other way.
+    way = -(other.mean() - turn * one.mean()) / turn
+    return np.array([way.real, way.imag, -np.angle(turn)])
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 7, 15])  # A search that accepts fewer differences loses 0, 7 and 15.
+def test_displacements_between_points_of_a_coarse_search_are_those_of_a_plain_one(seed):
+    """Over 0.5 s, the grid of the search has steps of 12.5 cm and 7.5°; displacements lie midway between its points."""
+    draws = np.random.default_rng(seed)
+    pose = (draws.integers(-3, 3, 3) + 0.5) * [0.125, 0.125, math.radians(7.5)]
+    places = np.column_stack([draws.uniform(1.2, 4, 30), draws.uniform(-2, 2, 30), np.zeros(30)])
+    clouds = [seen_from((0, 0, 0), places, 0), seen_from(pose, places, 5)]
+    sensors = mounted_sensors(MOUNTINGS)
+    groups = [EchoExtractor(sensors)({"sensor": cloud}) for cloud in clouds]
+    wanted = rigid_motion(*(group.position_m for group in groups))
+    assert wanted == pytest.approx(pose, abs=1e-3)
+    fit = fit_flow(*groups, sensors, 0.5, first_twist=np.zeros(3), second_twist=np.zeros(3))
+    assert fit.displacement == pytest.approx(wanted, abs=2e-3)
+
+
 @pytest.mark.parametrize("count", [40, 75])
 def test_noise_is_not_a_measured_motion(count):
     """The expected number of false alarms exceeds their rate, so that the limit holds for any number of echoes."""
