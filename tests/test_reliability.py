@@ -71,7 +71,7 @@ def test_unplugging_without_later_data_has_no_reconnection_time():
     assert vars(captures)["_waits_s"]([1_000_000_000, 5_000_000_000], [0, 4_000_000_000, 2_500_000_000]) == [1.5]
 
 
-@pytest.mark.alone  # the times of unplugging are fixed
+@pytest.mark.alone  # the limit is a wall-clock time
 def test_unplugged_sensor_is_reconnected(tmp_path, brief):
     found = captures.unplugs(brief, tmp_path, seed=SEED, count=SHORT.n_unplugs)
     assert (found["noticed"], found["wrong"]) == (SHORT.n_unplugs, 0)

@@ -86,18 +86,24 @@ def unplugs(source: Path, folder: Path, *, seed: int, count: int) -> Line:
     """Unplug a sensor at random times, also during measurements, and report the time until it measures again."""
     random_ = random.Random(seed)
     target = folder / "unplugs.h5"
-    moments, at_s = [], 5.0  # A busy machine takes seconds to start the capture.
-    for _ in range(count):
-        at_s += random_.uniform(1.0, 2.0)
-        away_s = random_.uniform(0.2, 1.0)
-        moments += ["--unplug", f"{at_s:.3f}:{away_s:.3f}"]
-        at_s += away_s + 2.5
-    with emulated(source, folder, "--sync-rate", "20", *moments) as ports:
-        lines = _capture(ports, target, "--trigger", "sync", "--duration", f"{at_s:.1f}")
+    plugged_ns = []
+    with _emulated_here(source, folder / "emulated", folder / "sent.ndjson", 20.0) as (emulator,):
+        command = [*_ERTIS, "capture", "--port", str(emulator.link), "-o", str(target), "--trigger", "sync"]
+        with subprocess.Popen([*command, "--json", "--quiet"], stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            came = map(json.loads, process.stdout)
+            lines = _until_stored(came)
+            for _ in range(count):
+                time.sleep(random_.uniform(1.0, 2.0))
+                emulator.unplug()
+                time.sleep(random_.uniform(0.2, 1.0))
+                plugged_ns.append(time.time_ns())
+                emulator.replug()
+                lines += _until_stored(came, after_ns=plugged_ns[-1])
+            process.send_signal(signal.SIGTERM)
+            lines += came
     found = _compare(target, lines[:-1], sent_by_emulators(folder))
     back_s = [line["away_s"] for line in lines if line["event"] == "back"]
-    events = [json.loads(line) for line in (folder / "sent.ndjson").read_text().splitlines()]
-    plugged_ns = [event["time_ns"] for event in events if event.get("event") == "plugged in"]
     stored_ns = [line["timestamp_ns"] for line in lines if line["event"] == "stored"]
     after_s = _waits_s(plugged_ns, stored_ns)
     return {
@@ -107,6 +113,16 @@ def unplugs(source: Path, folder: Path, *, seed: int, count: int) -> Line:
         "stored": lines[-1]["stored"],
         "slowest_s": max(after_s, default=0.0),
     }
+
+
+def _until_stored(came: Iterator[Line], *, after_ns: int = 0) -> list[Line]:
+    """Return the lines of a capture up to the first one about a measurement after a time."""
+    lines = []
+    for line in came:
+        lines.append(line)
+        if line["event"] == "stored" and line["timestamp_ns"] > after_ns:
+            break
+    return lines
 
 
 def _waits_s(plugged_ns: list[int], stored_ns: list[int]) -> list[float]:
@@ -176,8 +192,8 @@ def emulated(source: Path, folder: Path, *options: str, pulses_hz: float | None 
     log = folder / "sent.ndjson"
     log.unlink(missing_ok=True)
     if source.suffix == ".h5" and not options:
-        with _emulated_here(source, folder / "emulated", log, pulses_hz) as ports:
-            yield ports
+        with _emulated_here(source, folder / "emulated", log, pulses_hz) as emulators:
+            yield [str(each.link) for each in emulators]
         return
     if pulses_hz is not None:
         options += ("--sync-rate", f"{pulses_hz:g}")
@@ -197,7 +213,7 @@ def emulated(source: Path, folder: Path, *options: str, pulses_hz: float | None 
 
 
 @contextmanager
-def _emulated_here(source: Path, links: Path, log: Path, pulses_hz: float | None) -> Iterator[list[str]]:
+def _emulated_here(source: Path, links: Path, log: Path, pulses_hz: float | None) -> Iterator[list[Emulator]]:
     links.mkdir(exist_ok=True)
     emulators = []
     with ExitStack() as stack:
@@ -208,7 +224,7 @@ def _emulated_here(source: Path, links: Path, log: Path, pulses_hz: float | None
             emulators.append(stack.enter_context(Emulator(words, name=name, link=links / name, log=file)))
         if pulses_hz is not None:
             stack.enter_context(SyncChain(emulators, pulses_hz))
-        yield [str(links / name) for name in sensor_names(source)]
+        yield emulators
 
 
 def _ports(ports: list[str]) -> list[str]:
