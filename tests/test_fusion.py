@@ -211,6 +211,22 @@ def test_points_seen_by_two_sensors_are_more_precise():
     assert across_rad[both] < across_rad[one]
 
 
+def test_echoes_from_behind_of_an_opposite_emitter_make_points_more_precise():
+    """Two back-to-back sensors hear the same call, so their ranges halve the variance of one range."""
+    alone = scene().replace(
+        sensors=tuple(sensor for sensor in scene().sensors if sensor.name in {"front", "back"}),
+        points=(Point(position_m=(1.5, 0.0, 0.4), strength_db=-6.0),),
+    )
+    shown = {}
+    for sensor in alone.sensors:
+        with ertis.Pipeline(sensor.settings(), predict=False) as pipeline:
+            shown[sensor.name] = pipeline.process(ertis.render(alone, sensor=sensor.name))
+    places = {name: each for name, each in mountings().items() if name in shown}
+    both, one = ertis.fuse(shown.values(), places).points, ertis.fuse([shown["front"]], places).points
+    assert len(both) == len(one) == 1
+    assert both.uncertainty_m[0, 0] == pytest.approx(one.uncertainty_m[0, 0] / math.sqrt(2), rel=0.1)
+
+
 def test_amplitude_does_not_depend_on_the_number_of_sensors():
     levels_db = 20 * np.log10([highest(fused().image, *place) for place in PLACES_M])
     between = 1  # The second reflector lies between two sensors, whose echoes of both calls interfere.

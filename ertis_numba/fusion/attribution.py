@@ -16,7 +16,10 @@ __all__ = ["Attributed", "Attribution", "Rivalries", "Shares"]
 Singles = NDArray[np.float32]
 Places = NDArray[np.uint32]
 Shares: TypeAlias = Mapping[tuple[int, int], Singles]
-"""Share of each pixel that belongs to a pair of emitter and receiver: (pixel,) float32, 0 to 1."""
+"""Share of each pixel that belongs to a pair of emitter and receiver: (pixel,) float32, 0 to 1.
+
+It counts reflectors in front of the receiver, and is 0 for an emitter whose echoes come only from behind.
+"""
 
 # Power of other explanations relative to a pixel, at which the pixel is attributed to them. It begins with certain
 # ones, because reflectors of wrong attribution predict echoes as well.
@@ -270,6 +273,8 @@ class Attribution:
         found = {}
         for index, (each, rivalry) in enumerate(zip(hypotheses, self._rivalries[number], strict=True)):
             if each.is_mirrored:
+                # Sound of an opposite emitter comes only from behind. Its echoes still confirm reflectors.
+                found.setdefault((each.emitter, number), np.zeros_like(power))
                 continue
             expected = _NONE
             if each.emitter == number and confirmed is not None:
