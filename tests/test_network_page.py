@@ -150,7 +150,7 @@ def test_network_page_on_several_machines_runs(place, ports, monkeypatch):
     lines = lines_of(PAGE, "(?:central|sensor)")
     assert [line.split()[0] for line in lines] == ["keys", "keys", "keys", "serve", "capture"]
     # Two measurements of a sensor wait while the central node plans its images, and a third would drop the first.
-    monkeypatch.setenv("ERTIS_CAPTURE_RATE", "0.5")
+    monkeypatch.setenv("ERTIS_CAPTURE_RATE", "0.2")
     with Shell(place, ports) as shell:
         for line in [*lines[:-1], f"{lines[-1]} --json"]:
             local = line.replace("HOST", "127.0.0.1").replace("0.0.0.0", "127.0.0.1")
@@ -158,8 +158,7 @@ def test_network_page_on_several_machines_runs(place, ports, monkeypatch):
     events = [json.loads(line) for line in reported.splitlines()]
     acked = [each for each in events if each["event"] == "acked_through"]
     assert {each["sensor"]: each["acked_through"] for each in acked} == dict.fromkeys(SENSORS, 4)
-    reasons = {reason for each in acked for _, reason in each["dropped"]}
-    assert reasons <= {"the workers were getting ready"}  # as on a slow machine, whose workers start slowly
+    assert not any(each["dropped"] for each in acked)
 
 
 @pytest.mark.usefixtures("emulators")
