@@ -10,7 +10,7 @@ from ertis_numba.air import transmission_loss_db
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import is_passive
 from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
-from ertis_numba.passive import AcousticCamera, find_bearings, octave_bands
+from ertis_numba.passive import AcousticCamera, CrossSpectrum, find_bearings, octave_bands
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.methods import METHODS
 from ertis_numba.passive.parallel_bins import in_parts
@@ -132,6 +132,27 @@ def test_powers_equal_their_equation(method, diagonal_removal):
         expected = reference_powers(camera, camera.cross_spectrum().matrix.astype(complex))
         found = camera.powers()
     assert np.abs(found - expected).max() < 2e-4 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("n_sources", [1, 2, 20])
+def test_music_equals_its_equation_at_sharp_peaks(device, n_sources):
+    """Two sources lie in directions of the grid, 40 and 34 dB above the noise, and have peaks of 60 dB at most."""
+    changes = {key: value for key, value in SMALL.items() if not key.startswith("array.")}
+    settings = Settings().replace(**changes, **{"passive.method": "music", "passive.n_sources": n_sources})
+    random = np.random.default_rng(6)
+
+    def complex_noise(count):
+        return random.standard_normal((len(camera.frequency_hz), count, 64, 2)).view(complex)[..., 0]
+
+    with AcousticCamera(settings, device, 1) as camera:
+        waves = waves_of(camera)[:, :, [20, 45]] * [1.0, 0.5]
+        heard = waves @ complex_noise(2) + 0.01 * complex_noise(waves.shape[1])
+        matrix = heard @ heard.conj().transpose(0, 2, 1) / heard.shape[2]
+        spectrum = CrossSpectrum(matrix.astype(np.complex64), camera.frequency_hz, 64)
+        found = METHODS["music"](spectrum, camera.waves, settings.passive)
+        expected = np.minimum(reference_powers(camera, spectrum.matrix.astype(complex)), 1e6)
+    assert np.abs(10 * np.log10(found / expected)).max() < 0.1
 
 
 @pytest.mark.parametrize(("n_bins", "threads", "n_parts"), [(0, 2, 1), (15, 2, 1), (16, 4, 2), (92, 3, 3), (92, 1, 1)])

@@ -54,6 +54,21 @@ def test_steered_power_equals_its_reference(kernel_set, name):
     assert np.abs(out - expected).max() < 3e-6 * np.abs(matrices).sum(axis=(1, 2)).max()
 
 
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("n_vectors", [1, 2, 5])
+def test_steered_vectors_equal_their_reference(kernel_set, name, n_vectors):
+    n_mics, _, _, _, n_bins, n_directions = SHAPES[name]
+    random = np.random.default_rng(5)
+    vectors = complex_noise(random, (n_bins, n_vectors, n_mics))
+    steps = random.integers(0, 2**32, (n_mics, n_directions), dtype=np.uint32)
+    bins = np.concatenate([np.arange(n_bins - n_bins // 3), 1000 + np.arange(n_bins // 3)]).astype(np.uint32)  # a gap
+    out = np.full((n_bins, n_directions), GARBAGE, np.float32)
+    kernel_set.steer_vectors(vectors, steps, bins, out)
+    lags = np.exp(-2j * np.pi * (bins[:, None, None].astype(float) * steps / 2**32 % 1))
+    expected = (np.abs(vectors.conj().astype(complex) @ lags) ** 2).sum(axis=1)
+    assert np.abs(out - expected).max() < 3e-6 * (np.abs(vectors).sum(axis=2) ** 2).sum(axis=1).max()
+
+
 @pytest.mark.parametrize("device", KERNELS)
 def test_only_the_upper_triangle_and_the_real_diagonal_are_read(device):
     random = np.random.default_rng(3)

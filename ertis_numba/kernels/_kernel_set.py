@@ -74,6 +74,7 @@ class KernelSet(AdaptiveKernels):
     modulate_pdm: _contract.ModulatePdm
     cross_spectra: _contract.CrossSpectra
     steer_power: _contract.SteerPower
+    steer_vectors: _contract.SteerVectors
     clean_sources: _contract.CleanSources
 
     @classmethod

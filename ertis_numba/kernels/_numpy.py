@@ -515,6 +515,12 @@ def steer_power(matrices: Complex, steps: Turns, bins: Turns, out: Real) -> None
         power[:] = 2 * (lags.conj() * (upper @ lags)).real.sum(axis=0) + np.trace(matrix).real
 
 
+def steer_vectors(vectors: Complex, steps: Turns, bins: Turns, out: Real) -> None:
+    """Compute the power that vectors have for the wave from each direction."""
+    for each, number, power in zip(vectors, bins, out, strict=True):
+        power[:] = (np.abs(each.conj() @ _waves(steps, number)) ** 2).sum(axis=0)
+
+
 def _waves(steps: Turns, number: np.uint32) -> Complex:
     """Return the waves from all directions at a bin: (mic, direction) complex64."""
     return np.asarray(np.exp(np.float32(-2 * np.pi / 2**32) * (steps * number).view(np.int32) * np.complex64(1j)))

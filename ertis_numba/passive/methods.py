@@ -22,9 +22,10 @@ __all__ = ["METHODS", "capon", "clean_sc", "delay_and_sum", "functional", "hr_cl
 
 Matrices = NDArray[np.complex64]
 Powers = NDArray[np.float32]
+Vectors = NDArray[np.complex128]
 
 _LEAST: Final = np.float32(1e-30)
-
+_CANCELLED: Final = 3e-4  # Relative power of a wave below which single precision errs by more than 0.01 dB.
 
 Method = Callable[[CrossSpectrum, Waves, Passive], Powers]
 
@@ -76,12 +77,28 @@ def music(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
             f"but there are {spectrum.n_blocks}; give a larger passive.averages, or wider bands"
         )
 
-    def projections(matrices: Matrices) -> Matrices:
-        values, vectors = _eigen(matrices)
-        return _matrices(np.broadcast_to(np.arange(n_mics) < n_mics - n_sources, values.shape), vectors)
+    is_noise = 2 * n_sources > n_mics  # The smaller one of both subspaces takes fewer operations.
+    numbers = np.arange(n_mics - n_sources) if is_noise else np.arange(n_mics - n_sources, n_mics)
 
-    powers = waves.steer(in_parts(projections, spectrum.matrix, threads=waves.threads))
+    def bases(matrices: Matrices) -> Vectors:
+        return _eigen(matrices)[1][:, :, numbers].transpose(0, 2, 1)
+
+    vectors = in_parts(bases, spectrum.matrix, threads=waves.threads)
+    powers = waves.steer_vectors(vectors.astype(np.complex64)) if is_noise else _powers_outside(vectors, waves)
     return np.asarray(n_mics / np.maximum(powers, 1e-6 * n_mics), np.float32)
+
+
+def _powers_outside(vectors: Vectors, waves: Waves) -> Powers:
+    """Return the power of each wave outside the subspace that orthonormal vectors span: (bin, direction).
+
+    Where little power is left, the difference is computed in double precision.
+    """
+    n_mics = vectors.shape[2]
+    powers: Powers = n_mics - waves.steer_vectors(vectors.astype(np.complex64))
+    bins, directions = np.nonzero(powers < _CANCELLED * n_mics)
+    inside = np.einsum("knm,km->kn", vectors[bins].conj(), waves.vectors(bins, directions))
+    powers[bins, directions] = n_mics - (np.abs(inside) ** 2).sum(axis=1)
+    return powers
 
 
 def clean_sc(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:

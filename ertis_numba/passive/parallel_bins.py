@@ -2,19 +2,19 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 __all__ = ["in_parts"]
 
+Number = TypeVar("Number", np.complex64, np.complex128)
+
 _MIN_BINS: Final = 8  # Matrices of fewer bins take less time than the start of a thread.
 
 
-def in_parts(
-    function: Callable[..., NDArray[np.complex64]], *of_bins: NDArray[Any], threads: int
-) -> NDArray[np.complex64]:
+def in_parts(function: Callable[..., NDArray[Number]], *of_bins: NDArray[Any], threads: int) -> NDArray[Number]:
     """Return the results of a function that is called once per thread, each time with a part of the bins.
 
     NumPy computes linear algebra without holding the lock of the interpreter, so the parts run in parallel.

@@ -1,5 +1,6 @@
 """Waves from the directions of a map, and the operations on them that a compute device performs."""
 
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -74,11 +75,30 @@ class Waves:
         bins : (n,) intp
             Numbers of their bins; all bins by default.
         """
-        out = np.empty((len(matrices), self._turns.shape[1]), np.float32)
-        powers = self._powers[: len(matrices)]
+        return self._powers_of(self._kernels.steer_power, matrices, bins)
+
+    def steer_vectors(self, vectors: NDArray[np.complex64]) -> Powers:
+        """Return the sum of ``|x^H v|²`` over the vectors x of each bin, for the wave v from each direction.
+
+        Parameters
+        ----------
+        vectors : (bin, n, mic) complex64
+            Vectors of all bins.
+
+        Returns
+        -------
+        (bin, direction) float32
+        """
+        return self._powers_of(self._kernels.steer_vectors, vectors)
+
+    def _powers_of(
+        self, kernel: Callable[..., None], arrays: NDArray[np.complex64], bins: NDArray[np.intp] | None = None
+    ) -> Powers:
+        out = np.empty((len(arrays), self._turns.shape[1]), np.float32)
+        powers = self._powers[: len(arrays)]
         with self._kernels.threads(self.threads), self._lane.entered():
             numbers = self._bins if bins is None else self._lane.send(self._numbers[bins])
-            self._kernels.steer_power(self._lane.send(np.ascontiguousarray(matrices)), self._steps, numbers, powers)
+            kernel(self._lane.send(np.ascontiguousarray(arrays)), self._steps, numbers, powers)
             self._lane.fetch(powers, out)
             self._lane.wait()
         return out

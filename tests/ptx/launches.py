@@ -88,6 +88,7 @@ def _each(kernels):
     steps, bins = np.zeros((8, 90), np.uint32), np.arange(20, dtype=np.uint32)
     powers, hollow = np.zeros((20, 90), np.float32), True
     kernels.steer_power(matrices, steps, bins, powers)
+    kernels.steer_vectors(matrices[:, :3].copy(), steps, bins, powers)
     kernels.clean_sources(matrices, steps, bins, powers, hollow, powers)
     kernels.add_paths(
         np.zeros((1, 251), np.complex128),

@@ -18,7 +18,7 @@ from ertis_numba.kernels._contract.beams import (
     RectifyAndDecimate,
     SumDelayedInt16,
 )
-from ertis_numba.kernels._contract.passive import CleanSources, CrossSpectra, SteerPower
+from ertis_numba.kernels._contract.passive import CleanSources, CrossSpectra, SteerPower, SteerVectors
 from ertis_numba.kernels._contract.scenes import AddPaths, ModulatePdm
 from ertis_numba.kernels._contract.signals import (
     Decimate,
@@ -62,6 +62,7 @@ __all__ = [
     "RemoveGroupDelay",
     "Short",
     "SteerPower",
+    "SteerVectors",
     "SumDelayedInt16",
     "SumSpectra",
     "Taps",

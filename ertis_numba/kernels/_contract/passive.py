@@ -14,6 +14,7 @@ __all__ = [
     "CleanSources",
     "CrossSpectra",
     "SteerPower",
+    "SteerVectors",
 ]
 
 CLEAN_LOOP_GAIN: Final = np.float32(0.6)
@@ -63,6 +64,25 @@ class SteerPower(Protocol):
     """
 
     def __call__(self, matrices: Complex, steps: Turns, bins: Turns, out: Real) -> None: ...
+
+
+class SteerVectors(Protocol):
+    """Compute the power that vectors have for the wave from each direction.
+
+    ``out[k, direction] = Σ_n |Σ_i conj(vectors[k, n, i]) · v_i|²`` with the waves ``v`` of `SteerPower`. This is the
+    power of the matrix ``Σ_n x_n x_n^H`` of the vectors ``x_n``, and takes fewer operations if they are few.
+
+    Parameters
+    ----------
+    vectors : (bin, n, mic) complex64
+    steps : (mic, direction) uint32
+        As for `SteerPower`.
+    bins : (bin,) uint32
+        As for `SteerPower`.
+    out : (bin, direction) float32
+    """
+
+    def __call__(self, vectors: Complex, steps: Turns, bins: Turns, out: Real) -> None: ...
 
 
 class CleanSources(Protocol):

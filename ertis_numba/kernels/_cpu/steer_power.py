@@ -1,22 +1,18 @@
 # mypy: ignore-errors
 """Compute the power that Hermitian matrices have for the wave from each direction.
 
-A tile of directions keeps its phases in the first cache. Two rows of a matrix at a time accumulate their sums in
-registers, so that each phase is read for two rows. From bin to bin, a complex product turns the phases, which are
-computed anew every few bins, so that rounding errors remain below 2e-6.
+Two rows of a matrix at a time accumulate their sums in registers, so that each phase of a tile of directions is read
+for two rows.
 """
 
 import numpy as np
 from numba import njit, prange
 
-from ertis_numba.kernels._cpu.vectors import REGISTER_BYTES, add_product, load, splat, store, subtract_product
-from ertis_numba.kernels._scalar import cosine_and_sine
+from ertis_numba.kernels._cpu.vectors import add_product, load, splat, store, subtract_product
+from ertis_numba.kernels._cpu.wave_phases import LANES, REGISTERS, begin_phases, move_phases
 
 __all__ = ["steer_power"]
 
-_REGISTERS = 2
-_LANES = _REGISTERS * REGISTER_BYTES // 4  # directions of a tile
-_TURNED = 16  # bins from one cosine to the next
 _ZERO, _TWO = np.float32(0), np.float32(2)
 
 
@@ -39,53 +35,34 @@ def _pack(matrix, numbers):
     return trace
 
 
-@njit(nogil=True, cache=True, fastmath={"contract"})
-def _begin(steps, first, count, number, phases):
-    """Fill (mic, part, lane) with the phases of a tile at a bin."""
-    for mic in range(steps.shape[0]):
-        for lane in range(_LANES):
-            step = steps[mic, first + min(lane, count - 1)]
-            real, imag = cosine_and_sine(np.uint32(np.uint64(step) * np.uint64(number)))
-            phases[mic, 0, lane], phases[mic, 1, lane] = real, -imag
-
-
-@njit(nogil=True, cache=True)
-def _turn(phases, turns):
-    for place in range(0, phases.size, 2 * _LANES):
-        a, b = load(phases, place, _REGISTERS), load(phases, place + _LANES, _REGISTERS)
-        c, d = load(turns, place, _REGISTERS), load(turns, place + _LANES, _REGISTERS)
-        store(subtract_product(a * c, b, d), phases, place)
-        store(add_product(a * d, b, c), phases, place + _LANES)
-
-
 @njit(nogil=True, cache=True)
 def _sum_rows(numbers, n_mics, phases, trace, sums):
     """Fill the powers of a tile: twice the real parts of the upper triangle, plus the trace."""
-    total = splat(phases, _ZERO, _REGISTERS)
+    total = splat(phases, _ZERO, REGISTERS)
     k = 0
     for i in range(0, n_mics, 2):
-        a = splat(phases, _ZERO, _REGISTERS)
-        b = splat(phases, _ZERO, _REGISTERS)
-        c = splat(phases, _ZERO, _REGISTERS)
-        d = splat(phases, _ZERO, _REGISTERS)
+        a = splat(phases, _ZERO, REGISTERS)
+        b = splat(phases, _ZERO, REGISTERS)
+        c = splat(phases, _ZERO, REGISTERS)
+        d = splat(phases, _ZERO, REGISTERS)
         for j in range(i + 1, n_mics):
-            at = 2 * j * _LANES
-            real, imag = load(phases, at, _REGISTERS), load(phases, at + _LANES, _REGISTERS)
-            x, y = splat(phases, numbers[k], _REGISTERS), splat(phases, numbers[k + 1], _REGISTERS)
+            at = 2 * j * LANES
+            real, imag = load(phases, at, REGISTERS), load(phases, at + LANES, REGISTERS)
+            x, y = splat(phases, numbers[k], REGISTERS), splat(phases, numbers[k + 1], REGISTERS)
             a = subtract_product(add_product(a, x, real), y, imag)
             b = add_product(add_product(b, x, imag), y, real)
-            x, y = splat(phases, numbers[k + 2], _REGISTERS), splat(phases, numbers[k + 3], _REGISTERS)
+            x, y = splat(phases, numbers[k + 2], REGISTERS), splat(phases, numbers[k + 3], REGISTERS)
             c = subtract_product(add_product(c, x, real), y, imag)
             d = add_product(add_product(d, x, imag), y, real)
             k += 4
-        at = 2 * i * _LANES
-        total = add_product(total, load(phases, at, _REGISTERS), a)
-        total = add_product(total, load(phases, at + _LANES, _REGISTERS), b)
+        at = 2 * i * LANES
+        total = add_product(total, load(phases, at, REGISTERS), a)
+        total = add_product(total, load(phases, at + LANES, REGISTERS), b)
         if i + 1 < n_mics:
-            at += 2 * _LANES
-            total = add_product(total, load(phases, at, _REGISTERS), c)
-            total = add_product(total, load(phases, at + _LANES, _REGISTERS), d)
-    total = add_product(splat(phases, trace, _REGISTERS), splat(phases, _TWO, _REGISTERS), total)
+            at += 2 * LANES
+            total = add_product(total, load(phases, at, REGISTERS), c)
+            total = add_product(total, load(phases, at + LANES, REGISTERS), d)
+    total = add_product(splat(phases, trace, REGISTERS), splat(phases, _TWO, REGISTERS), total)
     store(total, sums, 0)
 
 
@@ -98,18 +75,15 @@ def steer_power(matrices, steps, bins, out):
     traces = np.empty(n_bins, np.float32)
     for k in prange(n_bins):
         traces[k] = _pack(matrices[k], numbers[k])
-    for tile in prange((n_directions + _LANES - 1) // _LANES):
-        first = tile * _LANES
-        count = min(_LANES, n_directions - first)
-        phases = np.empty((n_mics, 2, _LANES), np.float32)
-        turns = np.empty((n_mics, 2, _LANES), np.float32)
-        sums = np.empty(_LANES, np.float32)
-        _begin(steps, first, count, np.uint32(1), turns)
+    for tile in prange((n_directions + LANES - 1) // LANES):
+        first = tile * LANES
+        count = min(LANES, n_directions - first)
+        phases = np.empty((n_mics, 2, LANES), np.float32)
+        turns = np.empty((n_mics, 2, LANES), np.float32)
+        sums = np.empty(LANES, np.float32)
+        begin_phases(steps, first, count, np.uint32(1), turns)
         for k in range(n_bins):
-            if k % _TURNED == 0 or bins[k] != bins[k - 1] + np.uint32(1):
-                _begin(steps, first, count, bins[k], phases)
-            else:
-                _turn(phases, turns)
+            move_phases(steps, first, count, bins, k, turns, phases)
             _sum_rows(numbers[k], n_mics, phases, traces[k], sums)
             for lane in range(count):
                 out[k, first + lane] = sums[lane]
