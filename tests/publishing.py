@@ -1,6 +1,7 @@
 """A publisher for tests: the protocol of applications without image processing."""
 
 import contextlib
+import json
 import threading
 import time
 import types
@@ -243,6 +244,11 @@ def results_of(monkeypatch, owner, name):
 
     monkeypatch.setattr(owner, name, call)
     return results
+
+
+def events_of(lines):
+    """Return the events in lines of JSON, without those of a connection that a busy machine makes slowly."""
+    return (event for event in map(json.loads, lines) if event["event"] not in {"waiting", "note"})
 
 
 def end_when(monkeypatch, module, is_over):

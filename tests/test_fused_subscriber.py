@@ -1,6 +1,5 @@
 """Fused images of a central node, as an application receives them."""
 
-import json
 import threading
 
 import numpy as np
@@ -12,7 +11,7 @@ from ertis_cli.main import cli
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.fusion import Fuser
 from ertis_numba.network.fused_subscriber import FusedSubscriber
-from tests.publishing import PATIENCE_S, Publisher, image
+from tests.publishing import PATIENCE_S, Publisher, events_of, image
 
 AHEAD, BEHIND = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0)
 MOUNTINGS = {"front": ((0.2, 0.0, 0.0), AHEAD), "back": ((-0.2, 0.0, 0.0), BEHIND)}
@@ -150,7 +149,7 @@ def test_listen_prints_fused_pulses(tmp_path):
     with Publisher() as publisher, publisher.playing(pulses(count=6)):
         shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments, "--json"])
     assert shown.exit_code == 0, shown.output
-    subscribed, fused, summary = map(json.loads, shown.stdout.splitlines())
+    subscribed, fused, summary = events_of(shown.stdout.splitlines())
     assert (subscribed["event"], subscribed["products"]) == ("subscribed", ["energyscape"])
     assert fused["sensors"] == ["front", "back"]
     assert fused["nearest_m"][0] == pytest.approx(-1.14, abs=0.02)

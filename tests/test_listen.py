@@ -19,7 +19,24 @@ from ertis_numba.network.products import Arrival
 from ertis_numba.storage import open_energyscapes, open_recording, sensor_names
 from tests.central import running
 from tests.pages import environment
-from tests.publishing import Publisher, cloud, end_when, group, image, measurement, results_of, status
+from tests.publishing import (
+    PATIENCE_S,
+    Publisher,
+    cloud,
+    end_when,
+    events_of,
+    group,
+    image,
+    measurement,
+    results_of,
+    status,
+)
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch):
+    """Do not report the connection, which takes long on a busy machine."""
+    monkeypatch.setattr("ertis_cli._product_printer._SOON_S", PATIENCE_S)
 
 
 def listen(*arguments):
@@ -34,7 +51,7 @@ def heard(items, *arguments):
 
 def events(done):
     assert done.exit_code == 0, (done.stderr, done.exception)
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    return list(events_of(done.stdout.splitlines()))
 
 
 def test_listen_prints_a_line_per_image():
@@ -113,7 +130,8 @@ def test_ctrl_c_ends_listen_and_keeps_received_images(tmp_path, options, code):
         with subprocess.Popen(
             [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(tmp_path)
         ) as process:
-            reported = [json.loads(process.stdout.readline())["event"] for _ in range(2)]
+            came = events_of(process.stdout)
+            reported = [next(came)["event"] for _ in range(2)]
             process.send_signal(signal.SIGINT)
             rest, errors = process.communicate()
     assert reported == ["subscribed", "energyscape"]
@@ -215,7 +233,8 @@ def test_points_use_the_directions_of_each_image(capsys):
     assert found == [0.0, 20.0]
 
 
-def test_late_sensor_is_reported(capsys):
+def test_late_sensor_is_reported(capsys, monkeypatch):
+    monkeypatch.setattr("ertis_cli._product_printer._SOON_S", 3.0)
     heard = MicrophoneTable(as_json=False, quiet=False)
     heard.unanswered("tcp://127.0.0.1:1", 2.0)
     heard.unanswered("tcp://127.0.0.1:1", 4.0)

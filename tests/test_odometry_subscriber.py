@@ -24,7 +24,7 @@ import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.network.odometry_subscriber import OdometrySubscriber
 from tests.pages import environment
-from tests.publishing import PATIENCE_S, Publisher, end_when, image, results_of
+from tests.publishing import PATIENCE_S, Publisher, end_when, events_of, image, results_of
 
 AHEAD, BEHIND = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0)
 MOUNTINGS = {"front": ((0.2, 0.0, 0.0), AHEAD), "back": ((-0.2, 0.0, 0.0), BEHIND)}
@@ -244,7 +244,7 @@ def test_listen_prints_poses_and_writes_the_trajectory(tmp_path, mounting):
     with Publisher() as publisher, publisher.playing(images(*range(6))):
         shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments, "--json"])
     assert shown.exit_code == 0, shown.output
-    subscribed, first, second, summary = map(json.loads, shown.stdout.splitlines())
+    subscribed, first, second, summary = events_of(shown.stdout.splitlines())
     assert (subscribed["event"], subscribed["products"]) == ("subscribed", ["energyscape"])
     assert (first["event"], first["x_m"], first["velocity_m_s"], first["measured"]) == ("odometry", 0.0, None, True)
     assert math.hypot(*second["velocity_m_s"]) == pytest.approx(np.hypot(*STEP_M) / 0.1, abs=0.02)
@@ -281,7 +281,8 @@ def test_ctrl_c_ends_listen_and_writes_the_trajectory(tmp_path, mounting):
         with subprocess.Popen(
             [*command, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(tmp_path)
         ) as process:
-            _, first = (json.loads(process.stdout.readline()) for _ in range(2))
+            came = events_of(process.stdout)
+            _, first = next(came), next(came)
             process.send_signal(signal.SIGINT)
             rest, errors = process.communicate()
     assert process.returncode == 0, errors
@@ -314,7 +315,8 @@ def test_failure_of_listen_keeps_earlier_poses(tmp_path):
                 env=environment(tmp_path),
             ) as process,
         ):
-            _, event = (json.loads(process.stdout.readline())["event"] for _ in range(2))
+            came_of = events_of(process.stdout)
+            _, event = next(came_of), next(came_of)["event"]
             assert event == "odometry"
             came.set()
             rest, errors = process.communicate()
