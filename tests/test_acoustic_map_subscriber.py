@@ -16,7 +16,11 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Bearing, Measurement
 from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
 from ertis_numba.passive import AcousticCamera
-from tests.publishing import PATIENCE_S, Publisher, events_of, measurement
+from tests.publishing import PATIENCE_S, PATIENT_APPLICATIONS, Publisher, events_of, measurement, patient_applications
+
+__all__ = ["patient_applications"]  # A fixture, imported for use here.
+
+pytestmark = PATIENT_APPLICATIONS
 
 ROOT = Path(__file__).parents[1]
 

@@ -11,7 +11,11 @@ from ertis_cli.main import cli
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.fusion import Fuser
 from ertis_numba.network.fused_subscriber import FusedSubscriber
-from tests.publishing import PATIENCE_S, Publisher, events_of, image
+from tests.publishing import PATIENCE_S, PATIENT_APPLICATIONS, Publisher, events_of, image, patient_applications
+
+__all__ = ["patient_applications"]  # A fixture, imported for use here.
+
+pytestmark = PATIENT_APPLICATIONS
 
 AHEAD, BEHIND = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0)
 MOUNTINGS = {"front": ((0.2, 0.0, 0.0), AHEAD), "back": ((-0.2, 0.0, 0.0), BEHIND)}

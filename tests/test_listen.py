@@ -20,7 +20,7 @@ from ertis_numba.storage import open_energyscapes, open_recording, sensor_names
 from tests.central import running
 from tests.pages import environment
 from tests.publishing import (
-    PATIENCE_S,
+    PATIENT_APPLICATIONS,
     Publisher,
     cloud,
     end_when,
@@ -28,15 +28,14 @@ from tests.publishing import (
     group,
     image,
     measurement,
+    patient_applications,
     results_of,
     status,
 )
 
+__all__ = ["patient_applications"]  # A fixture, imported for use here.
 
-@pytest.fixture(autouse=True)
-def _patient(monkeypatch):
-    """Do not report the connection, which takes long on a busy machine."""
-    monkeypatch.setattr("ertis_cli._product_printer._SOON_S", PATIENCE_S)
+pytestmark = PATIENT_APPLICATIONS
 
 
 def listen(*arguments):

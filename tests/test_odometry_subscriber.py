@@ -24,7 +24,20 @@ import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.network.odometry_subscriber import OdometrySubscriber
 from tests.pages import environment
-from tests.publishing import PATIENCE_S, Publisher, end_when, events_of, image, results_of
+from tests.publishing import (
+    PATIENCE_S,
+    PATIENT_APPLICATIONS,
+    Publisher,
+    end_when,
+    events_of,
+    image,
+    patient_applications,
+    results_of,
+)
+
+__all__ = ["patient_applications"]  # A fixture, imported for use here.
+
+pytestmark = PATIENT_APPLICATIONS
 
 AHEAD, BEHIND = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 0.0)
 MOUNTINGS = {"front": ((0.2, 0.0, 0.0), AHEAD), "back": ((-0.2, 0.0, 0.0), BEHIND)}
