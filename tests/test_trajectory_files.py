@@ -124,6 +124,25 @@ def test_mcap_with_several_topics_needs_a_choice(tmp_path):
         read_trajectory(path, topic="/three")
 
 
+def test_damaged_mcap_is_refused(tmp_path):
+    """Cuts and changed bytes make the libraries raise a dozen types of errors."""
+    path = tmp_path / "drive.mcap"
+    write_mcap(path, {"/pose": ("geometry_msgs/msg/PoseStamped", [TIME_NS + number for number in range(40)])})
+    whole = path.read_bytes()
+    draws = np.random.default_rng(1)
+    spoilt = [whole[:place] for place in draws.integers(0, len(whole), 20)]
+    places = draws.integers(0, len(whole), 60)
+    spoilt += [whole[:place] + bytes([whole[place] ^ 0x15]) + whole[place + 1 :] for place in places]
+    refused = 0
+    for content in spoilt:
+        path.write_bytes(content)
+        try:
+            read_trajectory(path)
+        except (ArgumentError, DataError) as error:
+            refused += str(error).startswith(f"{path}: ")
+    assert refused > 20
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
@@ -145,6 +164,7 @@ def test_mcap_with_several_topics_needs_a_choice(tmp_path):
         ("a.csv", "time_s,x_m,y_m,yaw_deg\n1,2,3\n", "line 2 has 3 fields; give 4 as in the first line"),
         ("a.csv", "time_s,x_m,y_m,yaw_deg\n", "there are no poses"),
         ("a.mcap", "no file of this kind", "the file is damaged"),
+        ("a.mcap", "short", "the file is damaged or cut short; record it again"),
     ],
 )
 def test_unusable_files_are_refused(tmp_path, name, text, message):

@@ -36,11 +36,11 @@ def listen_odometry(
     as_json: bool,
 ) -> None:
     """Print one line per pulse until a signal, a count or a duration ends it; then write the trajectory, if any."""
-    from ertis_numba.atomic_files import check_target
+    from ertis_numba.interop import check_tum_target
     from ertis_numba.network.odometry_subscriber import OdometrySubscriber
 
     if target is not None:
-        check_target(target, overwrite=force)
+        check_tum_target(target, overwrite=force)
     listen_pulses(
         address,
         sensors,

@@ -57,10 +57,10 @@ def odometry(
     match, the last velocity is assumed to continue. Pulses may be at most a second apart.
     """
     from ertis_numba import write_tum
-    from ertis_numba.storage import check_target
+    from ertis_numba.interop import check_tum_target
 
     file = target or paths[0].with_suffix(".odometry.tum")
-    check_target(file, overwrite=force, sources=paths)
+    check_tum_target(file, overwrite=force, sources=paths)
 
     with ExitStack() as stack:
         readers = _pulses.open_sensors(paths, stack)

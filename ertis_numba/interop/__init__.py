@@ -6,7 +6,7 @@ from ertis_numba.interop._map_files import MAP_SUFFIXES, map_files, write_map
 from ertis_numba.interop.pcm import PcmReader, open_pcm
 from ertis_numba.interop.raw_pdm import RawReader, open_raw
 from ertis_numba.interop.rtis_folder import open_rtis_folder
-from ertis_numba.interop.trajectory_files import read_trajectory, write_tum
+from ertis_numba.interop.trajectory_files import check_tum_target, read_trajectory, write_tum
 
 __all__ = [
     "FORMATS",
@@ -15,6 +15,7 @@ __all__ = [
     "Drive",
     "PcmReader",
     "RawReader",
+    "check_tum_target",
     "choose_format",
     "export",
     "map_files",

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.atomic_files import atomic_write
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.atomic_files import atomic_write, check_target
+from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.extras import extra
 from ertis_numba.frames import Trajectory
 
-__all__ = ["read_trajectory", "write_tum"]
+__all__ = ["check_tum_target", "read_trajectory", "write_tum"]
 
 Floats = NDArray[np.float64]
 Found = TypeVar("Found")
@@ -113,9 +113,7 @@ def write_tum(path: str | Path, trajectory: Trajectory, *, overwrite: bool = Fal
     1700000000.123456789 1 2 0 0 0 0 1
     """
     checks.instance("trajectory", trajectory, Trajectory, "Odometry.trajectory and read_trajectory return")
-    suffix = Path(path).suffix.lower()
-    if suffix in _OTHER_SUFFIXES:
-        raise ArgumentError(f"output {path} ends in {suffix}, but the file is text of TUM; give a name in .tum or .txt")
+    check_tum_target(Path(path), overwrite=overwrite)
     with atomic_write(Path(path), overwrite=overwrite) as part, part.open("w", encoding="utf-8") as file:
         file.write(f"# {' '.join(_TUM)}\n")
         for time_ns, position, rotation in zip(
@@ -124,6 +122,27 @@ def write_tum(path: str | Path, trajectory: Trajectory, *, overwrite: bool = Fal
             # Decimal keeps nanoseconds, which a float64 of seconds since 1970 does not hold.
             numbers = " ".join(format(number, ".12g") for number in (*position, *rotation))
             file.write(f"{Decimal(time_ns).scaleb(-9):f} {numbers}\n")
+
+
+def check_tum_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
+    """Refuse a path to which `write_tum` could not write.
+
+    Parameters
+    ----------
+    path : Path
+    overwrite : bool
+    sources : iterable of Path
+        Input files, which are never overwritten.
+
+    Raises
+    ------
+    ArgumentError
+        As for `write_tum`.
+    """
+    suffix = path.suffix.lower()
+    if suffix in _OTHER_SUFFIXES:
+        raise ArgumentError(f"output {path} ends in {suffix}, but the file is text of TUM; give a name in .tum or .txt")
+    check_target(path, overwrite=overwrite, sources=sources)
 
 
 def _read_tum(text: str) -> Trajectory:
@@ -168,18 +187,25 @@ def _read_csv(text: str) -> Trajectory:
 
 def _read_mcap(path: Path, topic: str | None) -> Trajectory:
     with extra("ros", "trajectories in .mcap files need mcap and mcap-ros2-support"):
-        from mcap.exceptions import McapError  # noqa: PLC0415  an extra
         from mcap.reader import make_reader  # noqa: PLC0415  an extra
         from mcap_ros2.decoder import DecoderFactory  # noqa: PLC0415  an extra
-    try:
-        with path.open("rb") as file:
+    with path.open("rb") as file:
+        try:
             reader: Any = make_reader(file, decoder_factories=[DecoderFactory()])
             summary = reader.get_summary()
             chosen = _topic({} if summary is None else _pose_topics(summary), topic)
             messages = [message for *_, message in reader.iter_decoded_messages(topics=[chosen], log_time_order=True)]
-    except McapError as error:
-        raise DataError(f"the file is damaged ({error}); record it again, or repair it with 'mcap recover'") from error
-    stamps = [message.header.stamp for message in _some(messages)]
+            return _of_messages(_some(messages))
+        except ErtisError:
+            raise
+        except Exception as error:  # The libraries raise errors of any type.
+            raise DataError(
+                "the file is damaged or cut short; record it again, or repair it with 'mcap recover'"
+            ) from error
+
+
+def _of_messages(messages: list[Any]) -> Trajectory:
+    stamps = [message.header.stamp for message in messages]
     # Odometry and PoseWithCovarianceStamped hold a pose with covariance in their field "pose".
     holders = [message.pose for message in messages]
     poses = [getattr(holder, "pose", holder) for holder in holders]
@@ -262,6 +288,6 @@ def _trajectory(
     try:
         return Trajectory(np.array(times_ns, np.int64), position_m, rotation_xyzw, covariance, "file")
     except OverflowError as error:
-        raise DataError(f"a time is beyond the year 2262 ({error}); give seconds or nanoseconds since 1970") from error
+        raise DataError("a time is beyond the year 2262; give seconds or nanoseconds since 1970") from error
     except ArgumentError as error:
         raise DataError(str(error)) from error
