@@ -16,6 +16,8 @@ USAGE = {
     "peaks i.h5 --detector cfar --false-alarm 0": "--false-alarm is 0; give",
     "compare t.h5 --min-level nan": "--min-level is nan; give a finite number",
     "plot i.h5 -o a.png --dynamic-range 0": "--dynamic-range is 0; give a number above 0",
+    "plot i.h5 -o a.png --dynamic-range 1e300": "Invalid value for '--dynamic-range': 1e+300 is not in the range",
+    "plot eRTIS_v2 -o a.png --kind array --frequency 1e300": "Invalid value for '--frequency': 1e+300 is not in the",
     "plot i.h5 -o a.png --kind slices --left nan": "--left is nan; give a finite number",
     "plot eRTIS_v2 -o a.png --kind array --frequency 0": "--frequency is 0; give a number above 0",
     "plot eRTIS_v2 -o a.png --kind array --steer 100:0": (

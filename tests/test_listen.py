@@ -162,8 +162,8 @@ def test_listen_without_images_writes_no_file(tmp_path, monkeypatch, product):
             publisher.address, "--product", product, "--save", tmp_path / "none.h5", "--duration", 0.2, "--json"
         )
     assert done.exit_code == 1
-    reasons = {"raw": "is not written, because no measurement was received"}
-    reason = f"none.h5 {reasons.get(product, 'would contain no measurement')}"
+    received = {"raw": "measurement", "energyscape": "image"}[product]
+    reason = f"none.h5 is not written, because no {received} was received; run the command for a longer time"
     assert reason in done.stderr or reason in str(done.exception)
     last = json.loads(done.stdout.splitlines()[-1])
     assert (last["event"], last["received"], last["output"]) == ("listened", 0, None)

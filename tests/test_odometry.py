@@ -181,6 +181,19 @@ def test_odometry_command_explains_what_it_cannot_use(folder, tmp_path, names, s
     assert not target.exists()
 
 
+def test_odometry_command_refuses_settings_without_images(folder, tmp_path):
+    (tmp_path / "beams.toml").write_text('[processing]\nlast_stage = "beams"\n')
+    code, _, stderr = run(folder / "both.h5", "--settings", tmp_path / "beams.toml", "-o", tmp_path / "path.tum")
+    assert code == 2
+    assert 'beams, but echoes come from images; give last_stage = "envelope" in --settings FILE' in stderr
+
+
+def test_odometry_command_refuses_another_format_at_once(folder, tmp_path):
+    code, _, stderr = run(folder / "both.h5", "-o", tmp_path / "path.csv")
+    assert (code, stderr.count("\n")) == (1, 1)
+    assert "path.csv ends in .csv, but the file is text of TUM; give a name in .tum or .txt" in stderr
+
+
 def test_odometry_command_notes_steps_without_matches(folder, tmp_path):
     """The platform stands for two seconds without pulses before it drives on."""
     given, mounting = [], {}

@@ -167,7 +167,7 @@ def test_process_command_writes_the_results_of_a_stage(recording, tmp_path, stag
         (
             ("-o", "x.npz", "--last-stage", "beams", "--method", "paper"),
             1,
-            "but processing.method 'paper' returns none",
+            "but --method 'paper' returns none",
         ),
         (("-o", "x.npz", "--last-stage", "beams", "--sensor", "left"), 1, "left"),
     ],

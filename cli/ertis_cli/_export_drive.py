@@ -175,5 +175,5 @@ def _measured(
 
 
 def _as_recorded(settings: "Settings") -> "Settings":
-    _results.require_image(settings)
+    _results.require_image(settings, "odometry needs images; give --odometry TRAJ")
     return settings

@@ -201,7 +201,7 @@ def image_settings(settings_file: "Path | None", preset: str | None) -> "Callabl
 
     def changed(recorded: "Settings") -> "Settings":
         settings = options.settings_with(recorded, settings_file=settings_file, preset=preset)
-        _results.require_image(settings)
+        _results.require_image(settings, 'echoes come from images; give last_stage = "envelope" in --settings FILE')
         return settings
 
     return changed

@@ -27,15 +27,14 @@ def is_results_file(target: str | None) -> bool:
     return target is not None and Path(target).suffix.lower() == ".npz"
 
 
-def require_image(settings: "Settings") -> None:
-    """Raise an error if the last stage yields no image."""
+def require_image(
+    settings: "Settings",
+    reason: str = "an energyscape file holds images; give -o FILE.npz, or --last-stage envelope",
+) -> None:
+    """Raise an error with a reason and a remedy if the last stage yields no image."""
     stage = settings.processing.last_stage
     if stage != "envelope":
-        raise click.UsageError(
-            f"the last stage is {stage}, but an energyscape file holds images; give -o FILE.npz, or "
-            "--last-stage envelope",
-            click.get_current_context(),
-        )
+        raise click.UsageError(f"the last stage is {stage}, but {reason}", click.get_current_context())
 
 
 def write_results(

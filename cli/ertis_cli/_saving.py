@@ -51,6 +51,8 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
     DataError
         There is no product to save.
     """
+    from ertis_numba.errors import DataError
+
     if target is None:
         yield lambda _: None
         return
@@ -70,6 +72,10 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
                 writer.write(image)
 
             yield write
+            if not mounted:
+                raise DataError(
+                    f"{target} is not written, because no image was received; run the command for a longer time"
+                )
         return
     yield from _recording(target, overwrite=overwrite)
 

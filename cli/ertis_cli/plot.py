@@ -67,7 +67,12 @@ _ONLY = {
 @options.sensor("Sensor to plot; required if the file contains several sensors.")
 @options.measurement("Measurement, or map of a file of acoustic maps, to plot, counted from 0; the first by default.")
 @click.option(
-    "--dynamic-range", type=float, default=40.0, show_default=True, metavar="DB", help="Range of the colours."
+    "--dynamic-range",
+    type=click.FloatRange(max=1000.0),
+    default=40.0,
+    show_default=True,
+    metavar="DB",
+    help="Range of the colours.",
 )
 @click.option(
     "--theme",
@@ -99,7 +104,7 @@ _ONLY = {
 @click.option(
     "--frequency",
     "frequencies",
-    type=float,
+    type=click.FloatRange(max=1e9),
     multiple=True,
     metavar="HZ",
     help="Frequency of a beam pattern; repeatable up to five times.",

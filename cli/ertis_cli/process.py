@@ -203,7 +203,9 @@ def process(
             max_error_db=max_error_db,
         )
         settings = _acoustic_maps.with_map_options(settings, keys)
-        if not _results.is_results_file(target):
+        if fuse:
+            _results.require_image(settings, "--fuse needs images; give --last-stage envelope")
+        elif not _results.is_results_file(target):
             _results.require_image(settings)
         _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
         return settings
