@@ -232,7 +232,7 @@ def test_failed_recordings_do_not_stop_maps_of_others(folder):
     assert "passive.h5: all measurements become acoustic maps, which have no error budget; leave" in done.stderr
     assert names_in(folder / "images") == ["active.energy.h5"]
     done = run("process passive.h5 silent.h5 -o more --bands 80000:100000 --device cpu", code=1)
-    assert done.stderr.count("passive.bands_hz[0] ends at 100000 Hz, but the record reaches only 90000 Hz") == 2
+    assert done.stderr.count("--bands ends at 100000 Hz, but the record reaches only 90000 Hz") == 2
 
 
 @pytest.mark.usefixtures("in_test_process")
@@ -281,7 +281,7 @@ def test_options_without_effect_are_refused(folder, line, message):
 
 def test_errors_of_maps_leave_no_file(folder):
     done = run("process passive.h5 --bands 80000:100000 --device numpy", code=1)
-    assert "passive.bands_hz[0] ends at 100000 Hz, but the record reaches only 90000 Hz" in done.stderr
+    assert "--bands ends at 100000 Hz, but the record reaches only 90000 Hz" in done.stderr
     (folder / "passive.acoustic.h5").write_bytes(b"old")
     assert "exists" in run("process passive.h5 --device numpy", code=1).stderr
     assert (folder / "passive.acoustic.h5").read_bytes() == b"old"

@@ -179,8 +179,8 @@ def test_process_advice_on_faulty_microphones_works(recording, tmp_path):
 @pytest.mark.parametrize(
     ("channels", "message"),
     [
-        ("x", "'x' is not a list of channels; give integers, as in 5,12"),
-        ("40", "array.disabled is 40; give a whole number from 0 to 31"),
+        ("x", "'x' is not a list of channels; give integers from 0 to 1023, as in 5,12"),
+        ("40", "--without is 40; give a whole number from 0 to 31"),
     ],
 )
 def test_process_without_rejects_invalid_channels(recording, tmp_path, channels, message):

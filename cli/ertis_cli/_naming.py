@@ -9,7 +9,7 @@ import click
 
 from ertis_cli._config import long_name
 
-__all__ = ["name_options"]
+__all__ = ["name_options", "named"]
 
 _UNITS: Final = ("", "_bytes", "_c", "_db", "_deg", "_hz", "_limits_deg", "_m", "_ms", "_s")
 _KEY: Final = r"(?P<section>(?:accuracy|air|array|passive|processing)\.)?(?P<name>[a-z_]+)"
@@ -55,7 +55,7 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
             if not isinstance(error, ArgumentError):
                 raise
             ctx = click.get_current_context()
-            message = _named(str(error), ctx)
+            message = named(str(error), ctx)
             option = _refused(message, ctx)
             if option is not None and max(option.opts, key=len) not in _OF_FILES:
                 usage = click.UsageError(message, ctx=ctx)
@@ -67,7 +67,7 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _named(message: str, ctx: click.Context) -> str:
+def named(message: str, ctx: click.Context) -> str:
     """Return a message with the leading parameter name, and then others, replaced by the names of given options."""
     found = _NAMED.match(message)
     names = dict(_names(ctx))

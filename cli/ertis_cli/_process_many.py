@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _acoustic_maps, _plans, _progress, _tables, options
+from ertis_cli import _acoustic_maps, _naming, _plans, _progress, _tables, options
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -193,10 +193,12 @@ class _Report:
 
 
 def _named(event: "RecordingEnded") -> str:
-    """Return the error of a recording with the name of the recording."""
-    if not event.error or str(event.recording) in event.error:
+    """Return the error of a recording with the name of the recording, and with options as the user types them."""
+    before, context = f"{event.recording}: ", click.get_current_context(silent=True)
+    error = event.error.removeprefix(before)
+    if not error or str(event.recording) in error:
         return event.error
-    return f"{event.recording}: {event.error}"
+    return before + (error if context is None else _naming.named(error, context))
 
 
 def _lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
