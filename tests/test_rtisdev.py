@@ -29,14 +29,17 @@ from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation import Point, Scene
 from ertis_numba.simulation.render import render
 from tests import rtisdev_reference
+from tests.emulated import PATIENT, patient
 from tests.journals import ENVIRONMENT
 
+__all__ = ["patient"]  # A fixture, imported for use here.
+
 rtisdev = pytest.importorskip("rtisdev")
-pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore::DeprecationWarning"), PATIENT]
 
 ROOT = Path(__file__).parents[1]
 SCENE = ROOT / "data" / "synthetic" / "scenes" / "two_facing_sensors.toml"
-TIMEOUT_S = 200.0
+TIMEOUT_S = 600.0
 WIDE = ["3D_5m_1000", "3D_5m_3000", "3D_5m_4000", "3D_10m_3000"]
 MAX_ERROR_DB = -60
 N_COMBINED = 26  # ranges before and after a range whose sound contributes to it, half of 512 taps
