@@ -16,6 +16,7 @@ from ertis_numba.fusion.pairs import hypothesis, pair_of
 from ertis_numba.fusion.polar_grid import PolarGrid, close_directions
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, mounted_sensors
+from ertis_numba.fusion.tables import FusionTables
 from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
@@ -100,6 +101,16 @@ def test_fused_image_suppresses_foreign_echoes():
     levels = np.array(shown)
     assert np.all(levels[:, 0] < 10 ** (-15 / 20) * reference)
     assert np.sum(levels[:, 0] ** 2) < 10 ** (-20 / 10) * np.sum(levels[:, 1] ** 2)
+
+
+def test_power_of_a_pixel_counts_once(monkeypatch):
+    """Power that no reflector explains is no echo of several emitters at once."""
+    kept = []
+    monkeypatch.setattr(FusionTables, "points", lambda *given: kept.append(given[2].shares))
+    _ = ertis.fuse(images().values(), mountings()).points
+    for receiver in range(len(YAWS)):
+        total = sum(share for (_, number), share in kept[0].items() if number == receiver)
+        assert total.max() == pytest.approx(1, abs=1e-6)
 
 
 def test_fused_points_are_the_reflectors():

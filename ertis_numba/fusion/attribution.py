@@ -161,7 +161,9 @@ class Attribution:
                     return self._without(self._unheard | unheard)(images)
                 reflectivity = np.minimum(reflectivity, bound)
             shares = self._all_shares(images, reflectivity, confirmed, suppression)
-            reflectivity = self._mean(own, images, shares)
+            if suppression < _SUPPRESSION[-1]:
+                reflectivity = self._mean(own, images, shares)
+        _limit_sums(shares)
         return Attributed(np.minimum(self._mean(evidence, images, shares), bound), shares, self._unheard, bound)
 
     def single(self, images: Mapping[int, CoarseImage]) -> Singles:
@@ -351,6 +353,22 @@ class Attribution:
             values,
         )
         return _Evidence(pair, values)
+
+
+def _limit_sums(shares: Shares) -> None:
+    """Scale the shares of pixels whose power would count more than once.
+
+    A share is what rivals leave of a pixel, so each emitter has a share of power that no reflector explains.
+    """
+    for number in {number for _, number in shares}:
+        several = [share for (_, receiver), share in shares.items() if receiver == number]
+        factor = several[0].copy()
+        for share in several[1:]:
+            factor += share
+        np.maximum(factor, 1, out=factor)
+        np.reciprocal(factor, out=factor)
+        for share in several:
+            np.multiply(share, factor, out=share)
 
 
 def _rivalries(hypotheses: Sequence[Hypothesis], same_m: float) -> list[_Rivalry]:
