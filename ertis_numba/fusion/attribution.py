@@ -272,7 +272,7 @@ class Attribution:
             self._kernels.predict_echoes(each.begin, each.bounds, each.half_cell, each.half_gain, around, lobe, out)
         predicted = predicted.reshape(len(hypotheses), len(power))
         total = predicted.sum(axis=0)
-        found = {}
+        found: dict[tuple[int, int], Singles] = {}
         for index, (each, rivalry) in enumerate(zip(hypotheses, self._rivalries[number], strict=True)):
             if each.is_mirrored:
                 # Sound of an opposite emitter comes only from behind. Its echoes still confirm reflectors.
