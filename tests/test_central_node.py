@@ -203,16 +203,17 @@ def test_malformed_messages_are_counted_and_other_peers_served(tmp_path):
         stranger.socket.send_multipart([b""])
         node.measure(*given)
         node.hear_settled(12)
-        reported = ""
+        reported, n_repeated = "", 0
         while "has protocol version 1, " not in reported:  # flipping one bit never turns version 2 into 1
             if not stranger.socket.poll(500):  # a peer that does not read its socket loses answers
                 stranger.socket.send_multipart([b"eRTN\x01more"])
+                n_repeated += 1
             reported = stranger.hear(Refused).reason
     assert stored(tmp_path)[0] == wanted(given)
     refused = central.latest.refused
     assert refused["version"] >= 1
     assert "internal" not in refused
-    assert 200 < sum(refused.values()) < 310
+    assert 200 < sum(refused.values()) - n_repeated < 310
 
 
 def test_gap_with_line_feed_in_reason_is_refused(tmp_path):
