@@ -120,17 +120,23 @@ def test_command_obeys_its_control_file(tmp_path):
         try:
             events = (json.loads(line) for line in process.stdout)
 
+            def replace(text):
+                """Replace the file at once, so that the command never reads an empty one."""
+                new = tmp_path / "new.toml"
+                new.write_text(text)
+                new.replace(control)
+
             def text_of_note():
                 return next(event["text"] for event in events if event["event"] == "note")
 
             while next(events).get("topic") != "/front/points":
                 pass
-            control.write_text("paused = true")
+            replace("paused = true")
             assert text_of_note() == "new settings are in use"
-            control.write_text("speed = nothing")
+            replace("speed = nothing")
             assert "control.toml" in (text := text_of_note())
             assert text.endswith("; the former settings stay in use")
-            control.write_text("speed = 4.0")
+            replace("speed = 4.0")
             assert text_of_note() == "new settings are in use"
         finally:
             process.terminate()

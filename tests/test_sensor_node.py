@@ -9,7 +9,7 @@ import pytest
 from ertis_numba.errors import ArgumentError
 from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network import messages
-from ertis_numba.network.sensor_node import SensorNode, _outgoing_sessions as runs
+from ertis_numba.network.sensor_node import SensorNode, _link as link, _outgoing_sessions as runs
 from ertis_numba.settings import Air, Recording
 from tests.journals import EPOCH, TINY, entries, python
 from tests.sending import IMPATIENT, KEY, SOON_S, Node, has_all, impatient, until
@@ -57,7 +57,9 @@ def test_gaps_arrive_in_order():
     assert central.gaps[KEY] == [(5, 5, "footer"), (6, 6, "unplugged"), (7, 7, runs.NEVER_GIVEN)]
 
 
-def test_measurements_of_several_sensors_and_sessions_arrive():
+def test_measurements_of_several_sensors_and_sessions_arrive(monkeypatch):
+    for module, name in ((link, "_GREET_AGAIN_S"), (runs, "_PATIENCE_S")):  # A busy machine answers late.
+        monkeypatch.setattr(module, name, SOON_S)
     left, right, later = entries(20), entries(20, sensor="right", seed=2), entries(5, first=0, session_id=9, seed=3)
     with StandIn(window=2) as central, Node(central.address, ("left", "right")) as node:
         for pair in zip(left, right, strict=True):

@@ -12,7 +12,7 @@ import pytest
 from ertis_numba.errors import ArgumentError, DataError, NetworkError
 from ertis_numba.journal import LOST, Journal, JournalEntry
 from ertis_numba.journal._database import PAGE_BYTES
-from ertis_numba.network.sensor_node import _disk_spool as disk, _outgoing_sessions as runs
+from ertis_numba.network.sensor_node import _disk_spool as disk, _link as link, _outgoing_sessions as runs
 from ertis_numba.storage import open_recording
 from ertis_numba.storage.sealing import seal
 from tests.journals import ENVIRONMENT, EPOCH, TINY, create, entries
@@ -73,7 +73,9 @@ def test_acknowledged_measurements_leave_the_disk(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_earlier_sessions_are_sent_first(tmp_path):
+def test_earlier_sessions_are_sent_first(tmp_path, monkeypatch):
+    for module, name in ((link, "_GREET_AGAIN_S"), (runs, "_PATIENCE_S")):  # A busy machine answers late.
+        monkeypatch.setattr(module, name, SOON_S)
     old, older, new = entries(5, session_id=2), entries(5, session_id=1), entries(5, session_id=3)
     kept(tmp_path, older)
     journals(tmp_path)[0].rename(tmp_path / "20200101T000000Z-1.h5.journal")
