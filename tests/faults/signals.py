@@ -33,7 +33,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _STARTS = 5
 _MAX_TRIES = 10  # Tries per signal. Only signals that reach a running process count.
 _UNDISTURBED_S = 4.0
-_TIMEOUT_S = 30.0
+_TIMEOUT_S = 120.0
 _FAULTS = ("late", "codes", "tracebacks")
 _WAITING_S: Final = {"configure": 2.5, "status": 2.5}
 """Time in which a command waits for an answer; it fails some time later without one."""
