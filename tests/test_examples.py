@@ -142,11 +142,12 @@ def test_safety_stop_prints_every_change_of_speed(safety_stop, monkeypatch):
             publisher.publish(now(sequence, x_m, late_s))
 
     numbers = iter(range(100))
+    monkeypatch.setattr(safety_stop, "SILENCE_S", WAIT_S)  # Images are late on a busy machine.
     with Publisher() as publisher, running(monkeypatch, safety_stop.main, publisher.address, "front") as printed:
         publisher.pump(lambda: len(publisher.peers) == 1)
         until(["stop"])  # no image arrived yet
-        see(4.0, late_s=2.0)  # too old
-        see(4.0, late_s=-2.0)  # stamped in the future
+        see(4.0, late_s=2 * WAIT_S)  # too old
+        see(4.0, late_s=-2 * WAIT_S)  # stamped in the future
         see(4.0)
         until(["stop", "slow"])
         see(4.0)
@@ -155,6 +156,7 @@ def test_safety_stop_prints_every_change_of_speed(safety_stop, monkeypatch):
         until(["stop", "slow", "go", "stop"])
         see(1.3)
         until(["stop", "slow", "go", "stop", "slow"])
+        monkeypatch.setattr(safety_stop, "SILENCE_S", 0.1)
         until(["stop", "slow", "go", "stop", "slow", "stop"])  # no more images
 
 
