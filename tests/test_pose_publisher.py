@@ -444,10 +444,14 @@ def test_map_needs_no_trajectory_file(tmp_path):
     script.write_text(SCRIPT)
     place = {"translation_m": (0.1, 0.0, 0.4), "rotation_xyzw": IDENTITY}
     with Recording(tmp_path / "rec") as central, Node(central.address) as node:
-        subprocess.run([sys.executable, script, central.address], check=True, timeout=120, env=ENVIRONMENT)
-        node.hello("left", first=0, session_id=0, settings=measured[0].measurement.settings, **place)
-        node.measure(*measured)
-        node.hear_settled(2)
+        command = [sys.executable, script, central.address]
+        with subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True) as process:
+            # A node keeps poses before the first measurement for some seconds only, and processes may end slowly.
+            assert process.stdout.readline() == "sent\n"
+            node.hello("left", first=0, session_id=0, settings=measured[0].measurement.settings, **place)
+            node.measure(*measured)
+            node.hear_settled(2)
+        assert process.returncode == 0
         central.process.send_signal(signal.SIGTERM)
         assert central.event("sealed")["text"] == "1 measurement has no pose, because poses were missing at its time"
     recording = the_recording(tmp_path / "rec")
@@ -466,6 +470,7 @@ with PosePublisher(sys.argv[1], ["left"]) as publisher:
     for time_ns in range(0, 160_000_000, 10_000_000):
         publisher.send(time_ns, (10.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     publisher.flush(60.0)
+    print("sent", flush=True)
 """
 
 
