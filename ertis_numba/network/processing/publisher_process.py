@@ -182,8 +182,8 @@ class _Publisher:
         for item in items:
             self._subscribers.offer(item)
         published_ns = time.monotonic_ns()
+        mark("published", sensor, note.data.sequence)  # Before this process wakes others that may take its core.
         self._pipe.send(pipe_messages.ProductsQueued(job=note.job, published_ns=published_ns))
-        mark("published", sensor, note.data.sequence)
 
     def _hear(self, frames: list[zmq.Frame]) -> None:
         """Process a request of an application, or refuse it; never raises for its content."""
