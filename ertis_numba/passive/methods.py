@@ -95,9 +95,10 @@ def _powers_outside(vectors: Vectors, waves: Waves) -> Powers:
     """
     n_mics = vectors.shape[2]
     powers: Powers = n_mics - waves.steer_vectors(vectors.astype(np.complex64))
-    bins, directions = np.nonzero(powers < _CANCELLED * n_mics)
-    inside = np.einsum("knm,km->kn", vectors[bins].conj(), waves.vectors(bins, directions))
-    powers[bins, directions] = n_mics - (np.abs(inside) ** 2).sum(axis=1)
+    for k in np.flatnonzero(powers.min(axis=1) < _CANCELLED * n_mics):
+        near = np.flatnonzero(powers[k] < _CANCELLED * n_mics)
+        inside = waves.vectors(np.full_like(near, k), near) @ vectors[k].conj().T
+        powers[k, near] = n_mics - (np.abs(inside) ** 2).sum(axis=1)
     return powers
 
 
