@@ -436,6 +436,12 @@ def test_fuser_needs_mountings():
         ertis.Fuser({})
 
 
+def test_fused_image_of_sensors_far_apart_is_refused():
+    far = {name: ((1e6 + number, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)) for number, name in enumerate(mountings())}
+    with pytest.raises(ArgumentError, match=r"would reach 1e\+06 m and have \d+ cells, .*; correct the mountings"):
+        ertis.Fuser(far)(images().values())
+
+
 @pytest.mark.parametrize(("name", "value"), [("spacing_deg", 0.0), ("range_step_m", 1e-3), ("spacing_deg", math.nan)])
 def test_fuser_refuses_grids_that_are_too_fine(name, value):
     with pytest.raises(ArgumentError, match=name):

@@ -223,6 +223,24 @@ def test_order_of_recordings_does_not_change_the_map(folder, tmp_path):
     assert re.search(r"have different poses at \d+ ns; give one trajectory, such as --poses FILE", done.stderr)
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("timeless.h5", "all 3 pulses have the same time, 0.000 s; give recordings of a set clock"),
+        ("left.h5", "at 0.000 s, the poses move at 300 m/s and turn at 0 °/s; correct the poses"),
+    ],
+)
+def test_map_refuses_times_and_poses_that_cannot_be(folder, name, message):
+    with ertis.open_recording(folder / "left.h5") as recording:
+        timeless = [replace(each, stamp=replace(each.stamp, timestamp_ns=0)) for each in recording]
+        write_recording(folder / "timeless.h5", timeless, overwrite=True)
+    path = ertis.Trajectory([0, 10**9], [[0.0, 0.0, 0.0], [300.0, 0.0, 0.0]], [UNTURNED] * 2)
+    ertis.write_tum(folder / "rocket.tum", path, overwrite=True)
+    done = run(folder, f"{name} --poses rocket.tum --mounting both.h5 -o no.h5", code=1)
+    assert f"ertis: error: {message}\n" in done.stderr
+    assert not (folder / "no.h5").exists()
+
+
 def test_map_leaves_out_pulses_outside_of_the_poses(folder):
     ertis.write_tum(folder / "late.tum", poses(start_ns=50_000_000))
     done = run(folder, "both.h5 --poses late.tum --json -o late.h5")

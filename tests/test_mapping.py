@@ -459,7 +459,7 @@ def test_grid_keeps_values_as_it_grows_in_all_directions(n_dimensions):
     assert log_odds.shape == (1,) * n_dimensions
     assert log_odds.item() == 3.0
     assert origin_m == pytest.approx((0.0,) * n_dimensions)
-    with pytest.raises(ArgumentError, match="give a larger cell_m"):
+    with pytest.raises(ArgumentError, match=r"give larger cells \(cell_m\), or poses closer"):
         grid.window(np.array([1e5, 0.0, 0.0]), 1.0)
 
 

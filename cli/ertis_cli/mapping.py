@@ -179,11 +179,15 @@ def _located(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajector
     Raises
     ------
     DataError
-        There is none.
+        There is none, or all have the same time.
     """
     from ertis_numba.errors import DataError
 
     times_ns = _times_ns(groups)
+    if len(groups) > 1 and len(set(times_ns)) == 1:
+        raise DataError(
+            f"all {len(groups)} pulses have the same time, {times_ns[0] / 1e9:.3f} s; give recordings of a set clock"
+        )
     located = [group for group, is_covered in zip(groups, trajectory.covers(times_ns), strict=True) if is_covered]
     if not located:
         first_ns, last_ns = trajectory.time_ns[[0, -1]].tolist()

@@ -62,8 +62,8 @@ class PolarGrid:
         grid = cls(n_azimuths, rows, max(1, math.ceil(last_m / step_m)), step_m, height_m)
         if grid.n_cells > MAX_CELLS:
             raise ArgumentError(
-                f"the fused image would have {grid.n_cells} cells; give a larger spacing_deg or range_step_m, "
-                f"for at most {MAX_CELLS} cells"
+                f"the fused image would reach {last_m:.4g} m and have {grid.n_cells} cells, but the limit is "
+                f"{MAX_CELLS}; correct the mountings, shorten the ranges, or give a larger spacing_deg or range_step_m"
             )
         return grid
 

@@ -134,8 +134,8 @@ class Mapper:
             The pose is invalid, the trajectory does not cover the time of the pulse, the images do not fit together or
             have too few dimensions, or the map would have too many cells.
         DataError
-            The images are not from the same pulse, no sensor emitted, or with a half-life, their time is before that of
-            earlier ones.
+            The images are not from the same pulse, no sensor emitted, the trajectory is too fast, or with a half-life,
+            the time of the images is before that of earlier ones.
         """
         group = tuple(checks.items("images", images, Energyscape, "Pipeline.process returns"))
         if self._dimensions == 3 and any(image.is_planar for image in group):
@@ -223,7 +223,13 @@ def _at_rest(points: PointCloud, trajectory: Trajectory, rotation: Floats) -> Po
     linear_m_s, angular_rad_s = (each[0] @ rotation for each in trajectory.velocity_at([points.stamp.timestamp_ns]))
     if np.isnan(linear_m_s).any():
         return points
-    return compensate_motion(points, linear_m_s.tolist(), float(angular_rad_s[2]))
+    try:
+        return compensate_motion(points, linear_m_s.tolist(), float(angular_rad_s[2]))
+    except ArgumentError as error:  # The velocity exceeds a limit.
+        raise DataError(
+            f"at {points.stamp.timestamp_ns / _NS_PER_S:.3f} s, the poses move at {np.linalg.norm(linear_m_s):.4g} m/s "
+            f"and turn at {math.degrees(angular_rad_s[2]):.4g} °/s; correct the poses"
+        ) from error
 
 
 def _pose(pose: Pose, time_ns: int) -> tuple[Floats, Floats, Floats]:
