@@ -112,6 +112,7 @@ def test_readme_commands_run(place, tmp_path_factory):
     assert (place / "shelf.png").stat().st_size > 10_000
 
 
+@pytest.mark.alone  # the emulator keeps a rate of pulses
 def test_commands_of_the_devices_page_run(place):
     """The first emulator replays a recording of its scene, which starts sooner."""
     with contextlib.ExitStack() as background:
@@ -121,7 +122,7 @@ def test_commands_of_the_devices_page_run(place):
             else:
                 run_here(place, command)
     with open_recording(place / "BOTH.h5", sensor="east") as recording:
-        assert 0 < len(recording) <= 20  # On a busy machine, the emulator ignores pulses during a measurement.
+        assert 10 <= len(recording) <= 20  # A busy emulator ignores pulses during a measurement.
 
 
 def test_readme_example_runs(place, monkeypatch):
