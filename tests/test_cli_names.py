@@ -1,8 +1,9 @@
 """Error messages name options as typed, even if the library rejects the value."""
 
+import click
 import pytest
 from click.testing import CliRunner
-from ertis_cli import options
+from ertis_cli import _naming, options
 from ertis_cli.main import cli
 
 from ertis_numba.storage import GroundTruth, write_acoustic_maps, write_energyscapes, write_recording
@@ -41,6 +42,12 @@ USAGE = {
     "plot m.h5 -o a.png --photo a.jpg --photo-fov 200,40": "--photo-fov is 200; give a number from 1 to 170",
     "plot m.h5 -o a.png -m -1": "Invalid value for '--measurement' / '-m': -1 is not in the range x>=0",
     "export i.h5 -o a.csv -m -1": "Invalid value for '--measurement' / '-m': '-1' is not a measurement; give one",
+    "capture --port p -n 1 --to tcp://127.0.0.1:9 --ring nan": "--ring is nan; give a finite number",
+    "capture --port p -n 1 --to tcp://127.0.0.1:9 --spool s --spool-size inf": "--spool-size is inf; give a finite",
+    "capture --port p -n 1 --wait nan": "--wait is nan; give a finite number",
+    "capture --port p -n 1 --emissions 2 --emission-period nan": "--emission-period is nan; give a finite number",
+    "emulate r.h5 --sync-rate nan": "--sync-rate is nan; give a finite number",
+    "view i.h5 --clean-within nan": "--clean-within is nan; give a finite number",
     "calibrate r.h5 -o a.toml --gain-tolerance nan": "--gain-tolerance is nan; give a finite number",
     "status tcp://127.0.0.1:9 --patience 0": "--patience is 0; give a number above 0",
     "listen localhost": "address 'localhost' cannot be used; give tcp://HOST:PORT",
@@ -110,3 +117,19 @@ def test_plot_steer_rejects_a_single_number(folder, monkeypatch):
     done = CliRunner().invoke(cli, ["plot", "eRTIS_v2", "-o", "a.png", "--kind", "array", "--steer", "30"])
     assert done.exit_code == 2
     assert "'30' is not a direction; give azimuth and elevation, each from -90 to 90, as in 30:0" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("given", "message", "stated"),
+    [
+        ("--method fast", "passive.method is 'music'; give another", "passive.method"),
+        ("--map-method music", "passive.method is 'music'; give another", "--map-method"),
+        ("--map-method music", "processing.method is 'fast'; give another", "processing.method"),
+        ("--method fast", "processing.method is 'fast'; give another", "--method"),
+        ("--average 3", "passive.averages is 3; give another", "--average"),
+        ("--bands octaves", "passive.bands_hz[0] ends at 9 Hz; give another", "--bands"),
+    ],
+)
+def test_keys_of_images_and_maps_are_told_apart(given, message, stated):
+    ctx = cli.get_command(click.Context(cli), "process").make_context("process", ["a.h5", "-o", "b.h5", *given.split()])
+    assert _naming.named(message, ctx) == f"{stated} {message.partition(' ')[2]}"

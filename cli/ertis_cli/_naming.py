@@ -1,6 +1,7 @@
 """Names and exit codes of refused option values: ``--min-level is 3`` and 2 for ``min_level_db is 3``."""
 
 import functools
+import math
 import re
 from collections.abc import Callable, Iterator
 from typing import Any, Final
@@ -18,6 +19,8 @@ _NAMED: Final = re.compile(
     r"(?(section)(?= )|(?= (?:is|holds|runs from)\b))"
 )
 _AGAIN: Final = re.compile(rf"(?<![\w./-]){_KEY}(?:\[\d+\])?(?![\w./])")
+_OF_MAPS: Final = "passive_"
+"""Parameters of acoustic maps begin with it, and their keys with ``passive.``"""
 _KEYS: Final = {"without": "disabled"}
 """Keys of settings whose option has another name."""
 _TYPED: Final = re.compile(
@@ -47,6 +50,7 @@ def name_options(command: click.Command) -> None:
 def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(callback)
     def call(*arguments: Any, **options: Any) -> Any:
+        _require_finite(click.get_current_context())
         try:
             return callback(*arguments, **options)
         except ValueError as error:  # a builtin, so that the package need not be imported
@@ -58,27 +62,46 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
             message = named(str(error), ctx)
             option = _refused(message, ctx)
             if option is not None and max(option.opts, key=len) not in _OF_FILES:
-                usage = click.UsageError(message, ctx=ctx)
-                usage.param = option  # type: ignore[attr-defined]  # as for click.BadParameter
-                raise usage from error
+                raise _usage_error(message, option, ctx) from error
             error.args = (message, *error.args[1:])
             raise
 
     return call
 
 
+def _require_finite(ctx: click.Context) -> None:
+    """Raise an error for NaN and infinity, which lie within the ranges of click."""
+    for option in _given(ctx):
+        value = ctx.params.get(str(option.name))
+        for each in value if isinstance(value, tuple) else (value,):
+            if isinstance(each, float) and not math.isfinite(each):
+                name = long_name(option) if isinstance(option, click.Option) else str(option.name)
+                raise _usage_error(f"--{name} is {each}; give a finite number", option, ctx)
+
+
+def _usage_error(message: str, option: click.Parameter, ctx: click.Context) -> click.UsageError:
+    error = click.UsageError(message, ctx=ctx)
+    error.param = option  # type: ignore[attr-defined]  # as for click.BadParameter
+    return error
+
+
 def named(message: str, ctx: click.Context) -> str:
     """Return a message with the leading parameter name, and then others, replaced by the names of given options."""
     found = _NAMED.match(message)
     names = dict(_names(ctx))
-    if found is None or found["name"] not in names:
+    if found is None or _key(found) not in names:
         return message
 
     def again(other: re.Match[str]) -> str:
         is_key = other["section"] or "_" in other["name"]  # other words are no names
-        return names.get(other["name"], other[0]) if is_key else other[0]
+        return names.get(_key(other), other[0]) if is_key else other[0]
 
-    return f"{found['before'] or ''}{names[found['name']]}{_AGAIN.sub(again, message[found.end() :])}"
+    return f"{found['before'] or ''}{names[_key(found)]}{_AGAIN.sub(again, message[found.end() :])}"
+
+
+def _key(found: re.Match[str]) -> str:
+    """Return a name in a message, in which keys of acoustic maps differ from those of images."""
+    return (_OF_MAPS if found["section"] == "passive." else "") + found["name"]
 
 
 def _names(ctx: click.Context) -> Iterator[tuple[str, str]]:
@@ -86,7 +109,9 @@ def _names(ctx: click.Context) -> Iterator[tuple[str, str]]:
     for option in _given(ctx):
         if isinstance(option, click.Option):
             name = long_name(option)
-            for each in {str(option.name), name.replace("-", "_"), _KEYS.get(name, name)}:
+            is_of_maps = str(option.name).startswith(_OF_MAPS)
+            typed = f"{_OF_MAPS if is_of_maps else ''}{name.replace('-', '_')}"
+            for each in {str(option.name), typed, _KEYS.get(name, typed)}:
                 yield from ((f"{each}{unit}", f"--{name}") for unit in _UNITS)
 
 
