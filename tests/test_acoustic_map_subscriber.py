@@ -16,7 +16,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Bearing, Measurement
 from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
 from ertis_numba.passive import AcousticCamera
-from tests.publishing import PATIENCE_S, PATIENT_APPLICATIONS, Publisher, events_of, measurement, patient_applications
+from tests.publishing import PATIENCE_S, PATIENT_APPLICATIONS, Publisher, measurement, patient_applications
 
 __all__ = ["patient_applications"]  # A fixture, imported for use here.
 
@@ -144,7 +144,7 @@ def listen_to_bearings(measurements, *arguments):
 def test_listen_prints_bearings():
     (heard,) = heard_leak("3d:1000")
     settings, shown = heard.settings, listen_to_bearings([heard], "-q", "--json")
-    first, found, summary = events_of(shown.stdout.splitlines())
+    first, found, summary = map(json.loads, shown.stdout.splitlines())
     assert (first["event"], first["sensors"], first["products"]) == ("subscribed", None, ["raw"])
     assert (summary["received"], found["averages"], found["sensor"]) == (1, 1, "inspector")
     (leak,) = found["bearings"]
@@ -162,7 +162,7 @@ def test_listen_warns_once_of_given_directions_at_one_elevation():
     assert len(lines) >= 2
     assert all(line.split("kHz")[1].count("unknown") == 1 for line in lines)
     shown = listen_to_bearings(heard[:1], "--directions", "2d:61", "--json")
-    _, found, _ = events_of(shown.stdout.splitlines())
+    _, found, _ = map(json.loads, shown.stdout.splitlines())
     assert found["bearings"]
     assert all(each["upwards_deg"] is None and each["sideways_deg"] > 0 for each in found["bearings"])
 
@@ -171,7 +171,7 @@ def test_listen_warns_once_of_given_directions_at_one_elevation():
 def test_listen_searches_a_half_space_by_default_or_given_directions(arguments):
     shown = listen_to_bearings(heard_leak("2d:61"), "--json", *arguments)
     assert "warning" not in shown.stderr
-    _, found, _ = events_of(shown.stdout.splitlines())
+    _, found, _ = map(json.loads, shown.stdout.splitlines())
     (leak,) = found["bearings"]
     assert (leak["azimuth_deg"], leak["elevation_deg"]) == (pytest.approx(28, abs=0.5), pytest.approx(12, abs=0.5))
 

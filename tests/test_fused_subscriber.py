@@ -1,5 +1,6 @@
 """Fused images of a central node, as an application receives them."""
 
+import json
 import threading
 
 import numpy as np
@@ -11,7 +12,7 @@ from ertis_cli.main import cli
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.fusion import Fuser
 from ertis_numba.network.fused_subscriber import FusedSubscriber
-from tests.publishing import PATIENCE_S, PATIENT_APPLICATIONS, Publisher, events_of, image, patient_applications
+from tests.publishing import PATIENCE_S, PATIENT_APPLICATIONS, Publisher, image, patient_applications
 
 __all__ = ["patient_applications"]  # A fixture, imported for use here.
 
@@ -153,7 +154,7 @@ def test_listen_prints_fused_pulses(tmp_path):
     with Publisher() as publisher, publisher.playing(pulses(count=6)):
         shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments, "--json"])
     assert shown.exit_code == 0, shown.output
-    subscribed, fused, summary = events_of(shown.stdout.splitlines())
+    subscribed, fused, summary = map(json.loads, shown.stdout.splitlines())
     assert (subscribed["event"], subscribed["products"]) == ("subscribed", ["energyscape"])
     assert fused["sensors"] == ["front", "back"]
     assert fused["nearest_m"][0] == pytest.approx(-1.14, abs=0.02)

@@ -50,7 +50,7 @@ def heard(items, *arguments):
 
 def events(done):
     assert done.exit_code == 0, (done.stderr, done.exception)
-    return list(events_of(done.stdout.splitlines()))
+    return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 def test_listen_prints_a_line_per_image():

@@ -257,7 +257,7 @@ def test_listen_prints_poses_and_writes_the_trajectory(tmp_path, mounting):
     with Publisher() as publisher, publisher.playing(images(*range(6))):
         shown = CliRunner().invoke(cli, ["listen", publisher.address, *arguments, "--json"])
     assert shown.exit_code == 0, shown.output
-    subscribed, first, second, summary = events_of(shown.stdout.splitlines())
+    subscribed, first, second, summary = map(json.loads, shown.stdout.splitlines())
     assert (subscribed["event"], subscribed["products"]) == ("subscribed", ["energyscape"])
     assert (first["event"], first["x_m"], first["velocity_m_s"], first["measured"]) == ("odometry", 0.0, None, True)
     assert math.hypot(*second["velocity_m_s"]) == pytest.approx(np.hypot(*STEP_M) / 0.1, abs=0.02)
