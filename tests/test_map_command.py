@@ -226,11 +226,11 @@ def test_order_of_recordings_does_not_change_the_map(folder, tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("timeless.h5", "all 3 pulses have the same time, 0.000 s; give recordings of a set clock"),
+        ("timeless.h5", "all 3 pulses have the same time, 0.000 s; set the clock of the sensors, and record again"),
         ("left.h5", "at 0.000 s, the poses move at 300 m/s and turn at 0 °/s; correct the poses"),
     ],
 )
-def test_map_refuses_times_and_poses_that_cannot_be(folder, name, message):
+def test_map_refuses_impossible_times_and_poses(folder, name, message):
     with ertis.open_recording(folder / "left.h5") as recording:
         timeless = [replace(each, stamp=replace(each.stamp, timestamp_ns=0)) for each in recording]
         write_recording(folder / "timeless.h5", timeless, overwrite=True)

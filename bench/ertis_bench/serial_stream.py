@@ -101,7 +101,7 @@ def _send(job: _SenderJob) -> None:
     That is the time before it is written: on a busy machine, the image can be ready before this process runs again.
     The first block is sent after the signal that the receiver has opened the terminal.
     """
-    signal.pthread_sigmask(signal.SIG_BLOCK, {_BEGIN})  # It waits until it is asked for.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {_BEGIN})  # It stays pending until sigwait.
     words, terminal = np.load(job.words), Terminal()
     _emit_event(event="ready", port=terminal.port)
     signal.sigwait({_BEGIN})

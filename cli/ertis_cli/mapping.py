@@ -186,7 +186,8 @@ def _located(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajector
     times_ns = _times_ns(groups)
     if len(groups) > 1 and len(set(times_ns)) == 1:
         raise DataError(
-            f"all {len(groups)} pulses have the same time, {times_ns[0] / 1e9:.3f} s; give recordings of a set clock"
+            f"all {len(groups)} pulses have the same time, {times_ns[0] / 1e9:.3f} s; set the clock of the sensors, "
+            "and record again"
         )
     located = [group for group, is_covered in zip(groups, trajectory.covers(times_ns), strict=True) if is_covered]
     if not located:

@@ -276,7 +276,8 @@ class Attribution:
         for index, (each, rivalry) in enumerate(zip(hypotheses, self._rivalries[number], strict=True)):
             if each.is_mirrored:
                 # Sound of an opposite emitter comes only from behind. Its echoes still confirm reflectors.
-                found.setdefault((each.emitter, number), np.zeros_like(power))
+                if (each.emitter, number) not in found:
+                    found[each.emitter, number] = np.zeros_like(power)
                 continue
             expected = _NONE
             if each.emitter == number and confirmed is not None:

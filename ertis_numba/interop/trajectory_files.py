@@ -196,7 +196,7 @@ def _read_mcap(path: Path, topic: str | None) -> Trajectory:
             chosen = _topic({} if summary is None else _pose_topics(summary), topic)
             messages = [message for *_, message in reader.iter_decoded_messages(topics=[chosen], log_time_order=True)]
             return _of_messages(_some(messages))
-        except ErtisError:
+        except (ErtisError, MemoryError, OSError):
             raise
         except Exception as error:  # The libraries raise errors of any type.
             raise DataError(

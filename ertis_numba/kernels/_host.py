@@ -58,7 +58,7 @@ class HostMemory:
     def table(self, array: Array) -> Array:
         """Return ``array`` on the device. Callers must not modify it afterwards.
 
-        Its order is that of a GPU's arrays: Numba compiles a kernel again for each other order.
+        It is contiguous in the order of C, because Numba compiles a kernel again for each other order.
         """
         return cast("Array", np.ascontiguousarray(array).reshape(array.shape))
 

@@ -91,7 +91,8 @@ def main(job: FusedReceiverJob) -> None:
             line = FusedPulse(count, len(arrival.images), arrival.first_ns, arrival.ready_ns, time.monotonic_ns())
             os.write(diary, f"{json.dumps(line)}\n".encode())
             if n_points:
-                kept += [arrival] * (n_located % _CHECKED == 0)
+                if n_located % _CHECKED == 0:
+                    kept.append(arrival)
                 n_located += 1
         _emit(event="received", skipped=subscriber.n_skipped, dropped=subscriber.counts.dropped, **checked(job, kept))
     os.close(diary)

@@ -121,19 +121,16 @@ class Serve:
                 return True
         return False
 
-    def deliver(self, images: Path, *, timeout_s: float = 60.0) -> bool:
+    def deliver(self, images: Path, *, timeout_s: float = 60.0) -> None:
         """Wait until an application has received all published images, or learned that they were skipped for it.
+
+        After a timeout, the counts of the application show which images are missing.
 
         Parameters
         ----------
         images : Path
             Diary of the application, which has received images since the start of the central node.
         timeout_s : float
-
-        Returns
-        -------
-        bool
-            False after a timeout.
         """
         published = 0 if self.latest is None else sum(each.published for each in self.latest.sensors.values())
 
@@ -141,7 +138,7 @@ class Serve:
             received = read_received(images)
             return len(received.numbers) + received.dropped >= published
 
-        return until(is_complete, timeout_s=timeout_s)
+        until(is_complete, timeout_s=timeout_s)
 
     def processes(self) -> dict[str, list[int]]:
         """Return the processes of the central node."""

@@ -2,7 +2,7 @@
 """Compute the power that vectors have for the wave from each direction.
 
 Two vectors at a time accumulate their products in registers, so that each phase of a tile of directions is read for two
-vectors. Few microphones are summed before their total, so that rounding errors are about a third.
+vectors. Groups of eight microphones are summed first, which reduces rounding errors to about a third.
 """
 
 import numpy as np

@@ -2,8 +2,8 @@
 """Compute the power that vectors have for the wave from each direction.
 
 A thread handles one direction at one bin. It computes the phase of a microphone once, in workspace, and then reads it
-for each vector. All threads of a block read the same element of a vector at a time. Few microphones are summed before
-their total, so that rounding errors are about a third.
+for each vector. All threads of a block read the same element of a vector at a time. Groups of eight microphones are
+summed first, which reduces rounding errors to about a third.
 """
 
 import numpy as np

@@ -121,7 +121,7 @@ def _send_through_fault(
 
 
 def _acked_in_fault(address: str, sensor: str, diary: Path) -> tuple[int, int, str]:
-    """Watch a node with a failing disk for a time in which it stores nothing: a nearly full disk may take some more.
+    """Count acknowledgements while a node stores nothing. A nearly full disk may still store a few measurements.
 
     Returns
     -------
