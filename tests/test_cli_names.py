@@ -33,6 +33,7 @@ USAGE = {
     "process r.h5 -o a.h5 --bands 3000:5000,4000:6000": "--bands has overlapping bands 3000 to 5000 Hz and 4000",
     "process r.h5 -o a.h5 --directions 2d:9 --azimuth 200:300": "--azimuth is 200; give a number from -180 to 180",
     "process r.h5 -o a.h5 --directions 3d:9 --elevation 9:0": "--elevation runs from 9 to 0; give the smaller number",
+    "process r.h5 -o a.h5 --directions 2d:99999999999": "directions '2d:99999999999' has a count of 11 digits; give",
     "process r.h5 -o a.h5 --array-weights han": "--array-weights 'han' is unknown (did you mean 'hann'?); known are",
     "process r.h5 -o a.h5 --array-weights hann:3": "--array-weights is 'hann:3' although the window hann has no",
     "process r.h5 -o a.h5 --array-weights taylor:90": "parameter of --array-weights taylor is 90; give a number from",

@@ -30,7 +30,7 @@ _TYPED: Final = re.compile(
 """Messages about a value that is wrong by itself: other reasons follow a comma."""
 _QUOTED: Final = re.compile(
     r"(?!sensor ['\"])(?:count of )?(?P<name>[a-z_]+)(?: name)? (?P<quote>['\"])(?P<value>.*?)(?P=quote) "
-    r"(?:cannot (?:be used|name)|has no count|is (?:not a grid|unknown|\d+;))"
+    r"(?:cannot (?:be used|name)|has (?:no count|a count of)|is (?:not a grid|unknown|\d+;))"
 )
 """The same for quoted values, such as ``layout 'eRTIS_v9' is unknown``; sensors depend on files."""
 _OF_FILES: Final = frozenset({"--measurement", "--without"})
