@@ -124,6 +124,8 @@ def test_plot_steer_rejects_a_single_number(folder, monkeypatch):
     ("given", "message", "stated"),
     [
         ("--method fast", "passive.method is 'music'; give another", "passive.method"),
+        ("--without 3", "array.disabled is 99; give another", "array.disabled"),
+        ("--without 99", "array.disabled is 99; give another", "--without"),
         ("--map-method music", "passive.method is 'music'; give another", "--map-method"),
         ("--map-method music", "processing.method is 'fast'; give another", "processing.method"),
         ("--method fast", "processing.method is 'fast'; give another", "--method"),
@@ -131,6 +133,6 @@ def test_plot_steer_rejects_a_single_number(folder, monkeypatch):
         ("--bands octaves", "passive.bands_hz[0] ends at 9 Hz; give another", "--bands"),
     ],
 )
-def test_keys_of_images_and_maps_are_told_apart(given, message, stated):
+def test_keys_that_are_no_options_keep_their_names(given, message, stated):
     ctx = cli.get_command(click.Context(cli), "process").make_context("process", ["a.h5", "-o", "b.h5", *given.split()])
     assert _naming.named(message, ctx) == f"{stated} {message.partition(' ')[2]}"

@@ -89,7 +89,7 @@ def named(message: str, ctx: click.Context) -> str:
     """Return a message with the leading parameter name, and then others, replaced by the names of given options."""
     found = _NAMED.match(message)
     names = dict(_names(ctx))
-    if found is None or _key(found) not in names:
+    if found is None or _key(found) not in names or not _may_be_typed(found, ctx):
         return message
 
     def again(other: re.Match[str]) -> str:
@@ -97,6 +97,13 @@ def named(message: str, ctx: click.Context) -> str:
         return names.get(_key(other), other[0]) if is_key else other[0]
 
     return f"{found['before'] or ''}{names[_key(found)]}{_AGAIN.sub(again, message[found.end() :])}"
+
+
+def _may_be_typed(found: re.Match[str], ctx: click.Context) -> bool:
+    """Return False for a channel that only the settings exclude."""
+    channels = ctx.params.get("without")
+    value = re.match(r" is (\d+)", found.string[found.end() :])
+    return found["name"] != _KEYS["without"] or not (channels and value) or int(value[1]) in channels
 
 
 def _key(found: re.Match[str]) -> str:

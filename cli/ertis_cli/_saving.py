@@ -74,7 +74,8 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
             yield write
             if not mounted:
                 raise DataError(
-                    f"{target} is not written, because no image was received; run the command for a longer time"
+                    f"{target} is not written, because no image was received; check 'ertis status', or run the "
+                    "command longer"
                 )
         return
     yield from _recording(target, overwrite=overwrite)
@@ -132,7 +133,8 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
         if not len(journal):
             journal.remove()
             raise DataError(
-                f"{target} is not written, because no measurement was received; run the command for a longer time"
+                f"{target} is not written, because no measurement was received; check 'ertis status', or run the "
+                "command longer"
             )
     sealed = seal_in_subprocess(path, overwrite=overwrite)
     if sealed.recording is None:
