@@ -291,13 +291,29 @@ def test_keys_grant_each_node_its_listed_permissions(tmp_path):
         (("--duration", "0"), "--duration is 0; give a number above 0", 2),
         (("--deadline", "0"), "--deadline is 0; give a number above 0", 2),
         (("--range", "5:1"), "--range runs from 5 to 1", 2),
+        (("--directions", "foo"), "directions 'foo' is not a grid; give 90", 2),
+        (("--directions", "3x:5"), "directions '3x:5' is not a grid; give 90", 2),
+        (("--directions", "2d:0"), "count of directions '2d:0' is 0; give a whole number from 1", 2),
+        (("--directions", "2d:1000001"), "count of directions '2d:1000001' is 1000001; give a whole number from 1", 2),
+        (("--directions", "2d:99999999999"), "directions '2d:99999999999' has a count of 11 digits; give at most", 2),
+        (("--directions", "missing.csv"), "directions missing.csv: No such file or directory; give a readable CSV", 1),
     ],
 )
 def test_serve_refuses_invalid_options_in_one_line(options, reported, code):
-    done = CliRunner().invoke(cli, ["serve", "--listen", "tcp://127.0.0.1:0", *options])
+    serve = ["serve", "--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--duration", "0.1"]
+    done = CliRunner().invoke(cli, [*serve, *options])
     assert done.exit_code == code
     (line,) = done.stderr.splitlines()
     assert reported in line
+
+
+def test_serve_refuses_directions_of_its_environment_variable():
+    serve = ["serve", "--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--duration", "0.1"]
+    done = CliRunner().invoke(cli, serve, env={"ERTIS_SERVE_DIRECTIONS": "foo"})
+    assert done.exit_code == 2
+    (line,) = done.stderr.splitlines()
+    assert "directions 'foo' is not a grid" in line
+    assert "(from the variable ERTIS_SERVE_DIRECTIONS)" in line
 
 
 def test_refused_serve_leaves_no_files(tmp_path):

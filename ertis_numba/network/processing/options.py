@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry import direction_grid
 from ertis_numba.network.addresses import DEFAULT_PUBLISH
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.settings import Settings
@@ -51,7 +52,7 @@ class ProcessingOptions:
     Raises
     ------
     ArgumentError
-        An option cannot be used.
+        An option cannot be used, or the file of the directions cannot be read.
     """
 
     publish: str = DEFAULT_PUBLISH
@@ -80,7 +81,9 @@ class ProcessingOptions:
                 checks.integer(name, value, 1, 256)
         if self.quarantine is not None and not self.quarantine.is_dir():
             raise ArgumentError(f"quarantine folder {self.quarantine} does not exist; create it first")
-        self.applied(Settings())
+        applied = self.applied(Settings())
+        if "directions" in self.processing:
+            direction_grid(applied.processing)
 
     def applied(self, settings: Settings) -> Settings:
         """Return a sensor's settings with these options applied.
