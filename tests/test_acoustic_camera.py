@@ -1,5 +1,7 @@
 """Acoustic maps: equal to their equations in float64, and right about simulated sources."""
 
+import re
+
 import numpy as np
 import pytest
 import threadpoolctl
@@ -392,7 +394,7 @@ def test_octaves_share_each_frequency_once(fraction):
         ),
         ({"passive__bands_hz": [[25e3, 40e3], [20e3, 26e3]]}, "20000 to 26000 Hz and 25000 to 40000 Hz"),
         ({"passive__bands_hz": "third_octaves", "passive__limits_hz": [100e3, 101e3]}, "give wider limits"),
-        ({"passive__resolution_hz": 10.0}, "longer than the record"),
+        ({"passive__resolution_hz": 10.0}, "passive.resolution_hz needs blocks of"),
         ({"passive__method": "music", "passive__n_sources": 6}, "6 microphones"),
         ({"passive__method": "capon", "passive__diagonal_removal": True}, "does not support"),
         ({"passive__method": "loudest"}, "passive.method"),
@@ -402,6 +404,19 @@ def test_octaves_share_each_frequency_once(fraction):
 def test_settings_that_cannot_be_used_are_refused(changes, words):
     with pytest.raises(ArgumentError, match=words.replace("[", r"\[").replace("]", r"\]")):
         AcousticCamera(settings_of(**changes), "cpu")
+
+
+@pytest.mark.parametrize("bands_hz", [(1.0, 2.0), (10.0, 20.0), (1000.0, 1010.0)])
+def test_narrow_bands_are_refused_with_a_width_that_suffices(bands_hz):
+    narrow = settings_of(passive__bands_hz=[bands_hz], passive__resolution_hz=None)
+    with pytest.raises(
+        ArgumentError, match=r"^passive\.bands_hz needs blocks of .* bands of at least \d+ Hz"
+    ) as refused:
+        AcousticCamera(narrow, "cpu")
+    width_hz = int(re.search(r"at least (\d+) Hz", str(refused.value))[1])
+    wide = narrow.replace("passive.bands_hz", [(bands_hz[0], bands_hz[0] + width_hz)])
+    with AcousticCamera(wide, "cpu") as camera:
+        assert np.isfinite(camera.process(sound(wide, [(20, 0.1)])).power).all()
 
 
 def test_measurements_of_another_type_are_refused():

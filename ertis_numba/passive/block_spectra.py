@@ -52,16 +52,13 @@ class BlockSpectra:
         self._read = HeardSignals(settings, device=kernels.device, threads=threads)
         rate_hz, (n_mics, n_samples) = self._read.rate_hz, self._read.shape
         self.spacing_hz, self._n_block = _spacing(settings, self.bands_hz, rate_hz)
+        if self._n_block > n_samples:
+            self._read.close()
+            raise ArgumentError(_too_narrow(settings, self._n_block, n_samples, rate_hz))
         first = max(1, math.ceil(self.bands_hz.min() / self.spacing_hz - 0.5))
         stop = max(first + 2, math.floor(self.bands_hz.max() / self.spacing_hz + 0.5) + 1)
         self.bins = np.arange(first, stop, dtype=np.uint32)
         self.frequency_hz = self.bins * self.spacing_hz
-        if self._n_block > n_samples:
-            self._read.close()
-            raise ArgumentError(
-                f"a block of {self._n_block} samples, for frequencies {self.spacing_hz:g} Hz apart, is longer than the "
-                f"record with {n_samples} samples; give wider bands, or a larger passive.resolution_hz"
-            )
         self._memory = kernels.memory()
         self._lane = self._memory.lane()
         self._heard = np.zeros((n_mics, n_samples), np.float32)
@@ -130,6 +127,24 @@ def _spacing(settings: Settings, bands_hz: NDArray[np.float64], rate_hz: float) 
     widest_hz = settings.passive.resolution_hz
     if widest_hz is None:
         widest_hz = min(float(np.diff(bands_hz).min()) / _BINS_OF_A_BAND, _MAX_SPACING_HZ)
-    n_block = scipy.fft.next_fast_len(max(8, math.ceil(rate_hz / widest_hz)), real=True)
-    n_block += n_block % 2
+    n_block = _block_length(max(8, math.ceil(rate_hz / widest_hz)))
     return rate_hz / n_block, n_block
+
+
+def _block_length(n_samples: int) -> int:
+    """Return the length of the shortest block with an even, fast transform that has at least so many samples."""
+    n_block = int(scipy.fft.next_fast_len(n_samples, real=True))
+    return n_block + n_block % 2
+
+
+def _too_narrow(settings: Settings, n_block: int, n_samples: int, rate_hz: float) -> str:
+    """Return the message for a block that is longer than the record, with a width that suffices."""
+    n_longest = next(n for n in range(n_samples, 0, -1) if n == 1 or _block_length(n) <= n_samples)
+    n_bins, key, what = 1, "passive.resolution_hz", "one"
+    if settings.passive.resolution_hz is None:
+        n_bins, key, what = _BINS_OF_A_BAND, "passive.bands_hz", "bands"
+    least_hz = math.ceil(n_bins * rate_hz / n_longest)
+    return (
+        f"{key} needs blocks of {n_block / rate_hz:.3g} s, longer than the record with {n_samples / rate_hz:.3g} s; "
+        f"give {what} of at least {least_hz} Hz, or longer measurements"
+    )

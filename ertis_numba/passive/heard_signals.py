@@ -21,6 +21,7 @@ __all__ = ["HeardSignals", "heard_bands"]
 _RINGING_S: Final = 1e-3  # Time after the call in which the transducer and the filters ring.
 
 _RATE: Final = 2.5  # Least signal rate relative to the highest frequency.
+_MAX_FACTOR: Final = 40  # Largest decimation; 16 bits cannot hold the filters of larger ones.
 
 
 def heard_bands(settings: Settings) -> NDArray[np.float64]:
@@ -77,7 +78,7 @@ class HeardSignals:
             lowest_hz, highest_hz = float(bands_hz.min()), float(bands_hz.max())
         checks.between("highest_hz", highest_hz, 1.0, recording.sample_rate_hz / _RATE)
         self.band_hz = lowest_hz, highest_hz
-        factor = max(1, math.floor(recording.sample_rate_hz / (_RATE * highest_hz)))
+        factor = min(max(1, math.floor(recording.sample_rate_hz / (_RATE * highest_hz))), _MAX_FACTOR)
         self.rate_hz = recording.sample_rate_hz / factor
         self.n_masked = math.ceil((settings.call.end_s + _RINGING_S) * self.rate_hz)
         layout = microphones(settings.array)
