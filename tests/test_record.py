@@ -122,6 +122,7 @@ def test_record_ends_after_its_duration(tmp_path):
         (["--name", "a/b"], "--name 'a/b' cannot name a group in a file; give letters", 2),
         (["--duration", "0"], "--duration is 0; give a number above 0", 2),
         (["--metrics", "foo"], "--metrics is 'foo'; give HOST:PORT, such as 127.0.0.1:9101", 2),
+        (["--listen", "nonsense"], "error: --listen 'nonsense' cannot be used; give tcp://HOST:PORT", 2),
         (["--listen", "{taken}"], "is in use by another program; end that program or give another --listen", 1),
         (["--metrics", "{taken}"], "cannot listen at", 1),
     ],

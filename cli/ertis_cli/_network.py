@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ertis_numba.network.metrics import Metrics
     from ertis_numba.network.status import Status
 
-__all__ = ["allow", "client_keys", "key", "metrics", "require_duration", "server_key", "server_keys"]
+__all__ = ["allow", "client_keys", "key", "metrics", "require_address", "require_duration", "server_key", "server_keys"]
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -93,6 +93,20 @@ def metrics(given: str | None, latest: "Callable[[], Status]") -> "Metrics | Non
     except ArgumentError as error:
         raise ArgumentError(f"--metrics is {given!r}; give HOST:PORT, such as 127.0.0.1:9101") from error
     return Metrics(given, latest)
+
+
+def require_address(option: str, given: str | None) -> None:
+    """Check the address of an option before anything is opened.
+
+    Raises
+    ------
+    ArgumentError
+        The text is not an address.
+    """
+    from ertis_numba.network.addresses import endpoint
+
+    if given is not None:
+        endpoint(given, name=option)
 
 
 def require_duration(given: float | None) -> None:

@@ -54,6 +54,7 @@ def record(
     from ertis_numba.network.central_node import CentralNode
 
     _network.require_duration(duration)
+    _network.require_address("--listen", listen)
     served = _network.metrics(metrics, lambda: node.latest)
     archive = _central_watch.archive(folder, name, rotate_size, rotate_every)
     watch = _central_watch.CentralWatch(life, quiet=quiet, as_json=as_json)

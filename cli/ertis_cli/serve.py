@@ -111,6 +111,8 @@ def serve(
     from ertis_numba.settings import Settings, preset_tables
 
     _network.require_duration(duration)
+    _network.require_address("--listen", listen)
+    _network.require_address("--publish", publish)
     served = _network.metrics(metrics, lambda: node.latest)
     publish = life.addresses.get("publish") or publish or DEFAULT_PUBLISH
     changes = {

@@ -26,7 +26,7 @@ _ADDRESS: Final = re.compile(r"tcp://(\*|\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-
 _HTTP_HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-9.-]*)(?::[0-9]{1,5})?", re.ASCII)
 
 
-def endpoint(text: str) -> str:
+def endpoint(text: str, *, name: str = "address") -> str:
     """Return an address in the form of ZeroMQ.
 
     Parameters
@@ -34,6 +34,8 @@ def endpoint(text: str) -> str:
     text : str
         ``tcp://HOST:PORT``. A node that listens may give port 0 or ``*`` for a free port, and host ``*`` for all
         interfaces.
+    name : str
+        Name of the address in errors, such as the option by which users give it.
 
     Raises
     ------
@@ -42,13 +44,13 @@ def endpoint(text: str) -> str:
     """
     found = _ADDRESS.fullmatch(text) if isinstance(text, str) else None
     if found is None or (found[2] != "*" and int(found[2]) > 65535):
-        raise ArgumentError(f"address {text!r} cannot be used; give tcp://HOST:PORT, such as {DEFAULT_LISTEN}")
+        raise ArgumentError(f"{name} {text!r} cannot be used; give tcp://HOST:PORT, such as {DEFAULT_LISTEN}")
     if found[1].startswith("["):
         try:
             ipaddress.IPv6Address(found[1].strip("[]"))
         except ValueError as error:
             raise ArgumentError(
-                f"address {text!r} cannot be used ({error}); give one such as tcp://[::1]:5601"
+                f"{name} {text!r} cannot be used ({error}); give one such as tcp://[::1]:5601"
             ) from error
     return f"tcp://{found[1]}:{'*' if found[2] == '*' else int(found[2])}"
 
