@@ -82,6 +82,19 @@ def test_caption_of_a_map_states_the_source_that_peaks_lists():
     assert (ring.get_xdata()[0], ring.get_ydata()[0]) == pytest.approx((azimuth_deg, elevation_deg), abs=1e-6)
 
 
+def test_caption_of_a_line_states_its_highest_peak():
+    """The inverse of a narrow peak is so small that its interpolation may exceed the highest peak of the grid."""
+    found = acoustic_map("2d:361", method="music")
+    azimuth_deg = np.degrees(found.azimuth_rad)
+    inverse = [1 + (azimuth_deg - 28.0) ** 2, 0.9 + 5 * (azimuth_deg + 40.2) ** 2]
+    power = (1 / np.minimum(*inverse))[:, None].astype(np.float32)
+    found = found.replace(power=power, band_hz=BANDS_HZ[:1])
+    (first,) = ertis.find_sound_sources(found, top=1)
+    assert (np.degrees(first.azimuth_rad), azimuth_deg[power.argmax()]) == pytest.approx((-40.2, 28.0), abs=0.1)
+    figure = figures.acoustic_map(found)
+    assert f"loudest at azimuth {angle(28.0)}" in texts(figure)
+
+
 def test_labels_of_maps_keep_clear_of_the_edges():
     figure = figures.acoustic_map(acoustic_map())
     around = figure.axes[0].get_tightbbox(figure.canvas.get_renderer())

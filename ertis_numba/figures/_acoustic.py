@@ -27,6 +27,8 @@ _LINE_RATIO, _BAND_RATIO = 0.42, 0.42
 _SPARE_DB = 3.0
 _OPAQUE = 0.6  # of the colours over a photo
 _FADED = 0.3  # share of the dynamic range over which they fade in
+_NARROW = ("capon", "music")  # Interpolation may change the order of their peaks; the figure shows those of the grid.
+_ALL_DB = -1000.0
 _TICKS_DEG = (-60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60)
 
 
@@ -131,7 +133,7 @@ def draw_bands(canvas: Canvas, found: AcousticMap, *, direction_deg: tuple[float
 def _levels(
     canvas: Canvas, found: AcousticMap, band_hz: tuple[float, float] | None
 ) -> tuple[Canvas, NDArray[np.float32], SoundDirection]:
-    """Return the levels of a band in all directions, a canvas with their scale, and the loudest source."""
+    """Return the levels of a band in all directions, a canvas with their scale, and the loudest source in them."""
     from ertis_numba.passive import find_sound_sources  # noqa: PLC0415  few plots need it, and it imports kernels
 
     if band_hz is not None:
@@ -142,8 +144,12 @@ def _levels(
     power = _referred(found, reference).sum(axis=1)
     limits_hz = np.array([[found.band_hz.min(), found.band_hz.max()]])
     combined = found.replace(power=power[:, None].astype(np.float32), band_hz=limits_hz)
-    (loudest,) = find_sound_sources(combined, top=1)
-    return *_scaled(canvas, found, reference, power), loudest
+    is_narrow = found.settings.passive.method in _NARROW
+    sources = find_sound_sources(combined, top=None if is_narrow else 1, min_level_db=_ALL_DB if is_narrow else None)
+    directions = unit_vectors(*np.transpose([(each.azimuth_rad, each.elevation_rad) for each in sources]))
+    brightest = int(combined.power.argmax())
+    drawn = unit_vectors(found.azimuth_rad[[brightest]], found.elevation_rad[[brightest]])[0]
+    return *_scaled(canvas, found, reference, power), sources[int(np.argmax(directions @ drawn))]
 
 
 def _referred(found: AcousticMap, reference: LevelReference) -> NDArray[np.float64]:
