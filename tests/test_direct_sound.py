@@ -12,10 +12,12 @@ import ertis_numba as ertis
 from ertis_numba.constants import SYNC_STEP_S
 from ertis_numba.errors import ArgumentError
 from ertis_numba.fusion import DirectSoundCheck
+from ertis_numba.fusion.audibility import audible_ratio
 from ertis_numba.settings import Call, Processing, Recording
 from ertis_numba.simulation import Emitter, Point, Scene
 from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.storage import write_recording
+from ertis_numba.waveform import matched_filter_spectrum
 from tests import test_fusion
 
 SENSORS = tuple(test_fusion.YAWS)
@@ -145,6 +147,45 @@ def test_own_direct_sound_and_delayed_calls_do_not_matter():
 def test_inaudible_sound_is_not_reported():
     assert checked(scene(silent=True)).sounds == ()
     assert checked(scene(diameter_m=0.012)).sounds == ()
+
+
+def test_sound_that_is_heard_in_few_pulses_is_not_reported():
+    loud, silent = heard(scene(names=("front", "left"))), heard(scene(diameter_m=0.012, names=("front", "left")))
+    check = DirectSoundCheck(mountings(scene(names=("front", "left"))))
+    check.add(loud)
+    assert len(check.sounds) == 2
+    check.add(silent)
+    assert check.sounds == ()
+    check.add(loud)
+    assert len(check.sounds) == 2
+
+
+@pytest.mark.parametrize(("drift_ppm", "heard_pairs"), [(480.0, 2), (530.0, 0)])
+def test_maximum_at_the_end_of_the_window_is_no_sound(drift_ppm, heard_pairs):
+    assert len(checked(scene("left", drift_ppm, ("front", "left")), LATE).sounds) == heard_pairs
+
+
+@pytest.mark.parametrize("rate", [0.1, 0.01])
+def test_noise_exceeds_the_threshold_as_rarely_as_stated(rate):
+    """The limit counts each rise above the threshold, so it exceeds the probability, but by less than threefold."""
+    settings = scene().sensors[0].settings()
+    window_s, pulse_s, n_windows = 500e-6, 120e-6, 10_000
+    ratio = audible_ratio(settings, searched_s=2 * window_s, averaged_s=2 * (window_s - pulse_s), false_alarms=rate)
+    values = matched_filter_spectrum(settings, n_fft=2048).values
+    frequency_hz = np.arange(len(values)) * settings.signal_rate_hz / 2048
+    time_s = np.linspace(-window_s, window_s, 401)
+    waves = np.exp(2j * np.pi * frequency_hz[:, None] * time_s) * np.abs(values)[:, None]
+    draws = np.random.default_rng(7)
+    exceeded = 0
+    for _ in range(10):
+        noise = draws.normal(size=(n_windows // 10, len(values), 2)) @ [1, 1j]
+        level = np.abs(noise @ waves)
+        peak = level.argmax(axis=1)
+        outside = np.abs(time_s - time_s[peak, None]) >= pulse_s
+        background = np.sqrt(np.sum(level**2 * outside, axis=1) / outside.sum(axis=1))
+        exceeded += np.count_nonzero(level.max(axis=1) > ratio * background)
+    spread = 3 * np.sqrt(rate * n_windows)
+    assert rate * n_windows / 3 - spread < exceeded < rate * n_windows + spread
 
 
 def test_sound_that_is_heard_one_way_is_reported():

@@ -15,6 +15,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.constants import SYNC_STEP_S
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Measurement
+from ertis_numba.fusion.audibility import audible_ratio
 from ertis_numba.fusion.rig import MountedSensor, Mountings, mounted_sensors
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Settings
@@ -25,10 +26,11 @@ __all__ = ["DirectSound", "DirectSoundCheck"]
 
 Floats = NDArray[np.float64]
 
-_GATE_S: Final = 500e-6  # Largest error of an arrival that is found, …
-_MIN_GATE_S: Final = 250e-6  # … unless the sensor's own direct sound is near; pairs with less than this are left out.
 _PULSE_S: Final = 120e-6  # Half of the width of a pulse, outside which the background is measured.
-_AUDIBLE: Final = 4.0  # Amplitude relative to the background.
+_EDGE_S: Final = _PULSE_S / 2  # A maximum this close to the end of a window may belong to a pulse outside.
+_WINDOW_S: Final = 500e-6 + _EDGE_S  # Half of the window in which an arrival is searched, …
+_MIN_WINDOW_S: Final = 250e-6  # … unless the sensor's own direct sound is near; pairs with less are left out.
+_FALSE_ALARMS: Final = 1e-3  # Accepted probability that noise passes for a direct sound in a whole check.
 _OVERSAMPLING: Final = 8
 _MOUNTING_SD_M: Final = 1e-3  # of the position of a sensor along the way to another one
 _SIGMAS: Final = 3.0
@@ -36,13 +38,13 @@ _NEAREST_M: Final = 0.05
 
 
 class DirectSound(NamedTuple):
-    """Arrival of the direct sound of a neighbour.
+    """Arrival of the direct sound of a neighbour, which is audible in most pulses.
 
     Attributes
     ----------
     emitter, receiver : str
     difference_s : float
-        Measured minus predicted arrival, as a median over pulses.
+        Measured minus predicted arrival, as a median over the pulses in which it is audible.
     noise_s : float
         Standard deviation of the measured arrival.
     uncertainty_s : float
@@ -69,6 +71,10 @@ class DirectSoundCheck:
     than their mountings state. The way back tells both apart: a difference of clocks has the opposite sign there.
     Emitters are assumed to be at the origins of the sensors, as in images.
 
+    Noise alone passes for a direct sound in at most one of 1000 checks. Each of the n (n − 1) pairs of n sensors has an
+    equal share of this rate in a single pulse. Of several pulses, more than half must contain the sound, which is less
+    probable still, so the rate holds for any number of pulses.
+
     Parameters
     ----------
     mountings : mapping of str to (translation_m, rotation_xyzw)
@@ -91,7 +97,7 @@ class DirectSoundCheck:
 
     def __init__(self, mountings: Mountings) -> None:
         self._mountings = {sensor.name: sensor for sensor in mounted_sensors(mountings)}
-        self._found: dict[tuple[str, str], list[_Arrival]] = {}
+        self._found: dict[tuple[str, str], list[_Arrival | None]] = {}
         self._sample_s = 0.0
         self._speed_m_s = 0.0
 
@@ -127,17 +133,21 @@ class DirectSoundCheck:
                 and heard.settings.call.sounds_like(call)
                 and self._distance_m(name, other) > _NEAREST_M
             }
-            for other, arrival in _arrivals(each, self._mountings, starts_s).items():
+            arrivals = _arrivals(each, self._mountings, starts_s, _FALSE_ALARMS / self._n_pairs)
+            for other, arrival in arrivals.items():
                 self._found.setdefault((other, name), []).append(arrival)
             self._sample_s = max(self._sample_s, 1 / each.settings.signal_rate_hz)
             self._speed_m_s = sound_speed_m_s(each.settings.air)
 
     @property
     def sounds(self) -> tuple[DirectSound, ...]:
-        """Direct sound of each pair of emitter and receiver, where it is audible."""
+        """Direct sound of each pair of emitter and receiver, where it is audible in more than half of the pulses."""
         chain_s = SYNC_STEP_S * (len(self._mountings) - 1)
         found = []
-        for (emitter, receiver), arrivals in self._found.items():
+        for (emitter, receiver), searched in self._found.items():
+            arrivals = [each for each in searched if each is not None]
+            if 2 * len(arrivals) <= len(searched):
+                continue
             difference_s = float(np.median([each.difference_s for each in arrivals]))
             noise_s = float(np.median([each.noise_s for each in arrivals]))
             mounting_s = math.sqrt(2) * _MOUNTING_SD_M / self._speed_m_s
@@ -191,6 +201,10 @@ class DirectSoundCheck:
                     f"{one} emits and records {_microseconds(late_s)} than {other}, ± {1e6 * sd_s:.1f} µs; check the "
                     "SYNC line"
                 )
+
+    @property
+    def _n_pairs(self) -> int:
+        return len(self._mountings) * (len(self._mountings) - 1)
 
     def _is_wrong(self, difference_s: float, sd_s: float) -> bool:
         return abs(difference_s) > max(_SIGMAS * sd_s, self._sample_s)
@@ -253,9 +267,12 @@ def _lateness_s(names: Sequence[str], pairs: Mapping[tuple[str, str], tuple[floa
 
 
 def _arrivals(
-    measurement: Measurement, mountings: Mapping[str, MountedSensor], starts_s: Mapping[str, float]
-) -> dict[str, _Arrival]:
-    """Return the arrivals of direct sound at a sensor, by emitter."""
+    measurement: Measurement,
+    mountings: Mapping[str, MountedSensor],
+    starts_s: Mapping[str, float],
+    false_alarms: float,
+) -> dict[str, _Arrival | None]:
+    """Return the arrivals of direct sound at a sensor, by emitter, and None for those that are not audible."""
     settings = measurement.settings
     # Without its own delay, the matched filter yields times since the start of the record.
     settings = settings.replace(call=settings.call.replace(delay_s=0.0))
@@ -273,7 +290,7 @@ def _arrivals(
     }
     if not late_s:
         return {}
-    last_s = max(float(each.max()) for each in late_s.values()) + 2 * _GATE_S
+    last_s = max(float(each.max()) for each in late_s.values()) + 2 * _WINDOW_S
     needed = math.ceil(
         (last_s + settings.call.end_s + 2 * matched_guard_s(settings)) * settings.recording.sample_rate_hz
     )
@@ -283,32 +300,37 @@ def _arrivals(
     # Direct sound from the sensor itself is far louder, and hides that of neighbours.
     own_s = measurement.settings.call.start_s
     own_end_s = own_s + float(np.linalg.norm(layout.enabled_positions_m, axis=1).max()) / speed_m_s + _PULSE_S / 2
-    found = {}
+    found: dict[str, _Arrival | None] = {}
     for name, each in late_s.items():
         middle_s = float(each.mean())
-        gate_s = min(_GATE_S, max(own_s - _PULSE_S / 2 - middle_s, middle_s - own_end_s))
-        if gate_s < _MIN_GATE_S:
-            continue
-        beam = np.mean(spectra * np.exp(2j * math.pi * frequency_hz * each[:, None]), axis=0)
-        arrival = _strongest(beam, settings, gate_s)
-        if arrival is not None:
-            found[name] = arrival
+        window_s = min(_WINDOW_S, max(own_s - _PULSE_S / 2 - middle_s, middle_s - own_end_s))
+        if window_s >= _MIN_WINDOW_S:
+            beam = np.mean(spectra * np.exp(2j * math.pi * frequency_hz * each[:, None]), axis=0)
+            found[name] = _strongest(beam, settings, window_s, false_alarms)
     return found
 
 
-def _strongest(spectrum: NDArray[np.complex128], settings: Settings, gate_s: float) -> _Arrival | None:
-    """Return the time of the strongest pulse within a gate around time 0 of a beam, or None if it is not audible."""
+def _strongest(
+    spectrum: NDArray[np.complex128], settings: Settings, window_s: float, false_alarms: float
+) -> _Arrival | None:
+    """Return the time of the strongest pulse within a window around time 0 of a beam, or None if it is not audible."""
     count = len(spectrum)
     padded = np.zeros(_OVERSAMPLING * count, dtype=np.complex128)
     padded[: count // 2], padded[-(count - count // 2) :] = spectrum[: count // 2], spectrum[count // 2 :]
     amplitude = np.abs(np.fft.ifft(padded)) * _OVERSAMPLING
     step_s = 1 / (_OVERSAMPLING * settings.signal_rate_hz)
-    half = round(gate_s / step_s)
+    half, edge = round(window_s / step_s), round(_EDGE_S / step_s)
     level = np.concatenate([amplitude[-half:], amplitude[: half + 1]])
     peak = int(level.argmax())
     is_pulse = np.abs(np.arange(len(level)) - peak) * step_s < _PULSE_S
     background = float(np.sqrt(np.mean(level[~is_pulse] ** 2)))
-    if not 0 < peak < len(level) - 1 or level[peak] < _AUDIBLE * max(background, 1e-30):
+    audible = audible_ratio(
+        settings,
+        searched_s=2 * (window_s - _EDGE_S),
+        averaged_s=2 * (window_s - _PULSE_S),
+        false_alarms=false_alarms,
+    )
+    if not edge <= peak < len(level) - edge or level[peak] < audible * max(background, 1e-30):
         return None
     before, here, after = level[peak - 1 : peak + 2].tolist()
     offset = 0.5 * (before - after) / (before - 2 * here + after)
