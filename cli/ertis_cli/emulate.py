@@ -1,6 +1,7 @@
 """``ertis emulate``: emulated devices on pseudo terminals."""
 
 import json
+import math
 import sys
 import threading
 import time
@@ -43,6 +44,16 @@ class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 
             return self.fail(f"{value!r} is not a fault; give a kind and a probability, as in lose=0.01", param, ctx)
 
 
+class _Absence(click.ParamType):  # type: ignore[type-arg]  # as above
+    name = "AT:FOR"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        at_s, for_s = options.INTERVAL.convert(value, param, ctx)
+        if not (0 <= at_s < math.inf and 0 <= for_s < math.inf):
+            self.fail(f"{value!r} is not an absence; give two times of at least 0 s, as in 2:5", param, ctx)
+        return at_s, for_s
+
+
 @click.command()
 @options.input_file("SCENE.toml|REC.h5")
 @options.sensor("Emulate this sensor only; all by default.")
@@ -76,7 +87,7 @@ class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 
 @click.option(
     "--unplug",
     "absences",
-    type=options.INTERVAL,
+    type=_Absence(),
     multiple=True,
     metavar="AT:FOR",
     help="Unplug the devices after AT seconds, for FOR seconds; repeatable.",
