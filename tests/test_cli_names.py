@@ -48,6 +48,7 @@ USAGE = {
     "capture --port p -n 1 --wait nan": "--wait is nan; give a finite number",
     "capture --port p -n 1 --emissions 2 --emission-period nan": "--emission-period is nan; give a finite number",
     "emulate r.h5 --sync-rate nan": "--sync-rate is nan; give a finite number",
+    "capture --port p -n 1 --emissions 2 --emission-period 0 --dry-run": "--emission-period is 0; give a number",
     "emulate r.h5 --unplug nan:5": "Invalid value for '--unplug': 'nan:5' is not an absence; give two times",
     "emulate r.h5 --unplug -1:5": "Invalid value for '--unplug': '-1:5' is not an absence; give two times",
     "view i.h5 --clean-within nan": "--clean-within is nan; give a finite number",

@@ -208,7 +208,7 @@ def test_command_line_resets_a_sensor(tmp_path):
 
 
 def test_period_of_emissions_is_limited():
-    with pytest.raises(ArgumentError, match=r"emission period is 1 s, .* at most 65535 samples; give at most 0\.146 s"):
+    with pytest.raises(ArgumentError, match=r"emission_period_s is 1 s, .* at most 65535 samples; give at most 0\.146"):
         Setup.of(SHORT, emissions=2, emission_period_s=1.0)
 
 
@@ -218,7 +218,7 @@ def test_emissions_have_a_period():
     n_call = len(Setup.of(SHORT).codes)
     assert np.array_equal(setup.codes[:n_call], Setup.of(SHORT).codes)
     assert set(setup.codes[n_call:]) == {2048}
-    with pytest.raises(ArgumentError, match=r"emission period is 0\.001 s, but the call lasts 0\.0025 s"):
+    with pytest.raises(ArgumentError, match=r"emission_period_s is 0\.001 s, but the call lasts 0\.0025 s"):
         Setup.of(SHORT, emission_period_s=1e-3)
 
 

@@ -180,14 +180,14 @@ def _with_silence(codes: NDArray[np.uint16], rate_hz: float, period_s: float | N
     """Return codes with silence up to a period."""
     if period_s is None:
         return codes
-    n_samples = round(checks.positive("emission period", period_s) * rate_hz)
+    n_samples = round(checks.positive("emission_period_s", period_s) * rate_hz)
     if n_samples < len(codes):
         raise ArgumentError(
-            f"emission period is {period_s:g} s, but the call lasts {len(codes) / rate_hz:.3g} s; give at least that"
+            f"emission_period_s is {period_s:g} s, but the call lasts {len(codes) / rate_hz:.3g} s; give at least that"
         )
     if n_samples > DAC_SAMPLES[1]:
         raise ArgumentError(
-            f"emission period is {period_s:g} s, but a sensor plays at most {DAC_SAMPLES[1]} samples; give at most "
+            f"emission_period_s is {period_s:g} s, but a sensor plays at most {DAC_SAMPLES[1]} samples; give at most "
             f"{DAC_SAMPLES[1] / rate_hz:.3g} s"
         )
     return np.pad(codes, (0, n_samples - len(codes)), constant_values=2048)
