@@ -14,12 +14,12 @@ For the same reason, begin with the way ahead free. It needs rclpy, and no other
 import math
 import signal
 import sys
+import threading
 import time
 
 import rclpy
 from geometry_msgs.msg import Twist
 from rclpy.duration import Duration
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import LaserScan
@@ -75,12 +75,14 @@ def main(topic: str) -> None:
     """Drive until the program is interrupted."""
     # By default, signals end rclpy before the robot can be stopped.
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # A KeyboardInterrupt could come while rclpy converts a message, and end as another error.
+    ended = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: ended.set())
     node = StopBeforeWalls(topic)
     try:
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        while not ended.is_set():
+            rclpy.spin_once(node)
     finally:
         node.stop()
         rclpy.try_shutdown()

@@ -46,12 +46,14 @@ class PoseForwarder(Node):
 
 def main(topic: str, address: str, *sensors: str) -> None:
     """Forward poses until the program is interrupted."""
+    # Handlers of rclpy end spin. A KeyboardInterrupt could come while it converts a message, and end as another error.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)
     rclpy.init()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with PosePublisher(address, sensors, source="odometry") as publisher:
             rclpy.spin(PoseForwarder(topic, publisher))
-    except (KeyboardInterrupt, ExternalShutdownException):
+    except ExternalShutdownException:
         pass
     finally:
         rclpy.try_shutdown()

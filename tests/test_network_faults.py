@@ -354,6 +354,6 @@ def test_parts_match_their_descriptions():
 def test_node_that_does_not_start_is_reported(tmp_path):
     with (
         central("record", tmp_path, "-o", str(tmp_path / "file"), listen="tcp://nowhere") as node,
-        pytest.raises(DataError, match=r"event 'listening' of central did not arrive; .* ended with 1; .*ertis: error"),
+        pytest.raises(DataError, match=r"event 'listening' of central did not arrive; .* ended with 2; .*ertis: error"),
     ):
         node.wait_for("listening")
