@@ -26,7 +26,7 @@ _FUSED: Final = (
 _MAPS: Final = (
     "The view of acoustic maps runs without a browser, and draws all frames that a browser would show. It makes its "
     "cameras in three seconds before the measurement. Maps have third octaves from 8.9 to 89.5 kHz. A frame shows the "
-    "latest map of each sensor. The maps of one measurement in ten, if drawn, were compared with a separate "
+    "latest map of each sensor. One drawn map in ten was compared with a separate "
     "computation."
 )
 
