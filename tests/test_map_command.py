@@ -174,6 +174,13 @@ def test_map_writes_pictures_for_ros_and_points(folder):
     assert "resolution: 0.1\n" in (folder / "place.yaml").read_text("utf-8")
     run(folder, "both.h5 --poses poses.tum -q -o place.ply")
     assert (folder / "place.ply").read_bytes().startswith(b"ply\n")
+    grey = [set((folder / "place.pgm").read_bytes().split(b"\n", 3)[3])]
+    run(folder, "both.h5 --poses poses.tum -q --cell 0.1 -o place.pgm --probabilities --force")
+    grey.append(set((folder / "place.pgm").read_bytes().split(b"\n", 3)[3]))
+    assert "mode: raw\n" in (folder / "place.yaml").read_text("utf-8")
+    assert grey[0] == {0, 128, 254}
+    assert len(grey[1]) > 3
+    assert grey[1] <= {*range(101), 255}
 
 
 def test_plot_draws_a_map(folder):
@@ -274,6 +281,7 @@ def test_map_refuses_poses_at_other_times(folder):
             "suffix of the map '.tif' is unknown; known are .h5, .mcap, .pgm, .ply",
         ),
         ("both.h5 --poses none.tum", 1, "none.tum"),
+        ("both.h5 --poses poses.tum --probabilities -o place.h5", 1, "leave out probabilities, or choose a name"),
         ("passive.h5 --poses poses.tum", 1, "passive.h5: all measurements are passive and have no echoes"),
         ("both.h5 --poses poses.tum --cell 0", 2, "--cell"),
         ("both.h5 --poses poses.tum -o both.h5", 1, "both.h5"),

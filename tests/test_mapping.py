@@ -613,53 +613,12 @@ def test_map_and_recording_are_told_apart(tmp_path):
         ertis.read_map(tmp_path / "none.h5")
 
 
-def test_picture_for_ros_has_the_levels_and_the_place_of_the_cells(tmp_path):
-    files = ertis.write_map(tmp_path / "m.pgm", small())
-    assert files == (tmp_path / "m.pgm", tmp_path / "m.yaml")
-    probability, occupied, free, origin = loaded_by_map_server(files[1])
-    assert origin == [-1.0, 2.0, 0.0]
-    assert occupied.tolist() == small().is_occupied.tolist()
-    assert free.tolist() == small().is_free.tolist()
-    assert probability[0, 1] == pytest.approx(50 / 255)
-
-
-def loaded_by_map_server(path):
-    """Read a map as map_server of ROS 2 does in the mode trinary: rows from below."""
-    stated = dict(line.split(": ", 1) for line in path.read_text("utf-8").splitlines())
-    assert (stated["mode"], stated["negate"], stated["resolution"]) == ("trinary", "0", "0.5")
-    head, size, highest, pixels = (path.parent / stated["image"].strip('"')).read_bytes().split(b"\n", 3)
-    assert (head, highest) == (b"P5", b"255")
-    n_columns, n_rows = map(int, size.split())
-    grey = np.frombuffer(pixels, np.uint8).reshape(n_rows, n_columns)[::-1]
-    probability = (255 - grey.astype(float)) / 255
-    occupied, free = probability > float(stated["occupied_thresh"]), probability < float(stated["free_thresh"])
-    return probability, occupied, free, [float(each) for each in stated["origin"].strip("[]").split(",")]
-
-
 def test_ply_holds_the_occupied_cells(tmp_path):
     ertis.write_map(tmp_path / "m.ply", small())
     vertices = PlyData.read(str(tmp_path / "m.ply"))["vertex"]
     assert np.stack([vertices["x"], vertices["y"]], axis=1).tolist() == small().occupied_m.tolist()
     assert vertices["z"].tolist() == [0.0, 0.0]
     assert vertices["probability"] == pytest.approx(small().probability[small().is_occupied])
-
-
-def test_mcap_holds_an_occupancy_grid(tmp_path):
-    reader = pytest.importorskip("mcap_ros2.reader")
-    found = small().replace(time_ns=START_NS)
-    ertis.write_map(tmp_path / "m.mcap", found)
-    (message,) = reader.read_ros2_messages(tmp_path / "m.mcap")
-    assert message.channel.topic == "/map"
-    grid = message.ros_msg
-    assert grid.header.frame_id == "map"
-    assert grid.header.stamp.sec == START_NS // 10**9
-    assert (grid.info.height, grid.info.width) == found.log_odds.shape
-    assert grid.info.resolution == pytest.approx(found.cell_m)
-    assert (grid.info.origin.position.x, grid.info.origin.position.y) == found.origin_m
-    percent = np.array(grid.data).reshape(found.log_odds.shape)
-    known = found.log_odds != 0
-    assert (percent[~known] == -1).all()
-    assert np.abs(percent[known] - 100 * found.probability[known]).max() <= 0.5
 
 
 def test_unknown_format_of_a_map_is_refused(tmp_path):

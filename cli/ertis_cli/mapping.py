@@ -58,6 +58,11 @@ __all__ = ["mapping"]
     type=options.INTERVAL,
     help="Lowest and highest height of echoes in the world frame in m, to leave out floor and ceiling; all by default.",
 )
+@click.option(
+    "--probabilities",
+    is_flag=True,
+    help="Write probabilities in percent to .mcap and .pgm instead of 100 (occupied), 0 (free) and -1 (unknown).",
+)
 @options.emitter_diameter("Diameter of emitters")
 @_pulses.processing
 @options.force
@@ -72,6 +77,7 @@ def mapping(
     cell_m: float,
     half_life_s: float | None,
     height_m: tuple[float, float] | None,
+    probabilities: bool,
     emitter_diameter_m: float,
     preset: str | None,
     settings_file: Path | None,
@@ -94,7 +100,7 @@ def mapping(
     from ertis_numba.storage import check_target
 
     target = target or paths[0].with_suffix(".map.h5")
-    for each in map_files(target, n_dimensions=dimensions):
+    for each in map_files(target, n_dimensions=dimensions, probabilities=probabilities):
         check_target(each, overwrite=force, sources=paths)
 
     with ExitStack() as stack:
@@ -121,7 +127,7 @@ def mapping(
     occupancy = mapper.map
     if height_m is not None and not mapper.n_points:
         _report_heights(occupancy, height_m, quiet=quiet)
-    written = write_map(target, occupancy, overwrite=force)
+    written = write_map(target, occupancy, overwrite=force, probabilities=probabilities)
     if len(located) < len(groups):
         left_out = options.counted(len(groups) - len(located), "pulse")
         options.say(f"note: {left_out} of {len(groups)} outside of the time of the poses left out", quiet=quiet)

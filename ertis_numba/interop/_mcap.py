@@ -59,8 +59,10 @@ def write_mcap(
         _McapWriter(writer, find, mountings, topics).write(images)
 
 
-def map_mcap(occupancy: OccupancyMap) -> bytes:
-    """Return a file that holds a map as one latched message of type nav_msgs/OccupancyGrid on the topic /map.
+def map_mcap(occupancy: OccupancyMap, *, probabilities: bool = False) -> bytes:
+    """Return a file that holds a map as one latched message of type nav_msgs/msg/OccupancyGrid on the topic /map.
+
+    `occupancy_values` describes the cells.
 
     Raises
     ------
@@ -69,7 +71,7 @@ def map_mcap(occupancy: OccupancyMap) -> bytes:
     """
     file = io.BytesIO()
     with _started(file) as writer:
-        message = occupancy_message(occupancy)
+        message = occupancy_message(occupancy, probabilities=probabilities)
         _McapTopics(writer).add("/map", MAP_TYPE, message, occupancy.time_ns, is_latched=True)
     return file.getvalue()
 

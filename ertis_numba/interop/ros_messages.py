@@ -34,6 +34,7 @@ __all__ = [
     "header",
     "mounting_message",
     "occupancy_message",
+    "occupancy_values",
     "odometry_message",
     "odometry_transform",
     "points_message",
@@ -51,6 +52,7 @@ MESSAGES: Final[Mapping[str, str]] = {
 """Topics of a sensor, and their messages."""
 MAP_TYPE: Final = "nav_msgs/msg/OccupancyGrid"
 _MAP_FRAME = "map"
+_OCCUPIED, _FREE, _UNKNOWN = 100, 0, -1  # Values of nav_msgs/msg/OccupancyGrid.
 _ODOM: Final = "odom"
 """Frame in which the pose of the platform is continuous, by REP 105."""
 _PLANAR: Final = np.ix_((0, 1, 5), (0, 1, 5))
@@ -209,15 +211,28 @@ def sonar_image_message(image: Energyscape) -> dict[str, Any]:
     }
 
 
-def occupancy_message(occupancy: OccupancyMap) -> dict[str, Any]:
-    """Return a map in the frame ``map``, as nav_msgs/msg/OccupancyGrid.
+def occupancy_values(occupancy: OccupancyMap, *, probabilities: bool = False) -> NDArray[np.int8]:
+    """Return the cells in the values of nav_msgs/msg/OccupancyGrid: (row, column) int8.
 
-    Cells hold the probability of occupation in percent, and −1 where nothing is known.
+    Occupied cells hold 100, free ones 0, and all others −1, as gmapping and slam_toolbox publish them: Nav2 takes only
+    100 for an obstacle, and every other value except −1 for free space. With ``probabilities``, cells hold the
+    probability of occupation in percent, and −1 where nothing is known.
     """
+    if probabilities:
+        values = np.rint(100 * occupancy.probability).astype(np.int8)
+        values[occupancy.log_odds == 0] = _UNKNOWN
+        return values
+    values = np.full(occupancy.log_odds.shape, _UNKNOWN, np.int8)
+    values[occupancy.is_free] = _FREE
+    values[occupancy.is_occupied] = _OCCUPIED
+    return values
+
+
+def occupancy_message(occupancy: OccupancyMap, *, probabilities: bool = False) -> dict[str, Any]:
+    """Return a map in the frame ``map``, as nav_msgs/msg/OccupancyGrid with the values of `occupancy_values`."""
     stamp = Stamp(timestamp_ns=occupancy.time_ns)
-    percent = np.rint(100 * occupancy.probability).astype(np.int8)
-    percent[occupancy.log_odds == 0] = -1
-    n_rows, n_columns = percent.shape
+    values = occupancy_values(occupancy, probabilities=probabilities)
+    n_rows, n_columns = values.shape
     x_m, y_m = occupancy.origin_m
     named = header(stamp, frame=_MAP_FRAME)
     return {
@@ -232,7 +247,7 @@ def occupancy_message(occupancy: OccupancyMap) -> dict[str, Any]:
                 "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
             },
         },
-        "data": percent.ravel().tolist(),
+        "data": values.ravel().tolist(),
     }
 
 
