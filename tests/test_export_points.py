@@ -72,9 +72,9 @@ def test_clouds_come_back_bit_by_bit(tmp_path, kind, read, text):
     assert {"frame base_link", "sensor 0 left", "sensor 1 right"} <= set(comments)
     clouds = expected(given, translation_m=TURNED[0], rotation_xyzw=TURNED[1])
     assert len(points) == sum(map(len, clouds)) > 60
-    where = np.concatenate([cloud.on_platform_m() for cloud in clouds])
+    where = np.concatenate([cloud.on_platform_m() for cloud in clouds]).astype(points["x"].dtype)
     assert np.array_equal(np.column_stack([points[axis] for axis in "xyz"]), where)
-    assert points["x"].dtype == np.float32
+    assert points["x"].dtype == (np.float64 if kind == "ply" else np.float32)
     assert np.array_equal(points["intensity"], np.concatenate([cloud.amplitude for cloud in clouds]))
     uncertainty_m = np.column_stack([points["uncertainty_range"], points["uncertainty_across"]])
     assert np.array_equal(uncertainty_m, np.concatenate([cloud.uncertainty_m for cloud in clouds]))

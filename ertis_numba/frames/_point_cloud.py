@@ -153,8 +153,10 @@ class PointCloud(DegreesFromRadians):
             points[name] = getattr(self.stamp, name)
         return points
 
-    def on_platform_m(self) -> NDArray[np.float32]:
-        """Return the positions in the platform's frame: (point, axis) float32.
+    def on_platform_m(self) -> NDArray[np.float64]:
+        """Return the positions in the platform's frame: (point, axis) float64.
+
+        Mountings may be in coordinates of a country, of which float32 resolves half a metre only.
 
         Raises
         ------
@@ -172,4 +174,4 @@ class PointCloud(DegreesFromRadians):
         # v + 2 w (q × v) + 2 q × (q × v), the rotation of v by the unit quaternion (q, w)
         across = 2 * np.cross(axis, position_m)
         turned = position_m + w * across + np.cross(axis, across)
-        return np.asarray(turned + np.array(self.translation_m), dtype=np.float32)
+        return np.asarray(turned + np.array(self.translation_m))

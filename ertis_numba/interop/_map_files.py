@@ -165,7 +165,7 @@ def _decimal(number: float) -> str:
 
 def _ply(occupancy: OccupancyMap) -> bytes:
     place_m = occupancy.occupied_m
-    points = np.zeros(len(place_m), np.dtype([(name, "<f4") for name in ("x", "y", "z", "probability")]))
+    points = np.zeros(len(place_m), np.dtype([*((axis, "<f8") for axis in "xyz"), ("probability", "<f4")]))
     for name, coordinate_m in zip(("x", "y", "z"), place_m.T, strict=False):  # A plane has no z.
         points[name] = coordinate_m
     points["probability"] = occupancy.probability[occupancy.is_occupied]
@@ -174,7 +174,8 @@ def _ply(occupancy: OccupancyMap) -> bytes:
         "format binary_little_endian 1.0",
         "comment Occupied cells of ertis-numba",
         f"element vertex {len(points)}",
-        *(f"property float {name}" for name in points.dtype.names or ()),
+        *(f"property double {axis}" for axis in "xyz"),
+        "property float probability",
         "end_header",
     ]
     return "\n".join([*head, ""]).encode("ascii") + points.tobytes()

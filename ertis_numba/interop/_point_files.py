@@ -6,7 +6,7 @@ format, version 0.7; and RFC 4180 for CSV, except that lines end with a line fee
 
 import csv
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,9 @@ from ertis_numba.interop._points import PointTable
 __all__ = ["CSV_COLUMNS", "POINT_FIELDS", "write_csv", "write_pcd", "write_ply"]
 
 POINT_FIELDS: Final = {
-    "x": "<f4",
-    "y": "<f4",
-    "z": "<f4",
+    "x": "<f8",
+    "y": "<f8",
+    "z": "<f8",
     "intensity": "<f4",
     "uncertainty_range": "<f4",
     "uncertainty_across": "<f4",
@@ -29,7 +29,7 @@ POINT_FIELDS: Final = {
     "nanosec": "<u4",
 }
 """Fields of each point in PLY and PCD. Not all readers of these formats support 64-bit integers."""
-_PLY_TYPES = {"<f4": "float", "<u2": "ushort", "<u4": "uint", "<i4": "int"}
+_PLY_TYPES = {"<f4": "float", "<f8": "double", "<u2": "ushort", "<u4": "uint", "<i4": "int"}
 CSV_COLUMNS: Final = {
     "sensor": "sensor",
     "session_id": "session_id",
@@ -70,12 +70,15 @@ def write_ply(path: Path, table: PointTable, *, text: bool) -> None:
 def write_pcd(path: Path, table: PointTable, *, text: bool) -> None:
     """Write points as PCD 0.7, little-endian or as text.
 
+    PCL reads positions in float32 only. They are float64 if float32 would round one by more than 10 µm.
+
     Raises
     ------
     ArgumentError
         A number exceeds its type, or the name of a sensor is invalid.
     """
-    kinds = [np.dtype(dtype) for dtype in POINT_FIELDS.values()]
+    fields = POINT_FIELDS | dict.fromkeys("xyz", "<f4" if table.fits_float32 else "<f8")
+    kinds = [np.dtype(dtype) for dtype in fields.values()]
     count = len(table.rows)
     head = [
         "# .PCD v0.7 - Point Cloud Data file format",
@@ -91,18 +94,24 @@ def write_pcd(path: Path, table: PointTable, *, text: bool) -> None:
         f"POINTS {count}",
         f"DATA {'ascii' if text else 'binary'}",
     ]
-    _write(path, head, table.columns(POINT_FIELDS), text=text)
+    _write(path, head, table.columns(fields), text=text)
 
 
 def write_csv(path: Path, table: PointTable) -> None:
     """Write points as CSV."""
     rows = table.rows
     names = np.array([*table.sensors, ""])[rows["sensor"]]
-    columns = [names if column == "sensor" else rows[column].astype(str) for column in CSV_COLUMNS.values()]
+    columns = [names if column == "sensor" else _shortest(rows[column]) for column in CSV_COLUMNS.values()]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(CSV_COLUMNS)
         writer.writerows(zip(*columns, strict=True))
+
+
+def _shortest(column: NDArray[Any]) -> NDArray[np.str_]:
+    """Return the shortest texts that read back as the same numbers, of float32 if all of them are such numbers."""
+    single = column.astype(np.float32) if column.dtype.kind == "f" else column
+    return (single if np.array_equal(single, column, equal_nan=column.dtype.kind == "f") else column).astype(str)
 
 
 def _about(table: PointTable) -> list[str]:
@@ -115,7 +124,7 @@ def _write(path: Path, head: list[str], rows: NDArray[np.void], *, text: bool) -
     with path.open("wb") as file:
         file.write("\n".join([*head, ""]).encode("ascii"))
         if text:
-            # NumPy writes the shortest text that reads back as the same float32.
+            # NumPy writes the shortest text that reads back as the same number.
             columns = [rows[name].astype(str) for name in POINT_FIELDS]
             file.write("".join(f"{' '.join(row)}\n" for row in zip(*columns, strict=True)).encode("ascii"))
         else:

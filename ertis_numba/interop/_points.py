@@ -18,12 +18,14 @@ FindPoints: TypeAlias = Callable[[Energyscape], PointCloud]
 
 _POINT: Final = np.dtype(
     [
-        *((name, "<f4") for name in ("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across")),
+        *((name, "<f8") for name in "xyz"),
+        *((name, "<f4") for name in ("intensity", "uncertainty_range", "uncertainty_across")),
         ("sensor", "<u2"),
         *((name, "<i8") for name in ("session_id", "sequence", "sync_count", "timestamp_ns")),
     ]
 )
 _NS = 1_000_000_000
+_MAX_ROUNDING_M: Final = 1e-5
 _MAX_SEC = 2**31 - 1
 
 
@@ -44,6 +46,14 @@ class PointTable:
     rows: NDArray[np.void]
     sensors: tuple[str, ...]
     frame: str
+
+    @property
+    def fits_float32(self) -> bool:
+        """Return True if float32 rounds no position by more than 10 µm, which holds up to 168 m from the origin."""
+        return all(
+            np.abs(self.rows[axis] - self.rows[axis].astype(np.float32)).max(initial=0.0) <= _MAX_ROUNDING_M
+            for axis in "xyz"
+        )
 
     @classmethod
     def from_images(cls, images: Iterable[Energyscape], find: FindPoints, mountings: Mountings) -> "PointTable":
@@ -83,7 +93,7 @@ class PointTable:
         for name, dtype in dtypes.items():
             column: NDArray[Any] = times[name] if name in times else self.rows[name]
             made[name] = column.astype(dtype)
-            if not np.array_equal(made[name], column, equal_nan=column.dtype.kind == "f"):
+            if column.dtype.kind != "f" and not np.array_equal(made[name], column):
                 raise ArgumentError(
                     f"{name} of a measurement is {column.max()}, above the limit of the format; use csv"
                 )

@@ -120,7 +120,7 @@ def write_tum(path: str | Path, trajectory: Trajectory, *, overwrite: bool = Fal
             trajectory.time_ns.tolist(), trajectory.position_m.tolist(), trajectory.rotation_xyzw.tolist(), strict=True
         ):
             # Decimal keeps nanoseconds, which a float64 of seconds since 1970 does not hold.
-            numbers = " ".join(format(number, ".12g") for number in (*position, *rotation))
+            numbers = " ".join(format(number, ".15g") for number in (*position, *rotation))
             file.write(f"{Decimal(time_ns).scaleb(-9):f} {numbers}\n")
 
 

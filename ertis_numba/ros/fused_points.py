@@ -9,9 +9,12 @@ import numpy as np
 from ertis_numba.frames import PointCloud
 from ertis_numba.fusion.pulses import PulseGroups
 
-__all__ = ["FusedPoints", "joined"]
+__all__ = ["LOCAL_FRAME", "FusedPoints", "joined"]
 
 PLATFORM_FRAME: Final = "base_link"
+LOCAL_FRAME: Final = "base_link_local"
+"""Frame of fused points near the sensors, if these are far from the origin of their platform."""
+_FAR_M: Final = 1000.0  # Distance from which float32 rounds by more than 30 µm.
 
 
 class FusedPoints:
@@ -31,6 +34,9 @@ class FusedPoints:
 def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:
     """Return the points of several sensors as one cloud in the frame of the platform, with the earliest time.
 
+    If a sensor is more than 1 km from the origin of this frame, the points are in the frame ``base_link_local``, and
+    ``translation_m`` is its origin in whole kilometres.
+
     Parameters
     ----------
     clouds : mapping of str to PointCloud
@@ -42,11 +48,19 @@ def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:
         np.full((len(cloud), 2), np.nan, np.float32) if cloud.uncertainty_m is None else cloud.uncertainty_m
         for cloud in each
     ]
+    origin_m = _origin_m(each[0].translation_m or (0.0, 0.0, 0.0))
+    position_m = np.concatenate([cloud.on_platform_m() for cloud in each]) - origin_m
     return each[0].replace(
-        position_m=np.concatenate([cloud.on_platform_m() for cloud in each]),
+        position_m=position_m.astype(np.float32),
         amplitude=np.concatenate([cloud.amplitude for cloud in each]),
         uncertainty_m=np.concatenate(uncertainty_m),
-        stamp=replace(stamp, sensor=PLATFORM_FRAME),
-        translation_m=(0.0, 0.0, 0.0),
+        stamp=replace(stamp, sensor=LOCAL_FRAME if any(origin_m) else PLATFORM_FRAME),
+        translation_m=origin_m,
         rotation_xyzw=(0.0, 0.0, 0.0, 1.0),
     )
+
+
+def _origin_m(place_m: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return the origin of the points near a sensor."""
+    x_m, y_m, z_m = (_FAR_M * round(each_m / _FAR_M) if abs(each_m) > _FAR_M else 0.0 for each_m in place_m)
+    return x_m, y_m, z_m

@@ -26,7 +26,7 @@ from ertis_numba.interop.ros_messages import (
 )
 from ertis_numba.network.status import Status
 from ertis_numba.ros.diagnostics import diagnostics_message
-from ertis_numba.ros.fused_points import FusedPoints
+from ertis_numba.ros.fused_points import LOCAL_FRAME, FusedPoints
 from ertis_numba.ros.odometry_publisher import OdometryPublisher
 from ertis_numba.ros.participant import Participant, Topic
 from ertis_numba.ros.publishing_settings import PublishingSettings
@@ -228,6 +228,8 @@ class RosPublisher:
         groups = [] if place is None else self._fused.add(cloud.replace(translation_m=place[0], rotation_xyzw=place[1]))
         for group in groups if is_fused else ():
             if self._is_due("points", _ALL_SENSORS, group.stamp.timestamp_ns):
+                if group.stamp.sensor == LOCAL_FRAME and group.translation_m and group.rotation_xyzw:
+                    self._announce(group.stamp, (group.translation_m, group.rotation_xyzw))
                 self._topic(f"{self._base}/fused/points", MESSAGES["points"]).publish(points_message(group))
                 n_published += 1
         return n_published
@@ -290,7 +292,7 @@ class RosPublisher:
             own = replace(stamp, sensor=sensor)
             if known is not None:
                 transforms.append(mounting_message(own, known))
-            if "sonar_image" in self._wanted:
+            if "sonar_image" in self._wanted and sensor != LOCAL_FRAME:
                 transforms.append(sonar_frame_message(own))
         if transforms:
             self._topic(*_TRANSFORMS, latched=True).publish({"transforms": transforms})

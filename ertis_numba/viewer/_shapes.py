@@ -64,7 +64,7 @@ class Pose:
         """Return points of the sensor frame in the frame of the platform: (point, axis) float32."""
         amplitude = np.ones(len(position_m), np.float32)
         cloud = PointCloud(position_m, amplitude, Settings(), Stamp(), self.translation_m, self.rotation_xyzw)
-        return cloud.on_platform_m()
+        return cloud.on_platform_m().astype(np.float32)
 
 
 UNTURNED: Final = Pose()
