@@ -134,7 +134,8 @@ def test_command_writes_sound(recording, tmp_path, options, rate_hz, duration_s)
     done = run(recording, "-o", target, "--listen", "20,0", "--json", *options)
     assert done.exit_code == 0, done.output
     report = json.loads(done.stdout[done.stdout.index("{") :])
-    found_hz, samples = read_wav(target)
+    wav = read_wav(target)
+    found_hz, samples = wav.rate_hz, wav.samples[:]
     assert found_hz == rate_hz == report["rate_hz"]
     assert (
         len(samples) / rate_hz == pytest.approx(duration_s, abs=1e-3) == pytest.approx(report["duration_s"], abs=2e-3)

@@ -133,9 +133,12 @@ def import_raw(
     rest_s = getattr(measurements, "rest_s", 0.0)
     if rest_s:
         options.say(f"note: {rest_s:.4g} s at the ends of files were left out", quiet=quiet)
+    notes = getattr(measurements, "notes", ())
+    for note in notes:
+        options.say(f"note: {note}", quiet=quiet)
     _report_obstacle(measurements.settings, quiet=quiet)
     if as_json:
-        options.print_json({"output": str(target), "measurements": len(measurements)})
+        options.print_json({"output": str(target), "measurements": len(measurements), "notes": list(notes)})
 
 
 def _beside(first: Path) -> Path:

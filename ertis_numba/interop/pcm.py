@@ -15,7 +15,7 @@ from ertis_numba.frames import Behaviour, Measurement, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.interop._acoular import read_acoular
 from ertis_numba.settings import Recording, Settings, fit_ranges
-from ertis_numba.wav import read_wav
+from ertis_numba.wav import Samples, read_wav
 
 __all__ = ["PcmReader", "open_pcm"]
 
@@ -35,6 +35,7 @@ class _PcmFile:
     n_channels: int
     encoding: Literal["int16", "float32"]
     settings: Settings | None = None
+    notes: tuple[str, ...] = ()
 
 
 class PcmReader:
@@ -57,6 +58,8 @@ class PcmReader:
         Settings of the measurements, with sample rate, length and encoding of the files.
     rest_s : float
         Total duration of unused samples at the ends of the files, in seconds.
+    notes : tuple of str
+        Contradictions in the files, and how they were resolved.
     """
 
     def __init__(
@@ -73,6 +76,7 @@ class PcmReader:
         if not paths:
             raise ArgumentError("no PCM file is given; give at least one")
         self._files = [_inspect(path) for path in paths]
+        self.notes = tuple(note for file in self._files for note in file.notes)
         first = self._files[0]
         self._require_alike()
         known = _require_settings(settings, first)
@@ -105,7 +109,7 @@ class PcmReader:
     def __iter__(self) -> Iterator[Measurement]:
         sequence, period_ns = 0, 1e9 * self._period / self._files[0].rate_hz
         for file, count in zip(self._files, self._counts, strict=True):
-            _, numbers, _ = _read(file.path)
+            _, samples, _, _ = _read(file.path)
             for number in range(count):
                 start = self._start(number)
                 stamp = Stamp(
@@ -115,7 +119,7 @@ class PcmReader:
                     timestamp_ns=self._start_ns + round(sequence * period_ns),
                     behaviour=self._behaviour,
                 )
-                words = _samples(file, numbers, slice(start, start + self._n_samples), self._enabled)
+                words = _samples(file, samples[start : start + self._n_samples], start, self._enabled)
                 yield Measurement(words, self.settings, stamp)
                 sequence += 1
 
@@ -268,30 +272,31 @@ def _fitted(settings: Settings, recording: Recording, first: _PcmFile) -> Settin
 
 
 def _inspect(path: Path) -> _PcmFile:
-    rate_hz, numbers, settings = _read(path)
+    rate_hz, samples, settings, notes = _read(path)
     try:
         Recording(sample_rate_hz=rate_hz)
     except ArgumentError as error:
         raise DataError(f"{path}: {error}") from error
-    is_short = numbers.dtype.kind in "iu" and numbers.dtype.itemsize <= 2
-    n_samples, n_channels = numbers.shape
-    return _PcmFile(path, rate_hz, n_samples, n_channels, "int16" if is_short else "float32", settings)
+    is_short = samples.dtype.kind in "iu" and samples.dtype.itemsize <= 2
+    n_samples, n_channels = samples.shape
+    return _PcmFile(path, rate_hz, n_samples, n_channels, "int16" if is_short else "float32", settings, notes)
 
 
-def _read(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
+def _read(path: Path) -> tuple[float, Samples, Settings | None, tuple[str, ...]]:
+    """Return sample rate, samples, settings and notes of a file."""
     try:
         with path.open("rb"):
             pass
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; give a PCM file") from error
     if path.suffix.lower() in _ACOULAR:
-        return read_acoular(path)
-    return *read_wav(path), None
+        return *read_acoular(path), ()
+    wav = read_wav(path)
+    return wav.rate_hz, wav.samples, None, wav.notes
 
 
-def _samples(file: _PcmFile, numbers: NDArray[Any], samples: slice, enabled: NDArray[np.bool_]) -> NDArray[Any]:
+def _samples(file: _PcmFile, numbers: NDArray[Any], start: int, enabled: NDArray[np.bool_]) -> NDArray[Any]:
     """Return samples in the type of a recording; non-finite samples of disabled channels become 0."""
-    numbers = numbers[samples]
     if numbers.dtype.itemsize == 1:  # 8-bit WAV samples are unsigned.
         middle = _MIDDLE_OF_BYTES if numbers.dtype.kind == "u" else 0
         return ((numbers.astype(np.int16) - middle) * 256).astype("<i2")
@@ -307,7 +312,7 @@ def _samples(file: _PcmFile, numbers: NDArray[Any], samples: slice, enabled: NDA
         sample, channel = np.argwhere(broken & enabled)[0].tolist()
         came = numbers[sample, channel]
         raise DataError(
-            f"{file.path} contains {came:g} at sample {samples.start + sample} of channel {channel}; "
+            f"{file.path} contains {came:g} at sample {start + sample} of channel {channel}; "
             + (f"give numbers up to {_MAX_FLOAT32:.4g}" if np.isfinite(came) else "give finite numbers")
         )
     return words

@@ -49,7 +49,7 @@ def read_waveform(path: Path, *, key: str = "call.waveform") -> tuple[tuple[floa
         n_bytes = path.stat().st_size
         if n_bytes > _MAX_FILE_BYTES:
             raise SettingsError(f"{key} {path} has {n_bytes} bytes; the limit is {_MAX_FILE_BYTES}")
-        rate_hz, values = read_wav(path) if suffix == ".wav" else (None, _read_numbers(path, suffix))
+        rate_hz, values = _read_wav(path) if suffix == ".wav" else (None, _read_numbers(path, suffix))
     except (OSError, ValueError, EOFError, DataError) as error:  # np.load raises EOFError for empty files.
         if isinstance(error, SettingsError):
             raise
@@ -65,6 +65,11 @@ def read_waveform(path: Path, *, key: str = "call.waveform") -> tuple[tuple[floa
     # Unsigned bytes are the only WAV samples whose silence is not 0.
     middle = 128.0 if suffix == ".wav" and values.dtype == np.uint8 else 0.0
     return tuple((values.astype(np.float64) - middle).tolist()), rate_hz
+
+
+def _read_wav(path: Path) -> tuple[float, NDArray[Any]]:
+    wav = read_wav(path)
+    return wav.rate_hz, wav.samples[:]
 
 
 def _read_numbers(path: Path, suffix: str) -> NDArray[Any]:
