@@ -1,12 +1,12 @@
 """Predicted error of the images of a sensor, and the warning if it may exceed the budget."""
 
-import threading
 from dataclasses import dataclass
 from typing import Final, TypedDict
 
 import numpy as np
 
 from ertis_numba.errors import DataError
+from ertis_numba.forks import ForkSafeLock
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.kernels import KernelSet
@@ -181,7 +181,7 @@ class BudgetMonitor:
 
     def __init__(self, kernels: KernelSet, threads: int) -> None:
         self._kernels, self._threads = kernels, threads
-        self._lock = threading.Lock()
+        self._lock = ForkSafeLock()
         self._faintest = float("inf")
         self.prediction: Prediction | None = None
 

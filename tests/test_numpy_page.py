@@ -1,6 +1,9 @@
 """The examples of ``docs/how-to/numpy.md`` run, and are short."""
 
+import ast
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -21,7 +24,7 @@ def place(tmp_path):
 
 
 def test_page_has_short_examples():
-    assert len(EXAMPLES) == 5
+    assert len(EXAMPLES) == 6
     assert max(len(example.splitlines()) for example in EXAMPLES) <= 12
     assert max(map(len, "".join(EXAMPLES).splitlines())) <= 120
 
@@ -63,3 +66,10 @@ def test_own_beamformer_finds_the_reflectors(place):
         found = compare(images[0], recording.truth.reflectors[0], min_level_db=-20)
     assert len(found.matched) >= 3
     assert not found.missed
+
+
+def test_page_example_of_workers_runs_as_a_script(place):
+    (place / "script.py").write_text(EXAMPLES[5])
+    done = subprocess.run([sys.executable, "script.py"], cwd=place, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert len(ast.literal_eval(done.stdout)) == 2

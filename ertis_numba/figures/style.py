@@ -13,6 +13,7 @@ from matplotlib.textpath import text_to_path
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
+from ertis_numba.forks import ForkSafeLock
 
 __all__ = [
     "COLUMNS_MM",
@@ -37,7 +38,7 @@ LINES: tuple[str, ...] = ("-", "--", "-.", ":")  # which tell curves apart where
 
 _PT_PER_MM = 72 / 25.4
 _SLACK = 1.03  # letters are set to whole pixels on a screen
-_LOCK = threading.RLock()
+_LOCK = ForkSafeLock(threading.RLock)
 _SHADES = (0.6, 0.8, 0.45, 0.95)  # of the map of colours, for the second line on
 
 

@@ -11,6 +11,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.forks import ForkSafeLock
+
 __all__ = ["ImagePool"]
 
 _MAX_BYTES = 2**28  # total size of pooled arrays; callers that keep more images get separate arrays
@@ -34,7 +36,7 @@ class ImagePool:
 
     def __init__(self, make: Callable[[tuple[int, ...]], NDArray[np.float32]]) -> None:
         self._make = make
-        self._lock = threading.RLock()  # garbage collection may release an image while the lock is held
+        self._lock = ForkSafeLock(threading.RLock)  # garbage collection may release an image while the lock is held
         self._spare: list[NDArray[np.float32]] = []
         self._count = 0
         self._closed = False

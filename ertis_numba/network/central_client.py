@@ -16,6 +16,7 @@ from ertis_numba.network import addresses, messages
 from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import AskStatus, Configure, Configured, Message, Refused, Report
+from ertis_numba.network.owner import Owner
 from ertis_numba.network.status import Status
 from ertis_numba.settings import Settings
 
@@ -64,12 +65,15 @@ class CentralClient:
 
     def __enter__(self) -> Self:
         self._closing.clear()
+        self._owner = Owner("client")
         self._context = zmq.Context()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if not self._owner.is_this_process:
+            return
         self._closing.set()
         with self._turn:
             self._hang_up()
@@ -208,6 +212,7 @@ class CentralClient:
     def _opened(self) -> Connection:
         if self._context is None or self._closing.is_set():
             raise NetworkError("this client is not open; use it in a with statement")
+        self._owner.require_this_process()
         if self._connection is None:
             self._connection = Connection(self._context, self._address, keys=self._keys, max_bytes=_REPORT_BYTES)
         return self._connection

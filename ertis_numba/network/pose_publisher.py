@@ -18,6 +18,7 @@ from ertis_numba.network import addresses, messages
 from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import SILENCE_LIMIT_S, Bye, Ping, PlatformPose, Pong, Refused
+from ertis_numba.network.owner import Owner
 
 __all__ = ["PosePublisher"]
 
@@ -80,12 +81,15 @@ class PosePublisher:
         self._n_disconnections = 0
 
     def __enter__(self) -> Self:
+        self._owner = Owner("publisher")
         self._context = zmq.Context()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if not self._owner.is_this_process:
+            return
         if self._connection is not None:
             end_s = time.monotonic() + _FAREWELL_S
             while not self._has_sent(self._connection) and time.monotonic() < end_s:
@@ -194,6 +198,7 @@ class PosePublisher:
     def _opened(self) -> Connection:
         if self._context is None:
             raise NetworkError("this publisher is not open; use it in a with statement")
+        self._owner.require_this_process()
         if self._connection is None:
             self._connection = Connection(self._context, self._address, keys=self._keys)
         return self._connection

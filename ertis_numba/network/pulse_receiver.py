@@ -11,6 +11,7 @@ from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.network.keys import ClientKeys
+from ertis_numba.network.owner import Owner
 from ertis_numba.network.pulse_queue import PulseQueue
 from ertis_numba.network.subscriber import Subscriber, SubscriberCounts
 
@@ -113,6 +114,7 @@ class PulseReceiver:
         self._groups: PulseGroups[_Received] = PulseGroups.of(self._given)
         self.queue: PulseQueue[dict[str, _Received]] = PulseQueue()
         self._mountings: dict[str, _Place] = dict(self._given)
+        self._owner = Owner("receiver")
         self._thread = threading.Thread(target=self._run, name="ertis-pulse-receiver", daemon=True)
         self._thread.start()
 
@@ -141,6 +143,7 @@ class PulseReceiver:
         DataError
             The mounting of a sensor is unknown.
         """
+        self._owner.require_this_process()
         group = self.queue.take(timeout_s)
         if group is None:
             return None
@@ -153,6 +156,8 @@ class PulseReceiver:
 
     def close(self) -> None:
         """End waiting calls of `receive`."""
+        if not self._owner.is_this_process:
+            return
         self._subscriber.close()
         self.queue.close()
         if threading.current_thread() is not self._thread:

@@ -15,6 +15,7 @@ from ertis_numba.network import addresses
 from ertis_numba.network._subscription import SubscriberCounts, Subscription
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import PRODUCTS, Group, Product
+from ertis_numba.network.owner import Owner
 from ertis_numba.network.products import Arrival, trace
 from ertis_numba.network.receiving_loop import ReceivingLoop
 from ertis_numba.network.wakeup_socket import WakeupSocket
@@ -156,6 +157,7 @@ class Subscriber(ReceivingLoop[Kind_co]):
         # A signal handler may put to this kind of queue even if it has interrupted a thread that is taking from it.
         self._waiting: queue.SimpleQueue[Arrival | Exception | None] = queue.SimpleQueue()
         self._closed = False
+        self._owner = Owner("subscriber")
         self._wakeup_socket = WakeupSocket()
         self._subscription = Subscription(
             address,
@@ -199,6 +201,7 @@ class Subscriber(ReceivingLoop[Kind_co]):
             The central node has refused this application from the start. After a first acceptance, the subscriber keeps
             trying.
         """
+        self._owner.require_this_process()
         try:
             arrival = self._waiting.get(timeout=timeout_s)
         except queue.Empty:
@@ -219,6 +222,8 @@ class Subscriber(ReceivingLoop[Kind_co]):
     def close(self) -> None:
         """End the loop; waiting products are lost."""
         self._closed = True
+        if not self._owner.is_this_process:
+            return
         with suppress(queue.Empty):
             while True:
                 self._waiting.get_nowait()

@@ -104,7 +104,7 @@ class FastProcessor:
         ArgumentError
             The shape of ``data`` does not match the configuration.
         """
-        if not pdm or self._exact.has_lost_threads:
+        if not pdm or self._exact.has_lost_gpu:
             return self._exact.process(data, pdm=pdm)
         return cleaned(self._image(data), self._given.clean_multipliers)
 

@@ -4,11 +4,9 @@ Filters do not delay: the delay of an FIR filter with n taps, ``(n − 1) // 2``
 microphones are not divided by their number.
 """
 
-import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -28,9 +26,6 @@ _MAX_ORDER: Final = 5
 _TILE: Final = 256  # samples with a common unit; a tile of 32 microphones fits into an L1 cache
 _TAP_BITS: Final = 30
 _MAX_TAP_SUM: Final = 65_535  # of the magnitudes of a class of envelope taps
-_log = logging.getLogger("ertis_numba")
-_has_run = False  # True after this process has run kernels.
-_threads_are_lost = False  # True if a process that had run kernels was forked into this one.
 Real = NDArray[np.float32]
 Combine = Callable[[NDArray[np.int32], Real], None]
 """Function that fills beams with combinations of delayed signals."""
@@ -158,8 +153,7 @@ class Processor:
     def __init__(self, configuration: Configuration, *, device: str = "auto") -> None:
         self._given = configuration
         self._loaded = kernels.load(device)
-        if self._loaded.device == "cuda":  # Forked processes inherit no context of a GPU.
-            _note_run()
+        self._process_id = os.getpid()
         self._enabled = np.array([mic for mic in range(configuration.n_mics) if mic not in configuration.disabled])
         self._channels = np.arange(configuration.n_mics, dtype=np.int32)
         # With integers, all devices give the same bits, and sums of the magnitudes do not overflow.
@@ -174,7 +168,7 @@ class Processor:
 
     @property
     def _kernels(self) -> kernels.KernelSet:
-        return _without_threads() if _threads_are_lost else self._loaded
+        return kernels.load("cpu") if self.has_lost_gpu else self._loaded
 
     @property
     def configuration(self) -> Configuration:
@@ -182,9 +176,9 @@ class Processor:
         return self._given
 
     @property
-    def has_lost_threads(self) -> bool:
-        """True in a process that was forked after its parent had run kernels; compiled kernels cannot run in it."""
-        return _threads_are_lost
+    def has_lost_gpu(self) -> bool:
+        """True in a process that was forked from one that used a GPU, because forks cannot use it."""
+        return self._loaded.device == "cuda" and self._process_id != os.getpid()
 
     def process(self, data: NDArray[Any], *, pdm: bool) -> Real:
         """Return the result of the last stage that is on: signals, beams or an image, (row, sample) float32.
@@ -299,7 +293,6 @@ class Processor:
 
     def run(self, name: str, *arguments: Any, out: Real) -> None:
         """Run a kernel with arrays of the host, and fill ``out``."""
-        _note_run()
         kernel_set = self._kernels
         lane = kernel_set.memory().lane()
         with kernel_set.threads(kernel_set.max_threads), lane.entered():
@@ -327,32 +320,6 @@ def cleaned(image: Real, multipliers: tuple[float, float] | None) -> Real:
         of_mean, of_max = multipliers
         keep_strongest(image, of_max=of_max, of_mean=of_mean)
     return image
-
-
-def _note_run() -> None:
-    """Remember that this process has run kernels."""
-    global _has_run  # noqa: PLW0603  true of the whole process
-    _has_run = True
-
-
-def _after_fork() -> None:
-    """Notice that a forked process has no threads for kernels: OpenMP would end it, and GPUs do not work in it."""
-    global _threads_are_lost  # noqa: PLW0603  true of the whole process
-    _threads_are_lost = _threads_are_lost or _has_run
-
-
-@cache
-def _without_threads() -> kernels.KernelSet:
-    """Return kernels for a forked process."""
-    _log.warning(
-        "this process was forked from one that had processed measurements, and uses slow NumPy; create workers before "
-        "the first measurement is processed"
-    )
-    return kernels.load("numpy")
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
 
 
 def rounded(taps: NDArray[np.floating[Any]]) -> tuple[NDArray[np.int16], float]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import fft
 from ertis_numba.errors import ArgumentError
+from ertis_numba.forks import call_in_forks
 from ertis_numba.kernels import Lane
 from ertis_numba.stages.beamform import Buffers
 
@@ -31,10 +32,14 @@ class BufferPool:
     """Pool of buffers; it grows to the largest number of measurements in progress at the same time."""
 
     def __init__(self) -> None:
-        self._change = threading.Condition()
         self._spare: list[MeasurementBuffers] = []
-        self._n_busy = 0
         self._closed = False
+        self._forget_threads()
+        call_in_forks(self._forget_threads)
+
+    def _forget_threads(self) -> None:
+        self._change = threading.Condition()
+        self._n_busy = 0
 
     @contextmanager
     def acquired(self, make: Callable[[], MeasurementBuffers]) -> Iterator[MeasurementBuffers]:

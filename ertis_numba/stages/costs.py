@@ -8,7 +8,6 @@ import math
 import os
 import platform
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Collection
 from contextlib import ExitStack, suppress
@@ -22,6 +21,7 @@ import platformdirs
 from numpy.typing import NDArray
 
 from ertis_numba import fft
+from ertis_numba.forks import ForkSafeLock
 from ertis_numba.kernels import KernelSet
 from ertis_numba.stages.nominal_costs import NOMINAL_COSTS
 
@@ -179,7 +179,7 @@ def measured_costs(kernels: KernelSet, threads: int) -> Costs:
         return _KNOWN[key]
 
 
-_ONE_AT_A_TIME = threading.Lock()
+_ONE_AT_A_TIME = ForkSafeLock()
 _KNOWN: dict[tuple[str, int, str], Costs] = {}
 
 

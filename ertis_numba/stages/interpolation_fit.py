@@ -17,7 +17,6 @@ min-max interpolation, IEEE Trans. Signal Process. 51, 2003).
 
 import functools
 import math
-import threading
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +26,7 @@ import threadpoolctl
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
+from ertis_numba.forks import ForkSafeLock
 from ertis_numba.kernels import SteeringKernels
 
 __all__ = [
@@ -76,7 +76,7 @@ class _OneThread:
     """Context manager that limits BLAS to one thread while any Python thread is inside."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = ForkSafeLock()
         self._inside = 0
         self._controller: threadpoolctl.ThreadpoolController | None = None
         self._limits: Any = None

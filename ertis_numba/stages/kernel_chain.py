@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import fft
+from ertis_numba.forks import call_in_forks
 from ertis_numba.geometry import Grid
 from ertis_numba.kernels import KernelSet
 from ertis_numba.settings import Settings
@@ -84,6 +85,7 @@ class KernelChain(ABC):
     ) -> None:
         self._memory = kernels.memory(graphs=graphs)
         self._pool = BufferPool()
+        call_in_forks(self._forget_threads)
         self._kernels, self._threads = kernels, threads
         self._is_turned = settings.processing.level_directions
         with one_thread():
@@ -187,6 +189,9 @@ class KernelChain(ABC):
     @functools.cached_property
     def _executor(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(self._threads, thread_name_prefix="ertis-batch")
+
+    def _forget_threads(self) -> None:
+        self.__dict__.pop("_executor", None)
 
     def warm_up(self, words: NDArray[np.unsignedinteger[Any]]) -> None:
         """Process ``words`` once in every lane, which compiles kernels and allocates buffers."""

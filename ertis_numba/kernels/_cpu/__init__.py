@@ -16,7 +16,9 @@ from numba.core import event
 
 from ertis_numba import checks
 from ertis_numba.errors import DeviceError
+from ertis_numba.forks import ForkSafeLock
 from ertis_numba.kernels import _compile_notice
+from ertis_numba.kernels._cpu.after_fork import run_kernels_after_forks
 from ertis_numba.kernels._cpu.dot16 import RANGES
 from ertis_numba.kernels._cpu.features import INSTRUCTION_SET
 from ertis_numba.kernels._cpu.loading import load_without_compiler
@@ -44,8 +46,10 @@ class _CompilationListener(event.Listener):  # type: ignore[misc]  # Numba has n
 
 event.register("numba:compile", _CompilationListener())
 
+run_kernels_after_forks()
+
 _MAX_THREADS: int = numba.config.NUMBA_NUM_THREADS
-_ONE_AT_A_TIME = threading.RLock()
+_ONE_AT_A_TIME = ForkSafeLock(threading.RLock)
 
 
 def threading_layer() -> str:

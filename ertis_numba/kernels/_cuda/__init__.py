@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from ertis_numba import checks
 from ertis_numba.kernels._cuda.delay_and_sum_envelope_int16 import TILE_RANGES
-from ertis_numba.kernels._cuda.lane import SIMULATED
+from ertis_numba.kernels._cuda.lane import SIMULATED, require_own_process
 from ertis_numba.kernels._device_protocols import NewMemory
 from ertis_numba.kernels._kernel_set import KernelSet, twins_in
 
@@ -15,6 +15,7 @@ __all__ = ["kernel_set"]
 @contextlib.contextmanager
 def threads(count: int) -> Iterator[None]:
     """See `Threads`; one Python thread launches kernels, and the GPU has its own threads."""
+    require_own_process()
     checks.integer("threads", count, 1, 1)
     yield
 

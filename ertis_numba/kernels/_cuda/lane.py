@@ -1,6 +1,7 @@
 """Lanes of the GPU: a stream, and arrays that are allocated once."""
 
 import contextlib
+import os
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -14,12 +15,13 @@ from ertis_numba.errors import DeviceError
 from ertis_numba.kernels._cuda.copies import Copies
 from ertis_numba.kernels._cuda.graph import Graph
 
-__all__ = ["SIMULATED", "Lane", "current", "launch", "workspace"]
+__all__ = ["SIMULATED", "Lane", "current", "launch", "require_own_process", "workspace"]
 
 SIMULATED = bool(numba.config.ENABLE_CUDASIM)
 
 numba.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a small image needs only a small grid, so a warning would mislead
 
+_PROCESS_ID = os.getpid()
 _MAX_BLOCKS = 65_535  # limit of all axes of a grid except the first
 
 Allocate = Callable[[tuple[int, ...], DTypeLike], Any]
@@ -123,6 +125,15 @@ class Lane:
 
 
 _HERE = threading.local()
+
+
+def require_own_process() -> None:
+    """Raise DeviceError in a forked process, which cannot use the GPU of its parent."""
+    if os.getpid() != _PROCESS_ID:
+        raise DeviceError(
+            "device 'cuda' cannot be used in a process that was forked from one that uses it; create workers with "
+            "multiprocessing.get_context('spawn'), and data loaders with multiprocessing_context='spawn'"
+        )
 
 
 def current() -> Lane:

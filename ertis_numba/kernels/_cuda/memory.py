@@ -9,7 +9,7 @@ from numba.cuda.cudadrv.driver import CudaAPIError
 from numpy.typing import DTypeLike, NDArray
 
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels._cuda.lane import SIMULATED, Lane
+from ertis_numba.kernels._cuda.lane import SIMULATED, Lane, require_own_process
 from ertis_numba.kernels._device_protocols import Array
 from ertis_numba.kernels._images import ImagePool
 
@@ -24,6 +24,7 @@ class CudaMemory:
     n_lanes = 3  # one measurement being copied in, one being processed, one being copied out
 
     def __init__(self, *, graphs: bool | None = None) -> None:
+        require_own_process()
         self._graphs = graphs is not False  # Graphs make measurements two to three times as fast.
         self._bytes = 0
         self._images = ImagePool(lambda shape: self._pinned(shape, np.float32))

@@ -13,6 +13,7 @@ from ertis_numba.network import addresses
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.log import logger
 from ertis_numba.network.messages import MAX_SEQUENCE
+from ertis_numba.network.owner import Owner
 from ertis_numba.network.sensor_node._disk_spool import DiskSpool
 from ertis_numba.network.sensor_node._link import Central, Link
 from ertis_numba.network.sensor_node._memory_spool import SensorCounts, Spool
@@ -110,8 +111,10 @@ class SensorNode:
             else DiskSpool(Path(spool), ring_bytes, spool_bytes, on_note=self._on_note)
         )
         self._link: Link | None = None
+        self._owner = Owner("sensor node")
 
     def __enter__(self) -> Self:
+        self._owner = Owner("sensor node")
         self._spool.open()
         self._link = Link(
             self._address,
@@ -131,6 +134,8 @@ class SensorNode:
 
     def close(self) -> None:
         """Stop sending; closing twice is harmless. Measurements kept only in memory are lost, so call `flush` first."""
+        if not self._owner.is_this_process:
+            return
         if self._link is not None:
             self._link.stop()
             self._link = None
@@ -178,6 +183,7 @@ class SensorNode:
         ArgumentError
             A measurement does not match its sensor, or its number does not rise.
         """
+        self._owner.require_this_process()
         kept = self._spool.append(entries)
         for entry in kept:
             mark("kept", entry.measurement.stamp.sensor, entry.measurement.stamp.sequence)
@@ -211,6 +217,7 @@ class SensorNode:
         stop : callable, optional
             Called ten times a second; the wait ends early once it returns True.
         """
+        self._owner.require_this_process()
         return self._spool.wait(timeout_s, stop)
 
     @property
