@@ -139,7 +139,7 @@ def test_imported_ranges_fit_sample_rate_and_call(tmp_path, rate_hz, call):
     made = reader.settings
     band_hz = call.high_frequency_hz - call.low_frequency_hz
     assert 1.79 * band_hz < made.output_rate_hz < 4 * band_hz
-    assert made.processing.range_m == (0.5, 2.6)
+    assert made.processing.range_m == (0.43, 3.0)
     Pipeline(made).process(next(iter(reader)))
 
 

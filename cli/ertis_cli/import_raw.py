@@ -17,6 +17,16 @@ __all__ = ["import_raw"]
 
 _END_NS = 2**63  # in the year 2262
 _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
+_OF_PCM = {
+    "--skip": "skip_s",
+    "--length": "length_s",
+    "--start": "start",
+    "--passive": "passive",
+    "--join": "join",
+    "--time-expansion": "time_expansion",
+}
+"""Options for PCM by their names on the command line."""
+_UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
 
 
 @click.command("import")
@@ -54,10 +64,19 @@ _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
 @click.option(
     "--start",
     metavar="TIME",
+    multiple=True,
     type=click.DateTime([f"%Y-%m-%dT%H:%M{rest}{zone}" for rest in ("", ":%S", ":%S.%f") for zone in ("", "%z")]),
-    help="PCM: time of the first emission, as 2026-05-04T12:30 or 12:30:00.5, in UTC unless it has an offset.",
+    help="PCM: time of the first emission, as 2026-05-04T12:30 or 12:30:00.5, in UTC unless it has an offset; once for "
+    "the first file, or once for each file. By default, from metadata or names of the files.",
 )
 @click.option("--passive", is_flag=True, help="PCM: no call was emitted, so the settings need no call.")
+@click.option("--join", is_flag=True, help="PCM: each file holds one microphone or some, in the order of the channels.")
+@click.option(
+    "--time-expansion",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="FACTOR",
+    help="PCM: factor by which files play slower than the sound, such as 10; by default, as in their metadata.",
+)
 @click.option("--sensor", metavar="NAME", default="sensor", show_default=True, help="Name of the sensor.")
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
 @click.option("--humidity", type=float, metavar="PCT", help="Relative humidity in percent; 50 by default.")
@@ -73,8 +92,10 @@ def import_raw(
     settings_file: Path | None,
     skip_s: float | None,
     length_s: float | None,
-    start: datetime | None,
+    start: tuple[datetime, ...],
     passive: bool,
+    join: bool,
+    time_expansion: float | None,
     sensor: str,
     temperature: float | None,
     humidity: float | None,
@@ -93,13 +114,15 @@ def import_raw(
 
     Files that end in .wav contain multichannel PCM, as do .h5 files with the time_data of Acoular. Their channels are
     the rows of the layout, and their sample rate becomes that of the recording. With --passive, the files
-    contain sound without a call, for acoustic maps.
+    contain sound without a call, for acoustic maps. A folder of .wav files is imported in the order of their times.
+    Notes state the source of the times, and what was assumed or left out.
     """
+    from ertis_numba.interop import is_wav_folder
     from ertis_numba.storage import check_target, write_recording
 
-    is_pcm = all(path.suffix.lower() in _PCM for path in raw)
-    of_pcm = (("--skip", "skip_s"), ("--length", "length_s"), ("--start", "start"), ("--passive", "passive"))
-    for name, parameter in of_pcm:
+    folder = raw[0] if len(raw) == 1 and raw[0].is_dir() else None
+    is_pcm = all(path.suffix.lower() in _PCM for path in raw) if folder is None else is_wav_folder(folder)
+    for name, parameter in _OF_PCM.items():
         if typed(parameter) and not is_pcm:
             raise click.UsageError(f"{name} is for PCM (.wav, .h5); remove it", click.get_current_context())
     if not is_pcm and any(path.suffix.lower() in _PCM for path in raw):
@@ -107,32 +130,33 @@ def import_raw(
             "some files are PCM (.wav, .h5) and others are raw data; import each kind separately",
             click.get_current_context(),
         )
-    folder = raw[0] if len(raw) == 1 and raw[0].is_dir() else None
     if target is None:
         target = _beside(raw[0]) if folder is None else Path(f"{folder.resolve()}.h5")
     check_target(target, overwrite=force, sources=raw)
-    given = {"temperature_c": temperature, "humidity_percent": humidity}
-    air = {name: value for name, value in given.items() if value is not None}
     measurements: PcmReader | RawReader
     if is_pcm:
-        given_pcm = {
+        options_of_reader = {
+            "sensor": sensor,
             "skip_s": skip_s or 0.0,
             "length_s": length_s,
-            "start_ns": _since_1970_ns(start),
+            "start_ns": [_since_1970_ns(each) for each in start],
             "passive": passive,
+            "join": join,
+            "time_expansion": time_expansion,
+            "temperature_c": temperature,
+            "humidity_percent": humidity,
         }
-        measurements = _opened_pcm(raw, layout, preset, settings_file, sensor, given_pcm)
+        measurements = _opened_pcm(raw, layout, preset, settings_file, options_of_reader)
     else:
         measurements = _opened_raw(raw, folder, layout, preset, settings_file, sensor)
-    settings = measurements.settings
-    measurements.settings = settings.replace(air=settings.air.replace(**air))
+        given = {"temperature_c": temperature, "humidity_percent": humidity}
+        air = {name: value for name, value in given.items() if value is not None}
+        settings = measurements.settings
+        measurements.settings = settings.replace(air=settings.air.replace(**air))
     source = ", ".join(path.name for path in raw)
     with options.progress(measurements, length=len(measurements), label="importing", quiet=quiet) as shown:
         write_recording(target, shown, overwrite=force, source=source)
     options.say(f"{target}: {options.counted(len(measurements), 'measurement')}", quiet=quiet)
-    rest_s = getattr(measurements, "rest_s", 0.0)
-    if rest_s:
-        options.say(f"note: {rest_s:.4g} s at the ends of files were left out", quiet=quiet)
     notes = getattr(measurements, "notes", ())
     for note in notes:
         options.say(f"note: {note}", quiet=quiet)
@@ -178,24 +202,22 @@ def _opened_pcm(
     layout: str | None,
     preset: str | None,
     settings_file: Path | None,
-    sensor: str,
     given: dict[str, Any],
 ) -> "PcmReader":
     from ertis_numba.interop import open_pcm
 
-    settings = None
+    settings = whole_range = None
     if any(part is not None for part in (layout, preset, settings_file)):
         if settings_file is None and (layout is None or (preset is None and not given["passive"])):
             _require("--layout" if layout is None else "--preset")
-        settings = _settings(layout, preset, settings_file)
-    elif raw[0].suffix.lower() == ".wav":
+        settings = _settings(layout, preset, settings_file, {"processing.range_m": _UNSTATED_M})
+        whole_range = settings.processing.range_m == _UNSTATED_M
+    elif raw[0].is_dir() or raw[0].suffix.lower() == ".wav":
         _require("--settings")
-    return open_pcm(raw, settings, sensor=sensor, **given)
+    return open_pcm(raw, settings, whole_range=whole_range, **given)
 
 
-def _since_1970_ns(start: datetime | None) -> int:
-    if start is None:
-        return 0
+def _since_1970_ns(start: datetime) -> int:
     given = start if start.tzinfo else start.replace(tzinfo=UTC)
     since_1970_ns = (given - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000
     if not 0 <= since_1970_ns < _END_NS:
@@ -227,10 +249,14 @@ def _require(option: str) -> None:
     raise click.MissingParameter(ctx=click.get_current_context(), param_hint=f"'{option}'", param_type="option")
 
 
-def _settings(layout: str | None, preset: str | None, settings_file: Path | None) -> "Settings":
-    """Return the settings from preset, settings file and options."""
+def _settings(
+    layout: str | None, preset: str | None, settings_file: Path | None, changes: dict[str, Any] | None = None
+) -> "Settings":
+    """Return the settings from preset, changes of it, settings file and options."""
     from ertis_numba.settings import Array, Settings
 
     settings = Settings() if preset is None else Settings.from_preset(preset)
+    for name, value in (changes or {}).items():
+        settings = settings.replace(name, value)
     settings = options.settings_with(settings, settings_file=settings_file)
     return settings if layout is None else settings.replace(array=Array(layout=layout))

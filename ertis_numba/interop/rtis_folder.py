@@ -122,7 +122,9 @@ def _measurements(folder: Path) -> tuple[list[Path], list[int]]:
     except OSError as error:
         raise DataError(f"{folder}: {error.strerror}; give a folder of raw files") from error
     if not paths:
-        raise DataError(f"{folder} is a folder; give a file of raw words, or a folder with .bin files of RTIS Dev")
+        raise DataError(
+            f"{folder} is a folder; give a file of raw words, or a folder with .wav files or .bin files of RTIS Dev"
+        )
     split = [re.fullmatch(r"(.*?)(\d*)", path.stem) for path in paths]
     names = {match[1] for match in split if match}
     digits = [match[2] for match in split if match]

@@ -12,7 +12,7 @@ from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
 from ertis_numba.settings.passive import MAP_METHODS, MAX_BANDS, MapMethod, Passive
 from ertis_numba.settings.presets import PRESETS, PresetKind, preset_tables, preset_text, presets
 from ertis_numba.settings.processing import STAGES, Processing
-from ertis_numba.settings.ranges import fit_ranges
+from ertis_numba.settings.ranges import fit_ranges, record_range_m
 from ertis_numba.settings.recording import ENCODINGS, Air, Recording
 from ertis_numba.settings.settings import Settings
 from ertis_numba.settings.waveform import MAX_WAVEFORM_SAMPLES
@@ -43,4 +43,5 @@ __all__ = [
     "preset_tables",
     "preset_text",
     "presets",
+    "record_range_m",
 ]

@@ -8,7 +8,7 @@ from ertis_numba.settings.call import Call
 from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.recording import Recording
 
-__all__ = ["fit_ranges", "max_decimation"]
+__all__ = ["fit_ranges", "max_decimation", "record_range_m"]
 
 _MIN_SOUND_SPEED_M_S = 300.0  # slightly below the speed at -40 °C
 _MIN_RATE_PER_BANDWIDTH = 1.8  # ranges per second, relative to the bandwidth of the call
@@ -65,6 +65,23 @@ def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Proc
         suits = max_decimation(recording.sample_rate_hz, call, processing)
         changes |= {"range_decimation": _range_decimation(recording.sample_rate_hz / min_hz, suits), "decimation": None}
     return processing.replace(**changes)
+
+
+def record_range_m(recording: Recording, call: Call, sound_speed_m_s: float) -> tuple[float, float]:
+    """Return the ranges in metres whose echoes begin after the call and end within the record.
+
+    Both are rounded inwards to a centimetre. The first is 0 if no echo meets both conditions.
+
+    Examples
+    --------
+    >>> from ertis_numba.settings import Call, Recording, record_range_m
+    >>> record_range_m(Recording(n_samples=65_536), Call(), 343.0)
+    (0.43, 2.06)
+    """
+    first_m, last_m = (sound_speed_m_s * time_s / 2 for time_s in (call.duration_s, recording.duration_s - call.end_s))
+    steps = 100 if last_m > 0.1 else 1000
+    first_m, last_m = math.ceil(first_m * steps) / steps, math.floor(last_m * steps) / steps
+    return (first_m if first_m < last_m else 0.0, last_m)
 
 
 def max_decimation(sample_rate_hz: float, call: Call, processing: Processing) -> int:

@@ -25,7 +25,7 @@ from ertis_numba.analysis.health.limits import (
     MIN_LEVEL_DB,
     MIN_SAMPLES,
 )
-from ertis_numba.analysis.health.pcm_samples import by_numbers, scaled, swapped_bytes
+from ertis_numba.analysis.health.pcm_samples import by_numbers, scaled, sounding_part, swapped_bytes
 from ertis_numba.analysis.health.repeats import duplicates, hum, repeated_blocks, stuck_at_times
 from ertis_numba.analysis.health.report import ChannelHealth, Finding, Health
 from ertis_numba.analysis.health.spectra import by_spectra
@@ -45,7 +45,8 @@ _LOWEST_NOISE_DBFS = -95.0  # Noise in the call's band; rounding to 16 bits has 
 def health(measurement: Measurement) -> Health:
     """Return the health of the microphones and of the record of one measurement.
 
-    The checks cover the enabled channels and the first 524,288 samples. In the loud and the quiet eighth of the record,
+    The checks cover the enabled channels and the first 524,288 samples. PCM samples that are exactly 0 in all channels
+    at either end of the record are left out, because recorders with a trigger write them. In the loud and the quiet eighth of the record,
     the median channel has the most and the least power in the call's band.
 
     The dynamic range is ``10 log10(1/2 / noise · B T · N)``: a sine at full scale relative to the noise in the call's
@@ -81,17 +82,20 @@ def health(measurement: Measurement) -> Health:
     checks.instance("measurement", measurement, Measurement, "a recording holds")
     settings, has_call = measurement.settings, measurement.stamp.behaviour != "passive"
     enabled = np.flatnonzero(microphones(measurement.settings.array).enabled)
-    words = sample_format(settings).validated(measurement.data, any_length=True)[:MAX_SAMPLES]
+    record = sample_format(settings).validated(measurement.data, any_length=True)
+    sounding = slice(None) if settings.recording.is_pdm else sounding_part(record, enabled)
+    words = record[sounding][:MAX_SAMPLES]
     if len(words) < MIN_SAMPLES:
         too_short = f"the state of any microphone: the record has {len(words)} samples, fewer than {MIN_SAMPLES}"
         return Health(
             channels=tuple(ChannelHealth(channel=int(i)) for i in enabled), unknown=(too_short,), has_call=has_call
         )
     signal_of: Callable[[int], NDArray[np.float32]]
+    whole: Callable[[int], NDArray[np.float32]]
     columns: Callable[[int], NDArray[Any]]
     if settings.recording.is_pdm:
         octets = _bits.octets_of(words)
-        signal_of = functools.partial(_bits.signal_of, octets)
+        signal_of = whole = functools.partial(_bits.signal_of, octets)
         columns = functools.partial(_bits.bits_of, octets)
         reported, half_scale = by_bits(octets, enabled), 0.5
     else:
@@ -100,6 +104,8 @@ def health(measurement: Measurement) -> Health:
         if is_float:  # The unit of float samples may be the pascal.
             full = max(full, *(float(np.abs(words[:, i]).max()) for i in enabled))
         signal_of = functools.partial(scaled, words, full)
+        # Times since the start of the record include the silence before its first sound.
+        whole = functools.partial(scaled, record[:MAX_SAMPLES], full)
         columns, half_scale = functools.partial(_column, words), full
     found = {item.channel: item for item in reported}
     moving = [item for item in reported if not any(name.startswith("stuck") for name in item.faults)]
@@ -114,7 +120,7 @@ def health(measurement: Measurement) -> Health:
     heard = [item.channel for item in reported if not set(item.faults) & _DEAF and item.channel not in deaf]
     not_observable: tuple[str, ...] = () if has_call else (f"{DESCRIPTIONS}: no call was emitted",)
     if has_call and heard and not any("resolve" in text for text in unknown):
-        shown, not_observable = by_wavefront(signal_of, heard, settings, n_samples=len(words))
+        shown, not_observable = by_wavefront(whole, heard, settings, n_samples=min(len(record), MAX_SAMPLES))
         findings += shown
     findings = [*_of_channels(found.values()), *findings]
     channels = _with_faults(found, findings)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.health.limits import MAX_OFFSET, MAX_SATURATED, MAX_SWAP_DB, MIN_CHANGES, OFFSET_DEVIATIONS
 from ertis_numba.analysis.health.report import ChannelHealth, Finding
 
-__all__ = ["by_numbers", "scaled", "swapped_bytes"]
+__all__ = ["by_numbers", "scaled", "sounding_part", "swapped_bytes"]
 
 # The largest 16-bit sample, relative to full scale. float32 has no limit, so it clips at the level of its source.
 _FULL = 1 - 2.0**-15
@@ -18,6 +18,12 @@ _FULL = 1 - 2.0**-15
 def scaled(words: NDArray[Any], full: float, channel: int) -> NDArray[np.float32]:
     """Return the samples of a PCM channel, scaled to a full scale of 1."""
     return np.asarray(np.multiply(words[:, channel], np.float32(1 / full), dtype=np.float32))
+
+
+def sounding_part(words: NDArray[Any], enabled: NDArray[np.intp]) -> slice:
+    """Return the samples without those at either end that are 0 in all enabled channels; all, if no sample differs."""
+    sounding = np.flatnonzero((words[:, enabled] != 0).any(axis=1))
+    return slice(int(sounding[0]), int(sounding[-1]) + 1) if len(sounding) else slice(None)
 
 
 def by_numbers(channel: int, signal: NDArray[np.float32], *, is_float: bool) -> ChannelHealth:

@@ -1,0 +1,230 @@
+"""Single files of PCM, and files of single microphones that are joined: properties and samples."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.interop._acoular import read_acoular
+from ertis_numba.interop.recorder_metadata import RecorderMetadata, read_metadata
+from ertis_numba.interop.time_expansion import true_rate_hz
+from ertis_numba.settings import Recording, Settings
+from ertis_numba.wav import read_wav
+
+__all__ = ["PcmFile", "inspect", "joined", "per_file", "require_alike"]
+
+_ACOULAR: Final = {".h5", ".hdf5", ".hdf"}
+_MIDDLE_OF_BYTES: Final = 128
+_MAX_FLOAT32: Final = float(np.finfo(np.float32).max)
+
+
+@dataclass(frozen=True, slots=True)
+class PcmFile:
+    """Properties of a PCM file, or of several whose channels are joined.
+
+    Attributes
+    ----------
+    paths : tuple of Path
+        Files in the order of their channels.
+    rate_hz : float
+        Rate at which the sound was recorded.
+    n_samples : int
+    counts : tuple of int
+        Number of channels of each file.
+    kind : dtype
+        Type of the samples in the file.
+    metadata : RecorderMetadata
+    notes : tuple of str
+    settings : Settings or None
+        Settings in the file.
+    """
+
+    paths: tuple[Path, ...]
+    rate_hz: float
+    n_samples: int
+    counts: tuple[int, ...]
+    kind: np.dtype[Any]
+    metadata: RecorderMetadata
+    notes: tuple[str, ...] = ()
+    settings: Settings | None = None
+
+    @property
+    def path(self) -> Path:
+        """First file."""
+        return self.paths[0]
+
+    @property
+    def n_channels(self) -> int:
+        """Number of channels of all files."""
+        return sum(self.counts)
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the sound, in seconds."""
+        return self.n_samples / self.rate_hz
+
+    @property
+    def encoding(self) -> Literal["int16", "float32"]:
+        """Encoding of a recording that holds the samples."""
+        return "int16" if self.kind.kind in "iu" and self.kind.itemsize <= 2 else "float32"
+
+    def open(self) -> "PcmSamples":
+        """Return the samples."""
+        return PcmSamples(self, [_read(path)[1] for path in self.paths])
+
+
+class PcmSamples:
+    """Samples of a PCM file as numbers of a recording; slices are read when they are needed."""
+
+    def __init__(self, file: PcmFile, parts: Sequence[Any]) -> None:
+        self._file = file
+        self._parts = parts
+
+    def block(self, samples: slice, enabled: NDArray[np.bool_] | None = None) -> NDArray[Any]:
+        """Return samples, (sample, channel); non-finite samples of disabled channels become 0.
+
+        Raises
+        ------
+        DataError
+            A sample of an enabled channel is not finite, or exceeds float32.
+        """
+        several = [part[samples] for part in self._parts]
+        numbers = several[0] if len(several) == 1 else np.concatenate(several, axis=1)
+        return _converted(self._file, numbers, samples.start, enabled)
+
+
+def inspect(path: Path, expansion: float | None = None) -> PcmFile:
+    """Return the properties of a file.
+
+    Raises
+    ------
+    DataError
+        The file cannot be read, or its rate is unknown or out of range.
+    """
+    header_hz, numbers, settings, chunks, notes = _read(path)
+    try:
+        Recording(sample_rate_hz=header_hz)
+    except ArgumentError as error:
+        raise DataError(f"{path}: {error}") from error
+    metadata = read_metadata(chunks, header_hz)
+    rate_hz, expanded = true_rate_hz(path, header_hz, metadata, expansion)
+    n_samples, n_channels = numbers.shape
+    return PcmFile(
+        paths=(path,),
+        rate_hz=rate_hz,
+        n_samples=n_samples,
+        counts=(n_channels,),
+        kind=numbers.dtype,
+        metadata=metadata,
+        notes=(*notes, *metadata.notes, *expanded),
+        settings=settings,
+    )
+
+
+def joined(files: Sequence[PcmFile]) -> PcmFile:
+    """Return one file with the channels of all, cut to the shortest.
+
+    Raises
+    ------
+    DataError
+        The files differ in rate, type of numbers or time.
+    """
+    require_alike(files, joined=True)
+    first = files[0]
+    n_samples = min(file.n_samples for file in files)
+    notes = [f"the files are joined, {_channels(files)}"]
+    longest = max(file.n_samples for file in files)
+    if longest > n_samples:
+        notes.append(
+            f"the files differ in length; {(longest - n_samples) / first.rate_hz:.4g} s at the end are left out"
+        )
+    return replace(
+        first,
+        paths=tuple(file.path for file in files),
+        n_samples=n_samples,
+        counts=tuple(file.n_channels for file in files),
+        notes=(*notes, *per_file([(file.path, note) for file in files for note in file.notes])),
+    )
+
+
+def require_alike(files: Sequence[PcmFile], *, joined: bool = False) -> None:
+    """Refuse files that differ in rate, channels or type of numbers."""
+    first = files[0]
+    remedy = "join files of one recorder only" if joined else "import each file separately"
+    for file in files[1:]:
+        for name, came, wanted in (
+            ("Hz", file.rate_hz, first.rate_hz),
+            ("channels", file.n_channels, file.n_channels if joined else first.n_channels),
+            ("numbers", file.encoding, first.encoding),
+        ):
+            if came != wanted:
+                raise DataError(
+                    f"{file.path} has {_format_value(came)} {name}, but {first.path.name} has "
+                    f"{_format_value(wanted)}; {remedy}"
+                )
+
+
+def per_file(notes: Iterable[tuple[Path, str]]) -> list[str]:
+    """Return notes with the name of the first file that each applies to, and the number of others."""
+    paths: dict[str, list[Path]] = {}
+    for path, text in notes:
+        paths.setdefault(text, []).append(path)
+    return [
+        f"{those[0].name}{f' (and {len(those) - 1} more)' if len(those) > 1 else ''}: {text}"
+        for text, those in paths.items()
+    ]
+
+
+def _channels(files: Sequence[PcmFile]) -> str:
+    """Return the order of the channels in words."""
+    names = [file.path.name for file in files]
+    if len(names) > 4:
+        names = [*names[:2], "…", names[-1]]
+    return f"channel 0 first: {', '.join(names)}"
+
+
+def _read(path: Path) -> tuple[float, Any, Settings | None, dict[str, bytes], tuple[str, ...]]:
+    try:
+        with path.open("rb"):
+            pass
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; give a PCM file") from error
+    if path.suffix.lower() in _ACOULAR:
+        return *read_acoular(path), {}, ()
+    wav = read_wav(path)
+    return wav.rate_hz, wav.samples, None, wav.chunks, tuple(note.removeprefix(f"{path.name}: ") for note in wav.notes)
+
+
+def _converted(
+    file: PcmFile, numbers: NDArray[Any], first_sample: int, enabled: NDArray[np.bool_] | None
+) -> NDArray[Any]:
+    """Return numbers of a file in the type of a recording."""
+    if numbers.dtype.itemsize == 1:  # 8-bit WAV samples are unsigned.
+        middle = _MIDDLE_OF_BYTES if numbers.dtype.kind == "u" else 0
+        return ((numbers.astype(np.int16) - middle) * 256).astype("<i2")
+    if file.encoding == "int16":
+        return numbers.astype("<i2")
+    if numbers.dtype.kind == "i":
+        return (numbers / 2.0 ** (8 * numbers.dtype.itemsize - 1)).astype("<f4")
+    with np.errstate(over="ignore"):  # The check below refuses the result.
+        words = numbers.astype("<f4")
+    if enabled is None:
+        return words
+    broken = ~np.isfinite(words)
+    words[broken & ~enabled] = 0
+    if broken[:, enabled].any():
+        sample, channel = np.argwhere(broken & enabled)[0].tolist()
+        came = numbers[sample, channel]
+        raise DataError(
+            f"{file.path} contains {came:g} at sample {first_sample + sample} of channel {channel}; "
+            + (f"give numbers up to {_MAX_FLOAT32:.4g}" if np.isfinite(came) else "give finite numbers")
+        )
+    return words
+
+
+def _format_value(value: object) -> object:
+    return f"{value:g}" if isinstance(value, float) else value

@@ -1,0 +1,55 @@
+"""Folders of WAV files, such as the card of a recorder."""
+
+import re
+from pathlib import Path
+
+from ertis_numba.errors import DataError
+from ertis_numba.interop.pcm_files import inspect
+from ertis_numba.interop.recorder_names import times_in_names
+
+__all__ = ["is_wav_folder", "wav_files"]
+
+
+def is_wav_folder(path: str | Path) -> bool:
+    """Return True for a folder with WAV files, unless it contains .bin files of RTIS Dev.
+
+    Examples
+    --------
+    >>> from ertis_numba.interop import is_wav_folder
+    >>> is_wav_folder(".")
+    False
+    """
+    try:
+        suffixes = {each.suffix.lower() for each in Path(path).iterdir()} if Path(path).is_dir() else set()
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror}; give a folder that can be read") from error
+    return ".wav" in suffixes and ".bin" not in suffixes
+
+
+def wav_files(folder: Path, *, by_time: bool) -> list[Path]:
+    """Return the WAV files of a folder in the order of their times, otherwise of their names, in which numbers count.
+
+    Hidden files, which computers add to cards, are left out.
+
+    Raises
+    ------
+    DataError
+        A file cannot be read.
+    """
+    visible = [each for each in folder.iterdir() if not each.name.startswith(".") and each.suffix.lower() == ".wav"]
+    paths = sorted(visible, key=lambda path: _natural(path.name))
+    if not by_time:
+        return paths
+    moments = [
+        next(iter(inspect(path, 1.0).metadata.moments), named)
+        for path, named in zip(paths, times_in_names([path.name for path in paths]), strict=True)
+    ]
+    times_ns = [moment.since_1970_ns for moment in moments if moment is not None]
+    if len(times_ns) < len(paths):
+        return paths
+    return [paths[place] for place in sorted(range(len(paths)), key=times_ns.__getitem__)]
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Return a key by which ``mic2.wav`` precedes ``mic10.wav``."""
+    return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name)]

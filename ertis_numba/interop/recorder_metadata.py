@@ -1,0 +1,165 @@
+"""Time and time expansion in the metadata of recorders: chunks of WAV files.
+
+References: GUANO 1.0 (https://github.com/riggsd/guano-spec), EBU Tech 3285 (bext), the firmware of AudioMoth (comment),
+and the fields of Wildlife Acoustics' wamd.
+"""
+
+import math
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from typing import Final
+
+from ertis_numba.interop.recorder_names import Moment, times_in_names
+
+__all__ = ["RecorderMetadata", "read_metadata"]
+
+_AUDIOMOTH: Final = re.compile(
+    r"(?P<time>\d\d?:\d\d:\d\d(?:\.\d{1,6})?) (?P<day>\d\d)/(?P<month>\d\d)/(?P<year>\d{4}) "
+    r"\(UTC(?P<sign>[+-]?)(?P<hours>\d\d?)?(?::?(?P<minutes>\d\d))?\)"
+)
+_WAMD_TIME, _WAMD_EXPANSION = 0x05, 0x0F
+_BEXT_DATE: Final = slice(320, 338)
+_SAME_S: Final = 2.0  # Sources that differ by less agree: recorders write times before or after the first sample.
+
+
+@dataclass(slots=True)
+class RecorderMetadata:
+    """Statements of a recorder about a file.
+
+    Attributes
+    ----------
+    moments : list of Moment
+        Time of the first sample, from each source that states it; the most reliable source comes first.
+    expansion : float or None
+        Factor by which the header's rate is too low, as stated.
+    rate_hz : float or None
+        True sample rate, as stated.
+    notes : list of str
+        Statements that cannot be read.
+    """
+
+    moments: list[Moment] = field(default_factory=list)
+    expansion: float | None = None
+    rate_hz: float | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def read_metadata(chunks: Mapping[str, bytes], rate_hz: float) -> RecorderMetadata:
+    """Return time and time expansion in the chunks of a WAV file.
+
+    Parameters
+    ----------
+    chunks : mapping of str to bytes
+        See `ertis_numba.wav.WavFile`.
+    rate_hz : float
+        Sample rate in the header, in hertz.
+    """
+    found = RecorderMetadata()
+    _read_guano(chunks.get("guan", b""), found)
+    _read_wamd(chunks.get("wamd", b""), found)
+    info = dict(_info(chunks.get("INFO", b"")))
+    found.moments += _audiomoth(info.get(b"ICMT", ""))
+    found.moments += _bext(chunks.get("bext", b""), rate_hz)
+    found.moments += _creation(info.get(b"ICRD", ""))
+    return found
+
+
+def _read_guano(content: bytes, found: RecorderMetadata) -> None:
+    lines = content.decode("utf-8", "replace").replace("\0", "\n").splitlines()
+    fields = {key.strip(): value.strip() for key, colon, value in (line.partition(":") for line in lines) if colon}
+    if time := fields.get("Timestamp"):
+        try:
+            found.moments.append(_moment(time, "GUANO"))
+        except ValueError:
+            found.notes.append(f"GUANO Timestamp {time!r} is no time and is not used")
+    elif name := fields.get("Original Filename"):
+        found.moments += [
+            moment._replace(source="GUANO's Original Filename") for moment in times_in_names([name]) if moment
+        ]
+    found.expansion = _positive("TE", fields, found)
+    found.rate_hz = _positive("Samplerate", fields, found)
+
+
+def _positive(name: str, fields: dict[str, str], found: RecorderMetadata) -> float | None:
+    text = fields.get(name)
+    if not text:
+        return None
+    with suppress(ValueError):
+        number = float(text)
+        if 0 < number < math.inf:
+            return number
+    found.notes.append(f"GUANO {name} {text!r} is no positive number and is not used")
+    return None
+
+
+def _read_wamd(content: bytes, found: RecorderMetadata) -> None:
+    for kind, value in _wamd_fields(content):
+        if kind == _WAMD_TIME:
+            with suppress(ValueError):
+                text = value.decode("ascii", "replace").strip("\0 ")
+                found.moments.append(_moment(text, "Wildlife Acoustics metadata"))
+        if kind == _WAMD_EXPANSION and len(value) == 2 and found.expansion is None:
+            found.expansion = float(struct.unpack("<H", value)[0]) or None
+
+
+def _wamd_fields(content: bytes) -> Iterator[tuple[int, bytes]]:
+    place = 0
+    while place + 6 <= len(content):
+        kind, size = struct.unpack_from("<HI", content, place)
+        yield kind, content[place + 6 : place + 6 + size]
+        place += 6 + size
+
+
+def _info(content: bytes) -> Iterator[tuple[bytes, str]]:
+    """Yield the texts of a list of information."""
+    place = 0
+    while place + 8 <= len(content):
+        name, size = struct.unpack_from("<4sI", content, place)
+        yield name, content[place + 8 : place + 8 + size].split(b"\0")[0].decode("utf-8", "replace")
+        place += 8 + size + size % 2
+
+
+def _audiomoth(comment: str) -> Iterator[Moment]:
+    match = _AUDIOMOTH.search(comment)
+    if match is None:
+        return
+    with suppress(ValueError):
+        clock = datetime.fromisoformat(f"{match['year']}-{match['month']}-{match['day']}T{match['time']:0>8}")
+        offset = timedelta(hours=int(match["hours"] or 0), minutes=int(match["minutes"] or 0))
+        moment = Moment.of(clock, "the recorder's comment")
+        yield moment._replace(offset=-offset if match["sign"] == "-" else offset)
+
+
+def _bext(content: bytes, rate_hz: float) -> Iterator[Moment]:
+    """Yield the time of a broadcast extension; a time reference that agrees adds the fraction of a second."""
+    text = content[_BEXT_DATE].decode("ascii", "replace")
+    parts = re.fullmatch(r"(\d{4})\D(\d\d)\D(\d\d)(\d\d)\D(\d\d)\D(\d\d)", text)
+    if parts is None:
+        return
+    with suppress(ValueError):
+        clock = datetime(*map(int, parts.groups()))  # type: ignore[arg-type]  # noqa: DTZ001  six whole numbers
+        moment = Moment(clock, None, "bext metadata")
+        if len(content) >= 346:
+            midnight = clock.replace(hour=0, minute=0, second=0)
+            with suppress(OverflowError):
+                exact = midnight + timedelta(seconds=struct.unpack_from("<Q", content, 338)[0] / rate_hz)
+                if abs((exact - clock).total_seconds()) < _SAME_S:
+                    moment = moment._replace(clock=exact, resolution_s=1e-3)
+        yield moment
+
+
+def _creation(text: str) -> Iterator[Moment]:
+    """Yield the date of creation if it contains a time."""
+    with suppress(ValueError):
+        yield _moment(text, "the date of creation (ICRD)")
+
+
+def _moment(text: str, source: str) -> Moment:
+    """Return the moment that a text states; a date alone is none."""
+    if len(text.strip()) <= len("2024-05-18"):
+        raise ValueError(text)
+    return Moment.of(datetime.fromisoformat(text.strip()), source)

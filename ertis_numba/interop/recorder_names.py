@@ -1,0 +1,95 @@
+"""Times in the names of files that recorders write."""
+
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Final, NamedTuple
+
+__all__ = ["Moment", "times_in_names"]
+
+_ZONE: Final = r"(?P<zone>Z|[+-]\d{2}:?\d{2}(?!\d))?"
+_STAMP: Final = re.compile(
+    r"(?<!\d)(?P<year>(?:19|20|21|22)\d\d|\d\d)(?P<between>[-_.]?)(?P<month>\d\d)(?P=between)(?P<day>\d\d)"
+    r"[-_T $~]{0,3}"
+    r"(?P<hour>\d\d)(?P<gap>[-_.:]?)(?P<minute>\d\d)(?P=gap)(?P<second>\d\d)"
+    r"(?:[-_.,]?(?P<ms>\d{3})(?!\d))?" + _ZONE + r"(?!\d)"
+)
+_HEX: Final = re.compile(r"[0-9A-F]{8}", re.IGNORECASE)
+_HEX_S: Final = range(round(datetime(2014, 1, 1, tzinfo=UTC).timestamp()), 2**31)
+
+
+class Moment(NamedTuple):
+    """Time at which a file begins, as its source states it.
+
+    Attributes
+    ----------
+    clock : datetime
+        Reading of the clock, without a zone.
+    offset : timedelta or None
+        Offset of the clock from UTC; None if the source states none. UTC is then assumed.
+    source : str
+        Words for the source, such as ``GUANO``.
+    resolution_s : float
+        Step of the clock, in seconds.
+    """
+
+    clock: datetime
+    offset: timedelta | None
+    source: str
+    resolution_s: float = 1.0
+
+    @classmethod
+    def of(cls, stated: datetime, source: str) -> "Moment":
+        """Return the moment of a time with or without a zone."""
+        resolution_s = 1e-3 if stated.microsecond else 1.0
+        return cls(stated.replace(tzinfo=None), stated.utcoffset(), source, resolution_s)
+
+    @property
+    def since_1970_ns(self) -> int:
+        """Nanoseconds since 1970-01-01 UTC."""
+        since = self.clock - (self.offset or timedelta()) - datetime(1970, 1, 1)  # noqa: DTZ001  both without a zone
+        return since // timedelta(microseconds=1) * 1000
+
+
+def times_in_names(names: Sequence[str]) -> list[Moment | None]:
+    """Return the times in names of files; None for names without date and time.
+
+    Recognised are date and time in digits, such as ``20240518_042537.WAV``, ``SMU01234_20240518_042537_250.wav``,
+    ``T2024-05-18_04-25-37_0001234.WAV`` and ``240518_042537.wav``, and Unix seconds as eight hexadecimal digits, such
+    as ``5AFC0B40.WAV``. Eight decimal digits are a counter unless another name contains a letter.
+    """
+    stems = [name.rpartition(".")[0] or name for name in names]
+    are_hex = any(_HEX.fullmatch(stem) and not stem.isdigit() for stem in stems)
+    return [_stamp(stem) or (_unix_seconds(stem) if are_hex else None) for stem in stems]
+
+
+def _stamp(stem: str) -> Moment | None:
+    for found in _STAMP.finditer(stem):
+        part = {name: int(found[name] or 0) for name in ("year", "month", "day", "hour", "minute", "second", "ms")}
+        if part["year"] < 100 and (found["between"] or found["gap"]):
+            continue  # 24-05-18 may be any order of day, month and year.
+        try:
+            clock = datetime(  # noqa: DTZ001  the offset is separate
+                part["year"] + 2000 * (part["year"] < 100),
+                part["month"],
+                part["day"],
+                part["hour"],
+                part["minute"],
+                part["second"],
+                1000 * part["ms"],
+            )
+            offset = _offset(found["zone"])
+        except ValueError:  # Digits that are no date.
+            continue
+        return Moment(clock, offset, "file names", 1e-3 if found["ms"] else 1.0)
+    return None
+
+
+def _offset(zone: str | None) -> timedelta | None:
+    return datetime.strptime(zone, "%z").utcoffset() if zone else None
+
+
+def _unix_seconds(stem: str) -> Moment | None:
+    if not _HEX.fullmatch(stem) or int(stem, 16) not in _HEX_S:
+        return None
+    return Moment.of(datetime.fromtimestamp(int(stem, 16), UTC), "file names")

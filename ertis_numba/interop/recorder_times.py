@@ -1,0 +1,187 @@
+"""Times at which files of recorders begin: options, metadata or names, and notes about their source."""
+
+import itertools
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.interop.recorder_names import Moment, times_in_names
+
+__all__ = ["TimedFile", "file_times"]
+
+_SAME_S: Final = 2.0  # Sources that differ by less agree: recorders write times before or after the first sample.
+_UNKNOWN: Final = "use --start for the first file, or once for each file (start_ns)"
+
+
+class TimedFile(NamedTuple):
+    """File, its duration in seconds, and its time according to its metadata, the most reliable source first."""
+
+    path: Path
+    duration_s: float
+    moments: Sequence[Moment]
+
+
+def file_times(
+    files: Sequence[TimedFile], starts_ns: Sequence[int], *, first_s: Sequence[float]
+) -> tuple[list[int], list[str]]:
+    """Return the time of the first measurement of each file, in nanoseconds since 1970, and notes about the times.
+
+    Parameters
+    ----------
+    files : sequence of TimedFile
+        Files in the order of their times.
+    starts_ns : sequence of int
+        Times of the first measurements as given by the user: none, that of the first file, or one for each file.
+    first_s : sequence of float
+        Time of the first measurement of each file, relative to the start of the file.
+
+    Raises
+    ------
+    ArgumentError
+        The number of times is neither 0, 1 nor the number of files.
+    DataError
+        The files are not in the order of their times, or only some of them state a time.
+    """
+    if len(starts_ns) not in {0, 1, len(files)}:
+        raise ArgumentError(
+            f"start_ns has {len(starts_ns)} times for {len(files)} files; use one for the first file, or one for each "
+            "file (--start)"
+        )
+    if len(starts_ns) == len(files) and files:
+        _require_order(files, starts_ns)
+        return _without_overlaps(files, list(starts_ns), 0.0)
+    named = times_in_names([file.path.name for file in files])
+    best = [file.moments[0] if file.moments else name for file, name in zip(files, named, strict=True)]
+    known = [moment for moment in best if moment is not None]
+    firsts_ns = [round(1e9 * each) for each in first_s]
+    if not known:
+        begins_ns = _back_to_back_ns(files, starts_ns[0] - firsts_ns[0] if starts_ns else 0)
+        late_ns = firsts_ns if starts_ns else [each - firsts_ns[0] for each in firsts_ns]
+        return [sum(pair) for pair in zip(begins_ns, late_ns, strict=True)], _unknown(files, starts_ns)
+    if len(known) < len(best):
+        without = files[best.index(None)].path
+        with_time = next(file.path for file, moment in zip(files, best, strict=True) if moment)
+        raise DataError(
+            f"{without} states no time in its metadata or name, but {with_time.name} does; use --start once for each "
+            "file (start_ns), or import the files separately"
+        )
+    times_ns = [moment.since_1970_ns for moment in known]
+    if min(times_ns) < 0:
+        first = files[times_ns.index(min(times_ns))].path
+        raise DataError(f"{first} states a time before 1970 ({min(known).clock.isoformat(' ')}); {_UNKNOWN}")
+    _require_order(files, times_ns)
+    notes = [*_contradictions(files, named), _source(known, is_relative=bool(starts_ns))]
+    times_ns, overlaps = _without_overlaps(files, times_ns, max(moment.resolution_s for moment in known))
+    shift_ns = starts_ns[0] - firsts_ns[0] - times_ns[0] if starts_ns else 0
+    return [sum(pair) + shift_ns for pair in zip(times_ns, firsts_ns, strict=True)], notes + overlaps
+
+
+def _back_to_back_ns(files: Sequence[TimedFile], start_ns: int) -> list[int]:
+    ends_s = np.cumsum([file.duration_s for file in files])
+    return [start_ns, *(start_ns + np.rint(1e9 * ends_s[:-1]).astype(np.int64)).tolist()]
+
+
+def _unknown(files: Sequence[TimedFile], starts_ns: Sequence[int]) -> list[str]:
+    """Return the note on files without any time."""
+    if len(files) == 1:
+        return [f"{files[0].path.name} states no time, so its time is unknown; {_UNKNOWN.partition(',')[0]}"]
+    relative = "from --start on, without pauses" if starts_ns else "without pauses"
+    remedy = "use --start once for each file" if starts_ns else _UNKNOWN
+    return [f"no times are known from metadata or names; the files are stamped back to back, {relative}; {remedy}"]
+
+
+def _require_order(files: Sequence[TimedFile], times_ns: Sequence[int]) -> None:
+    for number, (before_ns, after_ns) in enumerate(itertools.pairwise(times_ns)):
+        if after_ns < before_ns:
+            raise DataError(
+                f"{files[number + 1].path} begins at {_text(after_ns)}, before {files[number].path.name} at "
+                f"{_text(before_ns)}; list the files in the order of their times, or import their folder"
+            )
+
+
+def _without_overlaps(
+    files: Sequence[TimedFile], times_ns: list[int], resolution_s: float
+) -> tuple[list[int], list[str]]:
+    """Return times in which files begin after the end of the previous one, and a note on those that overlap by more.
+
+    Times of a whole second may be up to a second too early.
+    """
+    found, overlaps = list(times_ns), []
+    for number in range(1, len(files)):
+        end_ns = found[number - 1] + round(1e9 * files[number - 1].duration_s)
+        overlap_s = (end_ns - found[number]) / 1e9
+        if 0 < overlap_s <= resolution_s:
+            found[number] = end_ns
+        elif overlap_s > resolution_s:
+            overlaps.append((number, overlap_s))
+    if not overlaps:
+        return found, []
+    number, overlap_s = overlaps[0]
+    more = f" (and {len(overlaps) - 1} more)" if len(overlaps) > 1 else ""
+    note = (
+        f"{files[number].path.name} begins {overlap_s:.3g} s before the end of {files[number - 1].path.name}{more}; "
+        "check the times, and import each recorder separately"
+    )
+    return found, [note]
+
+
+def _contradictions(files: Sequence[TimedFile], named: Sequence[Moment | None]) -> list[str]:
+    """Return a note on the first file whose sources contradict each other."""
+    found = []
+    for file, name in zip(files, named, strict=True):
+        for other in (*file.moments[1:], *([name] if name and file.moments else [])):
+            if not _agree(file.moments[0], other):
+                found.append((file, other))
+                break
+    if not found:
+        return []
+    file, other = found[0]
+    used = file.moments[0]
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    note = (
+        f"{file.path.name}{more}: {used.source} and {other.source} differ ({_stated(used)} and {_stated(other)}); "
+        f"{used.source} is used"
+    )
+    return [note]
+
+
+def _agree(one: Moment, other: Moment) -> bool:
+    """Whether two sources agree; a source without an offset may have the other's clock or UTC."""
+    if one.offset is not None and other.offset is not None:
+        return abs(one.since_1970_ns - other.since_1970_ns) < _SAME_S * 1e9
+    readings = [{each.clock, each.clock - (each.offset or timedelta())} for each in (one, other)]
+    return any(abs((a - b).total_seconds()) < _SAME_S for a in readings[0] for b in readings[1])
+
+
+def _source(known: Sequence[Moment], *, is_relative: bool) -> str:
+    """Return the note on the source and the zone of the times."""
+    sources = " and ".join(dict.fromkeys(moment.source for moment in known))
+    if is_relative:
+        return f"the times between files are from {sources}; that of the first file is --start"
+    span = _text(known[0].since_1970_ns)
+    if len(known) > 1:
+        span += f" to {_text(known[-1].since_1970_ns)}"
+    if all(moment.offset is None for moment in known):
+        return f"times are from {sources} ({span}); no offset is stated, so they are taken as UTC; else use --start"
+    offsets = dict.fromkeys("UTC" if moment.offset is None else _zone(moment.offset) for moment in known)
+    return f"times are from {sources} ({span}), with the offset {' and '.join(offsets)}"
+
+
+def _stated(moment: Moment) -> str:
+    return moment.clock.isoformat(" ") + ("" if moment.offset is None else f" {_zone(moment.offset)}")
+
+
+def _zone(offset: timedelta) -> str:
+    if not offset:
+        return "UTC"
+    minutes = round(offset.total_seconds() / 60)
+    return f"UTC{'-' if minutes < 0 else '+'}{abs(minutes) // 60:02}:{abs(minutes) % 60:02}"
+
+
+def _text(since_1970_ns: int) -> str:
+    moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=since_1970_ns // 1000)
+    return f"{moment:%Y-%m-%d %H:%M:%S}{f'.{moment.microsecond // 1000:03}' if moment.microsecond else ''} UTC"

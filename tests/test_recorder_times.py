@@ -1,0 +1,377 @@
+"""Times and sample rates of recorders' files: metadata, names, options, and contradictions between them."""
+
+import struct
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+import ertis_numba as ertis
+from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.interop.recorder_names import times_in_names
+from ertis_numba.settings import Array, Settings
+
+ONE = Settings(array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)))
+
+
+def chunk(name, content):
+    return name + struct.pack("<I", len(content)) + content + b"\0" * (len(content) % 2)
+
+
+def write(path, *chunks, rate_hz=250_000, seconds=0.01):
+    """Write a mono WAV of 16 bits with more chunks."""
+    samples = np.random.default_rng(1).normal(0, 60, round(rate_hz * seconds)).round().astype("<i2").tobytes()
+    form = struct.pack("<HHIIHH", 1, 1, rate_hz, 2 * rate_hz, 2, 16)
+    body = b"WAVE" + chunk(b"fmt ", form) + chunk(b"data", samples) + b"".join(chunks)
+    path.write_bytes(b"RIFF" + struct.pack("<I", len(body)) + body)
+    return path
+
+
+def guano(*lines):
+    return chunk(b"guan", "\n".join(("GUANO|Version: 1.0", *lines)).encode())
+
+
+def comment(text):
+    return chunk(b"LIST", b"INFO" + chunk(b"ICMT", text.encode() + b"\0"))
+
+
+def bext(day, time, reference=0):
+    return chunk(b"bext", bytes(320) + f"{day}{time}".encode() + struct.pack("<Q", reference) + bytes(256))
+
+
+def wamd(*fields):
+    return chunk(b"wamd", b"".join(struct.pack("<HI", kind, len(value)) + value for kind, value in fields))
+
+
+def seconds(text):
+    """Seconds since 1970 of a time in UTC."""
+    return datetime.fromisoformat(text).replace(tzinfo=UTC).timestamp()
+
+
+def opened(*paths, **options):
+    return ertis.open_pcm(paths, ONE, passive=True, **options)
+
+
+def times_s(reader):
+    return [measurement.stamp.timestamp_ns / 1e9 for measurement in reader]
+
+
+NAMES = {
+    "20240518_042537.WAV": "2024-05-18T04:25:37",  # AudioMoth
+    "20240518_042537T.WAV": "2024-05-18T04:25:37",  # AudioMoth, triggered
+    "24E144056_20240518_042537.WAV": "2024-05-18T04:25:37",
+    "5AFC0B40.WAV": "2018-05-16T10:43:12",  # AudioMoth, old
+    "SMU01234_20240518_042537.wav": "2024-05-18T04:25:37",  # Song Meter
+    "SM304472_0+1_20181219$100000.wav": "2018-12-19T10:00:00",
+    "S4U_20240518_042537_250.wav": "2024-05-18T04:25:37.250",
+    "MYOLUC_20240518_042537_000.wav": "2024-05-18T04:25:37",
+    "T2024-05-18_04-25-37_0001234.WAV": "2024-05-18T04:25:37",  # Avisoft
+    "T0000123_2024-05-18 04-25-37.wav": "2024-05-18T04:25:37",
+    "2024-05-18T04_25_37.wav": "2024-05-18T04:25:37",
+    "20240518T042537Z.wav": "2024-05-18T04:25:37",
+    "20240518T042537+1000_site.wav": "2024-05-17T18:25:37",  # Frontier Labs
+    "20240518042537.wav": "2024-05-18T04:25:37",
+    "240518_042537.wav": "2024-05-18T04:25:37",  # Zoom
+    "1_9999_20240518_042537.wav": "2024-05-18T04:25:37",
+    "240518_001.WAV": None,
+    "ZOOM0001.WAV": None,
+    "M00123.WAV": None,
+    "10160435.WAV": None,  # a counter
+    "20240518.wav": None,
+    "20241318_042537.wav": None,
+    "20240518_256199.wav": None,
+    "24-05-18_04-25-37.wav": None,
+    "mic1.wav": None,
+    "DEADBEEF.wav": None,
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_times_in_names_are_found(name):
+    (found,) = times_in_names([name])
+    stated = NAMES[name]
+    assert (found and found.since_1970_ns / 1e9) == (stated and pytest.approx(seconds(stated), abs=1e-6))
+
+
+def test_hexadecimal_name_without_a_letter_counts_beside_others():
+    first, second = times_in_names(["5AFC0B40.WAV", "59384210.WAV"])
+    assert second.since_1970_ns == 0x59384210 * 10**9
+    assert first.since_1970_ns == 0x5AFC0B40 * 10**9
+
+
+METADATA = {
+    "GUANO with offset": (guano("Timestamp: 2024-05-18T04:25:37.5+02:00"), "2024-05-18T02:25:37.5", "UTC+02:00"),
+    "GUANO in UTC": (guano("Timestamp:2024-05-18T04:25:37Z"), "2024-05-18T04:25:37", "UTC"),
+    "GUANO, local": (guano("  Timestamp :  2024-05-18 04:25:37"), "2024-05-18T04:25:37", "taken as UTC"),
+    "GUANO, name": (guano("Original Filename: A_20240518_042537.wav"), "2024-05-18T04:25:37", "Original Filename"),
+    "AudioMoth": (
+        comment("Recorded at 19:17:30 02/03/2023 (UTC) by AudioMoth 24E144085F256C7B at medium gain"),
+        "2023-03-02T19:17:30",
+        "comment",
+    ),
+    "AudioMoth in a zone": (
+        comment("Recorded at 19:17:30 02/03/2023 (UTC+2) by AudioMoth 24E144085F256C7B"),
+        "2023-03-02T17:17:30",
+        "UTC+02:00",
+    ),
+    "AudioMoth in half a zone": (
+        comment("Recorded at 19:17:30 02/03/2023 (UTC-3:30) by AudioMoth 24E144085F256C7B"),
+        "2023-03-02T22:47:30",
+        "UTC-03:30",
+    ),
+    "AudioMoth by GPS": (
+        comment("Recorded at 19:17:30.250 02/03/2023 (UTC) by AudioMoth"),
+        "2023-03-02T19:17:30.250",
+        "comment",
+    ),
+    "bext": (bext("2024-05-18", "04:25:37"), "2024-05-18T04:25:37", "bext"),
+    "bext, other separators": (bext("2024:05:18", "04-25-37"), "2024-05-18T04:25:37", "bext"),
+    "bext with samples": (
+        bext("2024-05-18", "04:25:37", round((4 * 3600 + 25 * 60 + 37.25) * 250_000)),
+        "2024-05-18T04:25:37.25",
+        "bext",
+    ),
+    "bext with time code": (bext("2024-05-18", "04:25:37", 12), "2024-05-18T04:25:37", "bext"),
+    "Wildlife Acoustics": (
+        wamd((1, b"SM3"), (5, b"2014-04-02 22:59:14-05:00")),
+        "2014-04-03T03:59:14",
+        "UTC-05:00",
+    ),
+    "ICRD": (
+        chunk(b"LIST", b"INFO" + chunk(b"ICRD", b"2024-05-18T04:25:37\0")),
+        "2024-05-18T04:25:37",
+        "date of creation",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", METADATA)
+def test_times_in_metadata_are_used(tmp_path, name):
+    content, stated, words = METADATA[name]
+    reader = opened(write(tmp_path / "M00123.WAV", content))
+    assert times_s(reader) == [pytest.approx(seconds(stated), abs=1e-6)]
+    assert words in reader.notes[0]
+
+
+UNUSED = {
+    "no chunk": (),
+    "empty bext": (bext("0000-00-00", "00:00:00"),),
+    "no bext": (bext("          ", "        "),),
+    "date only": (chunk(b"LIST", b"INFO" + chunk(b"ICRD", b"2024-05-18\0")),),
+    "other comment": (comment("Recorded yesterday"),),
+    "impossible day": (comment("Recorded at 19:17:30 32/13/2023 (UTC) by AudioMoth"),),
+    "day of wamd": (wamd((5, b"2014-04-02")),),
+}
+
+
+@pytest.mark.parametrize("name", UNUSED)
+def test_unknown_time_is_noted(tmp_path, name):
+    reader = opened(write(tmp_path / "M00123.WAV", *UNUSED[name]))
+    assert times_s(reader) == [0]
+    assert reader.notes == ("M00123.WAV states no time, so its time is unknown; use --start for the first file",)
+
+
+def test_invalid_guano_fields_are_noted(tmp_path):
+    lines = ("Timestamp: yesterday", "TE: none", "Samplerate: -1")
+    notes = " ".join(opened(write(tmp_path / "a.wav", guano(*lines))).notes)
+    assert "GUANO Timestamp 'yesterday' is no time and is not used" in notes
+    assert "GUANO TE 'none' is no positive number and is not used" in notes
+    assert "GUANO Samplerate '-1' is no positive number and is not used" in notes
+
+
+# ---- several files --------------------------------------------------------------------------------
+
+
+def test_triggered_files_keep_their_times(tmp_path):
+    paths = [write(tmp_path / f"20240518_04{minute}37.WAV") for minute in (25, 26, 40)]
+    reader = opened(*paths)
+    first = seconds("2024-05-18T04:25:37")
+    assert times_s(reader) == [first, first + 60, first + 900]
+    (note,) = reader.notes
+    assert "times are from file names (2024-05-18 04:25:37 UTC to 2024-05-18 04:40:37 UTC)" in note
+    assert "no offset is stated, so they are taken as UTC" in note
+
+
+def test_start_of_the_first_file_shifts_all(tmp_path):
+    paths = [write(tmp_path / f"20240518_04{minute}37.WAV") for minute in (25, 26)]
+    reader = opened(*paths, start_ns=10**18)
+    assert times_s(reader) == [1e9, 1e9 + 60]
+    assert reader.notes == ("the times between files are from file names; that of the first file is --start",)
+
+
+def test_start_of_each_file_overrides_names(tmp_path):
+    paths = [write(tmp_path / f"20240518_04{minute}37.WAV") for minute in (25, 26)]
+    reader = opened(*paths, start_ns=[10**18, 10**18 + 5 * 10**9])
+    assert times_s(reader) == [1e9, 1e9 + 5]
+    assert reader.notes == ()
+
+
+def test_files_without_times_follow_each_other(tmp_path):
+    paths = [write(tmp_path / f"M0012{number}.WAV", seconds=length) for number, length in ((3, 0.5), (4, 0.25))]
+    reader = opened(*paths)
+    assert times_s(reader) == [0, 0.5]
+    assert "no times are known from metadata or names; the files are stamped back to back" in reader.notes[0]
+    assert times_s(opened(*paths, start_ns=10**18)) == [1e9, 1e9 + 0.5]
+
+
+def test_several_measurements_of_a_file_follow_its_time(tmp_path):
+    path = write(tmp_path / "20240518_042537.WAV", seconds=0.3)
+    first = seconds("2024-05-18T04:25:37")
+    assert times_s(opened(path, length_s=0.1)) == pytest.approx([first, first + 0.1, first + 0.2], abs=1e-6)
+    assert times_s(opened(path, skip_s=0.05)) == pytest.approx([first + 0.05], abs=1e-6)
+    assert times_s(opened(path, skip_s=0.05, start_ns=10**18)) == [1e9]
+
+
+def test_names_of_whole_seconds_never_overlap(tmp_path):
+    paths = [write(tmp_path / f"T2024-05-18_04-25-37_000000{number}.WAV", seconds=0.25) for number in (1, 2)]
+    reader = opened(*paths)
+    first = seconds("2024-05-18T04:25:37")
+    assert times_s(reader) == pytest.approx([first, first + 0.25], abs=1e-6)
+    assert not any("before the end" in note for note in reader.notes)
+
+
+def test_overlapping_files_are_noted(tmp_path):
+    paths = [write(tmp_path / f"20240518_0425{second}.WAV", seconds=5) for second in (37, 39)]
+    reader = opened(*paths)
+    assert times_s(reader)[1] - times_s(reader)[0] == 2
+    assert any("20240518_042539.WAV begins 3 s before the end of 20240518_042537.WAV" in note for note in reader.notes)
+
+
+def test_contradicting_times_are_noted(tmp_path):
+    paths = [
+        write(tmp_path / f"20240518_04{minute}37.WAV", guano(f"Timestamp: 2024-05-18T05:{minute}:37+02:00"))
+        for minute in (25, 26)
+    ]
+    reader = opened(*paths)
+    assert times_s(reader)[0] == seconds("2024-05-18T03:25:37")
+    assert (
+        "20240518_042537.WAV (and 1 more): GUANO and file names differ (2024-05-18 05:25:37 UTC+02:00 and "
+        "2024-05-18 04:25:37); GUANO is used"
+    ) in reader.notes
+
+
+@pytest.mark.parametrize("name", ["20240518_042537.WAV", "20240518_022537.WAV"])
+def test_names_in_the_zone_or_in_utc_agree(tmp_path, name):
+    reader = opened(write(tmp_path / name, guano("Timestamp: 2024-05-18T04:25:37+02:00")))
+    assert not any("differ" in note for note in reader.notes)
+
+
+REFUSED = {
+    "backwards": (
+        ["20240518_042637.WAV", "20240518_042537.WAV"],
+        {},
+        DataError,
+        r"042537.WAV begins at 2024-05-18 04:25:37 UTC, before 20240518_042637.WAV at 2024-05-18 04:26:37 UTC; list",
+    ),
+    "starts backwards": (["a.wav", "b.wav"], {"start_ns": [10, 5]}, DataError, r"b.wav begins at 1970-01-01"),
+    "one without a time": (
+        ["20240518_042637.WAV", "b.wav"],
+        {},
+        DataError,
+        r"b.wav states no time in its metadata or name, but 20240518_042637.WAV does; use --start once for each file",
+    ),
+    "too many starts": (
+        ["a.wav", "b.wav"],
+        {"start_ns": [1, 2, 3]},
+        ArgumentError,
+        r"start_ns has 3 times for 2 files; use one for the first file, or one for each file",
+    ),
+    "before 1970": (["19691231_042637.WAV"], {}, DataError, r"states a time before 1970 \(1969-12-31 04:26:37\); use"),
+    "expansion": (["a.wav"], {"time_expansion": 1e9}, ArgumentError, r"time_expansion is 1e\+09; give a number from"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_contradicting_files_are_refused(tmp_path, name):
+    names, options, error, message = REFUSED[name]
+    with pytest.raises(error, match=message):
+        opened(*(write(tmp_path / each) for each in names), **options)
+
+
+# ---- time expansion -------------------------------------------------------------------------------
+
+EXPANDED = {
+    "TE": (38_400, ("TE: 10",), {}, 384_000),
+    "TE and rate": (38_400, ("TE:10", "Samplerate:384000"), {}, 384_000),
+    "rate only": (38_400, ("Samplerate: 384000",), {}, 384_000),
+    "rate, and TE of 1": (38_400, ("TE: 1", "Samplerate: 384000"), {}, 384_000),
+    "TE of 8": (32_000, ("TE: 8",), {}, 256_000),
+    "option": (44_100, (), {"time_expansion": 10}, 441_000),
+    "option as metadata": (38_400, ("TE: 10",), {"time_expansion": 10}, 384_000),
+    "option against metadata": (38_400, ("TE: 10",), {"time_expansion": 1}, 38_400),
+    "resampled": (44_100, ("Samplerate: 384000",), {"time_expansion": 384_000 / 44_100}, 384_000),
+}
+
+
+@pytest.mark.parametrize("name", EXPANDED)
+def test_time_expanded_files_have_their_true_rate(tmp_path, name):
+    rate_hz, lines, options, true_hz = EXPANDED[name]
+    path = write(tmp_path / "a.wav", guano(*lines), rate_hz=rate_hz, seconds=1)
+    reader = opened(path, **options)
+    assert reader.settings.recording.sample_rate_hz == pytest.approx(true_hz)
+    assert any(f"{true_hz} Hz" in note for note in reader.notes)
+
+
+def test_rate_of_the_header_needs_no_note(tmp_path):
+    path = write(tmp_path / "20240518_042537.WAV", guano("TE: 1", "Samplerate: 250000"))
+    reader = opened(path)
+    assert reader.settings.recording.sample_rate_hz == 250_000
+    assert not any("Hz" in note for note in reader.notes)
+
+
+def test_wildlife_acoustics_time_expansion_is_used(tmp_path):
+    path = write(tmp_path / "a.wav", wamd((0x0F, struct.pack("<H", 10))), rate_hz=25_600)
+    assert opened(path).settings.recording.sample_rate_hz == 256_000
+
+
+CONTRADICTIONS = {
+    "no whole factor": (("Samplerate: 384000",), r"44100 Hz, .* a sample rate of 384000 Hz; .* --time-expansion 8.70748"),
+    "lower": (("Samplerate: 22050",), r"--time-expansion 1 \(time_expansion=1\) if the header is right"),
+    "TE of the true rate": (("TE: 10", "Samplerate: 44100"), r"a time expansion of 10; .* --time-expansion 10 if"),
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_contradicting_rates_are_refused(tmp_path, name):
+    lines, message = CONTRADICTIONS[name]
+    with pytest.raises(DataError, match=message):
+        opened(write(tmp_path / "a.wav", guano(*lines), rate_hz=44_100))
+
+
+# ---- folders and command --------------------------------------------------------------------------
+
+
+def command(*arguments):
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+def test_folder_is_imported_in_the_order_of_times(tmp_path):
+    card = tmp_path / "card"
+    card.mkdir()
+    for name in ("B_20240518_042537.WAV", "A_20240518_042637.wav", "._B_20240518_042537.WAV", "CONFIG.TXT"):
+        write(card / name)
+    (tmp_path / "one.csv").write_text("0, 0\n")
+    done = command("import", card, "--layout", tmp_path / "one.csv", "--passive")
+    assert done.exit_code == 0, done.stderr
+    with ertis.open_recording(tmp_path / "card.h5") as recording:
+        times = [stamp.timestamp_ns / 1e9 for stamp in recording.stamps()]
+    assert times == [seconds("2024-05-18T04:25:37"), seconds("2024-05-18T04:26:37")]
+
+
+def test_folder_without_times_has_the_order_of_numbers(tmp_path):
+    for number in (2, 10, 1):
+        write(tmp_path / f"R_{number}.wav", seconds=0.01 * number)
+    assert times_s(opened(tmp_path)) == pytest.approx([0, 0.01, 0.03])
+
+
+def test_start_may_be_repeated(tmp_path):
+    paths = [write(tmp_path / f"{name}.wav") for name in "ab"]
+    (tmp_path / "one.csv").write_text("0, 0\n")
+    starts = ("--start", "2024-05-18T04:25", "--start", "2024-05-18T04:26")
+    done = command("import", *paths, "--layout", tmp_path / "one.csv", "--passive", *starts, "--json")
+    assert done.exit_code == 0, done.stderr
+    with ertis.open_recording(tmp_path / "a.h5") as recording:
+        first, second = (stamp.timestamp_ns / 1e9 for stamp in recording.stamps())
+    assert second - first == 60
