@@ -80,6 +80,7 @@ RUN_BY = {
     ],
     ("own-array", "$"): ["test_guide::test_own_array_page_runs"],
     ("own-array", "python"): ["test_guide::test_own_array_page_runs"],
+    ("recordings", "$"): ["test_import_recorders::test_commands_of_the_page_run"],
     ("plots", "$"): ["test_plot::test_plot_commands_of_the_page_run"],
     ("plots", "python"): ["test_plot::test_plot_code_of_the_page_runs"],
     ("python", "python"): ["test_guide::test_import_loads_no_submodules"],

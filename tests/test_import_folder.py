@@ -226,7 +226,10 @@ def test_file_of_many_measurements_is_imported(tmp_path):
 @pytest.mark.parametrize(
     ("made", "message"),
     [
-        ({"names": ()}, r"run.1 is a folder; give a file of raw words, or a folder with .bin files of RTIS Dev"),
+        (
+            {"names": ()},
+            r"run.1 is a folder; give a file of raw words, or a folder with .wav files or .bin files of RTIS Dev",
+        ),
         (
             {"names": ("a_1.bin", "b_2.bin")},
             "the order of its 2 .bin files is unknown, because their names are not like NAME<num",
@@ -312,7 +315,7 @@ def test_import_command_accepts_a_folder(tmp_path):
     folder = folder_of(tmp_path, names=("m_5.bin", "m_7.bin"))
     done = CliRunner().invoke(cli, ["import", str(folder), "--temperature", "12.5", "--sensor", "left", "--json"])
     assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout) == {"output": str(tmp_path / "run.1.h5"), "measurements": 2}
+    assert json.loads(done.stdout) == {"output": str(tmp_path / "run.1.h5"), "measurements": 2, "notes": []}
     with open_recording(tmp_path / "run.1.h5") as recording:
         assert [stamp.sequence for stamp in recording.stamps()] == [5, 7]
         assert [(gap.first, gap.last) for gap in recording.gaps] == [(6, 6)]

@@ -327,7 +327,7 @@ def test_wildlife_acoustics_time_expansion_is_used(tmp_path):
 
 
 CONTRADICTIONS = {
-    "no whole factor": (("Samplerate: 384000",), r"44100 Hz, .* a sample rate of 384000 Hz; .* --time-expansion 8.70748"),
+    "no whole factor": (("Samplerate: 384000",), r"44100 Hz, .* sample rate of 384000 Hz; .* --time-expansion 8.70748"),
     "lower": (("Samplerate: 22050",), r"--time-expansion 1 \(time_expansion=1\) if the header is right"),
     "TE of the true rate": (("TE: 10", "Samplerate: 44100"), r"a time expansion of 10; .* --time-expansion 10 if"),
 }

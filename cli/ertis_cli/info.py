@@ -172,12 +172,13 @@ def _sensor(reader: "_Reader") -> dict[str, Any]:
 
 def _recording(reader: "RecordingReader") -> dict[str, Any]:
     stamps = reader.stamps()
-    recording = reader.settings.recording
+    recording, processing = reader.settings.recording, reader.settings.processing
     return {
         "encoding": recording.encoding,
         "samples": recording.n_samples,
         "sample_rate_hz": recording.sample_rate_hz,
         "duration_ms": round(1000 * recording.duration_s, 3),
+        **({} if processing.mode == "passive" else {"range_m": list(processing.range_m)}),
         "first": stamps[0].iso,
         "last": stamps[-1].iso,
         "behaviour": dict(Counter(stamp.behaviour for stamp in stamps)),

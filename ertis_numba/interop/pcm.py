@@ -164,8 +164,8 @@ class PcmReader:
                     "(--skip) or give a shorter --length"
                 )
         self._cuts = [
-            _Cuts(skipped + np.rint(places).astype(np.int64), (skipped + places) / self._rate_hz)
-            for places in (period * np.arange(count) for count in counts)
+            _Cuts(skipped + np.rint(places).astype(np.int64), np.asarray((skipped + places) / self._rate_hz))
+            for places in (period * np.arange(count, dtype=np.float64) for count in counts)
         ]
 
     def _count(self, file: PcmFile, skipped: int, period: float) -> int:
@@ -182,7 +182,7 @@ class PcmReader:
         given = [start_ns] if isinstance(start_ns, int) else list(start_ns)
         starts_ns = [checks.integer("start_ns", each, 0, 2**63 - 1) for each in given]
         return file_times(
-            [TimedFile(file.path, file.duration_s, file.metadata.moments) for file in self._files],
+            [TimedFile(file.path, file.duration_s, file.metadata.stated_times) for file in self._files],
             starts_ns,
             first_s=[float(cuts.times_s[0]) for cuts in self._cuts],
         )

@@ -1,5 +1,6 @@
 """Single files of PCM, and files of single microphones that are joined: properties and samples."""
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +12,12 @@ from numpy.typing import NDArray
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.interop._acoular import read_acoular
 from ertis_numba.interop.recorder_metadata import RecorderMetadata, read_metadata
+from ertis_numba.interop.recorder_names import MAX_DIFFERENCE_S, StatedTime, times_in_names
 from ertis_numba.interop.time_expansion import true_rate_hz
 from ertis_numba.settings import Recording, Settings
 from ertis_numba.wav import read_wav
 
-__all__ = ["PcmFile", "inspect", "joined", "per_file", "require_alike"]
+__all__ = ["PcmFile", "first_stated_times", "inspect", "joined", "natural_order", "per_file", "require_alike"]
 
 _ACOULAR: Final = {".h5", ".hdf5", ".hdf"}
 _MIDDLE_OF_BYTES: Final = 128
@@ -131,9 +133,10 @@ def joined(files: Sequence[PcmFile]) -> PcmFile:
     Raises
     ------
     DataError
-        The files differ in rate, type of numbers or time.
+        The files differ in rate, type of numbers or time, or are in the order of the alphabet but not of numbers.
     """
     require_alike(files, joined=True)
+    _require_one_measurement(files)
     first = files[0]
     n_samples = min(file.n_samples for file in files)
     notes = [f"the files are joined, {_channels(files)}"]
@@ -149,6 +152,36 @@ def joined(files: Sequence[PcmFile]) -> PcmFile:
         counts=tuple(file.n_channels for file in files),
         notes=(*notes, *per_file([(file.path, note) for file in files for note in file.notes])),
     )
+
+
+def _require_one_measurement(files: Sequence[PcmFile]) -> None:
+    """Refuse files of different times, and the order in which shells list names with numbers."""
+    first, names = files[0], [file.path.name for file in files]
+    if names == sorted(names) != sorted(names, key=natural_order):
+        listed = ", ".join(names[:8]) + ", …" * (len(names) > 8)
+        raise DataError(
+            f"the files are in the order of the alphabet: {listed}; list them in the order of the channels, or import "
+            "their folder, in which numbers count"
+        )
+    times_ns = [time and time.since_1970_ns for time in first_stated_times(files)]
+    for file, time_ns in zip(files, times_ns, strict=True):
+        late_s = 0.0 if time_ns is None or times_ns[0] is None else (time_ns - times_ns[0]) / 1e9
+        if abs(late_s) > MAX_DIFFERENCE_S:
+            raise DataError(
+                f"{file.path} begins {abs(late_s):.6g} s {'after' if late_s > 0 else 'before'} {first.path.name}; join "
+                "files of the same time only"
+            )
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Return a key by which ``mic2.wav`` precedes ``mic10.wav``."""
+    return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name)]
+
+
+def first_stated_times(files: Sequence[PcmFile]) -> list[StatedTime | None]:
+    """Return the times of files from their metadata, otherwise from their names."""
+    named = times_in_names([file.path.name for file in files])
+    return [next(iter(file.metadata.stated_times), name) for file, name in zip(files, named, strict=True)]
 
 
 def require_alike(files: Sequence[PcmFile], *, joined: bool = False) -> None:

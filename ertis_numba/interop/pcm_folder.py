@@ -1,11 +1,9 @@
 """Folders of WAV files, such as the card of a recorder."""
 
-import re
 from pathlib import Path
 
 from ertis_numba.errors import DataError
-from ertis_numba.interop.pcm_files import inspect
-from ertis_numba.interop.recorder_names import times_in_names
+from ertis_numba.interop.pcm_files import first_stated_times, inspect, natural_order
 
 __all__ = ["is_wav_folder", "wav_files"]
 
@@ -37,19 +35,11 @@ def wav_files(folder: Path, *, by_time: bool) -> list[Path]:
         A file cannot be read.
     """
     visible = [each for each in folder.iterdir() if not each.name.startswith(".") and each.suffix.lower() == ".wav"]
-    paths = sorted(visible, key=lambda path: _natural(path.name))
+    paths = sorted(visible, key=lambda path: natural_order(path.name))
     if not by_time:
         return paths
-    moments = [
-        next(iter(inspect(path, 1.0).metadata.moments), named)
-        for path, named in zip(paths, times_in_names([path.name for path in paths]), strict=True)
-    ]
-    times_ns = [moment.since_1970_ns for moment in moments if moment is not None]
+    stated_times = first_stated_times([inspect(path, 1.0) for path in paths])
+    times_ns = [time.since_1970_ns for time in stated_times if time is not None]
     if len(times_ns) < len(paths):
         return paths
     return [paths[place] for place in sorted(range(len(paths)), key=times_ns.__getitem__)]
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a key by which ``mic2.wav`` precedes ``mic10.wav``."""
-    return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in re.split(r"(\d+)", name)]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Final
 
-from ertis_numba.interop.recorder_names import Moment, times_in_names
+from ertis_numba.interop.recorder_names import MAX_DIFFERENCE_S, StatedTime, times_in_names
 
 __all__ = ["RecorderMetadata", "read_metadata"]
 
@@ -23,7 +23,6 @@ _AUDIOMOTH: Final = re.compile(
 )
 _WAMD_TIME, _WAMD_EXPANSION = 0x05, 0x0F
 _BEXT_DATE: Final = slice(320, 338)
-_SAME_S: Final = 2.0  # Sources that differ by less agree: recorders write times before or after the first sample.
 
 
 @dataclass(slots=True)
@@ -32,7 +31,7 @@ class RecorderMetadata:
 
     Attributes
     ----------
-    moments : list of Moment
+    stated_times : list of StatedTime
         Time of the first sample, from each source that states it; the most reliable source comes first.
     expansion : float or None
         Factor by which the header's rate is too low, as stated.
@@ -42,7 +41,7 @@ class RecorderMetadata:
         Statements that cannot be read.
     """
 
-    moments: list[Moment] = field(default_factory=list)
+    stated_times: list[StatedTime] = field(default_factory=list)
     expansion: float | None = None
     rate_hz: float | None = None
     notes: list[str] = field(default_factory=list)
@@ -62,9 +61,9 @@ def read_metadata(chunks: Mapping[str, bytes], rate_hz: float) -> RecorderMetada
     _read_guano(chunks.get("guan", b""), found)
     _read_wamd(chunks.get("wamd", b""), found)
     info = dict(_info(chunks.get("INFO", b"")))
-    found.moments += _audiomoth(info.get(b"ICMT", ""))
-    found.moments += _bext(chunks.get("bext", b""), rate_hz)
-    found.moments += _creation(info.get(b"ICRD", ""))
+    found.stated_times += _audiomoth(info.get(b"ICMT", ""))
+    found.stated_times += _bext(chunks.get("bext", b""), rate_hz)
+    found.stated_times += _creation(info.get(b"ICRD", ""))
     return found
 
 
@@ -73,12 +72,12 @@ def _read_guano(content: bytes, found: RecorderMetadata) -> None:
     fields = {key.strip(): value.strip() for key, colon, value in (line.partition(":") for line in lines) if colon}
     if time := fields.get("Timestamp"):
         try:
-            found.moments.append(_moment(time, "GUANO"))
+            found.stated_times.append(_stated_time(time, "GUANO"))
         except ValueError:
             found.notes.append(f"GUANO Timestamp {time!r} is no time and is not used")
     elif name := fields.get("Original Filename"):
-        found.moments += [
-            moment._replace(source="GUANO's Original Filename") for moment in times_in_names([name]) if moment
+        found.stated_times += [
+            time._replace(source="GUANO's Original Filename") for time in times_in_names([name]) if time
         ]
     found.expansion = _positive("TE", fields, found)
     found.rate_hz = _positive("Samplerate", fields, found)
@@ -101,7 +100,7 @@ def _read_wamd(content: bytes, found: RecorderMetadata) -> None:
         if kind == _WAMD_TIME:
             with suppress(ValueError):
                 text = value.decode("ascii", "replace").strip("\0 ")
-                found.moments.append(_moment(text, "Wildlife Acoustics metadata"))
+                found.stated_times.append(_stated_time(text, "Wildlife Acoustics metadata"))
         if kind == _WAMD_EXPANSION and len(value) == 2 and found.expansion is None:
             found.expansion = float(struct.unpack("<H", value)[0]) or None
 
@@ -123,18 +122,18 @@ def _info(content: bytes) -> Iterator[tuple[bytes, str]]:
         place += 8 + size + size % 2
 
 
-def _audiomoth(comment: str) -> Iterator[Moment]:
+def _audiomoth(comment: str) -> Iterator[StatedTime]:
     match = _AUDIOMOTH.search(comment)
     if match is None:
         return
     with suppress(ValueError):
         clock = datetime.fromisoformat(f"{match['year']}-{match['month']}-{match['day']}T{match['time']:0>8}")
         offset = timedelta(hours=int(match["hours"] or 0), minutes=int(match["minutes"] or 0))
-        moment = Moment.of(clock, "the recorder's comment")
-        yield moment._replace(offset=-offset if match["sign"] == "-" else offset)
+        time = StatedTime.of(clock, "the recorder's comment")
+        yield time._replace(offset=-offset if match["sign"] == "-" else offset)
 
 
-def _bext(content: bytes, rate_hz: float) -> Iterator[Moment]:
+def _bext(content: bytes, rate_hz: float) -> Iterator[StatedTime]:
     """Yield the time of a broadcast extension; a time reference that agrees adds the fraction of a second."""
     text = content[_BEXT_DATE].decode("ascii", "replace")
     parts = re.fullmatch(r"(\d{4})\D(\d\d)\D(\d\d)(\d\d)\D(\d\d)\D(\d\d)", text)
@@ -142,24 +141,24 @@ def _bext(content: bytes, rate_hz: float) -> Iterator[Moment]:
         return
     with suppress(ValueError):
         clock = datetime(*map(int, parts.groups()))  # type: ignore[arg-type]  # noqa: DTZ001  six whole numbers
-        moment = Moment(clock, None, "bext metadata")
+        time = StatedTime(clock, None, "bext metadata")
         if len(content) >= 346:
             midnight = clock.replace(hour=0, minute=0, second=0)
             with suppress(OverflowError):
                 exact = midnight + timedelta(seconds=struct.unpack_from("<Q", content, 338)[0] / rate_hz)
-                if abs((exact - clock).total_seconds()) < _SAME_S:
-                    moment = moment._replace(clock=exact, resolution_s=1e-3)
-        yield moment
+                if abs((exact - clock).total_seconds()) < MAX_DIFFERENCE_S:
+                    time = time._replace(clock=exact, resolution_s=1e-3)
+        yield time
 
 
-def _creation(text: str) -> Iterator[Moment]:
+def _creation(text: str) -> Iterator[StatedTime]:
     """Yield the date of creation if it contains a time."""
     with suppress(ValueError):
-        yield _moment(text, "the date of creation (ICRD)")
+        yield _stated_time(text, "the date of creation (ICRD)")
 
 
-def _moment(text: str, source: str) -> Moment:
-    """Return the moment that a text states; a date alone is none."""
+def _stated_time(text: str, source: str) -> StatedTime:
+    """Return the time that a text states; a date alone is none."""
     if len(text.strip()) <= len("2024-05-18"):
         raise ValueError(text)
-    return Moment.of(datetime.fromisoformat(text.strip()), source)
+    return StatedTime.of(datetime.fromisoformat(text.strip()), source)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, NamedTuple
 
-__all__ = ["Moment", "times_in_names"]
+__all__ = ["MAX_DIFFERENCE_S", "StatedTime", "times_in_names"]
 
 _ZONE: Final = r"(?P<zone>Z|[+-]\d{2}:?\d{2}(?!\d))?"
 _STAMP: Final = re.compile(
@@ -15,10 +15,12 @@ _STAMP: Final = re.compile(
     r"(?:[-_.,]?(?P<ms>\d{3})(?!\d))?" + _ZONE + r"(?!\d)"
 )
 _HEX: Final = re.compile(r"[0-9A-F]{8}", re.IGNORECASE)
+MAX_DIFFERENCE_S: Final = 2.0
+"""Largest difference of times that agree: recorders state times before or after the first sample."""
 _HEX_S: Final = range(round(datetime(2014, 1, 1, tzinfo=UTC).timestamp()), 2**31)
 
 
-class Moment(NamedTuple):
+class StatedTime(NamedTuple):
     """Time at which a file begins, as its source states it.
 
     Attributes
@@ -39,8 +41,8 @@ class Moment(NamedTuple):
     resolution_s: float = 1.0
 
     @classmethod
-    def of(cls, stated: datetime, source: str) -> "Moment":
-        """Return the moment of a time with or without a zone."""
+    def of(cls, stated: datetime, source: str) -> "StatedTime":
+        """Return the stated time for a time with or without a zone."""
         resolution_s = 1e-3 if stated.microsecond else 1.0
         return cls(stated.replace(tzinfo=None), stated.utcoffset(), source, resolution_s)
 
@@ -51,7 +53,7 @@ class Moment(NamedTuple):
         return since // timedelta(microseconds=1) * 1000
 
 
-def times_in_names(names: Sequence[str]) -> list[Moment | None]:
+def times_in_names(names: Sequence[str]) -> list[StatedTime | None]:
     """Return the times in names of files; None for names without date and time.
 
     Recognised are date and time in digits, such as ``20240518_042537.WAV``, ``SMU01234_20240518_042537_250.wav``,
@@ -63,7 +65,7 @@ def times_in_names(names: Sequence[str]) -> list[Moment | None]:
     return [_stamp(stem) or (_unix_seconds(stem) if are_hex else None) for stem in stems]
 
 
-def _stamp(stem: str) -> Moment | None:
+def _stamp(stem: str) -> StatedTime | None:
     for found in _STAMP.finditer(stem):
         part = {name: int(found[name] or 0) for name in ("year", "month", "day", "hour", "minute", "second", "ms")}
         if part["year"] < 100 and (found["between"] or found["gap"]):
@@ -81,7 +83,7 @@ def _stamp(stem: str) -> Moment | None:
             offset = _offset(found["zone"])
         except ValueError:  # Digits that are no date.
             continue
-        return Moment(clock, offset, "file names", 1e-3 if found["ms"] else 1.0)
+        return StatedTime(clock, offset, "file names", 1e-3 if found["ms"] else 1.0)
     return None
 
 
@@ -89,7 +91,7 @@ def _offset(zone: str | None) -> timedelta | None:
     return datetime.strptime(zone, "%z").utcoffset() if zone else None
 
 
-def _unix_seconds(stem: str) -> Moment | None:
+def _unix_seconds(stem: str) -> StatedTime | None:
     if not _HEX.fullmatch(stem) or int(stem, 16) not in _HEX_S:
         return None
-    return Moment.of(datetime.fromtimestamp(int(stem, 16), UTC), "file names")
+    return StatedTime.of(datetime.fromtimestamp(int(stem, 16), UTC), "file names")

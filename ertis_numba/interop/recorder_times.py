@@ -9,11 +9,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.interop.recorder_names import Moment, times_in_names
+from ertis_numba.interop.recorder_names import MAX_DIFFERENCE_S, StatedTime, times_in_names
 
 __all__ = ["TimedFile", "file_times"]
 
-_SAME_S: Final = 2.0  # Sources that differ by less agree: recorders write times before or after the first sample.
 _UNKNOWN: Final = "use --start for the first file, or once for each file (start_ns)"
 
 
@@ -22,7 +21,7 @@ class TimedFile(NamedTuple):
 
     path: Path
     duration_s: float
-    moments: Sequence[Moment]
+    stated_times: Sequence[StatedTime]
 
 
 def file_times(
@@ -55,8 +54,8 @@ def file_times(
         _require_order(files, starts_ns)
         return _without_overlaps(files, list(starts_ns), 0.0)
     named = times_in_names([file.path.name for file in files])
-    best = [file.moments[0] if file.moments else name for file, name in zip(files, named, strict=True)]
-    known = [moment for moment in best if moment is not None]
+    best = [file.stated_times[0] if file.stated_times else name for file, name in zip(files, named, strict=True)]
+    known = [time for time in best if time is not None]
     firsts_ns = [round(1e9 * each) for each in first_s]
     if not known:
         begins_ns = _back_to_back_ns(files, starts_ns[0] - firsts_ns[0] if starts_ns else 0)
@@ -64,18 +63,18 @@ def file_times(
         return [sum(pair) for pair in zip(begins_ns, late_ns, strict=True)], _unknown(files, starts_ns)
     if len(known) < len(best):
         without = files[best.index(None)].path
-        with_time = next(file.path for file, moment in zip(files, best, strict=True) if moment)
+        with_time = next(file.path for file, time in zip(files, best, strict=True) if time)
         raise DataError(
             f"{without} states no time in its metadata or name, but {with_time.name} does; use --start once for each "
             "file (start_ns), or import the files separately"
         )
-    times_ns = [moment.since_1970_ns for moment in known]
+    times_ns = [time.since_1970_ns for time in known]
     if min(times_ns) < 0:
-        first = files[times_ns.index(min(times_ns))].path
-        raise DataError(f"{first} states a time before 1970 ({min(known).clock.isoformat(' ')}); {_UNKNOWN}")
+        earliest = times_ns.index(min(times_ns))
+        raise DataError(f"{files[earliest].path} states a time before 1970 ({_stated(known[earliest])}); {_UNKNOWN}")
     _require_order(files, times_ns)
     notes = [*_contradictions(files, named), _source(known, is_relative=bool(starts_ns))]
-    times_ns, overlaps = _without_overlaps(files, times_ns, max(moment.resolution_s for moment in known))
+    times_ns, overlaps = _without_overlaps(files, times_ns, max(time.resolution_s for time in known))
     shift_ns = starts_ns[0] - firsts_ns[0] - times_ns[0] if starts_ns else 0
     return [sum(pair) + shift_ns for pair in zip(times_ns, firsts_ns, strict=True)], notes + overlaps
 
@@ -129,18 +128,18 @@ def _without_overlaps(
     return found, [note]
 
 
-def _contradictions(files: Sequence[TimedFile], named: Sequence[Moment | None]) -> list[str]:
+def _contradictions(files: Sequence[TimedFile], named: Sequence[StatedTime | None]) -> list[str]:
     """Return a note on the first file whose sources contradict each other."""
     found = []
     for file, name in zip(files, named, strict=True):
-        for other in (*file.moments[1:], *([name] if name and file.moments else [])):
-            if not _agree(file.moments[0], other):
+        for other in (*file.stated_times[1:], *([name] if name and file.stated_times else [])):
+            if not _agree(file.stated_times[0], other):
                 found.append((file, other))
                 break
     if not found:
         return []
     file, other = found[0]
-    used = file.moments[0]
+    used = file.stated_times[0]
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     note = (
         f"{file.path.name}{more}: {used.source} and {other.source} differ ({_stated(used)} and {_stated(other)}); "
@@ -149,30 +148,30 @@ def _contradictions(files: Sequence[TimedFile], named: Sequence[Moment | None]) 
     return [note]
 
 
-def _agree(one: Moment, other: Moment) -> bool:
-    """Whether two sources agree; a source without an offset may have the other's clock or UTC."""
+def _agree(one: StatedTime, other: StatedTime) -> bool:
+    """Return True if two sources agree; a source without an offset may have the clock of the other, or UTC."""
     if one.offset is not None and other.offset is not None:
-        return abs(one.since_1970_ns - other.since_1970_ns) < _SAME_S * 1e9
+        return abs(one.since_1970_ns - other.since_1970_ns) < MAX_DIFFERENCE_S * 1e9
     readings = [{each.clock, each.clock - (each.offset or timedelta())} for each in (one, other)]
-    return any(abs((a - b).total_seconds()) < _SAME_S for a in readings[0] for b in readings[1])
+    return any(abs((a - b).total_seconds()) < MAX_DIFFERENCE_S for a in readings[0] for b in readings[1])
 
 
-def _source(known: Sequence[Moment], *, is_relative: bool) -> str:
+def _source(known: Sequence[StatedTime], *, is_relative: bool) -> str:
     """Return the note on the source and the zone of the times."""
-    sources = " and ".join(dict.fromkeys(moment.source for moment in known))
+    sources = " and ".join(dict.fromkeys(time.source for time in known))
     if is_relative:
         return f"the times between files are from {sources}; that of the first file is --start"
     span = _text(known[0].since_1970_ns)
     if len(known) > 1:
         span += f" to {_text(known[-1].since_1970_ns)}"
-    if all(moment.offset is None for moment in known):
+    if all(time.offset is None for time in known):
         return f"times are from {sources} ({span}); no offset is stated, so they are taken as UTC; else use --start"
-    offsets = dict.fromkeys("UTC" if moment.offset is None else _zone(moment.offset) for moment in known)
+    offsets = dict.fromkeys("UTC" if time.offset is None else _zone(time.offset) for time in known)
     return f"times are from {sources} ({span}), with the offset {' and '.join(offsets)}"
 
 
-def _stated(moment: Moment) -> str:
-    return moment.clock.isoformat(" ") + ("" if moment.offset is None else f" {_zone(moment.offset)}")
+def _stated(time: StatedTime) -> str:
+    return time.clock.isoformat(" ") + ("" if time.offset is None else f" {_zone(time.offset)}")
 
 
 def _zone(offset: timedelta) -> str:
@@ -183,5 +182,5 @@ def _zone(offset: timedelta) -> str:
 
 
 def _text(since_1970_ns: int) -> str:
-    moment = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=since_1970_ns // 1000)
-    return f"{moment:%Y-%m-%d %H:%M:%S}{f'.{moment.microsecond // 1000:03}' if moment.microsecond else ''} UTC"
+    time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=since_1970_ns // 1000)
+    return f"{time:%Y-%m-%d %H:%M:%S}{f'.{time.microsecond // 1000:03}' if time.microsecond else ''} UTC"

@@ -46,8 +46,8 @@ def health(measurement: Measurement) -> Health:
     """Return the health of the microphones and of the record of one measurement.
 
     The checks cover the enabled channels and the first 524,288 samples. PCM samples that are exactly 0 in all channels
-    at either end of the record are left out, because recorders with a trigger write them. In the loud and the quiet eighth of the record,
-    the median channel has the most and the least power in the call's band.
+    at either end of the record are left out, because recorders with a trigger write them. In the loud and the quiet
+    eighth of the record, the median channel has the most and the least power in the call's band.
 
     The dynamic range is ``10 log10(1/2 / noise · B T · N)``: a sine at full scale relative to the noise in the call's
     band, with the gains of matched filter and delay-and-sum. The gain of the matched filter is bandwidth times duration
