@@ -357,9 +357,10 @@ def test_acoular_sample_rate_may_be_an_array_of_one(tmp_path, rate_hz):
         (0.0, r"a\.h5: recording\.sample_rate_hz is 0; give a number from 1000 to 1e\+09"),
         (1e308, r"a\.h5: recording\.sample_rate_hz is 1e\+308; give a number"),
         (np.array([1.0, 2.0]), r"a\.h5: sample_freq is \[1\.0, 2\.0\]; give one number, the rate in Hz"),
-        ("fast", "contains no time_data with a sample_freq"),
+        ("fast", r"sample_freq is not a number; give one number, the rate in Hz"),
+        (h5py.Empty("f8"), r"sample_freq is not a number; give one"),
     ],
-    ids=["nan", "inf", "zero", "huge", "two", "text"],
+    ids=["nan", "inf", "zero", "huge", "two", "text", "empty"],
 )
 def test_invalid_sample_rates_are_refused(tmp_path, rate_hz, message):
     path = write_acoular(tmp_path / "a.h5", numbers().astype(np.float32), rate_hz)
@@ -374,10 +375,65 @@ def test_transposed_acoular_data_are_refused(tmp_path, options):
         ertis.open_pcm(path, PCM, **options)
 
 
-def test_other_hdf5_is_refused(tmp_path, measurement):
+def _strange(path, fill):
+    with h5py.File(path, "w") as file:
+        fill(file)
+    return path
+
+
+STRANGE = {
+    # other HDF5 files, and a part of the error
+    "no signals": (
+        lambda file: file.create_group("b"),
+        r"contains no time_data with a sample_freq, but b; save WAV, or",
+    ),
+    "empty": (lambda _: None, r"contains no time_data with a sample_freq, but nothing"),
+    "no rate": (
+        lambda file: file.create_dataset("time_data", data=numbers()),
+        r"time_data has no attribute sample_freq",
+    ),
+    "no data": (lambda file: file.create_dataset("time_data", data=h5py.Empty("f4")), r"time_data is empty; save WAV"),
+    "link": (lambda file: file.__setitem__("time_data", h5py.ExternalLink("b.h5", "a")), r"time_data is a link into"),
+    "complex": (lambda file: _rated(file, numbers().astype(complex)), r"time_data is complex128 of shape \(3000, 8\)"),
+    "text": (
+        lambda file: _rated(file, [b"a", b"b"]),
+        r"time_data is object of shape \(2, 1\); give floating or signed",
+    ),
+}
+
+
+def _rated(file, values):
+    file["time_data"] = values
+    file["time_data"].attrs["sample_freq"] = float(RATE_HZ)
+
+
+@pytest.mark.parametrize("name", STRANGE)
+def test_hdf5_without_signals_is_refused_by_its_content(tmp_path, name):
+    fill, message = STRANGE[name]
+    with pytest.raises(DataError, match=message):
+        ertis.open_pcm(_strange(tmp_path / "a.h5", fill), PCM)
+
+
+def test_recordings_need_no_import(tmp_path, measurement):
     path = write_recording(tmp_path / "rec.h5", [measurement])
-    with pytest.raises(DataError, match=r"contains no time_data with a sample_freq; give a file of Acoular"):
+    with pytest.raises(DataError, match=r"is a file of this package, and needs no import; use 'ertis process'"):
         ertis.open_pcm(path, PCM)
+
+
+def _like_pytables(file):
+    values = numbers().astype(">f4")
+    data = file.create_dataset("time_data", data=values, chunks=(64, 8), maxshape=(None, 8), compression="gzip")
+    data.attrs["sample_freq"] = float(RATE_HZ)
+    for owner in (file, data):
+        owner.attrs["CLASS"] = np.bytes_(b"EARRAY")
+        owner.attrs["TITLE"] = h5py.Empty("S1")
+        owner.attrs["VERSION"] = "1.1"
+    file.create_group("metadata").attrs["TITLE"] = h5py.Empty("S1")
+
+
+def test_acoular_files_of_pytables_are_imported(tmp_path):
+    (measurement,) = ertis.open_pcm(_strange(tmp_path / "a.h5", _like_pytables), PCM)
+    assert np.array_equal(measurement.data, numbers().astype(np.float32))
 
 
 # ---- commands -------------------------------------------------------------------------------------

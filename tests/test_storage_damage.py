@@ -22,6 +22,7 @@ from ertis_numba.storage import (
     write_energyscapes,
     write_recording,
 )
+from ertis_numba.storage.verify import verify
 from tests.files import image, line, noise
 
 GROUP = "sensors/eRTIS-7"
@@ -122,9 +123,33 @@ def test_file_of_a_killed_writer_is_not_reported_as_damaged(path):
         holder.kill()
     with pytest.raises(
         DataError,
-        match=r"rec.h5 is open for writing in another program, or that program was killed; close it there",
+        match=r"rec.h5 was not closed: its writer was killed, or .* run 'h5clear -s /.*/rec.h5' \(part of",
     ):
         open_recording(path)
+
+
+def add_empty(owner):
+    for name in ("TITLE", "a text", "numbers"):
+        owner.attrs[name] = h5py.Empty("f8" if name == "numbers" else "S1")
+
+
+def add_foreign_types(owner):
+    space = h5py.h5s.create(h5py.h5s.SCALAR)
+    h5py.h5a.create(owner.id, b"a bit field", h5py.h5t.STD_B8LE, space)
+    h5py.h5a.create(owner.id, b"a time", h5py.h5t.UNIX_D32LE, space)
+
+
+@pytest.mark.parametrize("add", [add_empty, add_foreign_types])
+def test_attributes_of_other_programs_are_no_damage(path, add):
+    with h5py.File(path, "r+") as file:
+        add(file)
+        file.visititems(lambda _, item: add(item))
+    with open_recording(path) as recording:
+        assert len(recording[:]) == 3
+        assert recording.attributes.get("TITLE", "") == ""
+        assert recording.attributes.get("numbers") is None
+    assert file_kind(path) == "recording"
+    assert all(report.is_intact for report in verify(path))
 
 
 def test_newer_format_version_is_refused(path):

@@ -14,14 +14,20 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.atomic_files import require_free_space
-from ertis_numba.errors import DamagedError, DataError, ForeignDataError
+from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, microphones, received_settings, self_contained
 from ertis_numba.settings import Array, Recording, Settings
 from ertis_numba.stages.signals import signals_of
+from ertis_numba.storage.opening import open_file, reading
+from ertis_numba.storage.schema import to_python
 from ertis_numba.storage.structure import local_member, require_attributes, stored_bytes
 
 __all__ = ["read_acoular", "write_acoular"]
+
+_WANTED = "a file of Acoular"
+_SAVE = "save WAV, or HDF5 with the dataset time_data, (sample, channel), and its attribute sample_freq"
+_MAX_NAMES = 8
 
 
 def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
@@ -55,25 +61,16 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
     DataError
         The file is not an Acoular file, or its data has another type or shape.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            data = local_member(file, "time_data", h5py.Dataset)
-            require_attributes(data)
-            stored_bytes(data, may_be_filtered=True)
-            numbers = np.asarray(data[()])
-            rates_hz = np.asarray(data.attrs["sample_freq"], dtype=np.float64)
-            reported = None
-            if "metadata" in file:
-                reported = local_member(file, "metadata", h5py.Group).attrs.get("settings")
-    except (DamagedError, ForeignDataError) as error:
-        raise DataError(f"{path}: {error}") from error
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    with open_file(path, _WANTED) as file, reading(file, path):
+        data = _time_data(file, path)
+        numbers = np.asarray(data[()])
+        rates_hz = _numbers(data.attrs["sample_freq"])
+        reported = _settings(file)
+    if rates_hz is None or rates_hz.size != 1:
         raise DataError(
-            f"{path} contains no time_data with a sample_freq; give a file of Acoular, or process a recording "
-            "with 'ertis process'"
-        ) from error
-    if rates_hz.size != 1:
-        raise DataError(f"{path}: sample_freq is {rates_hz.tolist()}; give one number, the rate in Hz")
+            f"{path}: sample_freq is {'not a number' if rates_hz is None else rates_hz.tolist()}; give one number, the "
+            "rate in Hz"
+        )
     rate_hz = float(rates_hz.item())
     numbers = numbers[:, None] if numbers.ndim == 1 else numbers
     if numbers.ndim != 2 or not numbers.size or numbers.dtype.kind not in "fi":
@@ -81,11 +78,40 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
             f"{path}: time_data is {numbers.dtype} of shape {numbers.shape}; give floating or signed numbers of shape "
             "(sample, channel)"
         )
-    return (
-        rate_hz,
-        numbers,
-        None if reported is None else _of_signals(received_settings(str(reported), str(path)), rate_hz),
-    )
+    return rate_hz, numbers, _of_signals(received_settings(reported, str(path)), rate_hz) if reported else None
+
+
+def _time_data(file: h5py.File, path: Path) -> h5py.Dataset:
+    """Return the signals; refuse a file without them, or without their rate."""
+    if "ertis_format" in file.attrs:
+        raise DataError(f"{path} is a file of this package, and needs no import; use 'ertis process' or 'ertis info'")
+    if "time_data" not in file:
+        names = ", ".join(sorted(file)[:_MAX_NAMES]) or "nothing"
+        raise DataError(f"{path} contains no time_data with a sample_freq, but {names}; {_SAVE}")
+    data = local_member(file, "time_data", h5py.Dataset)
+    require_attributes(data)
+    if data.shape is None:
+        raise DataError(f"{path}: time_data is empty; {_SAVE}")
+    if "sample_freq" not in data.attrs:
+        raise DataError(f"{path}: time_data has no attribute sample_freq, the rate in Hz; {_SAVE}")
+    stored_bytes(data, may_be_filtered=True)
+    return data
+
+
+def _numbers(value: Any) -> NDArray[np.float64] | None:
+    """Return an attribute as numbers; None if it has another type or no data."""
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+
+
+def _settings(file: h5py.File) -> str:
+    """Return the settings in files from `write_acoular`; empty for those of Acoular."""
+    if "metadata" not in file:
+        return ""
+    facts = local_member(file, "metadata", h5py.Group).attrs
+    return str(to_python(facts["settings"])) if "settings" in facts else ""
 
 
 def _of_signals(settings: Settings, rate_hz: float) -> Settings:

@@ -1,5 +1,6 @@
 """Check of parts of a recording that readers do not use: axes and attributes of all objects in the file."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,11 +52,11 @@ def find_damage(path: Path) -> str:
 def _damage_of(file: h5py.File, item: h5py.Group | h5py.Dataset) -> str:
     require_attributes(item)
     for name in item.attrs:
-        value = item.attrs[name]
-        if name == "REFERENCE_LIST":
-            for reference, axis in value:
-                if item not in list(file[reference].dims[int(axis)].values()):
-                    return f"is not an axis of {file[reference].name}"
+        with suppress(TypeError):  # Other programs add types without an equivalent in NumPy.
+            item.attrs[name]
+    for reference, axis in item.attrs.get("REFERENCE_LIST", ()):
+        if item not in list(file[reference].dims[int(axis)].values()):
+            return f"is not an axis of {file[reference].name}"
     if not isinstance(item, h5py.Dataset):
         return ""
     name = item.name.rpartition("/")[2]

@@ -1,44 +1,36 @@
 """Base class of the readers of files with one row per measurement."""
 
-import errno
 import hashlib
 import operator
-import re
+import shlex
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import ClassVar, Self, TypeVar, overload
 
 import h5py
 
-from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError, SettingsError
+from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
+from ertis_numba.storage.opening import RESULT_OR_RECORDING, open_file, reading
 from ertis_numba.storage.schema import FORMAT_VERSION, SensorGroup, Variable, content_sha256, to_python
 from ertis_numba.storage.structure import local_member, require_attributes, require_variables, sensors_of
 from ertis_numba.storage.truth import GroundTruth, read_truth
 
-__all__ = ["FileReader", "file_kind", "open_file", "reading", "sensor_names"]
+__all__ = ["FileReader", "file_kind", "sensor_names"]
 
 Item = TypeVar("Item")
-# Errors of h5py for damaged files.
-_UNREADABLE = (OSError, RuntimeError, LookupError, AttributeError, TypeError, ValueError)
-_SYSTEM_ERROR = re.compile(r"errno = (\d+), error message = '(.*?)'")  # Part of HDF5's own message.
-# Other errors may result from damaged addresses.
-_TRANSIENT_ERRNOS = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)
-_OPEN_FOR_WRITE = "already open for write"  # HDF5 marks a file as open, and a killed program leaves the mark.
 _OPTIONAL_DIMS = {"word"}  # The axis is left out if its length is one.
 _MAX_NAMES = 64  # Limit on sensors in an error.
-_STORED_END = re.compile(r"stored_eof = (\d+)")
 _KIND_NAMES = {
     "recording": "a recording",
     "energyscape": "an energyscape file",
     "acoustic_map": "a file of acoustic maps",
 }
-_WANTED = "a recording, an energyscape file or a file of acoustic maps"
 
 
 def file_kind(path: str | Path) -> str:
@@ -50,7 +42,7 @@ def file_kind(path: str | Path) -> str:
         The file cannot be read, or is none of them.
     """
     with open_file(Path(path)) as file:
-        return _kind(file, Path(path), _WANTED)
+        return _kind(file, Path(path), RESULT_OR_RECORDING)
 
 
 def sensor_names(path: str | Path) -> tuple[str, ...]:
@@ -62,7 +54,7 @@ def sensor_names(path: str | Path) -> tuple[str, ...]:
         The file cannot be read, or is of another kind.
     """
     with open_file(Path(path)) as file, reading(file, Path(path)):
-        _kind(file, Path(path), _WANTED)
+        _kind(file, Path(path), RESULT_OR_RECORDING)
         return sensors_of(file)
 
 
@@ -88,7 +80,7 @@ class FileReader(Sequence[Item]):
     """
 
     _kind: ClassVar[str]
-    _wanted: ClassVar[str] = _WANTED
+    _wanted: ClassVar[str] = RESULT_OR_RECORDING
     _row_name: ClassVar[str] = "measurement"
     _data: str
     _table: tuple[Variable, ...]
@@ -105,7 +97,7 @@ class FileReader(Sequence[Item]):
                 self._select_table()
                 self._require_variables()
                 self._rows = RowReader(self._group, self._data, self._row_name)
-                self.attributes = {name: to_python(value) for name, value in self._file.attrs.items()}
+                self.attributes = _attributes(self._file)
                 self.settings = received_settings(
                     self._group["settings"][()], f"{self.path}: settings", are_applied=self._kind != "recording"
                 )
@@ -227,56 +219,6 @@ class FileReader(Sequence[Item]):
             )
 
 
-@contextmanager
-def reading(file: h5py.File, path: Path) -> Iterator[None]:
-    """Name the file in errors, and report errors of h5py as damage."""
-    try:
-        yield
-    except DataError as error:
-        named = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
-        raise type(error)(named) from error
-    except SettingsError as error:
-        raise DataError(str(error)) from error
-    except ArgumentError:
-        raise
-    except _UNREADABLE as error:
-        if not file:
-            raise DataError(f"{path} is closed; open it again") from error
-        reported = _SYSTEM_ERROR.search(str(error))
-        if reported and int(reported[1]) in _TRANSIENT_ERRNOS:
-            raise DataError(f"{path} cannot be read ({reported[2]}); check the disk") from error
-        raise DamagedError(f"{path} is damaged or cut short ({_reason(error)}); copy it again") from error
-
-
-def open_file(path: Path, wanted: str = _WANTED) -> h5py.File:
-    """Open an HDF5 file for reading; errors name the kind of file that is wanted."""
-    if path.is_dir():
-        raise DataError(f"{path} is a folder; give {wanted}")
-    try:
-        with path.open("rb") as file:
-            n_bytes = file.seek(0, 2)
-    except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; give {wanted}") from error
-    if n_bytes == 0:
-        raise DataError(f"{path} is empty; give {wanted}")
-    if not h5py.is_hdf5(path):
-        remedy = f"give {wanted}, or import raw words first" if wanted == _WANTED else f"give {wanted}"
-        raise DataError(f"{path} is not an HDF5 file; {remedy}")
-    try:
-        return h5py.File(path, "r")
-    except BlockingIOError as error:
-        raise DataError(f"{path} is open for writing in another program; close it there first") from error
-    except OSError as error:
-        if _OPEN_FOR_WRITE in str(error):
-            raise DataError(
-                f"{path} is open for writing in another program, or that program was killed; close it there, or "
-                "copy the file"
-            ) from error
-        stored = _STORED_END.search(str(error))
-        amount = f" of {stored[1]}" if stored else ""
-        raise DataError(f"{path} is cut short or damaged: it has {n_bytes}{amount} bytes; copy it again") from error
-
-
 def _kind(file: h5py.File, path: Path, wanted: str) -> str:
     with reading(file, path):
         require_attributes(file)
@@ -285,7 +227,7 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
     if isinstance(kind, str) and kind == "occupancy_map":
         raise DataError(f"{path} is an occupancy map; give {wanted}")
     if not isinstance(kind, str) or kind not in _KIND_NAMES or not isinstance(version, int):
-        raise DataError(f"{path} is HDF5, but not of this package; give {wanted}")
+        raise DataError(f"{path} is HDF5, but not of this package; {_remedy(file, path, wanted)}")
     if version > FORMAT_VERSION:
         raise FormatVersionError(
             f"{path} has format version {version}, but this package reads up to {FORMAT_VERSION}; update ertis-numba"
@@ -293,6 +235,17 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
     return str(kind)
 
 
-def _reason(error: BaseException) -> str:
-    text = str(error.args[0]) if error.args else ""  # str() of a KeyError adds quotes.
-    return text.partition("\n")[0] or type(error).__name__
+def _remedy(file: h5py.File, path: Path, wanted: str) -> str:
+    """Return the remedy for an HDF5 file of another program."""
+    if "time_data" in file:
+        return f"import its signals with 'ertis import {shlex.quote(str(path))} --settings FILE.toml --output FILE.h5'"
+    return f"give {wanted}"
+
+
+def _attributes(file: h5py.File) -> dict[str, object]:
+    """Return the attributes of a file, except for those that other programs added in types without an equivalent."""
+    found = {}
+    for name in file.attrs:
+        with suppress(TypeError, ValueError):
+            found[name] = to_python(file.attrs[name])
+    return found

@@ -10,7 +10,7 @@ from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, reason, remedy
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
 from ertis_numba.frames import OccupancyMap
-from ertis_numba.storage._reader import open_file, reading
+from ertis_numba.storage.opening import open_file, reading
 from ertis_numba.storage.schema import (
     CONVENTIONS,
     FORMAT_VERSION,

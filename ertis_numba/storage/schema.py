@@ -389,7 +389,9 @@ def set_attributes(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Map
 
 
 def to_python(value: object) -> object:
-    """Return the value of an attribute as a Python object."""
+    """Return the value of an attribute as a Python object; without data, an empty text or None."""
+    if isinstance(value, h5py.Empty):
+        return "" if value.dtype.kind in "SUO" else None
     if isinstance(value, bytes):
         return value.decode(errors="replace")
     return value.item() if isinstance(value, np.generic) else value

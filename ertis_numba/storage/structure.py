@@ -97,8 +97,9 @@ def require_attributes(owner: h5py.File | h5py.Group) -> None:
         raise DamagedError(f"{owner.name} has {n_attributes} attributes; the limit is {MAX_ATTRIBUTES}")
     for name in owner.attrs:
         attribute = owner.attrs.get_id(name)
-        n_bytes = math.prod(attribute.shape) * max(attribute.dtype.itemsize, 1)
-        if max(n_bytes, attribute.get_storage_size()) > MAX_ATTRIBUTE_BYTES:
+        # NumPy lacks some of the types of other programs. The stored size of an attribute without data is an error.
+        n_bytes = attribute.get_space().get_simple_extent_npoints() * attribute.get_type().get_size()
+        if n_bytes and max(n_bytes, attribute.get_storage_size()) > MAX_ATTRIBUTE_BYTES:
             raise DamagedError(
                 f"attribute {name[:80]!r} of {owner.name} has {n_bytes} bytes; the limit is {MAX_ATTRIBUTE_BYTES}"
             )
