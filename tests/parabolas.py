@@ -1,4 +1,7 @@
-"""Reference implementation of peak interpolation: parabolas, corrected by their error for a point reflector."""
+"""Reference implementation of peak interpolation: parabolas, corrected by their error for a point reflector.
+
+Maxima stay within half of the way to each neighbour, and within the loss of the main lobe there.
+"""
 
 import functools
 import math
@@ -40,8 +43,15 @@ def interpolated(image, directions, around, direction, range_index):
             break
     if max(abs(found[0] - first[0]), abs(found[2] - first[2])) > 0.5:
         found = first
-    top = directions[direction] + found[1]
-    return top / np.linalg.norm(top), image.range_m[range_index] + found[0] * step_m, math.exp(found[2])
+    shift_m = min(0.5, max(-0.5, found[0])) * step_m
+    steps = [
+        0.5 * offset @ offset / (offset @ found[1]) for offset in offsets if offset @ found[1] > 0.5 * offset @ offset
+    ]
+    top = directions[direction] + min([1.0, *steps]) * found[1]
+    top = top / np.linalg.norm(top)
+    lobe = max(0.5, amplitude(image.settings, directions[direction] - top, shift_m))
+    highest = min(math.exp(measured[1]) * 10**0.025 / lobe, float(image.amplitude.max()) * 10 ** (0.99 / 20))
+    return top, image.range_m[range_index] + shift_m, min(math.exp(found[2]), highest)
 
 
 def amplitude(settings, direction_offset, range_offset_m):
@@ -72,19 +82,22 @@ def parabolas(logs, offsets):
 
 
 def quadric_top(offsets, rises):
-    """Offset and rise of the maximum of a quadric through samples around 0."""
+    """Offset and rise of the maximum of a quadric through samples around 0, or of a parabola at the edge of a grid."""
     none = np.zeros(3), 0.0
     reach = np.max(np.linalg.norm(offsets, axis=1))
-    if len(offsets) < 3 or np.linalg.norm(offsets.mean(axis=0)) > 0.25 * reach:
-        return none
     _, sizes, axes = np.linalg.svd(offsets, full_matrices=False)
-    n_axes = 2 if sizes[1] > 0.2 * sizes[0] else 1
-    x = offsets @ axes[:n_axes].T
+    if len(offsets) > 5 and sizes[1] > 0.2 * sizes[0] and are_around(offsets @ axes[:2].T):
+        x = offsets @ axes[:2].T
+        n_axes = 2
+    else:
+        pair = opposite(offsets)
+        if pair is None:
+            return none
+        axes = np.array([offsets[pair[0]] - offsets[pair[1]]]) / np.linalg.norm(offsets[pair[0]] - offsets[pair[1]])
+        x, rises = offsets[pair] @ axes.T, rises[pair]
+        n_axes = 1
     columns = [x[:, i] for i in range(n_axes)] + [x[:, i] * x[:, j] for i in range(n_axes) for j in range(i, n_axes)]
-    matrix = np.stack(columns, axis=1)
-    if len(matrix) <= matrix.shape[1]:
-        return none
-    fit = np.linalg.lstsq(matrix, rises, rcond=None)[0]
+    fit = np.linalg.lstsq(np.stack(columns, axis=1), rises, rcond=None)[0]
     slope = fit[:n_axes]
     curve = np.zeros((n_axes, n_axes))
     curve[np.triu_indices(n_axes)] = fit[n_axes:]
@@ -95,3 +108,20 @@ def quadric_top(offsets, rises):
     if np.linalg.norm(top) > reach:
         return none
     return top @ axes[:n_axes], float(0.5 * slope @ top)
+
+
+def are_around(places):
+    """True if no half-plane is free of neighbours, but for 31 degrees."""
+    angles = [math.atan2(y, x) for x, y in places if math.hypot(x, y) > 1e-9]
+    return all(min((other - angle) % math.tau or math.tau for other in angles) < 2.6 for angle in angles)
+
+
+def opposite(offsets):
+    """The two nearest neighbours on opposite sides."""
+    found = []
+    for first, a in enumerate(offsets):
+        for second, b in enumerate(offsets[:first]):
+            lengths = np.linalg.norm(a), np.linalg.norm(b)
+            if min(lengths) > 1e-9 and a @ b < -0.87 * lengths[0] * lengths[1]:
+                found.append((sum(lengths), [first, second]))
+    return min(found)[1] if found else None

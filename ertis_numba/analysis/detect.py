@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.analysis.noise import threshold_of
-from ertis_numba.analysis.peak_interpolation import PeakInterpolator
+from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
 from ertis_numba.analysis.side_lobes import SideLobes
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak
@@ -88,6 +88,7 @@ def find_peaks(
     side_lobes = SideLobes(image, directions, places[order])
     interpolate = PeakInterpolator(image.settings, directions, neighbours, only=places[:, 0])
     found: list[tuple[NDArray[np.float64], float, float]] = []
+    errors_rad: list[float] = []
     for k in order:
         if len(found) == top:
             break
@@ -97,17 +98,20 @@ def find_peaks(
             continue
         tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1])
         found.append((tops.direction[0], float(tops.range_m[0]), float(tops.amplitude[0])))
+        errors_rad.append(float(tops.width_rad[0]) / math.sqrt(12))
         side_lobes.add(*found[-1])
-    found.sort(key=lambda entry: -entry[2])
+    levels = listed(np.array([level for *_, level in found]), image)
     return [
         Peak(
             azimuth_deg=math.degrees(math.atan2(direction[1], direction[0])),
             elevation_deg=math.degrees(math.asin(max(-1.0, min(1.0, direction[2])))),
             range_m=range_m,
-            level_db=20 * math.log10(level / found[0][2]),
-            level_dbfs=20 * math.log10(level),
+            level_db=20 * math.log10(levels[k] / levels.max()),
+            level_dbfs=20 * math.log10(levels[k]),
+            grid_error_deg=math.degrees(errors_rad[k]),
         )
-        for direction, range_m, level in found
+        for k in sorted(range(len(found)), key=lambda k: -levels[k])
+        for direction, range_m, _ in found[k : k + 1]
     ]
 
 

@@ -1,27 +1,28 @@
 """Interpolation of the maxima of an image between its bins."""
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.frames import Energyscape
 from ertis_numba.settings import Settings
 from ertis_numba.stages.plan_response import deviation_of
 
-__all__ = ["PeakInterpolator", "QuadricFits", "Tops"]
+__all__ = ["PeakInterpolator", "Tops", "listed"]
 
-_ONE_SIDED = 0.25  # Mean offset of neighbours relative to their distance; above it, a direction is at the grid's edge.
-_LINE = 0.2  # Ratio of the widths of a direction's neighbours, below which they lie on a line.
 _MAX_CORRECTIONS = 8  # Number of corrections of the parabola error; coarse grids need more than fine ones.
 _CONVERGED = 1e-5  # Change by a correction, in range bins, in unit vectors and in nepers.
 _MAX_DIFFERENCE = 1.0  # Deviation in nepers from the samples of a single reflector; beyond it, there are several.
 _MAX_SHIFT = 0.5  # Change by all corrections, in range bins and in nepers; beyond it, they have not converged.
 _ABSENT = math.log(np.finfo(np.float32).tiny)  # Logarithm of an amplitude of 0, as of a bin that cleaning removes.
 _DARK = 1e-6  # Amplitude below the side lobes of any array.
+_EDGE_OF_LOBE = 0.5  # Amplitude relative to the maximum, below which a sample is not part of the main lobe.
+_NOISE = 10 ** (0.5 / 20)  # Noise may raise a maximum above a main lobe through its strongest sample.
+_NARROWER = 3.0  # The main lobe of adaptive beamformers in decibels, relative to that of delay-and-sum, is at most so.
 
 
 class Tops(NamedTuple):
@@ -33,14 +34,26 @@ class Tops(NamedTuple):
         Unit vectors.
     range_m, amplitude : (place,) float64
         Range in metres, and amplitude.
-    is_between : (place,) bool
-        True if the direction is interpolated; otherwise, it is the direction of the bin.
+    width_rad : (place,) float64
+        Spacing of the grid where the direction, or one of its angles, is that of the bin; 0 if it is interpolated.
     """
 
     direction: NDArray[np.float64]
     range_m: NDArray[np.float64]
     amplitude: NDArray[np.float64]
-    is_between: NDArray[np.bool_]
+    width_rad: NDArray[np.float64]
+
+
+def listed(amplitude: NDArray[np.float64], image: Energyscape) -> NDArray[np.float64]:
+    """Return amplitudes that exceed the strongest bin of an image by less than 1 dB.
+
+    Parameters
+    ----------
+    amplitude : (place,) float64
+        Interpolated amplitudes, which are higher if the grid is coarser than half of the main lobe.
+    image : Energyscape
+    """
+    return np.minimum(amplitude, float(image.amplitude.max(initial=0.0)) * 10 ** (MAX_RISE_DB / 20))
 
 
 class PeakInterpolator:
@@ -50,6 +63,9 @@ class PeakInterpolator:
     from array and call. It interpolates them as well, and subtracts the error of that interpolation. The correction
     applies to delay-and-sum of the fast method, and to maxima whose samples match a single reflector. Other maxima keep
     the result of the parabolas. At 60 dB above the noise, the correction reduces errors from about 4 mm to 0.1 mm.
+
+    A maximum never leaves the cell of its direction, which ends half-way to each neighbour. It exceeds its bin by at
+    most the loss of the main lobe over this distance. Lists of maxima also limit it by `listed`.
 
     Parameters
     ----------
@@ -75,7 +91,9 @@ class PeakInterpolator:
         self._row = np.zeros(len(directions), dtype=np.int64)
         self._row[wanted] = np.arange(len(wanted))
         self._fits = QuadricFits.of(directions, neighbours, wanted)
-        self._point_spread = PointSpread(settings) if settings.processing.method == "fast" else None
+        self._n_axes = 1 if np.ptp(directions[:, 2]) == 0 else 2
+        self._spread = PointSpread(settings)
+        self._is_predicted = settings.processing.method == "fast"
         self._deviation = deviation_of(settings, directions)
 
     def __call__(self, image: Energyscape, directions: NDArray[np.int64], ranges: NDArray[np.int64]) -> Tops:
@@ -91,16 +109,33 @@ class PeakInterpolator:
         rows, columns = _bins(directions, self._neighbours[directions], ranges, last=len(image.range_m) - 1)
         measured = np.log(np.maximum(image.amplitude[rows, columns].astype(np.float64), np.finfo(np.float32).tiny))
         found = self._tops(directions, measured)
-        if self._point_spread is not None and not image.settings.processing.is_adaptive:
-            found = self._corrected(self._point_spread, found, directions, measured, (rows, columns), step_m, image)
-        shift, offset, level = found[:, 0], found[:, 1:4], found[:, 4]
+        if self._is_predicted and not image.settings.processing.is_adaptive:
+            found = self._corrected(self._spread, found, directions, measured, (rows, columns), step_m, image)
+        shift_m, offset = found[:, 0].clip(-0.5, 0.5) * step_m, found[:, 1:4]
+        fits = self._row[directions]
+        offset = offset * self._fits.inside(fits, offset)[:, None]
         top = self._directions[directions] + offset
+        top /= np.linalg.norm(top, axis=1)[:, None]
+        is_between = offset.any(axis=1) & (self._fits.n_axes[fits] >= self._n_axes)
         return Tops(
-            direction=top / np.linalg.norm(top, axis=1)[:, None],
-            range_m=image.range_m[ranges] + shift * step_m,
-            amplitude=np.exp(level),
-            is_between=np.asarray(offset.any(axis=1)),
+            direction=top,
+            range_m=image.range_m[ranges] + shift_m,
+            amplitude=np.minimum(np.exp(found[:, 4]), self._highest(image, directions, measured[:, 1], top, shift_m)),
+            width_rad=np.where(is_between, 0.0, self._fits.width_rad[fits]),
         )
+
+    def _highest(
+        self,
+        image: Energyscape,
+        directions: NDArray[np.int64],
+        measured: NDArray[np.float64],
+        tops: NDArray[np.float64],
+        shift_m: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Return the largest possible amplitudes of reflectors at interpolated positions, from those of their bins."""
+        loss = self._spread(self._directions[directions] - tops, shift_m, image.settings.air).clip(_EDGE_OF_LOBE, 1.0)
+        lobe = loss**_NARROWER if image.settings.processing.is_adaptive else loss
+        return np.asarray(np.exp(measured) * _NOISE / lobe)
 
     def _corrected(
         self,
@@ -194,93 +229,3 @@ def _bins(
     columns[:, 0] -= inner
     columns[:, 2] += inner
     return np.concatenate([np.repeat(directions[:, None], 3, axis=1), around], axis=1), columns
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class QuadricFits:
-    """Fit of a quadric to each direction and its neighbours, over the plane or the line that contains them.
-
-    Attributes
-    ----------
-    axes : (direction, 2, axis) float64
-        Axes of the plane.
-    inverse : (direction, 5, neighbour) float64
-        Matrix from values to the coefficients of x, y, x², xy and y².
-    is_plane : (direction,) bool
-        False for a line, on which y is 0.
-    reach : (direction,) float64
-        Distance of the farthest neighbour. It is 0 if no quadric can be fitted, and at the edge of the grid, where all
-        neighbours lie on one side.
-    """
-
-    axes: NDArray[np.float64]
-    inverse: NDArray[np.float64]
-    is_plane: NDArray[np.bool_]
-    reach: NDArray[np.float64]
-
-    @classmethod
-    def of(
-        cls,
-        directions: NDArray[np.float64],
-        neighbours: NDArray[np.int64],
-        wanted: NDArray[np.int64],
-        weights: NDArray[np.float64] | None = None,
-    ) -> "QuadricFits":
-        """Return the fits of some directions of a grid.
-
-        Parameters
-        ----------
-        directions : (direction, axis) float64
-        neighbours : (direction, neighbour) int64
-        wanted : (place,) int64
-        weights : (place, neighbour) float64, optional
-            Weights of the neighbours' squared errors; equal by default.
-        """
-        n_directions, n_samples = len(wanted), neighbours.shape[1]
-        if n_samples < 3:
-            return cls(
-                np.zeros((n_directions, 2, 3)),
-                np.zeros((n_directions, 5, n_samples)),
-                np.zeros(n_directions, dtype=np.bool_),
-                np.zeros(n_directions),
-            )
-        offsets = directions[neighbours[wanted]] - directions[wanted][:, None]
-        reach = np.linalg.norm(offsets, axis=2).max(axis=1)
-        one_sided = np.linalg.norm(offsets.mean(axis=1), axis=1) > _ONE_SIDED * reach
-        _, sizes, axes = np.linalg.svd(offsets, full_matrices=False)
-        axes = axes[:, :2]
-        is_plane = sizes[:, 1] > _LINE * sizes[:, 0]
-        x, y = np.moveaxis(offsets @ axes.transpose(0, 2, 1), 2, 0)
-        y = np.where(is_plane[:, None], y, 0.0)
-        terms = np.stack([x, y, x * x, x * y, y * y], axis=2)
-        if weights is None:
-            inverse = np.linalg.pinv(terms)
-        else:
-            roots = np.sqrt(weights)
-            inverse = np.linalg.pinv(terms * roots[:, :, None]) * roots[:, None]
-        usable = n_samples > np.where(is_plane, 5, 2)
-        return cls(axes, inverse, is_plane, np.where(usable & ~one_sided, reach, 0.0))
-
-    def tops(
-        self, directions: NDArray[np.int64], rises: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return offsets from directions to the maxima of their quadrics, (place, axis) float64, and the rise there.
-
-        An offset is 0 if there is no maximum within the distance of the farthest neighbour.
-
-        Parameters
-        ----------
-        directions : (place,) int64
-        rises : (place, neighbour) float64
-            Values at the neighbours minus the value at the direction.
-        """
-        slope_x, slope_y, xx, xy, yy = np.einsum("pcn,pn->cp", self.inverse[directions], rises)
-        xx, yy = 2 * xx, np.where(self.is_plane[directions], 2 * yy, -1.0)
-        determinant = xx * yy - xy * xy
-        is_top = (xx < 0) & (determinant > 0)
-        scale = np.divide(1.0, determinant, out=np.zeros_like(determinant), where=is_top)
-        x, y = (xy * slope_y - yy * slope_x) * scale, (xy * slope_x - xx * slope_y) * scale
-        is_near = np.hypot(x, y) <= self.reach[directions]
-        x, y = np.where(is_near, x, 0.0), np.where(is_near, y, 0.0)
-        offset = x[:, None] * self.axes[directions, 0] + y[:, None] * self.axes[directions, 1]
-        return offset, 0.5 * (slope_x * x + slope_y * y)

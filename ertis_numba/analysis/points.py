@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.analysis.detect import neighbours_of, spacing_of
-from ertis_numba.analysis.peak_interpolation import PeakInterpolator
+from ertis_numba.analysis.detect import neighbours_of
+from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
 from ertis_numba.analysis.side_lobes import side_lobe_floor
 from ertis_numba.analysis.uncertainty import PositionUncertainty
 from ertis_numba.frames import Energyscape, PointCloud
@@ -68,7 +68,6 @@ class PointExtractor:
         self._directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         self._neighbours = neighbours_of(self._directions)
         self._interpolator = PeakInterpolator(settings, self._directions, self._neighbours)
-        self._spacing = spacing_of(self._directions, self._neighbours)
         self._uncertainty = PositionUncertainty(settings, is_planar=bool(np.ptp(self._directions[:, 2]) == 0))
 
     def __call__(self, image: Energyscape) -> PointCloud:
@@ -86,11 +85,10 @@ class PointExtractor:
         tops = self._interpolator(image, directions, ranges)
         position_m, levels = (
             (tops.direction * tops.range_m[:, None]).astype(np.float32),
-            tops.amplitude.astype(np.float32),
+            listed(tops.amplitude, image).astype(np.float32),
         )
         order = np.argsort(-levels, kind="stable")
-        resolution_rad = np.where(tops.is_between, 0.0, self._spacing[directions])
-        uncertainty_m = self._uncertainty(image, position_m, levels, resolution_rad)
+        uncertainty_m = self._uncertainty(image, position_m, levels, tops.width_rad)
         return PointCloud(
             position_m[order], levels[order], image.settings, image.stamp, uncertainty_m=uncertainty_m[order]
         )

@@ -42,9 +42,19 @@ class SoundDirection(NamedTuple):
     level_dbfs: float | None
     level_db: float | None
     source_level_db: float | None
+    grid_error_rad: float = math.nan
 
     @classmethod
-    def of(cls, found: "AcousticMap", band: int, azimuth_rad: float, elevation_rad: float, *, power: float) -> Self:
+    def of(
+        cls,
+        found: "AcousticMap",
+        band: int,
+        azimuth_rad: float,
+        elevation_rad: float,
+        *,
+        power: float,
+        grid_error_rad: float = math.nan,
+    ) -> Self:
         """Return a direction of a map, with all known levels of a power.
 
         Parameters
@@ -55,6 +65,8 @@ class SoundDirection(NamedTuple):
         azimuth_rad, elevation_rad : float
         power : float
             Mean square of the sound at the array.
+        grid_error_rad : float
+            NaN, the default, if it is unknown.
         """
         level_dbfs = 10 * math.log10(power) if power else -math.inf
         levels: dict[str, float | None] = dict.fromkeys(LEVEL_UNITS)
@@ -62,20 +74,21 @@ class SoundDirection(NamedTuple):
             offset_db = level_offset_db(found.settings, found.centre_hz[band : band + 1], unit)
             levels[name] = None if offset_db is None or np.isnan(offset_db[0]) else level_dbfs + float(offset_db[0])
         low_hz, high_hz = found.band_hz[band].tolist()
-        return cls((low_hz, high_hz), azimuth_rad, elevation_rad, **levels)
+        return cls((low_hz, high_hz), azimuth_rad, elevation_rad, **levels, grid_error_rad=grid_error_rad)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the direction in degrees and the levels for JSON; levels are null if they are unknown or infinite."""
+        """Return the direction in degrees and the levels for JSON; unknown or infinite numbers are null."""
         return {
             "band_hz": [round(edge_hz, 3) for edge_hz in self.band_hz],
             "azimuth_deg": round(math.degrees(self.azimuth_rad), 4),
             "elevation_deg": round(math.degrees(self.elevation_rad), 4),
             **{name: _rounded(getattr(self, name)) for name in reversed(LEVEL_UNITS)},
+            "grid_error_deg": _rounded(math.degrees(self.grid_error_rad)),
         }
 
 
-def _rounded(level_db: float | None) -> float | None:
-    return None if level_db is None or not math.isfinite(level_db) else round(level_db, 4)
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(value, 4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -62,6 +62,10 @@ class Peak(RadiansFromDegrees):
         Level in dB relative to the strongest peak of the same energyscape, at most 0.
     level_dbfs : float, default NaN
         Level in dB relative to a full-scale echo in every microphone; NaN if it is unknown.
+    grid_error_deg : float, default NaN
+        Standard deviation of the direction that the grid causes, in degrees: 0 if the direction is interpolated. At the
+        edge of a grid, one or both angles are those of the grid, and it is the spacing divided by √12. It is infinite
+        for a single direction, and NaN if it is unknown.
 
     Examples
     --------
@@ -75,3 +79,4 @@ class Peak(RadiansFromDegrees):
     range_m: float
     level_db: float
     level_dbfs: float = field(default=math.nan, compare=False)
+    grid_error_deg: float = field(default=math.nan, compare=False)

@@ -18,6 +18,7 @@ from ertis_numba.geometry import (
 )
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.block_spectra import BlockSpectra
+from ertis_numba.passive.components import gathered
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.methods import METHODS
 from ertis_numba.passive.wave_delays import WaveDelays
@@ -33,8 +34,9 @@ class AcousticCamera:
 
     Signals are cut into blocks that overlap by half. Their spectra, under a Hann window, give the cross-spectral matrix
     of the microphones, which is averaged over blocks and measurements. A map is the power of this matrix for the wave
-    from each direction. Measurements with a call are accepted; the time of the call is left out. Use each object in one
-    thread only.
+    from each direction. Maps of CLEAN-SC and HR-CLEAN-SC sum the components of a direction and its neighbours at the
+    strongest of them, whose value is the power of the source. Measurements with a call are accepted; the time of the
+    call is left out. Use each object in one thread only.
 
     Parameters
     ----------
@@ -168,7 +170,7 @@ class AcousticCamera:
         """
         with one_thread():
             power = (self._shares @ self.powers()).T
-        return AcousticMap(
+        found = AcousticMap(
             np.ascontiguousarray(power),
             self.grid.azimuth_rad,
             self.grid.elevation_rad,
@@ -179,6 +181,7 @@ class AcousticCamera:
             self._n_blocks,
             self._masked_s,
         )
+        return gathered(found)
 
     def reset(self) -> None:
         """Discard all measurements."""

@@ -1,5 +1,6 @@
 """Sources of sound in acoustic maps, with directions and levels interpolated between those of the grid."""
 
+import functools
 import math
 from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
@@ -9,9 +10,10 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.analysis.detect import neighbours_of
-from ertis_numba.analysis.peak_interpolation import QuadricFits
+from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.frames import AcousticMap, SoundDirection
 from ertis_numba.geometry import unit_vectors
+from ertis_numba.passive.components import COMPONENT_METHODS, strongest_first
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.settings import Passive
 
@@ -19,21 +21,44 @@ __all__ = ["find_sound_sources"]
 
 Floats = NDArray[np.float64]
 
-_COMPONENTS: Final = frozenset({"clean_sc", "hr_clean_sc"})  # Their maps hold the powers of sources, and 0 elsewhere.
 _INVERSE: Final = frozenset({"capon", "music"})  # The inverses of their powers are quadratic forms, and thus smooth.
 _MIN_LEVEL_DB: Final = -10.0  # Side lobes of most arrays are lower.
 _MIN_COMPONENT_DB: Final = -20.0  # CLEAN-SC removes side lobes, but 1 % of a source may remain.
 _FLOOR: Final = 2.0  # Lowest power of a maximum relative to the median over directions; that of noise varies less.
 _SIDE_LOBES: Final = 2.0  # Lowest power of a maximum relative to predicted side lobes.
 _FREQUENCIES: Final = 9  # Frequencies of a band at which side lobes are predicted.
+_NARROWER: Final = 3.0  # Main lobe of Capon and MUSIC in decibels, relative to that of delay-and-sum; it may be more.
+_EDGE_OF_LOBE: Final = 1e-3  # Power of delay-and-sum relative to a maximum, below which it is not of the main lobe.
+_LEAST_LOSS: Final = 0.25  # Power relative to a maximum at the edge of a cell; grids with less do not resolve it.
+_NOISE: Final = 10**0.05  # Noise may raise a maximum above a main lobe through its strongest sample.
 _TINY: Final = 1e-300
 
 
 class _Top(NamedTuple):
-    """Source of a band, with its direction as a unit vector, (axis,) float64."""
+    """Source of a band, with its direction as a unit vector, (axis,) float64, and the width of its cell.
+
+    The width is 0 if the direction is interpolated.
+    """
 
     direction: Floats
     power: float
+    width_rad: float
+
+
+class _Grid(NamedTuple):
+    """Directions with their neighbours, and the number of their axes."""
+
+    directions: Floats
+    neighbours: NDArray[np.int64]
+    n_axes: int
+
+    @classmethod
+    def of(cls, directions: Floats) -> "_Grid":
+        return cls(directions, neighbours_of(directions), 1 if np.ptp(directions[:, 2]) == 0 else 2)
+
+    def spacing_rad(self, place: int) -> float:
+        """Return the distance from a direction to its nearest neighbour; infinite if there is none."""
+        return float(QuadricFits.of(self.directions, self.neighbours, np.array([place])).width_rad[0])
 
 
 def find_sound_sources(
@@ -41,17 +66,20 @@ def find_sound_sources(
 ) -> list[SoundDirection]:
     """Return the sources of sound in an acoustic map, band by band, strongest first.
 
-    Maps of CLEAN-SC and HR-CLEAN-SC hold the powers of sources. The bins of a source may lie at neighbouring directions
-    of the grid. Its power is therefore the sum over a direction and its neighbours, and its direction their mean,
-    weighted by power.
+    Maps of CLEAN-SC and HR-CLEAN-SC hold the powers of sources, each at a direction of the grid. Direction and level are
+    those of the map: the level is the sum of the components of all bins in this direction and its neighbours.
 
     In other maps, a source is a local maximum. A quadric through the neighbouring directions interpolates its direction
     and its level. It fits the logarithm of the power, or for Capon and MUSIC its inverse. Maxima below twice the median
     over all directions belong to the floor of the map, and are left out. With delay-and-sum, so are maxima below twice
     the side lobes of stronger sources. The strongest direction of each band is always returned.
 
+    An interpolated maximum stays within half of the way to each neighbour, and within the main lobe through its
+    direction. It exceeds the maximum of the map by less than 1 dB. At the edge of a grid, it is interpolated along the
+    edge only, and in a corner not at all; `SoundDirection.grid_error_rad` states the error.
+
     Errors are small if the main lobe is at least two spacings of the grid wide. The peaks of Capon are often narrower;
-    their levels are then too low. CLEAN-SC finds a source in each bin at a direction of the grid, with the level there.
+    their levels are then too low.
 
     Parameters
     ----------
@@ -85,29 +113,43 @@ def find_sound_sources(
     passive = found.settings.passive
     method = passive.method
     if min_level_db is None:
-        min_level_db = _MIN_COMPONENT_DB if method in _COMPONENTS else _MIN_LEVEL_DB
+        min_level_db = _MIN_COMPONENT_DB if method in COMPONENT_METHODS else _MIN_LEVEL_DB
     least = 10 ** (checks.between("min_level_db", min_level_db, -1000.0, 0.0) / 10)
-    directions = unit_vectors(found.azimuth_rad, found.elevation_rad)
-    neighbours = neighbours_of(directions)
-    search: Callable[[Floats, Floats, NDArray[np.int64], Passive], Iterator[_Top]]
-    search = _components if method in _COMPONENTS else _maxima
+    grid = _Grid.of(unit_vectors(found.azimuth_rad, found.elevation_rad))
+    search = _components if method in COMPONENT_METHODS else _maxima
     delays, out = WaveDelays(found.settings), []
     for band, power in enumerate(found.power.T.astype(np.float64)):
-        tops = sorted(search(power, directions, neighbours, passive), key=lambda each: -each.power)
+        highest = float(power.max(initial=0.0)) * 10 ** (MAX_RISE_DB / 10)
+        loss_of = functools.partial(_loss, delays, found.band_hz[band])
+        tops = sorted(search(power, grid, passive, loss_of), key=lambda each: -each.power)
         tops = [each for each in tops if each.power >= least * tops[0].power]
         if method == "delay_and_sum":
             tops = _without_side_lobes(tops, delays, found.band_hz[band], top=top)
         for each in tops[:top]:
             x, y, z = each.direction.tolist()
             angles_rad = math.atan2(y, x), math.asin(max(-1.0, min(1.0, z)))
-            out.append(SoundDirection.of(found, band, *angles_rad, power=each.power))
+            error_rad = each.width_rad / math.sqrt(12)
+            listed = min(each.power, highest)
+            out.append(SoundDirection.of(found, band, *angles_rad, power=listed, grid_error_rad=error_rad))
     return out
+
+
+def _loss(delays: WaveDelays, band_hz: Floats, tops: Floats, directions: Floats) -> Floats:
+    """Return the powers of beams in directions relative to those of maxima near them: (place,) float64."""
+    apart_s = delays(tops) - delays(directions)
+    beams = np.exp(1j * _omega(band_hz) * apart_s).mean(axis=2)
+    return np.asarray((np.abs(beams) ** 2).mean(axis=0).clip(_LEAST_LOSS, 1.0))
+
+
+def _omega(band_hz: Floats) -> Floats:
+    """Return angular frequencies of a band: (frequency, 1, 1) float64."""
+    return 2 * np.pi * np.linspace(band_hz[0], band_hz[1], _FREQUENCIES)[:, None, None]
 
 
 def _without_side_lobes(tops: list[_Top], delays: WaveDelays, band_hz: Floats, *, top: int) -> list[_Top]:
     """Return the maxima that exceed the side lobes of the stronger ones, up to a number, the strongest first."""
     delay_s = delays(np.array([each.direction for each in tops]))
-    omega = 2 * np.pi * np.linspace(band_hz[0], band_hz[1], _FREQUENCIES)[:, None, None]
+    omega = _omega(band_hz)
     kept: list[int] = []
     explained = np.zeros(len(tops))
     for place, each in enumerate(tops):
@@ -120,42 +162,43 @@ def _without_side_lobes(tops: list[_Top], delays: WaveDelays, band_hz: Floats, *
     return [tops[place] for place in kept]
 
 
-def _components(power: Floats, directions: Floats, neighbours: NDArray[np.int64], _: Passive) -> Iterator[_Top]:
-    """Yield sums of powers over a direction and its neighbours, from the strongest direction on."""
-    left = power.copy()
-    for place in np.argsort(-power, kind="stable"):
-        if not power[place]:
-            break
-        if not left[place]:
-            continue
-        around = neighbours[place]
-        mean = left[around] @ directions[around]
-        yield _Top(mean / np.linalg.norm(mean), float(left[around].sum()))
-        left[around] = 0
-    if not power.any():
-        yield _Top(directions[0], 0.0)
+def _components(power: Floats, grid: _Grid, *_: object) -> Iterator[_Top]:
+    """Yield the directions with more power than their neighbours, from the strongest on; one in silence."""
+    is_left = np.ones(len(power), dtype=np.bool_)
+    for place in strongest_first(power) or [0]:
+        if is_left[place]:
+            is_left[grid.neighbours[place]] = False
+            yield _Top(grid.directions[place], float(power[place]), grid.spacing_rad(place))
 
 
-def _maxima(power: Floats, directions: Floats, neighbours: NDArray[np.int64], passive: Passive) -> Iterator[_Top]:
+def _maxima(power: Floats, grid: _Grid, passive: Passive, loss_of: Callable[[Floats, Floats], Floats]) -> Iterator[_Top]:
     """Yield the interpolated local maxima above the floor of a map, and the strongest in any case."""
-    strongest, is_inverse = int(power.argmax()), passive.method in _INVERSE
-    order = passive.functional_order if passive.method == "functional" else 1
-    is_peak = (power >= power[neighbours].max(axis=1)) & (power > _FLOOR * np.median(power))
-    places = np.union1d(np.flatnonzero(is_peak), strongest)
-    around = neighbours[places]
-    weights = None
-    if is_inverse:
-        values = -1 / np.maximum(power, _TINY)
+    around = power[grid.neighbours]
+    is_first = ~((around == power[:, None]) & (grid.neighbours < np.arange(len(power))[:, None])).any(axis=1)
+    is_peak = (power >= around.max(axis=1)) & is_first & (power > _FLOOR * np.median(power))
+    places = np.union1d(np.flatnonzero(is_peak), int(power.argmax()))
+    order = _order_of(passive)
+    floor = _EDGE_OF_LOBE**order
+    relative = np.clip(around[places] / np.maximum(power[places, None], _TINY), floor, 1.0)
+    if passive.method in _INVERSE:
+        fits = QuadricFits.of(grid.directions, grid.neighbours, places)
+        offsets, rises = fits.tops(np.arange(len(places)), 1 - 1 / relative)
+        rises = -np.log(np.where(rises < 1, 1 - rises, 1.0))  # A peak may be too narrow for a quadric.
     else:  # Beyond the main lobe, the logarithm falls steeply, so weights are small there.
-        values = np.log(np.maximum(power, _TINY))
-        weights = np.maximum(power[around] / np.maximum(power[places, None], _TINY), _TINY) ** (1 / order)
-    fits = QuadricFits.of(directions, neighbours, places, weights)
-    offsets, rises = fits.tops(np.arange(len(places)), values[around] - values[places, None])
-    for place, offset, rise in zip(places, offsets, rises, strict=True):
-        top, value = directions[place] + offset, values[place] + rise
-        level = float(power[place])
-        if is_inverse and value < 0:  # A peak may be too narrow for a quadric.
-            level = -1 / float(value)
-        elif level and not is_inverse:
-            level = math.exp(value)
-        yield _Top(top / np.linalg.norm(top), level)
+        fits = QuadricFits.of(grid.directions, grid.neighbours, places, relative ** (1 / order))
+        offsets, rises = fits.tops(np.arange(len(places)), np.log(relative))
+    offsets *= fits.inside(np.arange(len(places)), offsets)[:, None]
+    tops = grid.directions[places] + offsets
+    tops /= np.linalg.norm(tops, axis=1)[:, None]
+    if passive.method != "music":  # Its numbers have no level, and no main lobe of delay-and-sum.
+        rises = np.minimum(rises, order * np.log(_NOISE / loss_of(tops, grid.directions[places])))
+    powers = power[places] * np.exp(rises)
+    widths = np.where(offsets.any(axis=1) & (fits.n_axes >= grid.n_axes), 0.0, fits.width_rad)
+    yield from (_Top(top, float(each), float(width)) for top, each, width in zip(tops, powers, widths, strict=True))
+
+
+def _order_of(passive: Passive) -> float:
+    """Return the main lobe of a method in decibels, relative to that of delay-and-sum."""
+    if passive.method == "functional":
+        return float(passive.functional_order)
+    return _NARROWER if passive.method in _INVERSE else 1.0

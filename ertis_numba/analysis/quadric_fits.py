@@ -1,0 +1,157 @@
+"""Quadrics through values at neighbouring directions, whose maxima stay within the cell of a direction."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["MAX_RISE_DB", "QuadricFits"]
+
+MAX_RISE_DB = 0.99
+"""Largest level of an interpolated maximum in dB, relative to the strongest bin; with rounding, it stays below 1 dB."""
+
+_MAX_GAP_RAD = 2.6  # Neighbours within less than half a turn lie on one side: at the edge of a grid.
+_LINE = 0.2  # Ratio of the widths of a direction's neighbours, below which they lie on a line.
+_OPPOSITE = -0.87  # Cosine of the angle between two neighbours that lie on opposite sides.
+_WELL_POSED = 0.02  # Least singular value relative to the largest; uniform weights have 0.17 within a grid.
+_SAME = 1e-9  # Distance in radians below which two directions are one.
+_MAX_REACH_RAD = 1.0  # Beyond it, the plane that touches the sphere is no approximation.
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class QuadricFits:
+    """Fit of a quadric to each direction and its neighbours, over the plane or the line that contains them.
+
+    A plane needs neighbours all around. Otherwise, as at the edge of a grid, a parabola through two opposite neighbours
+    remains, and no fit at all if there are none, as in a corner.
+
+    Attributes
+    ----------
+    axes : (direction, 2, axis) float64
+        Axes of the plane; the first one is that of the line.
+    inverse : (direction, 5, neighbour) float64
+        Matrix from values to the coefficients of x, y, x², xy and y².
+    n_axes : (direction,) int64
+        Axes along which maxima are interpolated: 2, 1 or 0.
+    reach : (direction,) float64
+        Distance of the farthest neighbour; 0 without a fit.
+    offsets : (direction, neighbour, axis) float64
+        Offsets of the neighbours. The cell of a direction ends half-way to each of them.
+    """
+
+    axes: Floats
+    inverse: Floats
+    n_axes: NDArray[np.int64]
+    reach: Floats
+    offsets: Floats
+
+    @classmethod
+    def of(
+        cls, directions: Floats, neighbours: NDArray[np.int64], wanted: NDArray[np.int64], weights: Floats | None = None
+    ) -> "QuadricFits":
+        """Return the fits of some directions of a grid.
+
+        Parameters
+        ----------
+        directions : (direction, axis) float64
+        neighbours : (direction, neighbour) int64
+        wanted : (place,) int64
+        weights : (place, neighbour) float64, optional
+            Weights of the neighbours' squared errors; equal by default.
+        """
+        offsets = directions[neighbours[wanted]] - directions[wanted][:, None]
+        _, sizes, axes = np.linalg.svd(np.pad(offsets, ((0, 0), (0, max(0, 3 - offsets.shape[1])), (0, 0))))
+        axes = axes[:, :2]
+        reach = np.linalg.norm(offsets, axis=2).max(axis=1, initial=0.0)
+        x, y = np.moveaxis(offsets @ axes.transpose(0, 2, 1), 2, 0)
+        is_plane = (sizes[:, 1] > _LINE * sizes[:, 0]) & (offsets.shape[1] > 5) & _are_around(x, y)
+        terms = np.stack([x, y, x * x, x * y, y * y], axis=2)
+        roots = np.ones_like(x) if weights is None else np.sqrt(weights)
+        inverse = np.linalg.pinv(terms * roots[:, :, None]) * roots[:, None]
+        is_plane &= _are_well_posed(terms * roots[:, :, None], reach)
+        n_axes = np.where(is_plane, 2, 0)
+        for place in np.flatnonzero(~is_plane):
+            pair = _opposite_pair(offsets[place])
+            if pair is not None:
+                axes[place, 0], inverse[place] = _line_through(offsets[place], *pair)
+                n_axes[place] = 1
+        reach = np.where((n_axes > 0) & (reach <= _MAX_REACH_RAD), reach, 0.0)
+        return cls(axes, inverse, np.where(reach > 0, n_axes, 0), reach, offsets)
+
+    @property
+    def width_rad(self) -> Floats:
+        """Distance of the nearest other neighbour, which is the width of a cell: (direction,); infinite if none."""
+        distance = np.linalg.norm(self.offsets, axis=2)
+        return np.asarray(np.where(distance > _SAME, distance, np.inf).min(axis=1, initial=np.inf))
+
+    def tops(self, directions: NDArray[np.int64], rises: Floats) -> tuple[Floats, Floats]:
+        """Return offsets from directions to the maxima of their quadrics, (place, axis) float64, and the rise there.
+
+        An offset is 0 if there is no maximum within the distance of the farthest neighbour. It may lie outside of the
+        cell: see `inside`.
+
+        Parameters
+        ----------
+        directions : (place,) int64
+        rises : (place, neighbour) float64
+            Values at the neighbours minus the value at the direction.
+        """
+        slope_x, slope_y, xx, xy, yy = np.einsum("pcn,pn->cp", self.inverse[directions], rises)
+        xx, yy = 2 * xx, np.where(self.n_axes[directions] == 2, 2 * yy, -1.0)
+        determinant = xx * yy - xy * xy
+        is_top = (xx < 0) & (determinant > 0)
+        scale = np.divide(1.0, determinant, out=np.zeros_like(determinant), where=is_top)
+        x, y = (xy * slope_y - yy * slope_x) * scale, (xy * slope_x - xx * slope_y) * scale
+        is_near = np.hypot(x, y) <= self.reach[directions]
+        x, y = np.where(is_near, x, 0.0), np.where(is_near, y, 0.0)
+        offset = x[:, None] * self.axes[directions, 0] + y[:, None] * self.axes[directions, 1]
+        return offset, 0.5 * (slope_x * x + slope_y * y)
+
+    def inside(self, directions: NDArray[np.int64], offset: Floats) -> Floats:
+        """Return the factors, at most 1, that shorten offsets so that they end within their cells: (place,) float64."""
+        neighbours = self.offsets[directions]
+        along = np.einsum("pna,pa->pn", neighbours, offset)
+        half = 0.5 * (neighbours**2).sum(axis=2)
+        is_ahead = along > 0
+        return np.asarray(np.divide(half, along, out=np.ones_like(half), where=is_ahead).min(axis=1, initial=1.0))
+
+
+def _are_around(x: Floats, y: Floats) -> NDArray[np.bool_]:
+    """Return True where neighbours lie all around 0: (place,) bool."""
+    distance = np.hypot(x, y)
+    angle = np.arctan2(y, x)
+    farthest = np.take_along_axis(angle, distance.argmax(axis=1)[:, None], axis=1)
+    angle = np.sort(np.where(distance > _SAME, angle, farthest), axis=1)
+    gaps = np.diff(angle, axis=1, append=angle[:, :1] + 2 * np.pi)
+    return np.asarray(gaps.max(axis=1) < _MAX_GAP_RAD)
+
+
+def _are_well_posed(terms: Floats, reach: Floats) -> NDArray[np.bool_]:
+    """Return True where values determine all coefficients of a quadric: (place,) bool."""
+    unit = np.where(reach > 0, reach, 1.0)[:, None]
+    scale = np.concatenate([unit, unit, unit**2, unit**2, unit**2], axis=1)
+    sizes = np.linalg.svd(terms / scale[:, None], compute_uv=False)
+    return np.asarray(sizes[:, -1] > _WELL_POSED * sizes[:, 0])
+
+
+def _opposite_pair(offsets: Floats) -> tuple[int, int] | None:
+    """Return the nearest two neighbours on opposite sides; None if there are none."""
+    distance = np.linalg.norm(offsets, axis=1)
+    is_other = distance > _SAME
+    unit = offsets / np.where(is_other, distance, 1.0)[:, None]
+    sums = np.where(unit @ unit.T < _OPPOSITE, distance[:, None] + distance, np.inf)
+    first, second = np.unravel_index(int(sums.argmin()), sums.shape)
+    return (int(first), int(second)) if np.isfinite(sums[first, second]) else None
+
+
+def _line_through(offsets: Floats, first: int, second: int) -> tuple[Floats, Floats]:
+    """Return the axis through two neighbours, and the matrix of the parabola through them and 0: (5, neighbour)."""
+    axis = offsets[first] - offsets[second]
+    axis /= np.linalg.norm(axis)
+    a, b = offsets[[first, second]] @ axis
+    inverse = np.zeros((5, len(offsets)))
+    inverse[0, [first, second]] = np.array([b * b, -a * a]) / (a * b * (b - a))
+    inverse[2, [first, second]] = np.array([-b, a]) / (a * b * (b - a))
+    return axis, inverse

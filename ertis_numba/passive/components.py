@@ -1,0 +1,50 @@
+"""Components of CLEAN-SC, gathered at the directions of their sources."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.analysis.detect import neighbours_of
+from ertis_numba.frames import AcousticMap
+from ertis_numba.geometry import unit_vectors
+
+__all__ = ["COMPONENT_METHODS", "gathered", "strongest_first"]
+
+COMPONENT_METHODS: Final = frozenset({"clean_sc", "hr_clean_sc"})
+"""Methods whose maps hold the powers of sources, and 0 elsewhere."""
+
+
+def gathered(found: AcousticMap) -> AcousticMap:
+    """Return a map of components, in which each source has one direction; other maps remain as they are.
+
+    The bins of a source between directions of the grid yield components in several of them. From the strongest
+    direction of a band on, the components of a direction and its neighbours are summed there. The power of a source in
+    the map is therefore its level, and the sum over all directions remains.
+
+    Parameters
+    ----------
+    found : AcousticMap
+
+    Returns
+    -------
+    AcousticMap
+    """
+    if found.settings.passive.method not in COMPONENT_METHODS:
+        return found
+    neighbours = neighbours_of(unit_vectors(found.azimuth_rad, found.elevation_rad))
+    power = np.zeros_like(found.power)
+    for band in range(power.shape[1]):
+        left = found.power[:, band].astype(np.float64)
+        for place in strongest_first(left):
+            if left[place]:
+                around = np.union1d(neighbours[place], place)
+                power[place, band] = left[around].sum()
+                left[around] = 0
+    return found.replace(power=power)
+
+
+def strongest_first(power: NDArray[np.float64]) -> list[int]:
+    """Return the directions with power, the strongest first."""
+    places = np.flatnonzero(power)
+    return [int(place) for place in places[np.argsort(-power[places], kind="stable")]]
