@@ -1,5 +1,6 @@
 """``ertis peaks``: reflectors in an energyscape file, or sources in acoustic maps."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import partial
@@ -34,7 +35,7 @@ _SOURCE_COLUMNS: dict[str, _tables.Side] = {
     **dict.fromkeys(("map", "band_khz", "azimuth_deg", "elevation_deg"), "right"),
 }
 _OF_IMAGES = ("detector", "false_alarm", "everything", "truth")
-_DIGITS = {"azimuth_deg": 4, "elevation_deg": 4, "angle_deg": 4, "range_m": 6, "level_db": 4, "level_dbfs": 4}
+_DIGITS = dict.fromkeys((*_PLACE, "angle_deg", "level_dbfs", "grid_error_deg"), 4) | {"range_m": 6}
 
 
 @click.command()
@@ -89,7 +90,9 @@ def peaks(
 
     There is one entry per reflector, the strongest of each measurement first. level_db is relative to the strongest
     peak, and level_dbfs to a full-scale echo in every microphone. Maxima that noise alone may cause in
-    one of 1000 images are omitted unless --all is given. This limit exists only for delay-and-sum.
+    one of 1000 images are omitted unless --all is given. This limit exists only for delay-and-sum. grid_error_deg is
+    the standard deviation of directions that cannot be interpolated, as at the edge of the grid; other directions have
+    0. No level is more than 1 dB above its image or map.
 
     With --detector cfar, a reflector exceeds the noise around it in range, at any level, and is at most 10 dB below the
     strongest echo at its range. The noise is estimated from 32 bins of the same direction (OS-CFAR), so that
@@ -103,7 +106,8 @@ def peaks(
     For a file of acoustic maps, there is one entry per source, the strongest of each map and band first. Maps of
     CLEAN-SC and HR-CLEAN-SC yield their components, summed over neighbouring directions of the grid. Other maps yield
     local maxima above the floor of the map, interpolated between directions of the grid; side lobes of delay-and-sum
-    are left out. The loudest direction of each band is always listed. level_dbfs is the mean square, where a full-scale
+    are left out. grid_error_deg is the standard deviation of directions that are not interpolated, as at the edge of
+    the grid. The loudest direction of each band is always listed. level_dbfs is the mean square, where a full-scale
     tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones. source_level_db, in dB re 20 µPa
     at 1 m from the source, also needs the distance of the source (process --focus). Maps of the method music have no
     levels. Maps are counted from 0, regardless of the number of measurements that they average. --measurement chooses a
@@ -151,8 +155,9 @@ def peaks(
         find = _finder(detector, _TOP if top is None else top, min_level, false_alarm, everything=everything)
         rows = [row for name in sensors for row in _found(path, name, find, measurement)]
         report = {"peaks": rows}
-        cells = [(*_cells(row, row), f"{row['level_dbfs']:.1f}") for row in rows]
-        table = _tables.TextTable({**_COLUMNS, "level_dbfs": "right"}, cells)
+        more = {"level_dbfs": ".1f"} | ({"grid_error_deg": ".2f"} if _has_grid_errors(rows) else {})
+        cells = [(*_cells(row, row), *_formatted(row, more)) for row in rows]
+        table = _tables.TextTable(_COLUMNS | dict.fromkeys(more, "right"), cells)
     if as_json:
         options.print_json(report)
         return
@@ -190,17 +195,23 @@ def _list_sources(
     if as_json:
         options.print_json({"sources": rows})
         return
-    optional = [name for name in ("level_db", "source_level_db") if any(row[name] is not None for row in rows)]
-    levels = ("level_dbfs", *optional)
-    columns: dict[str, _tables.Side] = {**_SOURCE_COLUMNS, **dict.fromkeys(levels, "right")}
-    _tables.TextTable(columns, [_source_cells(row, levels) for row in rows]).print()
+    optional = (name for name in ("level_db", "source_level_db") if any(row[name] is not None for row in rows))
+    more = {"grid_error_deg": ".2f"} if _has_grid_errors(rows) else {}
+    more |= dict.fromkeys(("level_dbfs", *optional), ".1f")
+    _tables.TextTable(
+        _SOURCE_COLUMNS | dict.fromkeys(more, "right"), [_source_cells(row, more) for row in rows]
+    ).print()
 
 
-def _source_cells(row: dict[str, Any], levels: tuple[str, ...]) -> tuple[str, ...]:
+def _has_grid_errors(rows: list[dict[str, Any]]) -> bool:
+    """Return True if the direction of a row is not interpolated between directions of the grid."""
+    return any(row["grid_error_deg"] != 0 for row in rows)
+
+
+def _source_cells(row: dict[str, Any], more: dict[str, str]) -> tuple[str, ...]:
     band = "–".join(f"{edge_hz / 1e3:.1f}" for edge_hz in row["band_hz"])
-    angles = (f"{row[name]:+.2f}" for name in ("azimuth_deg", "elevation_deg"))
-    shown = ("-" if row[name] is None else f"{row[name]:.1f}" for name in levels)
-    return (row["sensor"], str(row["map"]), band, *angles, *shown)
+    angles = _formatted(row, dict.fromkeys(("azimuth_deg", "elevation_deg"), "+.2f"))
+    return (row["sensor"], str(row["map"]), band, *angles, *_formatted(row, more))
 
 
 def _finder(
@@ -266,7 +277,16 @@ def _beside_the_truth(place: dict[str, Any], comparison: "Comparison") -> Iterat
 
 def _cells(place: dict[str, Any], found: dict[str, Any]) -> tuple[str, ...]:
     """Return the cells with the sensor, measurement and position of a reflector or a peak."""
-    return (place["sensor"], str(place["measurement"]), *(f"{found[name]:{form}}" for name, form in _PLACE.items()))
+    return (place["sensor"], str(place["measurement"]), *_formatted(found, _PLACE))
+
+
+def _formatted(row: dict[str, Any], forms: dict[str, str]) -> tuple[str, ...]:
+    """Return the cells of numbers with given formats; a dash for unknown ones."""
+    return tuple(_dash(name) if row[name] is None else f"{row[name]:{form}}" for name, form in forms.items())
+
+
+def _dash(name: str) -> str:
+    return "–" if name in ("azimuth_deg", "elevation_deg") else "-"
 
 
 def _error(match: "Match") -> dict[str, float]:
@@ -274,6 +294,10 @@ def _error(match: "Match") -> dict[str, float]:
 
 
 def _rounded(item: Any) -> dict[str, Any]:
-    """Return the fields of a peak or a reflector with rounded numbers, without its emitter."""
+    """Return the fields of a peak or a reflector with rounded numbers, or None, without its emitter."""
     fields = {name: value for name, value in asdict(item).items() if name != "emitter"}
-    return {name: round(value, _DIGITS[name]) if name in _DIGITS else value for name, value in fields.items()}
+    return {name: _number(value, _DIGITS[name]) if name in _DIGITS else value for name, value in fields.items()}
+
+
+def _number(value: float, digits: int) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None

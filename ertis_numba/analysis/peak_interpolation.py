@@ -112,16 +112,14 @@ class PeakInterpolator:
         if self._is_predicted and not image.settings.processing.is_adaptive:
             found = self._corrected(self._spread, found, directions, measured, (rows, columns), step_m, image)
         shift_m, offset = found[:, 0].clip(-0.5, 0.5) * step_m, found[:, 1:4]
-        fits = self._row[directions]
-        offset = offset * self._fits.inside(fits, offset)[:, None]
+        offset, width_rad = self._fits.within_cells(self._row[directions], offset, n_axes=self._n_axes)
         top = self._directions[directions] + offset
         top /= np.linalg.norm(top, axis=1)[:, None]
-        is_between = offset.any(axis=1) & (self._fits.n_axes[fits] >= self._n_axes)
         return Tops(
             direction=top,
             range_m=image.range_m[ranges] + shift_m,
             amplitude=np.minimum(np.exp(found[:, 4]), self._highest(image, directions, measured[:, 1], top, shift_m)),
-            width_rad=np.where(is_between, 0.0, self._fits.width_rad[fits]),
+            width_rad=width_rad,
         )
 
     def _highest(

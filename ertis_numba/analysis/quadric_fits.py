@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 __all__ = ["MAX_RISE_DB", "QuadricFits"]
 
@@ -13,6 +14,8 @@ MAX_RISE_DB = 0.99
 _MAX_GAP_RAD = 2.6  # Neighbours within less than half a turn lie on one side: at the edge of a grid.
 _LINE = 0.2  # Ratio of the widths of a direction's neighbours, below which they lie on a line.
 _OPPOSITE = -0.87  # Cosine of the angle between two neighbours that lie on opposite sides.
+_MAX_BORDERS = 16  # Each shortens an offset to the border with one other cell; most need none, some need two.
+_BESIDE = 0.75  # Share of an offset within its cell, below which the maximum lies elsewhere.
 _WELL_POSED = 0.02  # Least singular value relative to the largest; uniform weights have 0.17 within a grid.
 _SAME = 1e-9  # Distance in radians below which two directions are one.
 _MAX_REACH_RAD = 1.0  # Beyond it, the plane that touches the sphere is no approximation.
@@ -37,15 +40,21 @@ class QuadricFits:
         Axes along which maxima are interpolated: 2, 1 or 0.
     reach : (direction,) float64
         Distance of the farthest neighbour; 0 without a fit.
-    offsets : (direction, neighbour, axis) float64
-        Offsets of the neighbours. The cell of a direction ends half-way to each of them.
+    width_rad : (direction,) float64
+        Distance of the nearest other direction, which is the width of a cell; infinite if there is none.
+    wanted : (direction,) int64
+        Numbers of the directions in the grid.
+    grid : KDTree
+        All directions. The cell of a direction ends half-way to each of the others.
     """
 
     axes: Floats
     inverse: Floats
     n_axes: NDArray[np.int64]
     reach: Floats
-    offsets: Floats
+    width_rad: Floats
+    wanted: NDArray[np.int64]
+    grid: KDTree
 
     @classmethod
     def of(
@@ -78,19 +87,16 @@ class QuadricFits:
                 axes[place, 0], inverse[place] = _line_through(offsets[place], *pair)
                 n_axes[place] = 1
         reach = np.where((n_axes > 0) & (reach <= _MAX_REACH_RAD), reach, 0.0)
-        return cls(axes, inverse, np.where(reach > 0, n_axes, 0), reach, offsets)
-
-    @property
-    def width_rad(self) -> Floats:
-        """Distance of the nearest other neighbour, which is the width of a cell: (direction,); infinite if none."""
-        distance = np.linalg.norm(self.offsets, axis=2)
-        return np.asarray(np.where(distance > _SAME, distance, np.inf).min(axis=1, initial=np.inf))
+        distance = np.linalg.norm(offsets, axis=2)
+        width_rad = np.where(distance > _SAME, distance, np.inf).min(axis=1, initial=np.inf)
+        n_axes = np.where(reach > 0, n_axes, 0)
+        return cls(axes, inverse, n_axes, reach, width_rad, wanted, KDTree(directions))
 
     def tops(self, directions: NDArray[np.int64], rises: Floats) -> tuple[Floats, Floats]:
         """Return offsets from directions to the maxima of their quadrics, (place, axis) float64, and the rise there.
 
         An offset is 0 if there is no maximum within the distance of the farthest neighbour. It may lie outside of the
-        cell: see `inside`.
+        cell: see `within_cells`.
 
         Parameters
         ----------
@@ -109,13 +115,31 @@ class QuadricFits:
         offset = x[:, None] * self.axes[directions, 0] + y[:, None] * self.axes[directions, 1]
         return offset, 0.5 * (slope_x * x + slope_y * y)
 
-    def inside(self, directions: NDArray[np.int64], offset: Floats) -> Floats:
-        """Return the factors, at most 1, that shorten offsets so that they end within their cells: (place,) float64."""
-        neighbours = self.offsets[directions]
-        along = np.einsum("pna,pa->pn", neighbours, offset)
-        half = 0.5 * (neighbours**2).sum(axis=2)
-        is_ahead = along > 0
-        return np.asarray(np.divide(half, along, out=np.ones_like(half), where=is_ahead).min(axis=1, initial=1.0))
+    def within_cells(self, directions: NDArray[np.int64], offset: Floats, *, n_axes: int) -> tuple[Floats, Floats]:
+        """Return offsets that end within their cells, (place, axis) float64, and the width of cells: (place,) float64.
+
+        A width is 0 if the direction is interpolated along as many axes as the grid has, ``n_axes``.
+
+        Parameters
+        ----------
+        directions : (place,) int64
+        offset : (place, axis) float64
+            Result of `tops`; longer ones are shortened.
+        n_axes : int
+        """
+        here = self.grid.data[self.wanted[directions]]
+        share = np.ones(len(offset))
+        for _ in range(_MAX_BORDERS):
+            top = here + share[:, None] * offset
+            _, nearest = self.grid.query(top / np.linalg.norm(top, axis=1)[:, None])
+            other = self.grid.data[nearest] - here
+            half, along = 0.5 * (other**2).sum(axis=1), (other * offset).sum(axis=1)
+            is_beyond = share * along > half * (1 + _SAME)
+            if not is_beyond.any():
+                break
+            share[is_beyond] = half[is_beyond] / along[is_beyond]
+        is_between = offset.any(axis=1) & (share > _BESIDE) & (self.n_axes[directions] >= n_axes)
+        return offset * share[:, None], np.where(is_between, 0.0, self.width_rad[directions])
 
 
 def _are_around(x: Floats, y: Floats) -> NDArray[np.bool_]:

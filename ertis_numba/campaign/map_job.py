@@ -14,7 +14,7 @@ from ertis_numba.campaign.sensor_processing import describe_faults, require_same
 from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.errors import DataError
 from ertis_numba.frames import AcousticMap
-from ertis_numba.passive import AcousticCamera, find_sound_sources
+from ertis_numba.passive import AcousticCamera, find_sound_sources, gathered
 from ertis_numba.passive.bands import shaped_noise_warning
 from ertis_numba.settings import Settings
 from ertis_numba.storage import AcousticMapWriter, RecordingReader, open_recording
@@ -118,7 +118,7 @@ class _MapsOfSensor:
     def report(self) -> dict[str, Any]:
         """Return the report of ``--json``; ``loudest`` holds the strongest sources of the mean of all measurements."""
         assert self._last is not None  # noqa: S101  a recording has at least one measurement
-        mean = self._last.replace(power=np.asarray(self._sum / len(self._recording), np.float32))
+        mean = gathered(self._last.replace(power=np.asarray(self._sum / len(self._recording), np.float32)))
         return {
             "sensor": self._recording.sensor,
             "measurements": len(self._recording),

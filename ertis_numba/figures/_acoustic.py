@@ -134,7 +134,7 @@ def _levels(
     canvas: Canvas, found: AcousticMap, band_hz: tuple[float, float] | None
 ) -> tuple[Canvas, NDArray[np.float32], SoundDirection]:
     """Return the levels of a band in all directions, a canvas with their scale, and the loudest source in them."""
-    from ertis_numba.passive import find_sound_sources  # noqa: PLC0415  few plots need it, and it imports kernels
+    from ertis_numba.passive import find_sound_sources, gathered  # noqa: PLC0415  few plots need it
 
     if band_hz is not None:
         found.in_band(*band_hz)  # raises an error if there is none
@@ -143,13 +143,15 @@ def _levels(
     reference = found.reference
     power = _referred(found, reference).sum(axis=1)
     limits_hz = np.array([[found.band_hz.min(), found.band_hz.max()]])
-    combined = found.replace(power=power[:, None].astype(np.float32), band_hz=limits_hz)
+    combined = gathered(found.replace(power=power[:, None].astype(np.float32), band_hz=limits_hz))
     is_narrow = found.settings.passive.method in _NARROW
     sources = find_sound_sources(combined, top=None if is_narrow else 1, min_level_db=_ALL_DB if is_narrow else None)
     directions = unit_vectors(*np.transpose([(each.azimuth_rad, each.elevation_rad) for each in sources]))
     brightest = int(combined.power.argmax())
     drawn = unit_vectors(found.azimuth_rad[[brightest]], found.elevation_rad[[brightest]])[0]
-    return *_scaled(canvas, found, reference, power), sources[int(np.argmax(directions @ drawn))]
+    return *_scaled(canvas, found, reference, combined.power[:, 0].astype(np.float64)), sources[
+        int(np.argmax(directions @ drawn))
+    ]
 
 
 def _referred(found: AcousticMap, reference: LevelReference) -> NDArray[np.float64]:

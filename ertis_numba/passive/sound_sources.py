@@ -20,6 +20,7 @@ from ertis_numba.settings import Passive
 __all__ = ["find_sound_sources"]
 
 Floats = NDArray[np.float64]
+_LossOf = Callable[[Floats, Floats], Floats]
 
 _INVERSE: Final = frozenset({"capon", "music"})  # The inverses of their powers are quadratic forms, and thus smooth.
 _MIN_LEVEL_DB: Final = -10.0  # Side lobes of most arrays are lower.
@@ -66,8 +67,8 @@ def find_sound_sources(
 ) -> list[SoundDirection]:
     """Return the sources of sound in an acoustic map, band by band, strongest first.
 
-    Maps of CLEAN-SC and HR-CLEAN-SC hold the powers of sources, each at a direction of the grid. Direction and level are
-    those of the map: the level is the sum of the components of all bins in this direction and its neighbours.
+    Maps of CLEAN-SC and HR-CLEAN-SC hold the powers of sources, each at a direction of the grid. Direction and level
+    are those of the map: the level is the sum of the components of all bins in this direction and its neighbours.
 
     In other maps, a source is a local maximum. A quadric through the neighbouring directions interpolates its direction
     and its level. It fits the logarithm of the power, or for Capon and MUSIC its inverse. Maxima below twice the median
@@ -171,7 +172,7 @@ def _components(power: Floats, grid: _Grid, *_: object) -> Iterator[_Top]:
             yield _Top(grid.directions[place], float(power[place]), grid.spacing_rad(place))
 
 
-def _maxima(power: Floats, grid: _Grid, passive: Passive, loss_of: Callable[[Floats, Floats], Floats]) -> Iterator[_Top]:
+def _maxima(power: Floats, grid: _Grid, passive: Passive, loss_of: _LossOf) -> Iterator[_Top]:
     """Yield the interpolated local maxima above the floor of a map, and the strongest in any case."""
     around = power[grid.neighbours]
     is_first = ~((around == power[:, None]) & (grid.neighbours < np.arange(len(power))[:, None])).any(axis=1)
@@ -187,13 +188,12 @@ def _maxima(power: Floats, grid: _Grid, passive: Passive, loss_of: Callable[[Flo
     else:  # Beyond the main lobe, the logarithm falls steeply, so weights are small there.
         fits = QuadricFits.of(grid.directions, grid.neighbours, places, relative ** (1 / order))
         offsets, rises = fits.tops(np.arange(len(places)), np.log(relative))
-    offsets *= fits.inside(np.arange(len(places)), offsets)[:, None]
+    offsets, widths = fits.within_cells(np.arange(len(places)), offsets, n_axes=grid.n_axes)
     tops = grid.directions[places] + offsets
     tops /= np.linalg.norm(tops, axis=1)[:, None]
     if passive.method != "music":  # Its numbers have no level, and no main lobe of delay-and-sum.
         rises = np.minimum(rises, order * np.log(_NOISE / loss_of(tops, grid.directions[places])))
     powers = power[places] * np.exp(rises)
-    widths = np.where(offsets.any(axis=1) & (fits.n_axes >= grid.n_axes), 0.0, fits.width_rad)
     yield from (_Top(top, float(each), float(width)) for top, each, width in zip(tops, powers, widths, strict=True))
 
 

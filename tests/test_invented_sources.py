@@ -1,0 +1,163 @@
+"""No listed level exceeds its image or acoustic map by more than 1 dB, and no listed direction leaves its cell.
+
+``ERTIS_RANDOM_CASES=10000 pytest tests/test_invented_sources.py`` tries more random cases.
+"""
+
+import os
+
+import numpy as np
+import pytest
+from ertis_bench.passive.signals import NoiseSource, listening, noise
+from scipy.spatial import KDTree
+
+import ertis_numba as ertis
+from ertis_numba.analysis.detect import find_peaks, neighbours_of
+from ertis_numba.analysis.points import PointExtractor
+from ertis_numba.analysis.quadric_fits import QuadricFits
+from ertis_numba.frames import AcousticMap
+from ertis_numba.geometry import Grid, direction_grid, unit_vectors
+from ertis_numba.passive import find_sound_sources
+from ertis_numba.passive.components import COMPONENT_METHODS
+from ertis_numba.settings import MAP_METHODS, Processing
+from tests.random_sounds import C_M_S, map_power, random_image, random_map, settings_of
+from tests.test_detect import image_of
+
+MANY = os.environ.get("ERTIS_RANDOM_CASES")
+N_MAPS, N_IMAGES = (int(MANY), int(MANY)) if MANY else (120, 80)
+LIMIT_DB = 1.0
+
+
+def are_in_cells(grid, level, listed, tolerance=1e-7):
+    """True for each listed direction whose nearest direction of the grid is a local maximum; ties count for both."""
+    directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+    is_maximum = (level >= level[neighbours_of(directions)].max(axis=1)).reshape(len(directions), -1).any(axis=1)
+    tree = KDTree(directions)
+    away, _ = tree.query(listed)
+    return [
+        is_maximum[tree.query_ball_point(each, near + tolerance)].any() for each, near in zip(listed, away, strict=True)
+    ]
+
+
+def test_no_source_is_louder_than_its_map():
+    for seed in range(N_MAPS):
+        found = random_map(seed, most=10_000 if MANY else 2000)
+        sources = find_sound_sources(found, top=None)
+        assert sources, seed
+        for each in sources:
+            band = [tuple(edges) for edges in found.band_hz.tolist()].index(each.band_hz)
+            highest_dbfs = found.level_dbfs[:, band].max()
+            if each.level_dbfs is not None and np.isfinite(highest_dbfs):
+                assert each.level_dbfs <= highest_dbfs + LIMIT_DB, (seed, each)
+            assert each.grid_error_rad >= 0
+        listed = unit_vectors(*np.transpose([(each.azimuth_rad, each.elevation_rad) for each in sources]))
+        is_interpolated = found.settings.passive.method not in COMPONENT_METHODS
+        assert not is_interpolated or all(are_in_cells(found, found.power, listed)), seed
+
+
+def test_no_peak_is_louder_than_its_image():
+    for seed in range(N_IMAGES):
+        image = random_image(seed)
+        highest_dbfs = image.level_dbfs.max()
+        peaks = find_peaks(image, top=20)
+        assert all(peak.level_dbfs <= highest_dbfs + LIMIT_DB for peak in peaks), (seed, peaks)
+        if peaks:
+            listed = unit_vectors(*np.transpose([(peak.azimuth_rad, peak.elevation_rad) for peak in peaks]))
+            assert all(are_in_cells(image, image.amplitude, listed)), (seed, peaks)
+        step_m = float(image.range_m[1] - image.range_m[0]) if len(image.range_m) > 1 else 0.0
+        assert all(image.range_m[0] - step_m <= peak.range_m <= image.range_m[-1] + step_m for peak in peaks), seed
+        cloud = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad))(image)
+        assert (cloud.amplitude <= image.amplitude.max() * 10 ** (LIMIT_DB / 20)).all(), seed
+
+
+@pytest.mark.parametrize("diagonal_removal", [False, True])
+@pytest.mark.parametrize("method", MAP_METHODS)
+def test_sources_of_a_camera_stay_within_its_map(method, diagonal_removal):
+    if diagonal_removal and method in ("functional", "capon", "music"):
+        return  # These methods need the diagonal.
+    for seed, directions, limits_deg in ((0, "3d:300", (-30.0, 30.0)), (1, "3d:60", (-90.0, 90.0))):
+        changes = {"azimuth_limits_deg": limits_deg, "elevation_limits_deg": (-20.0, 20.0), "directions": directions}
+        settings = listening(
+            **{f"processing__{name}": value for name, value in changes.items()},
+            passive__bands_hz=[[20e3, 24e3], [38e3, 42e3]],
+            passive__method=method,
+            passive__diagonal_removal=diagonal_removal,
+        )
+        with ertis.AcousticCamera(settings, "cpu", 1) as camera:
+            for sources in ([], [NoiseSource(29.5, 3, 0.05), NoiseSource(-50, 19, 0.02)]):
+                found = camera.process(noise(settings, sources, own_rms=0.005, seed=seed))
+                listed = find_sound_sources(found, top=None)
+                for each in listed if method != "music" else ():
+                    band = [tuple(edges) for edges in found.band_hz.tolist()].index(each.band_hz)
+                    assert each.level_dbfs <= found.level_dbfs[:, band].max() + LIMIT_DB
+
+
+def edge_map(azimuth_deg, elevation_deg, directions, **limits):
+    """Map of a tone in white noise, heard by a spiral of 1.4 m, as of acoustic cameras."""
+    turn = np.arange(64) * 2.399963
+    radius_m = 0.7 * np.sqrt((np.arange(64) + 0.5) / 64)
+    places_m = np.round(np.stack([0 * turn, radius_m * np.cos(turn), radius_m * np.sin(turn)], axis=1), 6)
+    settings = settings_of(places_m, {"directions": directions, **limits})
+    grid = direction_grid(settings.processing)
+    directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+    wave_1_m = 2 * np.pi * 6000 / C_M_S
+    places_m -= places_m.mean(axis=0)
+    towards = unit_vectors(np.radians([azimuth_deg]), np.radians([elevation_deg]))[0]
+    heard = np.exp(1j * wave_1_m * places_m @ towards)
+    waves = np.exp(1j * wave_1_m * directions @ places_m.T)
+    power = map_power(waves, np.outer(heard, heard.conj()) + 1e-3 * np.eye(64), "delay_and_sum", 1, removed=False)
+    band_hz = np.array([[5999.0, 6001.0]])
+    return AcousticMap(power[:, None].astype(np.float32), grid.azimuth_rad, grid.elevation_rad, band_hz, settings)
+
+
+LIMITS = {"azimuth_limits_deg": (-30.0, 30.0), "elevation_limits_deg": (-20.0, 20.0)}
+
+
+@pytest.mark.parametrize("azimuth_deg", [-29.7, 0.3, 29.2])
+@pytest.mark.parametrize("elevation_deg", [-19.6, 0.4, 19.9])
+def test_source_in_the_cell_at_an_edge_is_listed_there(azimuth_deg, elevation_deg):
+    found = edge_map(azimuth_deg, elevation_deg, "3d:3000", **LIMITS)  # directions are 0.9° apart
+    (source,) = find_sound_sources(found, top=1)
+    apart_deg = [np.degrees(source.azimuth_rad) - azimuth_deg, np.degrees(source.elevation_rad) - elevation_deg]
+    is_inner = abs(azimuth_deg) < 29 and abs(elevation_deg) < 19
+    assert np.abs(apart_deg).max() < (0.05 if is_inner else 0.5)
+    assert source.level_dbfs == pytest.approx(0, abs=0.05 if is_inner else 1.0)
+    assert np.degrees(source.grid_error_rad) == pytest.approx(0 if is_inner else 0.9 / np.sqrt(12), abs=0.04)
+
+
+def test_source_at_an_edge_is_interpolated_along_it():
+    spread = {"azimuth_limits_deg": (-30.0, 30.0), "elevation_limits_deg": (0.0, 20.0)}
+    grid_deg = np.unique(np.degrees(direction_grid(Processing(directions="3d:300", **spread)).elevation_rad))
+    found = edge_map(4.3, grid_deg[0] - 0.5, "3d:300", **spread)  # directions are 2° apart
+    (source,) = find_sound_sources(found, top=1)
+    assert np.degrees(source.azimuth_rad) == pytest.approx(4.3, abs=0.1)
+    assert np.degrees(source.elevation_rad) == pytest.approx(grid_deg[0], abs=0.01)
+    assert source.grid_error_rad > 0
+
+
+@pytest.mark.parametrize(("directions", "error_deg"), [("2d:121", 0.0), ("3d:900", 0.0), ("2d:1", np.inf)])
+def test_peak_states_the_error_that_the_grid_causes(directions, error_deg):
+    (peak,) = find_peaks(image_of([(12.34, 1, 1.2, 1.0)], directions=directions, range_m=(1.1, 1.3)), top=1)
+    assert peak.grid_error_deg == error_deg
+    if directions == "3d:900":
+        (peak,) = find_peaks(image_of([(91.0, 5.0, 1.2, 1.0)], directions=directions, range_m=(1.1, 1.3)), top=1)
+        assert 1 < peak.grid_error_deg < 2  # directions are 4.8° apart
+
+
+def angles_of(directions, *, shown):
+    """Numbers of axes of the fits of directions, (azimuth, elevation) in degrees."""
+    vectors = unit_vectors(*np.radians(directions).T)
+    fits = QuadricFits.of(vectors, neighbours_of(vectors), np.arange(len(vectors)))
+    return fits.n_axes[shown].tolist()
+
+
+def test_fits_have_the_axes_that_neighbours_determine():
+    square = np.array([(azimuth, elevation) for azimuth in range(5) for elevation in range(5)], dtype=float)
+    assert angles_of(square, shown=[12, 2, 0]) == [2, 1, 0]  # middle, edge, corner
+    row = np.array([(azimuth, 0.0) for azimuth in range(4)])
+    assert angles_of(row, shown=slice(None)) == [0, 1, 1, 0]
+    column = np.array([(10.0, elevation) for elevation in range(12)])
+    assert angles_of(column, shown=[0, 1, 5, 11]) == [0, 1, 1, 0]
+    two_rows = np.array([(azimuth, elevation) for azimuth in range(9) for elevation in (0.0, 1.0)])
+    assert angles_of(two_rows, shown=[8, 9]) == [1, 1]
+    assert angles_of(np.array([(0.0, 0.0)]), shown=[0]) == [0]
+    assert angles_of(np.array([(0.0, 0.0)] * 12), shown=[0]) == [0]
