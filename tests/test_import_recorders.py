@@ -18,6 +18,7 @@ from ertis_numba.simulation import Point
 from ertis_numba.simulation.render import Simulator
 from tests.pages import commands_in, page, run_here
 from tests.rings import PCM, RATE_HZ, scene_of
+from tests.test_sync_channel import record
 
 LINE = Settings(array=Array(layout="line", positions_m=tuple((0.0, 0.01 * place, 0.0) for place in range(4))))
 
@@ -131,6 +132,8 @@ def test_commands_of_the_page_run(tmp_path):
             write(tmp_path / folder / f"{name}.wav", noise()[:, 0])
     (tmp_path / "one.csv").write_text("0, 0\n")
     (tmp_path / "pair.csv").write_text("0, 0\n10, 0\n")
+    write(tmp_path / "loopback.wav", record([1.37e-3], 0.02).astype("f4"))
+    ring_file(tmp_path).rename(tmp_path / "call.toml")
     for each in commands_in(page("recordings")):
         run_here(tmp_path, each)
     with ertis.open_recording(tmp_path / "joined.h5") as recording:

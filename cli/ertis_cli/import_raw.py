@@ -24,6 +24,7 @@ _OF_PCM = {
     "--passive": "passive",
     "--join": "join",
     "--time-expansion": "time_expansion",
+    "--sync-channel": "sync_channel",
 }
 """Options for PCM by their names on the command line."""
 _UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
@@ -77,6 +78,12 @@ _UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
     metavar="FACTOR",
     help="PCM: factor by which files play slower than the sound, such as 10; by default, as in their metadata.",
 )
+@click.option(
+    "--sync-channel",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="PCM: channel with the emitted call or its trigger, which is left out; measurements begin at its emissions.",
+)
 @click.option("--sensor", metavar="NAME", default="sensor", show_default=True, help="Name of the sensor.")
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
 @click.option("--humidity", type=float, metavar="PCT", help="Relative humidity in percent; 50 by default.")
@@ -96,6 +103,7 @@ def import_raw(
     passive: bool,
     join: bool,
     time_expansion: float | None,
+    sync_channel: int | None,
     sensor: str,
     temperature: float | None,
     humidity: float | None,
@@ -133,6 +141,8 @@ def import_raw(
     if target is None:
         target = _beside(raw[0]) if folder is None else Path(f"{folder.resolve()}.h5")
     check_target(target, overwrite=force, sources=raw)
+    given = {"temperature_c": temperature, "humidity_percent": humidity}
+    air = {name: value for name, value in given.items() if value is not None}
     measurements: PcmReader | RawReader
     if is_pcm:
         options_of_reader = {
@@ -143,14 +153,12 @@ def import_raw(
             "passive": passive,
             "join": join,
             "time_expansion": time_expansion,
-            "temperature_c": temperature,
-            "humidity_percent": humidity,
+            "sync_channel": sync_channel,
+            "air": air,
         }
         measurements = _opened_pcm(raw, layout, preset, settings_file, options_of_reader)
     else:
         measurements = _opened_raw(raw, folder, layout, preset, settings_file, sensor)
-        given = {"temperature_c": temperature, "humidity_percent": humidity}
-        air = {name: value for name, value in given.items() if value is not None}
         settings = measurements.settings
         measurements.settings = settings.replace(air=settings.air.replace(**air))
     source = ", ".join(path.name for path in raw)

@@ -1,191 +1,23 @@
 """Multichannel PCM recordings of microphone arrays: WAV files, and HDF5 files of Acoular."""
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Final
 
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Behaviour, Measurement, Stamp
 from ertis_numba.geometry import microphones
+from ertis_numba.interop.pcm_cuts import cut_at_emissions, cut_regularly
 from ertis_numba.interop.pcm_files import PcmFile, inspect, joined, per_file, require_alike
 from ertis_numba.interop.pcm_folder import is_wav_folder, wav_files
+from ertis_numba.interop.pcm_reader import PcmReader
 from ertis_numba.interop.recorder_times import TimedFile, file_times
-from ertis_numba.interop.sample_levels import SampleLevels
 from ertis_numba.settings import Processing, Recording, Settings, fit_ranges, record_range_m
 
-__all__ = ["PcmReader", "open_pcm"]
+__all__ = ["open_pcm"]
 
-_MAX_DURATION_S: Final = 1e9
 _MAX_EXPANSION: Final = 1000.0
-
-
-class _Cuts(NamedTuple):
-    """First samples of the measurements in a file, and the times of their emissions relative to its start."""
-
-    samples: NDArray[np.int64]
-    times_s: NDArray[np.float64]
-
-
-class PcmReader:
-    """Reader of the measurements in PCM files, one file at a time.
-
-    Such files contain no SYNC count, so it equals the number of the measurement. 8-bit and 16-bit samples become int16.
-    All others become float32, which represents 24-bit and single-precision samples exactly.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        Files with the same sample rate and number of channels. Each contains one measurement, or several of
-        ``length_s``.
-    settings, sensor, skip_s, length_s, start_ns, passive, join, time_expansion, whole_range, temperature_c, \
-    humidity_percent
-        See `open_pcm`.
-
-    Attributes
-    ----------
-    settings : Settings
-        Settings of the measurements, with sample rate, length and encoding of the files.
-    """
-
-    def __init__(
-        self,
-        paths: Sequence[Path],
-        settings: Settings | None,
-        *,
-        sensor: str = "sensor",
-        skip_s: float = 0.0,
-        length_s: float | None = None,
-        start_ns: int | Sequence[int] = (),
-        passive: bool = False,
-        join: bool = False,
-        time_expansion: float | None = None,
-        whole_range: bool | None = None,
-        temperature_c: float | None = None,
-        humidity_percent: float | None = None,
-    ) -> None:
-        if not paths:
-            raise ArgumentError("no PCM file is given; give at least one")
-        if time_expansion is not None:
-            checks.between("time_expansion", time_expansion, 1 / _MAX_EXPANSION, _MAX_EXPANSION)
-        files = [inspect(path, time_expansion) for path in paths]
-        first = files[0]
-        known = _with_air(_require_settings(settings, first), temperature_c, humidity_percent)
-        if join:
-            files = [joined(files)]
-        require_alike(files)
-        _require_channels(files, known)
-        self._files = files
-        self._rate_hz = files[0].rate_hz
-        self._cut(skip_s, length_s)
-        self._behaviour: Behaviour = "passive" if passive else "unknown"
-        if passive:
-            known = known.replace("processing.mode", "passive")
-        recording = Recording(sample_rate_hz=self._rate_hz, n_samples=self._n_samples, encoding=files[0].encoding)
-        self.settings, ranges = _fitted(known, recording, files[0], whole_range=whole_range)
-        self._enabled = microphones(self.settings.array).enabled
-        self._sensor = checks.sensor_name(sensor)
-        self._firsts_ns, times = self._times(start_ns)
-        self._notes = [*times, *per_file([(file.path, note) for file in files for note in file.notes]), *ranges]
-        self._levels: dict[Path, SampleLevels] = {}
-
-    def __len__(self) -> int:
-        return sum(len(cuts.samples) for cuts in self._cuts)
-
-    def __iter__(self) -> Iterator[Measurement]:
-        sequence = 0
-        for file, cuts, first_ns in zip(self._files, self._cuts, self._firsts_ns, strict=True):
-            samples = file.open()
-            levels = self._levels[file.path] = SampleLevels(
-                self.settings.recording.full_scale,
-                is_bytes=file.kind.itemsize == 1,
-                is_float=file.kind.kind == "f",
-            )
-            after_ns = np.rint(1e9 * (cuts.times_s - cuts.times_s[0])).astype(np.int64).tolist()
-            for start, later_ns in zip(cuts.samples.tolist(), after_ns, strict=True):
-                stamp = Stamp(
-                    sensor=self._sensor,
-                    sequence=sequence,
-                    sync_count=sequence,
-                    timestamp_ns=first_ns + later_ns,
-                    behaviour=self._behaviour,
-                )
-                words = samples.block(slice(start, start + self._n_samples), self._enabled)
-                levels.add(words)
-                yield Measurement(words, self.settings, stamp)
-                sequence += 1
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Source of the times, assumptions and losses; those about the samples follow once they have been read."""
-        levels = [(path, levels.note) for path, levels in self._levels.items() if levels.note]
-        return (*self._notes, *self._rest(), *per_file(levels))
-
-    @property
-    def rest_s(self) -> float:
-        """Total duration of unused samples at the ends of the files, in seconds."""
-        ends = [int(cuts.samples[-1]) + self._n_samples for cuts in self._cuts]
-        return sum(file.n_samples - end for file, end in zip(self._files, ends, strict=True)) / self._rate_hz
-
-    def _rest(self) -> list[str]:
-        """Return the note on samples that no measurement contains."""
-        if not self.rest_s:
-            return []
-        shortest = min(self._files, key=lambda file: file.n_samples)
-        text = f"{self.rest_s:.4g} s at the ends of files were left out"
-        if self._is_whole and self.rest_s > shortest.duration_s / 2:
-            text += (
-                f", because {shortest.path.name} lasts only {shortest.duration_s:.4g} s; use --length (length_s) for "
-                "several measurements per file"
-            )
-        return [text]
-
-    def _cut(self, skip_s: float, length_s: float | None) -> None:
-        """Set the places of the measurements in the files, and their length."""
-        skipped = round(checks.between("skip_s", skip_s, 0.0, _MAX_DURATION_S) * self._rate_hz)
-        # An interval between emissions may contain a fraction of a sample, which must not accumulate.
-        period = float(min(file.n_samples for file in self._files) - skipped)
-        if length_s is not None:
-            checks.positive("length_s", length_s)
-            period = checks.between("length_s", length_s, 0.0, _MAX_DURATION_S) * self._rate_hz
-        self._is_whole = length_s is None
-        self._n_samples = math.floor(period * (1 + 1e-12))
-        counts = [1 if self._is_whole else self._count(file, skipped, period) for file in self._files]
-        for file, count in zip(self._files, counts, strict=True):
-            if count < 1 or self._n_samples < 1:
-                raise DataError(
-                    f"{file.path} lasts {file.duration_s:.4g} s, but {skipped / self._rate_hz:.4g} s to "
-                    f"skip and a measurement of {max(self._n_samples, 1) / self._rate_hz:.4g} s are needed; skip less "
-                    "(--skip) or give a shorter --length"
-                )
-        self._cuts = [
-            _Cuts(skipped + np.rint(places).astype(np.int64), np.asarray((skipped + places) / self._rate_hz))
-            for places in (period * np.arange(count, dtype=np.float64) for count in counts)
-        ]
-
-    def _count(self, file: PcmFile, skipped: int, period: float) -> int:
-        """Return the number of measurements in a file."""
-        if self._n_samples < 1:
-            return 0
-        count = int((file.n_samples - skipped) / period) + 1
-        while count and skipped + round((count - 1) * period) + self._n_samples > file.n_samples:
-            count -= 1
-        return count
-
-    def _times(self, start_ns: int | Sequence[int]) -> tuple[list[int], list[str]]:
-        """Return the times of the first measurements of the files, and notes about them."""
-        given = [start_ns] if isinstance(start_ns, int) else list(start_ns)
-        starts_ns = [checks.integer("start_ns", each, 0, 2**63 - 1) for each in given]
-        return file_times(
-            [TimedFile(file.path, file.duration_s, file.metadata.stated_times) for file in self._files],
-            starts_ns,
-            first_s=[float(cuts.times_s[0]) for cuts in self._cuts],
-        )
 
 
 def open_pcm(
@@ -199,9 +31,9 @@ def open_pcm(
     passive: bool = False,
     join: bool = False,
     time_expansion: float | None = None,
+    sync_channel: int | None = None,
     whole_range: bool | None = None,
-    temperature_c: float | None = None,
-    humidity_percent: float | None = None,
+    air: Mapping[str, float] | None = None,
 ) -> PcmReader:
     """Open files of multichannel PCM: WAV, or Acoular's HDF5 (``time_data`` and its ``sample_freq``).
 
@@ -236,11 +68,15 @@ def open_pcm(
     time_expansion : float, optional
         Factor by which files play slower than the sound was recorded; by default that in the metadata, otherwise 1.
         The sample rate is that of the header times the factor, and all times count in the recorded sound.
+    sync_channel : int, optional
+        Channel of the files with the emitted call or the pulses of its trigger, counted from 0. Each measurement then
+        begins at the sample nearest to its emission, and the channel is left out of the data. Without ``length_s``,
+        a measurement lasts until the next emission.
     whole_range : bool, optional
         True if ``processing.range_m`` becomes what the record contains: ranges whose whole echo begins after the call
         and ends within the record. By default, this replaces only the default ``processing.range_m``.
-    temperature_c, humidity_percent : float, optional
-        Air, instead of that of the settings.
+    air : mapping of str to float, optional
+        Values that replace those of the settings, such as ``{"temperature_c": 3.0}``.
 
     Returns
     -------
@@ -268,20 +104,51 @@ def open_pcm(
     several = [Path(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
     if len(several) == 1 and is_wav_folder(several[0]):
         several = wav_files(several[0], by_time=not join)
-    return PcmReader(
-        several,
-        settings,
-        sensor=sensor,
-        skip_s=skip_s,
-        length_s=length_s,
-        start_ns=start_ns,
-        passive=passive,
-        join=join,
-        time_expansion=time_expansion,
-        whole_range=whole_range,
-        temperature_c=temperature_c,
-        humidity_percent=humidity_percent,
+    if not several:
+        raise ArgumentError("no PCM file is given; give at least one")
+    if time_expansion is not None:
+        checks.between("time_expansion", time_expansion, 1 / _MAX_EXPANSION, _MAX_EXPANSION)
+    files = [inspect(path, time_expansion) for path in several]
+    known = _require_settings(settings, files[0])
+    known = known.replace(air=known.air.replace(**(air or {})))
+    if join:
+        files = [joined(files)]
+    require_alike(files)
+    _require_channels(files, known, sync_channel)
+    if sync_channel is None:
+        cuts = cut_regularly(files, skip_s=skip_s, length_s=length_s)
+    else:
+        _require_emissions(skip_s, passive=passive)
+        speed_m_s = sound_speed_m_s(known.air)
+        cuts = cut_at_emissions(files, known.call, channel=sync_channel, length_s=length_s, sound_speed_m_s=speed_m_s)
+    if passive:
+        known = known.replace("processing.mode", "passive")
+    recording = Recording(sample_rate_hz=files[0].rate_hz, n_samples=cuts.n_samples, encoding=files[0].encoding)
+    fitted, ranges = _fitted(known, recording, files[0], whole_range=whole_range)
+    starts_ns = [start_ns] if isinstance(start_ns, int) else list(start_ns)
+    firsts_ns, times = file_times(
+        [TimedFile(file.path, file.duration_s, file.metadata.stated_times) for file in files],
+        [checks.integer("start_ns", each, 0, 2**63 - 1) for each in starts_ns],
+        first_s=[float(times_s[0]) for times_s in cuts.times_s],
     )
+    of_files = per_file([(file.path, note) for file in files for note in file.notes])
+    return PcmReader(
+        files,
+        cuts,
+        fitted,
+        sensor=sensor,
+        behaviour="passive" if passive else "unknown",
+        firsts_ns=firsts_ns,
+        without=sync_channel,
+        notes=[*times, *of_files, *([] if fitted.processing.mode == "passive" else cuts.notes), *ranges],
+    )
+
+
+def _require_emissions(skip_s: float, *, passive: bool) -> None:
+    """Refuse options that contradict a loopback channel."""
+    for name, is_used in (("--skip", skip_s), ("--passive", passive)):
+        if is_used:
+            raise ArgumentError(f"{name} and --sync-channel cannot be combined; remove one of them")
 
 
 def _require_settings(settings: Settings | None, first: PcmFile) -> Settings:
@@ -291,16 +158,17 @@ def _require_settings(settings: Settings | None, first: PcmFile) -> Settings:
     return known
 
 
-def _with_air(settings: Settings, temperature_c: float | None, humidity_percent: float | None) -> Settings:
-    given = {"temperature_c": temperature_c, "humidity_percent": humidity_percent}
-    return settings.replace(
-        air=settings.air.replace(**{key: value for key, value in given.items() if value is not None})
-    )
-
-
-def _require_channels(files: Sequence[PcmFile], settings: Settings) -> None:
+def _require_channels(files: Sequence[PcmFile], settings: Settings, sync_channel: int | None) -> None:
     first, layout = files[0], microphones(settings.array)
     wanted = len(layout.enabled)
+    if sync_channel is not None:
+        checks.integer("sync_channel", sync_channel, 0, first.n_channels - 1)
+        if first.n_channels != wanted + 1:
+            raise DataError(
+                f"{first.path} has {first.n_channels} channels, but {wanted} of array {layout.name!r} and the one of "
+                "--sync-channel are needed; give a layout with one row for each other channel (--layout)"
+            )
+        return
     if first.n_channels == wanted:
         return
     if first.n_samples == wanted:

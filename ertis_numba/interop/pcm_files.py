@@ -74,17 +74,18 @@ class PcmFile:
         """Encoding of a recording that holds the samples."""
         return "int16" if self.kind.kind in "iu" and self.kind.itemsize <= 2 else "float32"
 
-    def open(self) -> "PcmSamples":
-        """Return the samples."""
-        return PcmSamples(self, [_read(path)[1] for path in self.paths])
+    def open(self, *, without: int | None = None) -> "PcmSamples":
+        """Return the samples, without one of the channels if desired."""
+        return PcmSamples(self, [_read(path)[1] for path in self.paths], without)
 
 
 class PcmSamples:
     """Samples of a PCM file as numbers of a recording; slices are read when they are needed."""
 
-    def __init__(self, file: PcmFile, parts: Sequence[Any]) -> None:
+    def __init__(self, file: PcmFile, parts: Sequence[Any], without: int | None = None) -> None:
         self._file = file
         self._parts = parts
+        self._without = without
 
     def block(self, samples: slice, enabled: NDArray[np.bool_] | None = None) -> NDArray[Any]:
         """Return samples, (sample, channel); non-finite samples of disabled channels become 0.
@@ -94,9 +95,27 @@ class PcmSamples:
         DataError
             A sample of an enabled channel is not finite, or exceeds float32.
         """
-        several = [part[samples] for part in self._parts]
-        numbers = several[0] if len(several) == 1 else np.concatenate(several, axis=1)
+        numbers = self._numbers(samples)
+        if self._without is not None:
+            numbers = np.delete(numbers, self._without, axis=1)
         return _converted(self._file, numbers, samples.start, enabled)
+
+    def channel(self, channel: int, samples: slice) -> NDArray[np.float64]:
+        """Return samples of one channel, in units of the file.
+
+        Raises
+        ------
+        DataError
+            A sample is not finite.
+        """
+        numbers = self._numbers(samples)[:, channel].astype(np.float64)
+        if not np.isfinite(numbers).all():
+            raise DataError(f"{self._file.path} contains numbers that are not finite in channel {channel}; remove them")
+        return numbers
+
+    def _numbers(self, samples: slice) -> NDArray[Any]:
+        several = [part[samples] for part in self._parts]
+        return several[0] if len(several) == 1 else np.concatenate(several, axis=1)
 
 
 def inspect(path: Path, expansion: float | None = None) -> PcmFile:

@@ -1,0 +1,176 @@
+"""Places of the measurements in PCM files: at regular intervals, or at the emissions in a loopback channel."""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import checks
+from ertis_numba.errors import DataError
+from ertis_numba.interop.pcm_files import PcmFile, per_file
+from ertis_numba.interop.sync_channel import find_emissions
+from ertis_numba.settings import Call
+
+__all__ = ["Cuts", "cut_at_emissions", "cut_regularly"]
+
+_MAX_DURATION_S: Final = 1e9
+_NEARLY: Final = 0.8  # Minimum length of the last measurement of a file, relative to the others.
+
+
+@dataclass(frozen=True, slots=True)
+class Cuts:
+    """Measurements of equal length in files.
+
+    Attributes
+    ----------
+    n_samples : int
+        Length of a measurement.
+    samples : list of (measurement,) int64
+        First sample of each measurement of each file.
+    times_s : list of (measurement,) float64
+        Time of each emission since the start of its file, in seconds.
+    notes : tuple of str
+        Assumption about the emission, or where it was found.
+    """
+
+    n_samples: int
+    samples: list[NDArray[np.int64]]
+    times_s: list[NDArray[np.float64]]
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.samples))
+
+    def rest_s(self, files: Sequence[PcmFile]) -> float:
+        """Return the total duration after the last measurements of files, in seconds."""
+        ends = [int(starts[-1]) + self.n_samples for starts in self.samples]
+        return sum((file.n_samples - end) / file.rate_hz for file, end in zip(files, ends, strict=True))
+
+
+def cut_regularly(files: Sequence[PcmFile], *, skip_s: float, length_s: float | None) -> Cuts:
+    """Return one measurement per file, with the length of the shortest file, or several of ``length_s``.
+
+    Raises
+    ------
+    ArgumentError
+        A time is invalid.
+    DataError
+        A file is too short.
+    """
+    rate_hz = files[0].rate_hz
+    skipped = round(checks.between("skip_s", skip_s, 0.0, _MAX_DURATION_S) * rate_hz)
+    # An interval between emissions may contain a fraction of a sample, which must not accumulate.
+    period = float(min(file.n_samples for file in files) - skipped)
+    if length_s is not None:
+        period = _checked_length_s(length_s) * rate_hz
+    n_samples = math.floor(period * (1 + 1e-12))
+    counts = [1 if length_s is None else _count(file.n_samples - skipped, period, n_samples) for file in files]
+    for file, count in zip(files, counts, strict=True):
+        if count < 1 or n_samples < 1:
+            raise DataError(
+                f"{file.path} lasts {file.duration_s:.4g} s, but {skipped / rate_hz:.4g} s to skip and a measurement "
+                f"of {max(n_samples, 1) / rate_hz:.4g} s are needed; skip less (--skip) or give a shorter --length"
+            )
+    several = [period * np.arange(count, dtype=np.float64) for count in counts]
+    return Cuts(
+        n_samples,
+        [skipped + np.rint(places).astype(np.int64) for places in several],
+        [np.asarray((skipped + places) / rate_hz) for places in several],
+        (_assumption(skip_s, length_s),),
+    )
+
+
+def cut_at_emissions(
+    files: Sequence[PcmFile], call: Call, *, channel: int, length_s: float | None, sound_speed_m_s: float
+) -> Cuts:
+    """Return a measurement for each emission in a channel, which lasts until the next one or for ``length_s``.
+
+    Raises
+    ------
+    ArgumentError
+        The length is invalid.
+    DataError
+        A file contains no emission, or the next emission follows before the length.
+    """
+    rate_hz = files[0].rate_hz
+    found = [
+        find_emissions(
+            functools.partial(file.open().channel, channel),
+            file.n_samples,
+            call,
+            rate_hz=rate_hz,
+            path=file.path,
+            channel=channel,
+        )
+        for file in files
+    ]
+    several = [np.rint(each.times).astype(np.int64) for each in found]
+    n_samples = _shortest(files, several)
+    if length_s is not None:
+        wanted = math.floor(_checked_length_s(length_s) * rate_hz * (1 + 1e-12))
+        if wanted > n_samples:
+            raise DataError(
+                f"{files[0].path}: {n_samples / rate_hz:.6g} s follow an emission until the next one or the end, but "
+                f"--length is {length_s:g} s; use a shorter --length (length_s)"
+            )
+        n_samples = wanted
+    kept = [starts[starts + n_samples <= file.n_samples] for file, starts in zip(files, several, strict=True)]
+    times = [each.times[: len(starts)] for starts, each in zip(kept, found, strict=True)]
+    rounding = max(float(np.abs(exact - starts).max()) for exact, starts in zip(times, kept, strict=True))
+    cuts = Cuts(n_samples, kept, [exact / rate_hz for exact in times], ())
+    summary = (
+        f"{len(cuts)} emission{'s' * (len(cuts) > 1)} found in channel {channel}, which is left out"
+        f"{_intervals(cuts.times_s)}; rounding to samples changes ranges by up to "
+        f"{1e3 * rounding / rate_hz * sound_speed_m_s / 2:.2g} mm"
+    )
+    notes = [(file.path, note) for file, each in zip(files, found, strict=True) for note in each.notes]
+    n_left = sum(map(len, several)) - len(cuts)
+    left = [f"emissions left out because their file ends too early: {n_left}"] * bool(n_left)
+    return Cuts(cuts.n_samples, cuts.samples, cuts.times_s, (summary, *per_file(notes), *left))
+
+
+def _checked_length_s(length_s: float) -> float:
+    checks.positive("length_s", length_s)
+    return checks.between("length_s", length_s, 0.0, _MAX_DURATION_S)
+
+
+def _count(n_samples: int, period: float, length: int) -> int:
+    """Return the number of measurements in a number of samples."""
+    if length < 1:
+        return 0
+    count = int(n_samples / period) + 1
+    while count and round((count - 1) * period) + length > n_samples:
+        count -= 1
+    return count
+
+
+def _assumption(skip_s: float, length_s: float | None) -> str:
+    """Return the note on the assumed times of the emissions."""
+    text = f"the sample at {skip_s:g} s of each file" if skip_s else "the first sample of each file"
+    if length_s is not None:
+        text += f", and one every {length_s:g} s after it,"
+    return (
+        f"{text} is taken as the start of the emission, where range is 0; use --skip or --sync-channel (skip_s, "
+        "sync_channel) if the emission is later"
+    )
+
+
+def _shortest(files: Sequence[PcmFile], several: Sequence[NDArray[np.int64]]) -> int:
+    """Return the smallest number of samples from an emission to the next one, or to the end of its file.
+
+    The end of a file with several emissions may cut off the last one, unless it nearly fits.
+    """
+    intervals = [int(np.diff(starts).min()) for starts in several if len(starts) > 1]
+    rests = [(file.n_samples - int(starts[-1]), len(starts)) for file, starts in zip(files, several, strict=True)]
+    needed = _NEARLY * min([*intervals, *(rest for rest, count in rests if count == 1)])
+    return min([*intervals, *(rest for rest, count in rests if count == 1 or rest >= needed)])
+
+
+def _intervals(several: Sequence[NDArray[np.float64]]) -> str:
+    """Return the intervals between emissions in words."""
+    intervals_s = np.concatenate([np.diff(times_s) for times_s in several])
+    return f", {intervals_s.min():.6g} to {intervals_s.max():.6g} s apart" if len(intervals_s) else ""
