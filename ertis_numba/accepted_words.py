@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import microphones
+from ertis_numba.geometry import microphones, require_plausible_size
 from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Array, Call, Recording, Settings
 
@@ -26,9 +26,15 @@ class AcceptedWords:
     Attributes
     ----------
     format : SampleFormat
+
+    Raises
+    ------
+    ArgumentError
+        The array has a size that does not suit the sound; see `require_plausible_size`.
     """
 
     def __init__(self, settings: Settings) -> None:
+        require_plausible_size(settings)
         self._settings = self._accepted_settings = settings
         self.format = sample_format(settings)
 

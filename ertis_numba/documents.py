@@ -126,7 +126,11 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
                 wrong = next(inner for inner in within if inner.partition(".")[0] not in table.__struct_fields__)
                 raise self._unknown_key(f"{name}.{wrong}")
             own[name] = table.replace(**within)
-        return msgspec.structs.replace(self, **own)
+        return msgspec.structs.replace(self, **self._completed(own))
+
+    def _completed(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """Return the changes of a copy with those that follow from them; none by default."""
+        return changes
 
     def _paths(self) -> Iterator[str]:
         """Yield the keys of this table and of those in it."""

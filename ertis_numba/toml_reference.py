@@ -13,7 +13,7 @@ import msgspec
 import tomli_w
 
 from ertis_numba.documents import TomlTable
-from ertis_numba.geometry.layouts import LayoutFile
+from ertis_numba.geometry.layout_files import LayoutFile
 from ertis_numba.settings import Settings
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.units import unit_of
@@ -90,6 +90,8 @@ def reference(document: str) -> tuple[TableReference, ...]:
     examples = _read(f"every_{document}_key.toml")
     if document == "settings":  # A call has an own waveform or the other keys, so no file holds all of them.
         examples["call"] = _read("own_waveform.toml")["call"] | examples["call"]
+    if document == "layout":  # Positions are in millimetres or have a unit of their own.
+        examples |= _read("layout_in_metres.toml")
     if document == "scene":  # Its sensors move by themselves, or a platform moves them.
         examples["platform"] = _read("scenes/moving_platform.toml", "ertis_examples.synthetic")["platform"]
     sections = [section for section in _ReferenceBuilder(examples).sections(DOCUMENTS[document]) if section.keys]
@@ -115,7 +117,11 @@ class _ReferenceBuilder:
         for field in msgspec.structs.fields(kind):
             inner = _table_in(field.type)
             if inner is None:
-                keys.append(_key(field, *texts.get(field.name, ("", "")), self._example(path, field.name)))
+                keys.append(
+                    _key(
+                        field, _default(kind, field), *texts.get(field.name, ("", "")), self._example(path, field.name)
+                    )
+                )
             elif kind is Settings or inner not in _OF_SETTINGS:  # which the reference of settings has
                 tables.append((field, inner))
         yield TableReference(header, _summary(kind), tuple(keys))
@@ -147,14 +153,18 @@ def _table_in(kind: Any) -> type[TomlTable] | None:
     return next(tables, None)
 
 
-def _key(field: msgspec.structs.FieldInfo, kind: str, about: str, example: Any) -> KeyReference:
+def _default(kind: type[TomlTable], field: msgspec.structs.FieldInfo) -> Any:
+    """Return the value of a key that is left out; NODEFAULT if it must not be."""
+    if field.required:
+        return msgspec.NODEFAULT
+    if kind in _OF_SETTINGS:
+        return getattr(kind(), field.name)  # A structure may complete its defaults when it is created.
+    return field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+
+
+def _key(field: msgspec.structs.FieldInfo, default: Any, kind: str, about: str, example: Any) -> KeyReference:
     kind = kind.partition(", default")[0]
     parts = None if get_origin(field.type) is Literal else _PARTS.search(kind)
-    default = field.default if field.default is not msgspec.NODEFAULT else None
-    if field.default_factory is not msgspec.NODEFAULT:
-        default = field.default_factory()
-    elif field.required:
-        default = msgspec.NODEFAULT
     return KeyReference(
         name=field.name,
         about=about,

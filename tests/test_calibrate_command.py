@@ -12,7 +12,7 @@ from ertis_bench.faulty_arrays import faulty_array, record
 from ertis_cli.main import cli
 
 from ertis_numba.geometry import layout_file, load_layout
-from ertis_numba.geometry.layouts import LayoutFile
+from ertis_numba.geometry.layout_files import LayoutFile
 from ertis_numba.settings import Settings
 from ertis_numba.simulation.scene import load_scene
 from ertis_numba.storage import open_energyscapes, write_recording

@@ -40,7 +40,7 @@ CASES = {
     "NaN in layout": (
         "import good.bin -o out.h5 --layout nan.csv --preset short_25_50",
         1,
-        "layout nan.csv: positions_mm holds nan at [1, 2]; give finite numbers",
+        "layout nan.csv, line 2: z is nan; use a finite number",
     ),
     "unknown preset": (
         "import good.bin -o out.h5 --layout eRTIS_v2 --preset short_30_50",

@@ -136,8 +136,8 @@ def test_sound_pressure_level_follows_from_the_sensitivity_of_a_data_sheet():
         ("none.toml", None, r"layout .*none\.toml: .*; give a readable file or one of eRTIS_v2, "),
         ("bytes.csv", b"\xff", r"layout .*bytes\.csv: .*; give a readable file or one of"),
         ("l.toml", b"positions_mm = [", r"layout .*l\.toml: .*; correct it or remove it"),
-        ("l.toml", b"", r"layout .*l\.toml: `positions_mm` is missing; give it"),
-        ("l.toml", b"positions_mm = 3", r"layout .*l\.toml, line 1, positions_mm: Expected `array`, got `int`"),
+        ("l.toml", b"", r"layout .*l\.toml: the file is empty; give a readable file or one of"),
+        ("l.toml", b"positions_mm = 3", r"layout .*l\.toml, line 1, positions_mm: Expected `array \| null`, got `int`"),
         (
             "l.toml",
             b"positions_mm = [['a', 'b']]",
@@ -170,7 +170,7 @@ def test_sound_pressure_level_follows_from_the_sensitivity_of_a_data_sheet():
         (
             "l.csv",
             b"1, 2\n3, x\n",
-            r"layout .*l\.csv: could not convert .*x'; give rows of numbers (separated|parted) by commas",
+            r"layout .*l\.csv, line 2: z is 'x'; use a number",
         ),
         (
             "l.toml",
@@ -178,8 +178,8 @@ def test_sound_pressure_level_follows_from_the_sensitivity_of_a_data_sheet():
             r"channels 0 and 2 have the same position; correct one, or list it under 'disabled'",
         ),
         ("l.toml", b"gain = [1.0]\npositions_mm = [[1, 2], [3, 4]]", r"l\.toml: array\.gain has shape \(1,\)"),
-        ("l.csv", b"# nothing\n", r"layout .*l\.csv: positions_mm does not consist of rows of 2 or 3 numbers"),
-        ("l.csv", b"1, nan\n", r"layout .*l\.csv: positions_mm holds nan at \[0, 2\]"),
+        ("l.csv", b"# nothing\n", r"layout .*l\.csv: no positions; use one row per channel, y, z or x, y, z"),
+        ("l.csv", b"1, nan\n", r"layout .*l\.csv, line 1: z is nan; use a finite number"),
         ("l.csv", b"1, 2\n" * 1025, r"layout .*l\.csv: number of array\.positions_m is 1025; give .* from 1 to 1024"),
     ],
 )
@@ -439,15 +439,6 @@ def test_image_extends_to_the_usual_spacing_of_directions(gaps_deg, wanted_deg):
 )
 def test_full_circle_is_recognised_by_its_largest_gap(azimuth_deg, wanted):
     assert is_closed(np.radians(azimuth_deg)) == wanted
-
-
-def test_layout_in_metres_is_refused(tmp_path):
-    path = tmp_path / "mine.csv"
-    path.write_text("0.02, 0\n0, 0.02\n-0.02, 0\n")
-    with pytest.raises(
-        ArgumentError, match=r"microphones lie within 0\.04 mm, too close .*; give positions in millimetres"
-    ):
-        load_layout(path)
 
 
 def fan(azimuth_deg, range_m=(0.5, 5.0)):

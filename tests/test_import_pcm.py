@@ -186,7 +186,7 @@ REFUSED = {
     "channels": (
         lambda folder: write_wav(folder / "a.wav", numbers(n_channels=7)),
         {},
-        r"has 7 channels, but array 'ring' has 8; give a layout with one row for each channel",
+        r"has 7 channels, but array '\w+' has 8; (use a layout with|correct array.positions_m, )one row for each",
     ),
     "slow": (
         lambda folder: write_wav(folder / "a.wav", numbers(), 44_100),

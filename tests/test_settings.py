@@ -345,8 +345,13 @@ def test_range_decimation_without_a_useful_divisor_is_refused():
 
 
 def test_distant_microphones_are_refused():
-    with pytest.raises(ArgumentError, match=r"array.positions_m\[1\] is 40; give a number from -10 to 10"):
+    with pytest.raises(
+        ArgumentError, match=r"array.positions_m spans 40 m, more than 25 m; are the numbers millimetre"
+    ):
         Array(positions_m=((0.0, 0.0, 0.0), (40.0, 0.0, 0.0)))
+    with pytest.raises(ArgumentError, match=r"array.positions_m\[1\] is 4e\+07; give a number from -1e\+07 to 1e\+07"):
+        Array(positions_m=((0.0, 0.0, 0.0), (4e7, 0.0, 0.0)))
+    assert Array(positions_m=((5e5, 5e6, 0.0), (5e5, 5e6 + 20, 0.0)), enabled=(True, True)).layout == "own array"
 
 
 def test_settings_of_older_recordings_are_read():

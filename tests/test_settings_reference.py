@@ -79,7 +79,7 @@ def test_settings_reference_is_printed_as_json():
     reported = json.loads(CliRunner().invoke(cli, ["settings", "layout", "--json"]).stdout)
     (table,) = reported["tables"]
     (found,) = (key for key in table["keys"] if key["name"] == "positions_mm")
-    assert (found["unit"], found["default"]) == ("mm", "required")
+    assert (found["unit"], found["default"]) == ("mm", "none")
 
 
 def test_reference_page_has_every_key():

@@ -32,7 +32,7 @@ _OPTIONS = (
         "--layout",
         metavar="NAME",
         shell_complete=options.complete_layouts,
-        help="Name of a shipped layout, or a .toml or .csv file; eRTIS_v3D1 by default.",
+        help="Name of a shipped layout, or a layout file such as .csv or .toml; eRTIS_v3D1 by default.",
     ),
     click.option(
         "--settings", "settings_file", type=click.Path(path_type=Path), metavar="FILE", help="Settings file (TOML)."
@@ -64,6 +64,7 @@ def settings_from(
     settings = Settings.load(settings_file) if settings_file else Settings.from_preset(preset or "default_25_50")
     if layout is not None:
         settings = settings.replace(array=Array(layout=layout))
+    options.note_layout(settings.array)
     if temperature is not None:
         air = Air() if settings_file is None else settings.air
         settings = settings.replace(air=air.replace(temperature_c=temperature))

@@ -37,7 +37,7 @@ _UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
     "--layout",
     metavar="NAME",
     shell_complete=options.complete_layouts,
-    help="Name of a shipped layout, or a .toml or .csv file; not needed if a folder contains it.",
+    help="Name of a shipped layout, or a layout file such as .csv or .toml; not needed if a folder contains it.",
 )
 @click.option(
     "--preset",
@@ -267,4 +267,7 @@ def _settings(
     for name, value in (changes or {}).items():
         settings = settings.replace(name, value)
     settings = options.settings_with(settings, settings_file=settings_file)
-    return settings if layout is None else settings.replace(array=Array(layout=layout))
+    if layout is not None:
+        settings = settings.replace(array=Array(layout=layout))
+        options.note_layout(settings.array)
+    return settings

@@ -18,7 +18,7 @@ from ertis_numba.constants import MAX_MICROPHONES
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
     from ertis_numba.pipeline import Pipeline
-    from ertis_numba.settings import Settings
+    from ertis_numba.settings import Array, Settings
     from ertis_numba.stages.costs import PlanCosts
 
 __all__ = [
@@ -43,6 +43,7 @@ __all__ = [
     "input_file",
     "measurement",
     "min_level",
+    "note_layout",
     "note_unlisted_directions",
     "note_when_slow",
     "output",
@@ -339,6 +340,7 @@ def settings_with(
     from ertis_numba.settings import preset_tables
 
     settings = recorded if settings_file is None else recorded.updated_from_file(settings_file)
+    note_layout(settings.array)
     if preset is not None:
         keys = preset_tables(preset, "processing")["processing"]
         settings = settings.replace(processing=settings.processing.replace(**keys))
@@ -411,6 +413,18 @@ def complete_layouts(ctx: click.Context, param: click.Parameter, incomplete: str
 
     names = [CompletionItem(name) for name in layout_names() if name.startswith(incomplete)]
     return names or [CompletionItem(incomplete, type="file")]
+
+
+def note_layout(array: "Array") -> None:
+    """Print the notes about the layout file of an array, once per command and unless it is quiet."""
+    from ertis_numba.geometry import microphones
+
+    context = click.get_current_context()
+    noted: set[str] = context.meta.setdefault("ertis_cli.noted_layouts", set())
+    if array.is_file and array.layout not in noted:
+        noted.add(array.layout)
+        for note in microphones(array).notes:
+            say(f"note: {note}", quiet=bool(context.params.get("quiet")))
 
 
 def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:

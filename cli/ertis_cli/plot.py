@@ -297,8 +297,9 @@ def _measurement(path: Path, sensor: str | None, index: int) -> "Measurement":
 def _require_no_array(path: Path) -> None:
     """Raise an error for input that only ``--kind array`` supports."""
     from ertis_numba.geometry import layout_names
+    from ertis_numba.settings import LAYOUT_SUFFIXES
 
-    if path.suffix.lower() in {".csv", ".toml"} or (str(path) in layout_names() and not path.exists()):
+    if path.suffix.lower() in LAYOUT_SUFFIXES or (str(path) in layout_names() and not path.exists()):
         raise click.UsageError(
             f"{path} contains no measurement; give --kind array, or a recording, an energyscape file or a file of "
             "acoustic maps",
@@ -309,19 +310,21 @@ def _require_no_array(path: Path) -> None:
 def _settings(path: Path, sensor: str | None) -> "Settings":
     """Return the settings of a file, or default settings with the array of a layout."""
     from ertis_numba.geometry import layout_names
-    from ertis_numba.settings import Array, Settings
+    from ertis_numba.settings import LAYOUT_SUFFIXES, Array, Settings
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording
 
     suffix = path.suffix.lower()
     is_name = str(path) in layout_names() or not (suffix or path.exists())  # a layout, possibly misspelt
-    is_layout = is_name or suffix == ".csv" or (suffix == ".toml" and _is_layout(path))
+    is_layout = is_name or (suffix in LAYOUT_SUFFIXES and (suffix != ".toml" or _is_layout(path)))
     if sensor is not None and (is_layout or suffix == ".toml"):
         raise click.UsageError(
             "--sensor is for files with several sensors; remove it with settings or a layout",
             click.get_current_context(),
         )
     if is_layout:
-        return Settings(array=Array(layout=str(path)))
+        settings = Settings(array=Array(layout=str(path)))
+        options.note_layout(settings.array)
+        return settings
     if suffix == ".toml":
         return Settings.load(path)
     opened = open_energyscapes if file_kind(path) == "energyscape" else open_recording
@@ -332,6 +335,6 @@ def _settings(path: Path, sensor: str | None) -> "Settings":
 def _is_layout(path: Path) -> bool:
     """Return True if a TOML file is a layout, with positions at its top level, and not settings."""
     try:
-        return bool(re.search(r"^\s*positions_mm\s*=", path.read_text("utf-8"), re.MULTILINE))
+        return bool(re.search(r"^\s*positions(_\w+)?\s*=", path.read_text("utf-8"), re.MULTILINE))
     except (OSError, UnicodeDecodeError):
         return False  # reading it as settings reports the error

@@ -15,6 +15,7 @@ from ertis_numba.geometry.layouts import (
     layout_text,
     load_layout,
     microphones,
+    require_plausible_size,
     self_contained,
     storable,
     written_out,
@@ -22,6 +23,7 @@ from ertis_numba.geometry.layouts import (
 from ertis_numba.geometry.levelling import levelled_grid
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
+from ertis_numba.geometry.position_files import SENSOR_FRAME
 from ertis_numba.geometry.sector import Fan, plan_m, round_step
 from ertis_numba.geometry.untrusted_settings import received_settings
 from ertis_numba.geometry.weights import array_weights, effective_count
@@ -31,6 +33,7 @@ __all__ = [
     "FAR",
     "MAX_DIRECTIONS",
     "PAPER_GRIDS",
+    "SENSOR_FRAME",
     "Fan",
     "Grid",
     "Layout",
@@ -53,6 +56,7 @@ __all__ = [
     "plane_delays",
     "reach_rad",
     "received_settings",
+    "require_plausible_size",
     "round_step",
     "self_contained",
     "spacing_rad",

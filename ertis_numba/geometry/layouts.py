@@ -1,7 +1,6 @@
 """Microphone layouts from settings, files and the package itself."""
 
 import functools
-import re
 from dataclasses import dataclass, replace
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -12,67 +11,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.csv_numbers import csv_rows
-from ertis_numba.documents import TomlDocument
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry.grids import grid_count
-from ertis_numba.settings import Array, Settings
+from ertis_numba.geometry.layout_files import LayoutFile, parse_layout, read_layout, unclear_unit
+from ertis_numba.settings import LAYOUT_SUFFIXES, Array, Settings
 
 __all__ = [
     "Layout",
-    "LayoutFile",
     "layout_file",
     "layout_names",
     "layout_text",
     "load_layout",
     "microphones",
+    "require_plausible_size",
     "self_contained",
     "storable",
     "written_out",
 ]
 
-_SMALLEST_M = 1e-3  # minimum size of an array: metres given instead of millimetres are below it
 _FLAT_M = 1e-3  # extent along x below which an array counts as flat
-_SPLIT_ROW = re.compile(r"\[\s+((?:[-\d.e]+,\s+)+)\]")  # numbers of a list on lines of their own
+_MIN_LARGE_M = 1.0  # Extent below which an array is plausible with any record.
 _CENTRED_M = 1e-12  # rounding error in the mean of centred positions
-
-
-class LayoutFile(TomlDocument, frozen=True, kw_only=True):
-    """Microphones of an array: the complete content of a layout file.
-
-    Attributes
-    ----------
-    positions_mm : list of (y, z) or (x, y, z)
-        Positions in the sensor frame in millimetres, one per channel, in the order of the bits.
-    name : str
-        Name in recordings and pictures; the name of the file by default.
-    source : str
-        Origin of the numbers, for readers of the file; empty by default.
-    word_bits : {8, 16, 32, 64}
-        Bits of one PDM word; 32 by default.
-    disabled : tuple of int
-        Channels without a microphone; none by default.
-    gain : tuple of float, optional
-        Calibrated sensitivity of each channel, 1 by default. Processing divides the signal by it.
-    delay_s : tuple of float, optional
-        Calibrated delay of each channel in seconds, 0 by default. Processing compensates for it.
-    sensitivity_dbfs : float, optional
-        Sensitivity of the microphones as in their data sheet: level of a sine of 94 dB, 1 Pa RMS, relative to a
-        full-scale sine, -120 to 20 dBFS; unknown by default.
-    """
-
-    positions_mm: list[list[float]]
-    name: str = ""
-    source: str = ""
-    word_bits: int = 32
-    disabled: tuple[int, ...] = ()
-    gain: tuple[float, ...] | None = None
-    delay_s: tuple[float, ...] | None = None
-    sensitivity_dbfs: float | None = None
-
-    def to_toml(self) -> str:
-        """Return TOML text with one position per line."""
-        return _SPLIT_ROW.sub(lambda found: f"[{' '.join(found.group(1).split()).rstrip(',')}]", super().to_toml())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +54,10 @@ class Layout:
         Bits of one PDM word.
     sensitivity_dbfs : float, optional
         Level of a sine of 94 dB relative to a full-scale sine; None, the default, if it is unknown.
+    notes : tuple of str
+        Remarks about the file of the layout, such as a unit that it does not state; none by default.
+    unit_is_stated : bool
+        False for a file that states no unit, whose numbers are taken for millimetres; True by default.
     """
 
     name: str
@@ -103,6 +67,8 @@ class Layout:
     delay_s: NDArray[np.float64]
     word_bits: int
     sensitivity_dbfs: float | None = None
+    notes: tuple[str, ...] = ()
+    unit_is_stated: bool = True
 
     @property
     def n_words(self) -> int:
@@ -202,9 +168,15 @@ def layout_file(layout: Layout, *, name: str, source: str = "") -> LayoutFile:
 
 
 def load_layout(name: str | Path) -> Layout:
-    """Return a shipped layout, or one from a ``.toml`` or ``.csv`` file.
+    r"""Return a shipped layout, or one from a file.
 
-    A CSV file has one row per channel, ``y, z`` or ``x, y, z`` in millimetres, in the order of the bits.
+    A file has one row per channel, in the order of the bits. Its ending determines the format:
+
+    - ``.csv``, ``.tsv``, ``.txt``: ``y, z`` or ``x, y, z``, in millimetres unless a header states another unit, as in
+      ``y_m,z_m``. A header may also name the axes in another order.
+    - ``.toml``: the keys of `ertis settings layout`.
+    - ``.npy``: numbers of shape (channels, 2) or (channels, 3), in millimetres.
+    - ``.xml``: an array of Acoular, in metres, which is turned into the sensor frame; see `Layout.notes`.
 
     Parameters
     ----------
@@ -218,7 +190,7 @@ def load_layout(name: str | Path) -> Layout:
     Raises
     ------
     ArgumentError
-        The name is unknown, or the file cannot be read or used.
+        The name is unknown, the file cannot be read or used, or its unit or axes are unclear.
 
     Examples
     --------
@@ -226,76 +198,27 @@ def load_layout(name: str | Path) -> Layout:
     >>> layout = load_layout(layout_names()[0])
     >>> layout.positions_m.shape == (len(layout.enabled), 3)
     True
+    >>> from pathlib import Path
+    >>> size = Path("bats.csv").write_text("x_m,y_m,z_m\n0,0,0\n0,1.2,0\n0,0,1.2\n")
+    >>> float(load_layout("bats.csv").positions_m.max())
+    0.8
     """
-    path = Path(name)
-    if path.suffix.lower() not in {".toml", ".csv"}:
-        return microphones(_shipped_array(str(name)))
-    try:
-        text = path.read_text("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = checks.reason_unreadable(error)
+    suffix = Path(name).suffix.lower()
+    if suffix in LAYOUT_SUFFIXES:
+        file = read_layout(name, ", ".join(layout_names()))
+        return replace(microphones(file.array), notes=file.notes, unit_is_stated=file.unit_is_stated)
+    if suffix and Path(name).exists():
         raise ArgumentError(
-            f"layout {name}: {reason}; give a readable file or one of {', '.join(layout_names())}"
-        ) from error
-    if path.suffix.lower() == ".csv":
-        file = LayoutFile(name=path.stem, positions_mm=csv_rows(f"layout {name}", text))
-    else:
-        file = LayoutFile.from_toml(text, f"layout {name}")
-    return microphones(_placed(str(name), file))
+            f"layout {name}: files with the ending {suffix} are not read; save the positions as .csv with a header, "
+            f"such as x_m,y_m,z_m, or choose another of {', '.join(LAYOUT_SUFFIXES)}"
+        )
+    return microphones(_shipped_array(str(name)))
 
 
 @functools.cache
 def _shipped_array(name: str) -> Array:
     """Return a shipped layout; its file is read once."""
-    return _placed(name, LayoutFile.from_toml(layout_text(name), f"layout {name}"))
-
-
-def _placed(source: str, file: LayoutFile) -> Array:
-    """Return the validated array of a layout file."""
-    rows = file.positions_mm
-    if not rows or any(len(row) != len(rows[0]) or len(row) not in {2, 3} for row in rows):
-        raise ArgumentError(
-            f"layout {source}: positions_mm does not consist of rows of 2 or 3 numbers; give y, z or x, y, z of each "
-            "channel"
-        )
-    positions_m = np.zeros((len(rows), 3))
-    positions_m[:, 3 - len(rows[0]) :] = np.asarray(rows, dtype=np.float64) / 1000
-    enabled = np.ones(len(rows), dtype=np.bool_)
-    for channel in file.disabled:
-        enabled[checks.integer(f"layout {source}: a disabled channel", channel, 0, len(rows) - 1)] = False
-    checks.finite_array(f"layout {source}: positions_mm", np.where(enabled[:, None], positions_m, 0.0))
-    try:
-        made = Array(
-            layout=file.name or source,
-            positions_m=tuple(tuple(row) for row in np.where(enabled[:, None], positions_m, 0.0).tolist()),
-            enabled=tuple(enabled.tolist()),
-            gain=file.gain,
-            delay_s=file.delay_s,
-            word_bits=file.word_bits,
-            sensitivity_dbfs=file.sensitivity_dbfs,
-        )
-    except ArgumentError as error:
-        raise ArgumentError(f"layout {source}: {error}") from error
-    across_m = float(np.ptp(positions_m[enabled], axis=0).max(initial=0.0)) if enabled.any() else 0.0
-    if enabled.sum() > 1 and across_m < _SMALLEST_M:
-        raise ArgumentError(
-            f"layout {source}: its microphones lie within {1e3 * across_m:.3g} mm, too close to distinguish "
-            "directions; give positions in millimetres"
-        )
-    _require_apart(source, positions_m, np.flatnonzero(enabled))
-    return made
-
-
-def _require_apart(source: str, positions_m: NDArray[np.float64], channels: NDArray[np.intp]) -> None:
-    """Raise an error for two microphones in one place, which is probably a copied row that was not changed."""
-    first: dict[tuple[float, ...], int] = {}
-    for channel in channels.tolist():
-        place = tuple(positions_m[channel].tolist())
-        if first.setdefault(place, channel) != channel:
-            raise ArgumentError(
-                f"layout {source}: channels {first[place]} and {channel} have the same position; correct one, or list "
-                "it under 'disabled' in a .toml file"
-            )
+    return parse_layout(name, layout_text(name)).array
 
 
 def microphones(array: Array) -> Layout:
@@ -378,7 +301,7 @@ def self_contained(settings: Settings) -> Settings:
     Raises
     ------
     ArgumentError
-        The layout is unknown, or its file cannot be read or used.
+        The layout is unknown, its file cannot be read or used, or its size does not suit the sound.
 
     Examples
     --------
@@ -387,8 +310,36 @@ def self_contained(settings: Settings) -> Settings:
     >>> len(self_contained(Settings()).array.positions_m)
     32
     """
+    require_plausible_size(settings)
     array = written_out(settings.array)
     return settings if array is settings.array else settings.replace(array=array)
+
+
+def require_plausible_size(settings: Settings) -> None:
+    """Ask for the unit of an array whose size does not suit the sound that it receives.
+
+    Raises
+    ------
+    ArgumentError
+        The layout file states no unit, and the array would be smaller than a third of the shortest wavelength; or the
+        array is larger than 1 m and than the way that sound travels during a record.
+    """
+    layout, recording = microphones(settings.array), settings.recording
+    speed_m_s = sound_speed_m_s(settings.air)
+    span_m = float(np.ptp(layout.enabled_positions_m, axis=0).max())
+    highest_hz = settings.call.high_frequency_hz
+    if settings.processing.mode == "passive":
+        highest_hz = min(settings.passive.extent_hz[1], recording.sample_rate_hz / 2)
+    if not layout.unit_is_stated and 0 < span_m < speed_m_s / highest_hz / 3:
+        reason = f", less than a third of the wavelength at {highest_hz / 1e3:g} kHz"
+        raise ArgumentError(unclear_unit(f"layout {settings.array.layout}", 1e3 * span_m, reason))
+    reach_m = speed_m_s * recording.duration_s
+    if span_m > max(_MIN_LARGE_M, reach_m):
+        raise ArgumentError(
+            f"array {layout.name!r} spans {span_m:.3g} m, but sound travels only {reach_m:.3g} m in a record of "
+            f"{1e3 * recording.duration_s:.3g} ms; are its positions in millimetres? Correct their unit, or use longer "
+            "records"
+        )
 
 
 def storable(settings: Settings) -> Settings:

@@ -16,7 +16,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.atomic_files import require_free_space
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import Layout, microphones, received_settings, self_contained
+from ertis_numba.geometry import SENSOR_FRAME, Layout, microphones, received_settings, self_contained
 from ertis_numba.settings import Array, Recording, Settings
 from ertis_numba.stages.signals import signals_of
 from ertis_numba.storage.opening import open_file, reading
@@ -137,4 +137,5 @@ def _xml(layout: Layout) -> str:
         if layout.enabled[channel]
     ]
     name = escape(layout.name)
-    return "\n".join(['<?xml version="1.0" encoding="utf-8"?>', f'<MicArray name="{name}">', *rows, "</MicArray>", ""])
+    head = f'<MicArray name="{name}" axes="{SENSOR_FRAME}">'
+    return "\n".join(['<?xml version="1.0" encoding="utf-8"?>', head, *rows, "</MicArray>", ""])

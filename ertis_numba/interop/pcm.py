@@ -179,7 +179,9 @@ def _require_channels(files: Sequence[PcmFile], settings: Settings, sync_channel
             f"{text}, as all {len(files)} files have together; use --join (join=True) if they are the microphones of "
             "one measurement"
         )
-    raise DataError(f"{text}; give a layout with one row for each channel (--layout)")
+    if settings.array.positions_m is not None:
+        raise DataError(f"{text}; correct array.positions_m, one row for each of {first.n_channels} channels")
+    raise DataError(f"{text}; use a layout with one row for each channel (--layout, or array.layout in the settings)")
 
 
 def _fitted(

@@ -1,5 +1,9 @@
 """Microphone array: positions, calibration and word format."""
 
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
 import numpy as np
 
 from ertis_numba import checks
@@ -7,10 +11,22 @@ from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH, WORD_BITS
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["Array"]
+__all__ = ["LAYOUT_SUFFIXES", "LENGTH_UNITS_M", "MAX_SPAN_M", "MIN_SPAN_M", "OWN_ARRAY", "Array"]
 
+LAYOUT_SUFFIXES: Final = (".toml", ".csv", ".tsv", ".txt", ".npy", ".xml")
+"""Endings of layout files."""
+LENGTH_UNITS_M: Final = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+"""Units of positions in files, in metres."""
+OWN_ARRAY: Final = "own array"
+"""Name of an array whose positions have none."""
+MIN_SPAN_M: Final = 2e-3
+"""Smallest extent of an array; single microphones are larger than that."""
+MAX_SPAN_M: Final = 25.0
+"""Largest extent of an array. An array of 26 mm has a larger one if its millimetres are taken for metres."""
+
+_NAMED: Final = "eRTIS_v3D1"
 _SENSITIVITIES_DBFS = -120.0, 20.0
-_MAX_COORDINATE_M = 10.0  # A larger coordinate is probably in millimetres.
+_MAX_COORDINATE_M = 1e7  # Positions may be in a grid of the Earth, whose coordinates reach this.
 
 
 class Array(TomlTable, frozen=True, kw_only=True):
@@ -19,7 +35,8 @@ class Array(TomlTable, frozen=True, kw_only=True):
     Attributes
     ----------
     layout : str, default "eRTIS_v3D1"
-        Name of a shipped layout, or the path of a layout file (.toml, .csv). If ``positions_m`` is given, only a label.
+        Name of a shipped layout, or the path of a layout file (.toml, .csv, .tsv, .txt, .npy, .xml). If ``positions_m``
+        is given, only a label: the name of the settings file, or "own array", by default.
     positions_m : tuple of (x, y, z), optional, default None
         Microphone positions in the sensor frame in metres, one per channel, in the order of the bits.
     enabled : tuple of bool, optional, default None
@@ -39,7 +56,7 @@ class Array(TomlTable, frozen=True, kw_only=True):
         full-scale sine, -120 to 20 dBFS. That of the layout by default; sound pressures are unknown without it.
     """
 
-    layout: str = "eRTIS_v3D1"
+    layout: str = ""
     positions_m: tuple[tuple[float, float, float], ...] | None = None
     enabled: tuple[bool, ...] | None = None
     gain: tuple[float, ...] | None = None
@@ -50,6 +67,8 @@ class Array(TomlTable, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.layout:
+            msgspec.structs.force_setattr(self, "layout", _NAMED if self.positions_m is None else OWN_ARRAY)
         checks.length("array.layout", self.layout, MAX_NAME_LENGTH)
         checks.choice("array.word_bits", checks.integer("array.word_bits", self.word_bits, 1), WORD_BITS)
         if self.sensitivity_dbfs is not None:
@@ -72,12 +91,30 @@ class Array(TomlTable, frozen=True, kw_only=True):
             checks.between(f"magnitude of array.gain[{channel}]", abs(gain), 1e-3, 1e3)
         self._check_per_channel("delay_s", -1e-3, 1e-3)
 
+    @property
+    def is_file(self) -> bool:
+        """True if ``layout`` is the path of a layout file that has not been read."""
+        return self.positions_m is None and Path(self.layout).suffix.lower() in LAYOUT_SUFFIXES
+
+    def _completed(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """Other positions need another name."""
+        is_other = changes.get("positions_m", self.positions_m) != self.positions_m
+        return {"layout": OWN_ARRAY, **changes} if is_other and changes["positions_m"] is not None else changes
+
     def _check_positions(self, positions_m: tuple[tuple[float, float, float], ...]) -> None:
         checks.integer("number of array.positions_m", len(positions_m), 1, MAX_MICROPHONES)
         checks.finite_array("array.positions_m", np.asarray(positions_m, dtype=np.float64))
         for channel, position in enumerate(positions_m):
             for coordinate_m in position:
                 checks.between(f"array.positions_m[{channel}]", coordinate_m, -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
+        enabled = np.ones(len(positions_m), dtype=np.bool_) if self.enabled is None else np.asarray(self.enabled)
+        if len(enabled) == len(positions_m) and enabled.any():
+            span_m = float(np.ptp(np.asarray(positions_m)[enabled], axis=0).max())
+            if span_m > MAX_SPAN_M:
+                raise ArgumentError(
+                    f"array.positions_m spans {span_m:.4g} m, more than {MAX_SPAN_M:g} m; are the numbers millimetres? "
+                    "Divide them by 1000"
+                )
 
     def _check_per_channel(self, name: str, low: float, high: float) -> None:
         """Refuse a list without exactly one number in ``[low, high]`` for each channel."""

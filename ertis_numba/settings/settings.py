@@ -257,13 +257,21 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         except ArgumentError as error:
             raise SettingsError(f"{path}: {error}") from error
 
+    @classmethod
+    def _load(cls, path: Path) -> tuple[Self, dict[str, Any]]:
+        """Read a file, whose name becomes that of an array given by positions."""
+        held, tables = super()._load(path)
+        if "positions_m" in (array := tables.get("array", {})) and "layout" not in array:
+            held = held.replace("array.layout", path.name)
+        return held, tables
+
     def resolve_paths(self, folder: Path) -> Self:
         """Return settings whose files, of layout, directions, delays, waveform and filters, are relative to a folder.
 
         Waveform and filters are read, because other settings depend on them.
         """
         array, processing = self.array, self.processing
-        if array.positions_m is None and Path(array.layout).suffix.lower() in {".csv", ".toml"}:
+        if array.is_file:
             array = array.replace(layout=str(folder / array.layout))
         return self.replace(
             array=array, processing=processing.resolve_paths(folder), call=self.call.resolve_paths(folder)

@@ -12,8 +12,7 @@ import numpy as np
 from ertis_numba import checks
 from ertis_numba.documents import TomlDocument
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import written_out
-from ertis_numba.settings import Array
+from ertis_numba.geometry import require_plausible_size, written_out
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.platform import MovingPose, Platform
 from ertis_numba.simulation.sensors import Sensor
@@ -158,16 +157,15 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
         Paths are relative to ``folder``; paths of direction files are resolved but not read.
         """
         sensors = [sensor.resolve_paths(folder) for sensor in self.sensors]
+        for sensor in sensors:
+            require_plausible_size(sensor)
         return self.replace(
-            sensors=tuple(sensor.replace(array=_read(sensor.array)) for sensor in sensors),
+            sensors=tuple(
+                sensor.replace(array=written_out(sensor.array)) if sensor.array.is_file else sensor
+                for sensor in sensors
+            ),
             sonars=tuple(sonar.replace(call=sonar.call.resolve_paths(folder)) for sonar in self.sonars),
         )
-
-
-def _read(array: Array) -> Array:
-    if array.positions_m is not None or Path(array.layout).suffix.lower() not in {".toml", ".csv"}:
-        return array
-    return written_out(array)
 
 
 def load_scene(path: str | Path) -> Scene:

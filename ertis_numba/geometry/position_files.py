@@ -1,0 +1,143 @@
+"""Files of microphone positions of other programs: text tables, NumPy arrays and arrays of Acoular."""
+
+import io
+from pathlib import Path
+from typing import Final
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from ertis_numba import checks
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry.position_headings import AXES
+from ertis_numba.geometry.position_tables import PositionTable, read_position_table
+
+__all__ = ["FLAT", "SENSOR_FRAME", "layout_bytes", "layout_file_text", "read_position_file"]
+
+SENSOR_FRAME: Final = "x forward, y left, z up"
+"""Value of the attribute ``axes`` of an XML file in the sensor frame, which is not turned."""
+_MAX_BYTES: Final = 4_000_000  # 1024 microphones with long names need 100,000 bytes.
+_TURNED: Final = (
+    "a file of Acoular, whose arrays face -z with x to the right and y up, seen from behind; here, they face x with "
+    "y to the left and z up"
+)
+FLAT: Final = 1e-3
+"""Extent of an axis, relative to the largest, below which an array counts as flat."""
+
+
+def layout_bytes(path: str | Path, names: str) -> bytes:
+    """Return the content of a layout file; ``names`` are the shipped layouts, for errors.
+
+    Raises
+    ------
+    ArgumentError
+        The file cannot be read, is empty, or is too large for a layout.
+    """
+    remedy = f"give a readable file or one of {names}"
+    try:
+        with Path(path).open("rb") as file:
+            content = file.read(_MAX_BYTES + 1)
+    except OSError as error:
+        raise ArgumentError(f"layout {path}: {checks.reason_unreadable(error)}; {remedy}") from error
+    if not content.strip():
+        raise ArgumentError(f"layout {path}: the file is empty; {remedy}")
+    if len(content) > _MAX_BYTES:
+        raise ArgumentError(f"layout {path}: more than {_MAX_BYTES / 1e6:g} MB, too large for a layout; {remedy}")
+    return content
+
+
+def layout_file_text(path: str | Path, content: bytes, names: str) -> str:
+    """Return the text of a layout file in UTF-8, UTF-16 with a byte order mark, or Windows-1252.
+
+    Raises
+    ------
+    ArgumentError
+        The content is not text.
+    """
+    is_utf_16 = content[:2] in {b"\xff\xfe", b"\xfe\xff"}
+    try:
+        text = content.decode("utf-16" if is_utf_16 else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        text = content.decode("cp1252", "replace")
+        if not any(character.isdigit() for character in text):
+            reason = checks.reason_unreadable(error)
+            raise ArgumentError(f"layout {path}: {reason}; give a readable file or one of {names}") from error
+    if "\0" in text or "\N{REPLACEMENT CHARACTER}" in text:
+        raise ArgumentError(f"layout {path}: the file is binary, not text; give a readable file or one of {names}")
+    return text
+
+
+def read_position_file(path: str | Path, content: bytes, names: str) -> PositionTable:
+    """Return the positions in a file other than TOML, by its ending.
+
+    Parameters
+    ----------
+    path : str or Path
+        File with one of the endings in `ertis_numba.settings.LAYOUT_SUFFIXES`.
+    content : bytes
+        Its content.
+    names : str
+        Names of the shipped layouts, for errors.
+
+    Raises
+    ------
+    ArgumentError
+        The content has another format, or its axes or unit are unclear.
+    """
+    source, suffix = f"layout {path}", Path(path).suffix.lower()
+    if suffix == ".xml":
+        return _of_acoular(source, content)
+    if suffix == ".npy":
+        return _of_numpy(source, content)
+    return read_position_table(source, layout_file_text(path, content, names))
+
+
+def _of_numpy(source: str, content: bytes) -> PositionTable:
+    try:
+        numbers = np.load(io.BytesIO(content), allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise ArgumentError(f"{source} cannot be read as an array of NumPy; save its numbers by numpy.save") from error
+    if getattr(numbers, "ndim", 0) != 2 or numbers.shape[1] not in {2, 3} or numbers.dtype.kind not in "iuf":
+        found = f"{numbers.dtype} of shape {numbers.shape}" if isinstance(numbers, np.ndarray) else "several arrays"
+        raise ArgumentError(f"{source} contains {found}; use numbers of shape (channels, 2) or (channels, 3)")
+    checks.finite_array(source, numbers.astype(np.float64))
+    positions = np.zeros((len(numbers), len(AXES)))
+    positions[:, len(AXES) - numbers.shape[1] :] = numbers
+    return PositionTable(positions, "")
+
+
+def _of_acoular(source: str, content: bytes) -> PositionTable:
+    """Return the positions in an XML file for `acoular.MicGeom`, in metres and turned into the sensor frame.
+
+    Its arrays mostly lie in x and y. The maps and sources of Acoular's examples lie at negative z, and x points to the
+    right for an observer behind the array who looks at them.
+    """
+    try:
+        root = ET.fromstring(content)  # noqa: S314  Expat limits the expansion of entities.
+    except ET.ParseError as error:
+        raise ArgumentError(f"{source}: not XML ({error}); use a <MicArray> of Acoular, or a .csv file") from error
+    if root.tag != "MicArray":
+        raise ArgumentError(f"{source} contains <{root.tag}>; use a file of Acoular with <MicArray>")
+    rows = list(root.iter("pos"))
+    if not rows:
+        raise ArgumentError(f"{source}: no <pos>; use one <pos Name= x= y= z=> per channel")
+    positions = np.array([[_coordinate(source, row, place, axis) for axis in AXES] for place, row in enumerate(rows)])
+    if root.get("axes") == SENSOR_FRAME:
+        return PositionTable(positions, "m")
+    extent = np.ptp(positions, axis=0)
+    is_flat = extent < FLAT * extent.max()
+    if is_flat[0] and not is_flat[2]:
+        return PositionTable(positions, "m", (f"a file of Acoular; its array lies in y and z, so it faces {AXES[0]}",))
+    turned = np.column_stack([-positions[:, 2], -positions[:, 0], positions[:, 1]])
+    return PositionTable(turned, "m", (_TURNED,))
+
+
+def _coordinate(source: str, row: ET.Element, place: int, axis: str) -> float:
+    text = row.get(axis, "")
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise ArgumentError(f"{source}, <pos> {place + 1}: {axis} is {text!r:.40}; use a finite number in metres")
+    return value

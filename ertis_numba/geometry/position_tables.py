@@ -1,0 +1,273 @@
+"""Microphone positions in text tables with any usual separators, header and unit."""
+
+import csv
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import ArgumentError
+from ertis_numba.geometry.position_headings import AXES, ColumnHeading, heading, unit_in_comment, unit_named
+from ertis_numba.settings import LENGTH_UNITS_M
+
+__all__ = ["HEADER_EXAMPLES", "PositionTable", "read_position_table"]
+
+HEADER_EXAMPLES: Final = "x_m,y_m,z_m or y_mm,z_mm"
+_DECIMAL_COMMA: Final = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+_SEPARATE_NUMBERS: Final = re.compile(r"\d[ \t]+[-+.\d]")
+_MIN_COUNTED: Final = 3  # Fewer rows can have positions of 0 and 1 by chance.
+
+_Rows = Sequence[tuple[int, list[str]]]
+"""Number and cells of each line."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionTable:
+    """Positions as a file states them.
+
+    Attributes
+    ----------
+    positions : (channel, axis) float64
+        Coordinates x, y and z in the unit of the file; x is 0 if the file has none.
+    unit : str
+        Unit that the file states; empty if it states none.
+    notes : tuple of str
+        Remarks for the user; none by default.
+    """
+
+    positions: NDArray[np.float64]
+    unit: str
+    notes: tuple[str, ...] = ()
+
+
+def read_position_table(source: str, text: str) -> PositionTable:
+    """Return the positions in a table with one row per channel, in the order of the bits.
+
+    Cells are separated by commas, semicolons, tabs or spaces; a decimal comma is accepted unless commas separate. A
+    comment follows #, % or //. A header, or a comment above the positions, names the
+    axes in any order, and may state their unit, as in ``x_m``, ``y (mm)`` or ``Z [cm]``. Without a header, columns are
+    ``y, z`` or ``x, y, z``, after a column of names or numbers of the channels, if any.
+
+    Parameters
+    ----------
+    source : str
+        Name of the table in errors.
+    text : str
+
+    Raises
+    ------
+    ArgumentError
+        A cell is not a finite number, rows differ in length or order, or the axes or the unit are unclear.
+    """
+    lines, comments = _without_comments(text)
+    rows = list(_cells(lines))
+    header = _header(rows)
+    if header is not None:
+        rows = rows[1:]
+        if rows and _are_units(rows[0][1], len(header)):
+            header = [f"{name} {unit}" for name, unit in zip(header, rows[0][1], strict=True)]
+            rows = rows[1:]
+    if not rows:
+        raise ArgumentError(f"{source}: no positions; use one row per channel, y, z or x, y, z")
+    _require_widths(source, rows)
+    headings = _headings(source, header, comments, rows)
+    places = _places(source, headings)
+    positions = np.zeros((len(rows), len(AXES)))
+    for axis, place in places.items():
+        positions[:, AXES.index(axis)] = [_number(source, line, axis, cells[place]) for line, cells in rows]
+    unread = []
+    for place, column in enumerate(headings):
+        labels = [(line, float(cells[place])) for line, cells in rows if _is_number(cells[place])]
+        if place not in places.values() and labels:
+            if column.is_label and len(labels) == len(rows):
+                _require_order(source, column, labels)
+            elif not column.is_label:
+                unread.append(column.text)
+    unit = next((headings[place].unit for place in places.values() if headings[place].unit), "")
+    notes = (f"columns that are not read: {', '.join(unread)}",) if unread else ()
+    return PositionTable(positions, unit or unit_in_comment("\n".join(comments)), notes)
+
+
+def _without_comments(text: str) -> tuple[list[tuple[int, str]], list[str]]:
+    """Return the lines with content and their numbers, and the comments above the first of them."""
+    lines: list[tuple[int, str]] = []
+    comments: list[str] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        content, *comment = re.split(r"#+|%+|//+", line, maxsplit=1)
+        if content.strip():
+            if lines or not content.lower().startswith("sep="):  # as spreadsheets name the separator
+                lines.append((number, content))
+        elif not lines:
+            comments.append("".join(comment).strip())
+    return lines, comments
+
+
+def _cells(lines: Sequence[tuple[int, str]]) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the cells of each line, with decimal points; empty cells at its end are left out."""
+    delimiter = _delimiter([line for _, line in lines])
+    for number, line in lines:
+        (cells,) = csv.reader([_spaced(line) if delimiter == " " else line], delimiter=delimiter, skipinitialspace=True)
+        cells = [cell.strip().replace("\N{MINUS SIGN}", "-") for cell in cells]
+        if delimiter != ",":
+            cells = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
+        while len(cells) > 1 and not cells[-1]:
+            cells.pop()
+        yield number, cells
+
+
+def _delimiter(lines: Sequence[str]) -> str:
+    """Return the character that separates cells."""
+    if any(";" in line for line in lines):
+        return ";"
+    commas_are_decimal = all(
+        "," not in cell or _DECIMAL_COMMA.fullmatch(cell) for line in lines for cell in line.split()
+    )
+    if any("\t" in line.strip() for line in lines) and commas_are_decimal:
+        return "\t"
+    by_space = commas_are_decimal and any(_SEPARATE_NUMBERS.search(line) for line in lines)
+    return "," if any("," in line for line in lines) and not by_space else " "
+
+
+def _spaced(line: str) -> str:
+    """Return a line with single spaces between cells, and none before the unit of a heading in brackets."""
+    return re.sub(r"\s+", " ", re.sub(r"\s+(?=[\[(])", "", line.strip()))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return "_" not in cell
+
+
+def _header(rows: _Rows) -> list[str] | None:
+    """Return the cells of the header; None if the first row contains positions."""
+    if not rows:
+        return None
+    first = rows[0][1]
+    if not first[0] and first[1:] == _counted(len(first) - 1):  # as pandas numbers columns without names
+        return [""] * len(first)
+    is_header = not any(map(_is_number, first)) or any(heading(cell).axis for cell in first)
+    return first if is_header else None
+
+
+def _are_units(cells: Sequence[str], width: int) -> bool:
+    """Return True for a row of units below the header."""
+    return len(cells) == width and any(map(unit_named, cells)) and not any(map(_is_number, cells))
+
+
+def _counted(count: int, start: int = 0) -> list[str]:
+    return [str(number) for number in range(start, start + count)]
+
+
+def _require_widths(source: str, rows: _Rows) -> None:
+    first, width = rows[0][0], len(rows[0][1])
+    for line, cells in rows:
+        if len(cells) != width:
+            raise ArgumentError(
+                f"{source}, line {line}: number of cells {len(cells)}, but line {first} has {width}; use y, z or "
+                "x, y, z in every row"
+            )
+
+
+def _headings(source: str, header: list[str] | None, comments: Sequence[str], rows: _Rows) -> list[ColumnHeading]:
+    """Return the headings: those of the header, those in a comment above the positions, or the usual ones."""
+    width = len(rows[0][1])
+    if header is None or not any(header):
+        return _in_comments(comments, width) or _usual(source, rows, has_index=header is not None)
+    if len(header) == width - 1:  # R leaves out the heading of row names.
+        header = ["", *header]
+    headings = [heading(name) for name in header]
+    if not any(each.axis for each in headings):
+        raise ArgumentError(
+            f"{source}: no column of its header ({', '.join(header):.60}) is named x, y or z; name them, as in "
+            f"{HEADER_EXAMPLES}"
+        )
+    if len(header) > width and not any(each.axis for each in headings[width:]):
+        return headings[:width]
+    if len(header) != width:
+        raise ArgumentError(
+            f"{source}, line {rows[0][0]}: number of cells {width}, but the header has {len(header)}; use one cell for "
+            "each column"
+        )
+    return headings
+
+
+def _in_comments(comments: Sequence[str], width: int) -> list[ColumnHeading]:
+    """Return the headings in the last comment that has one for each column; none if there is no such comment."""
+    for comment in reversed(comments):
+        for cells in (re.split(r"[,;\t]", comment), _spaced(comment).split(" ")):
+            headings = [heading(cell.strip()) for cell in cells]
+            known = all(each.axis or each.is_label for each in headings)
+            if len(headings) == width and known and any(each.axis for each in headings):
+                return headings
+    return []
+
+
+def _usual(source: str, rows: _Rows, *, has_index: bool) -> list[ColumnHeading]:
+    """Return the headings of a table without a header: names or numbers of the channels, then y, z or x, y, z."""
+    width, first = len(rows[0][1]), [cells[0] for _, cells in rows]
+    counts = first in (_counted(len(rows)), _counted(len(rows), 1))
+    if width == len(AXES) and counts and len(rows) >= _MIN_COUNTED and not has_index:
+        raise ArgumentError(
+            f"{source}: its first column counts the rows; does it contain numbers of channels, or positions along x? "
+            "Add a header: channel,y_mm,z_mm or x_mm,y_mm,z_mm"
+        )
+    has_labels = has_index or not any(map(_is_number, first)) or (width == len(AXES) + 1 and counts)
+    n_axes = width - has_labels
+    if n_axes not in {2, 3}:
+        raise ArgumentError(
+            f"{source}, line {rows[0][0]}: number of cells {width}; use rows of y, z or x, y, z, or add a header, such "
+            f"as {HEADER_EXAMPLES}"
+        )
+    if rows[0][1] == _counted(width) and all("." in cell for _, cells in rows[1:] for cell in cells) and rows[1:]:
+        raise ArgumentError(
+            f"{source}, line {rows[0][0]}: {', '.join(rows[0][1])}; are these numbers of columns, or a position? "
+            f"Replace the line by a header, such as {HEADER_EXAMPLES}, or write decimal points"
+        )
+    return [ColumnHeading()] * has_labels + [ColumnHeading(axis, axis) for axis in AXES[-n_axes:]]
+
+
+def _places(source: str, headings: Sequence[ColumnHeading]) -> dict[str, int]:
+    """Return the column of each axis."""
+    places: dict[str, int] = {}
+    for place, column in enumerate(headings):
+        if column.axis and places.setdefault(column.axis, place) != place:
+            raise ArgumentError(f"{source}: two columns are named {column.axis}; rename or remove one")
+        if column.unit and column.unit not in LENGTH_UNITS_M:
+            raise ArgumentError(
+                f"{source}: column {column.text!r} has the unit {column.unit}; use {', '.join(LENGTH_UNITS_M)}"
+            )
+    if {*places} not in ({"y", "z"}, {"x", "y", "z"}):
+        raise ArgumentError(
+            f"{source}: its header names only {' and '.join(sorted(places))}, but x is forward, y left and z up; "
+            "which way do the microphones face? Name the columns of a flat array y and z, or add the missing column"
+        )
+    units = {headings[place].unit for place in places.values()} - {""}
+    if len(units) > 1:
+        raise ArgumentError(f"{source}: its columns have the units {', '.join(sorted(units))}; use one unit")
+    return places
+
+
+def _require_order(source: str, column: ColumnHeading, labels: Sequence[tuple[int, float]]) -> None:
+    """Refuse rows that are not in the order of their numbers, or that leave out a channel."""
+    for (_, before), (line, number) in itertools.pairwise(labels):
+        if number <= before or (column.numbers_channels and number != before + 1):
+            raise ArgumentError(
+                f"{source}, line {line}: {column.text or 'row'} {number:g} follows {before:g}, but the rows must be "
+                "the channels in ascending order; sort them, and add missing ones"
+            )
+
+
+def _number(source: str, line: int, axis: str, cell: str) -> float:
+    """Return the number in a cell."""
+    if not _is_number(cell):
+        raise ArgumentError(f"{source}, line {line}: {axis} is {cell!r:.40}; use a number")
+    if not np.isfinite(float(cell)):
+        raise ArgumentError(f"{source}, line {line}: {axis} is {cell}; use a finite number")
+    return float(cell)
