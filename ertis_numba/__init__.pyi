@@ -23,6 +23,7 @@ from .errors import (
     FormatVersionError as FormatVersionError,
     JournalInUseError as JournalInUseError,
     NetworkError as NetworkError,
+    PoseWarning as PoseWarning,
     RefusedError as RefusedError,
     SettingsError as SettingsError,
     SonarDisconnectedError as SonarDisconnectedError,

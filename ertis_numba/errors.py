@@ -17,9 +17,9 @@
     └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
         └── RefusedError                 it denies access or rejects a request
 
-Each class also inherits the built-in exception in brackets. Two warnings, both ``UserWarning``, complete them:
-``ErrorBudgetWarning`` for images that may exceed their error budget, and ``CallMismatchWarning`` for echoes that do not
-match the call.
+Each class also inherits the built-in exception in brackets. Three warnings, all ``UserWarning``, complete them:
+``ErrorBudgetWarning`` for images that may exceed their error budget, ``CallMismatchWarning`` for echoes that do not
+match the call, and ``PoseWarning`` for poses that tilt a platform by more than 30°.
 """
 
 __all__ = [
@@ -35,6 +35,7 @@ __all__ = [
     "FormatVersionError",
     "JournalInUseError",
     "NetworkError",
+    "PoseWarning",
     "RefusedError",
     "SettingsError",
     "SonarDisconnectedError",
@@ -104,3 +105,7 @@ class ErrorBudgetWarning(UserWarning):
 
 class CallMismatchWarning(UserWarning):
     """Echoes do not match the call in the settings, so that ranges in images are wrong."""
+
+
+class PoseWarning(UserWarning):
+    """Most poses tilt a platform by more than 30°, as those of a camera do, so that its map may be wrong."""

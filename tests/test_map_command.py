@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
+from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
 from ertis_numba.campaign import find_recordings
@@ -59,7 +60,7 @@ def poses(*, start_ns=0, x_m=10.0):
 
 
 def run(folder, line, *, code=0):
-    arguments = [str(folder / each) if re.search(r"\.(h5|tum|pgm|ply)$", each) else each for each in line.split()]
+    arguments = [str(folder / each) if re.search(r"\.(h5|tum|txt|pgm|ply)$", each) else each for each in line.split()]
     done = CliRunner().invoke(cli, ["map", *arguments])
     assert done.exit_code == code, done.output
     return done
@@ -255,6 +256,47 @@ def test_map_leaves_out_pulses_outside_of_the_poses(folder):
     assert json.loads(done.stdout)["left_out"] == 1
 
 
+def of_camera(trajectory):
+    """Return the poses of a camera that looks ahead on the platform."""
+    optical = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    return trajectory.replace(rotation_xyzw=(Rotation.from_quat(trajectory.rotation_xyzw) * optical).as_quat())
+
+
+def test_map_notes_poses_of_a_camera_and_converts_them(folder):
+    ertis.write_tum(folder / "camera.tum", of_camera(poses()))
+    add_poses(folder / "both.h5", of_camera(poses()), output=folder / "of_camera.h5")
+    note = "its −y axis points up, as that of a camera (z forward, y down); choose the axes camera (--pose-axes of "
+    run(folder, "both.h5 --poses poses.tum -q -o level.h5")
+    for number, line in enumerate(("both.h5 --poses camera.tum", "of_camera.h5")):
+        done = run(folder, f"{line} -o turned{number}.h5")
+        assert done.stderr.count(note) == 1
+        assert "PoseWarning" not in done.stderr
+        done = run(folder, f"{line} -o converted{number}.h5 --pose-axes camera")
+        assert "note" not in done.stderr
+        maps = [ertis.read_map(folder / name) for name in ("level.h5", f"converted{number}.h5")]
+        assert maps[0].log_odds.shape == maps[1].log_odds.shape
+        assert maps[0].log_odds == pytest.approx(maps[1].log_odds, abs=1e-4)
+    done = CliRunner().invoke(cli, ["info", str(folder / "of_camera.h5"), "--json"])
+    assert note in json.loads(done.stdout)["sensors"][0]["pose_warning"]
+    done = CliRunner().invoke(
+        cli, ["process", str(folder / "of_camera.h5"), "-o", str(folder / "l.h5"), "--level", "-q"]
+    )
+    assert (
+        f"sensor left: most poses tilt the platform by more than 30°: its z axis is 90° from vertical, and {note}"
+        in done.stderr
+    )
+
+
+def test_map_reads_poses_of_kitti_with_their_times(folder):
+    (folder / "kitti.txt").write_text("".join("1 0 0 0 0 1 0 0 0 0 1 0\n" for _ in range(2)))
+    (folder / "times.txt").write_text("0.0\n1.0\n")
+    assert "no times; give the file of their times" in run(folder, "both.h5 --poses kitti.txt -o k.h5", code=1).stderr
+    run(folder, "both.h5 --poses kitti.txt -o k.h5 --times times.txt --pose-axes camera-world")
+    (folder / "ms.tum").write_text("0 10 0 0 0 0 0 1\n1000 10 0 0 0 0 0 1\n")
+    assert "times from 0 to 1000 read as seconds" in run(folder, "both.h5 --poses ms.tum -o m.h5").stderr
+    assert "note" not in run(folder, "both.h5 --poses ms.tum -o s.h5 --time-unit ms").stderr
+
+
 def test_map_states_pulses_between_distant_poses(folder):
     few = poses()
     ertis.write_tum(folder / "few.tum", few.replace(time_ns=2 * few.time_ns))
@@ -281,6 +323,7 @@ def test_map_refuses_poses_at_other_times(folder):
             "suffix of the map '.tif' is unknown; known are .h5, .mcap, .pgm, .ply",
         ),
         ("both.h5 --poses none.tum", 1, "none.tum"),
+        ("both.h5 --time-unit ms", 2, "--time-unit requires --poses; add --poses FILE, or remove --time-unit"),
         ("both.h5 --poses poses.tum --probabilities -o place.h5", 1, "leave out probabilities, or choose a name"),
         ("passive.h5 --poses poses.tum", 1, "passive.h5: all measurements are passive and have no echoes"),
         ("both.h5 --poses poses.tum --cell 0", 2, "--cell"),

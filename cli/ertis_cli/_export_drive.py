@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _pulses, _results
+from ertis_cli import _poses, _pulses, _results
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -121,11 +121,11 @@ def drive_of(
     DataError
         A file cannot be read, or no motion could be measured.
     """
-    from ertis_numba import load_scene, read_trajectory
+    from ertis_numba import load_scene
     from ertis_numba.errors import ArgumentError
     from ertis_numba.interop import Drive
 
-    true = ears.trajectory if poses is None else read_trajectory(poses)
+    true = ears.trajectory if poses is None else _poses.trajectory_of(poses, quiet=quiet)
     if true is None:
         raise ArgumentError(
             f"{ears.path} has no poses; give true ones with --poses TRAJ, or without ground truth the output of "
@@ -135,7 +135,7 @@ def drive_of(
         poses=true,
         odometry=_measured(readers, ears, chosen, known, quiet=quiet)
         if odometry is None
-        else read_trajectory(odometry),
+        else _poses.trajectory_of(odometry, quiet=quiet),
         scene=None if scene is None else load_scene(scene),
         beam_azimuth_deg=beam_azimuth_deg,
     )

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _poses, options
 
 if TYPE_CHECKING:
     from ertis_numba.frames import Trajectory
@@ -28,7 +28,7 @@ _MAX_OFFSET_S = 4e9  # Covers clocks that count from another year; times remain 
     metavar="S",
     help="Seconds to add to the times of the trajectory, if its clock differs from that of the recording.",
 )
-@click.option("--topic", metavar="NAME", help="Topic of an MCAP file; the only one with poses by default.")
+@_poses.reading
 @click.option(
     "--output",
     "-o",
@@ -45,26 +45,27 @@ def import_poses(
     path: Path,
     trajectory_file: Path,
     offset_s: float,
-    topic: str | None,
     target: Path | None,
     force: bool,
     quiet: bool,
     as_json: bool,
+    **reading: Any,
 ) -> None:
     """Add the poses of a platform to recordings.
 
-    TRAJ is a text file of TUM (.tum, .txt), a table (.csv), or messages of ROS 2 (.mcap). The trajectory is
-    interpolated at the times of the measurements of all sensors, and must cover them. A note states the number of
-    poses that were interpolated between poses more than a second apart. A folder stands for its recordings (*.h5). A
-    recording is replaced only when the new one is complete.
+    TRAJ is a text file of TUM (.tum, .txt), a table (.csv) such as those of EuRoC, poses of KITTI with --times, or
+    messages of ROS 2 (.mcap). The trajectory is interpolated at the times of the measurements of all sensors, and must
+    cover them. Notes state rows that were left out, and the number of poses that were interpolated between poses more
+    than a second apart. A folder stands for its recordings (*.h5). A recording is replaced only when the new one is
+    complete.
     """
-    from ertis_numba import checks, read_trajectory
+    from ertis_numba import checks
     from ertis_numba.atomic_files import make_folder
     from ertis_numba.storage import add_poses, check_target, recorded_trajectory, require_fitting_poses
     from ertis_numba.storage.poses import count_in_gaps
 
     checks.between("offset_s", offset_s, -_MAX_OFFSET_S, _MAX_OFFSET_S)
-    given = read_trajectory(trajectory_file, topic=topic)
+    given = _poses.trajectory_of(trajectory_file, quiet=quiet, **reading)
     shifted: Trajectory = given.replace(time_ns=given.time_ns + round(offset_s * _NS_PER_S))
     recordings = _recordings(path)
     outputs = _outputs(recordings, target, is_folder=path.is_dir())
@@ -84,7 +85,14 @@ def import_poses(
         if n_in_gaps:
             between = f"poses of {trajectory_file} more than a second apart"
             options.say(f"note: {n_in_gaps} of {count} interpolated between {between}", quiet=quiet)
-        reports.append({"output": str(written), "poses": len(poses), "path_length_m": round(poses.length_m, 6)})
+        reports.append(
+            {
+                "output": str(written),
+                "poses": len(poses),
+                "path_length_m": round(poses.length_m, 6),
+                "notes": list(given.notes),
+            }
+        )
     if as_json:
         for report in reports:
             options.print_json(report)

@@ -1,12 +1,13 @@
 """``ertis map``: occupancy maps from recordings and the poses of their platform."""
 
+import warnings
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _pulses, options
+from ertis_cli import _poses, _pulses, options
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,6 +28,7 @@ __all__ = ["mapping"]
     metavar="FILE",
     help="Poses of the platform in the world frame, .tum, .csv or .mcap; those of the recordings by default.",
 )
+@_poses.reading
 @options.output("Map to write: .h5, .ply, .mcap, or .pgm with a .yaml for ROS; REC.map.h5 by default.")
 @click.option(
     "--dimensions",
@@ -88,6 +90,7 @@ def mapping(
     force: bool,
     quiet: bool,
     as_json: bool,
+    **reading: Any,
 ) -> None:
     """Compute an occupancy map from recordings and poses.
 
@@ -95,6 +98,7 @@ def mapping(
     'ertis process --fuse'. Images of 'ertis process' are used as they are. Cells with echoes become occupied, and cells
     in front of the first clear echo of a direction become free. Pulses outside of the time of the poses are left out.
     """
+    from ertis_numba.errors import PoseWarning
     from ertis_numba.interop import map_files, write_map
     from ertis_numba.mapping import Mapper
     from ertis_numba.storage import check_target
@@ -105,7 +109,7 @@ def mapping(
 
     with ExitStack() as stack:
         readers = _pulses.open_sensors(paths, stack, images=True)
-        trajectory = _trajectory(poses_file, paths)
+        trajectory = _trajectory(poses_file, paths, quiet=quiet, **reading)
         changed = _pulses.image_settings(settings_file, preset)
         pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
         mapper = Mapper(
@@ -121,7 +125,10 @@ def mapping(
         located = _located(groups, trajectory)
         _note_gaps(located, trajectory, quiet=quiet)
         by_name = {reader.sensor: reader for reader in readers}
-        with options.progress(located, length=len(located), label="mapping", quiet=quiet) as shown:
+        with (
+            options.progress(located, length=len(located), label="mapping", quiet=quiet) as shown,
+            warnings.catch_warnings(category=PoseWarning, action="ignore"),  # A note says the same.
+        ):
             for group in shown:
                 mapper.add([pipelines.image(by_name[name][place.index]) for name, place in group.items()], trajectory)
     occupancy = mapper.map
@@ -131,7 +138,10 @@ def mapping(
     if len(located) < len(groups):
         left_out = options.counted(len(groups) - len(located), "pulse")
         options.say(f"note: {left_out} of {len(groups)} outside of the time of the poses left out", quiet=quiet)
-    report = _report(written, readers, occupancy) | {"left_out": active.n_passive + len(groups) - len(located)}
+    report = _report(written, readers, occupancy) | {
+        "left_out": active.n_passive + len(groups) - len(located),
+        "notes": list(trajectory.notes),
+    }
     size = " × ".join(f"{side_m:.2f}" for side_m in report["size_m"])
     options.say(
         f"{target}: {options.counted(len(located), 'pulse')}, {size} m, {report['occupied']} cells occupied, "
@@ -156,27 +166,38 @@ def _report_heights(occupancy: "OccupancyMap", height_m: tuple[float, float], *,
     options.say(f"note: {reason}", quiet=quiet)
 
 
-def _trajectory(poses_file: Path | None, paths: "Sequence[Path]") -> "Trajectory":
-    """Return the poses of a file, or else those of the recordings.
+def _trajectory(
+    poses_file: Path | None, paths: "Sequence[Path]", *, quiet: bool, pose_axes: Any, **reading: Any
+) -> "Trajectory":
+    """Return the poses of a file, or else those of the recordings, and print notes on them.
 
     Raises
     ------
     UsageError
-        There are none.
+        There are none, or an option is for files only.
     """
+    from ertis_numba.frames.platform_tilt import tilt_note
     from ertis_numba.storage import platform_trajectory
 
     if poses_file is not None:
-        from ertis_numba import read_trajectory
-
-        return read_trajectory(poses_file)
+        return _poses.trajectory_of(poses_file, quiet=quiet, pose_axes=pose_axes, **reading)
+    for name, value in reading.items():
+        if value is not None:
+            option = f"--{name.replace('_', '-')}"
+            raise click.UsageError(
+                f"{option} requires --poses; add --poses FILE, or remove {option}", click.get_current_context()
+            )
     found = platform_trajectory(paths)
-    if found is not None:
-        return found
-    raise click.UsageError(
-        f"{paths[0]} contains no poses of the platform; give --poses FILE, or add them to the recording",
-        click.get_current_context(),
-    )
+    if found is None:
+        raise click.UsageError(
+            f"{paths[0]} contains no poses of the platform; give --poses FILE, or add them to the recording",
+            click.get_current_context(),
+        )
+    found = found.converted(pose_axes)
+    note = tilt_note(found.rotation_xyzw, found.position_m)
+    found = found.replace(notes=(note,) if note else ())
+    _poses.print_notes(paths[0], found.notes, quiet=quiet)
+    return found
 
 
 def _located(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajectory") -> "list[dict[str, StampedIndex]]":

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement, Stamp
+from ertis_numba.frames.platform_tilt import tilt_note
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.storage import RecordingReader
 
@@ -26,6 +27,11 @@ class Attitudes:
         Stamps of the measurements.
     rotation_xyzw : sequence of 4 float, optional
         Rotation of the sensor on its platform; that of the recording by default.
+
+    Attributes
+    ----------
+    note : str or None
+        Note that most poses tilt the platform by more than 30°, if they do.
 
     Raises
     ------
@@ -53,7 +59,9 @@ class Attitudes:
                 f"{name} has no pose at {n_missing} of {len(stamps)} measurements; add poses with 'ertis "
                 "import-poses', or leave out --level"
             )
-        platform = Rotation.from_quat(recording.trajectory.at(times_ns).rotation_xyzw)
+        poses = recording.trajectory.at(times_ns)
+        self.note = tilt_note(poses.rotation_xyzw, poses.position_m)
+        platform = Rotation.from_quat(poses.rotation_xyzw)
         self._attitudes = dict(zip(times_ns.tolist(), (platform * Rotation.from_quat(place)).as_quat(), strict=True))
 
     def __call__(self, measurement: Measurement) -> NDArray[np.float64]:

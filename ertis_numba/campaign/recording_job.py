@@ -97,7 +97,8 @@ def prepare_recording(
         Limit on images that wait to be written, in bytes. See `SensorProcessing`.
     warn : callable
         Called with a line for each sensor that has faulty microphones, whose echoes do not match the call, or whose
-        images may exceed the error budget, and for each sensor with passive measurements, which are left out.
+        images may exceed the error budget, and for each sensor with passive measurements, which are left out, or with
+        level directions from poses that tilt the platform by more than 30°.
     show : callable
         Called with the name of a sensor and each result about its plan.
 
@@ -136,6 +137,9 @@ def prepare_recording(
             recording.attitudes(options.mounting) if each.processing.level_directions else None
             for recording, each in zip(recordings, chosen, strict=True)
         ]
+        for recording, attitudes in zip(recordings, levelled, strict=True):
+            if attitudes is not None and attitudes.note:
+                warn(f"{path}: sensor {recording.sensor}: {attitudes.note}")
         checks = _begin_checks(stack, recordings, chosen)
         runs = [
             SensorProcessing(pipeline, batch=options.batch, max_bytes=max_bytes, attitudes=attitudes)

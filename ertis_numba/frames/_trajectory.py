@@ -1,7 +1,7 @@
 """Trajectories: poses of a platform at increasing times."""
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,8 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames._replacing import replaced
+from ertis_numba.frames.platform_tilt import POSE_AXES, turned_axes
 
-__all__ = ["Trajectory"]
+__all__ = ["PoseAxes", "Trajectory"]
+
+PoseAxes: TypeAlias = Literal["platform", "camera", "camera-world"]
+"""Axes of the frame to which poses belong."""
 
 _NS_PER_S: Final = 1e9
 _MAX_TIME_NS: Final = 2**62  # Differences of such times fit into 64 bits.
@@ -43,6 +47,8 @@ class Trajectory:
     max_gap_s : float or None, default None
         Longest interval between two poses in which poses are interpolated, in seconds. Longer intervals have no poses.
         None allows any interval.
+    notes : tuple of str, default ()
+        Findings of `read_trajectory` that matter to users, such as rows left out. Other trajectories have none.
 
     Raises
     ------
@@ -66,6 +72,7 @@ class Trajectory:
     covariance: NDArray[np.float64] | None = None
     source: str = ""
     max_gap_s: float | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         time_ns = _times("time_ns", self.time_ns)
@@ -140,6 +147,40 @@ class Trajectory:
             There is no such field, or a value cannot be used.
         """
         return replaced("Trajectory", self, changes)
+
+    def converted(self, pose_axes: PoseAxes) -> "Trajectory":
+        """Return the poses of a platform, for poses of a frame with other axes.
+
+        Parameters
+        ----------
+        pose_axes : {"platform", "camera", "camera-world"}
+            Axes of this trajectory. "platform": x forward, y left, z up, which changes nothing. "camera": z forward, x
+            right, y down, in a world whose z axis is up. "camera-world": the world has the axes of a camera as well, as
+            in KITTI and in visual odometry whose world is its first camera.
+
+        Returns
+        -------
+        Trajectory
+
+        Raises
+        ------
+        ArgumentError
+            The axes are unknown.
+
+        Examples
+        --------
+        >>> from ertis_numba import Trajectory
+        >>> ahead = Trajectory([0, 1], [[0, 0, 0], [0, 0, 2]], [[0, 0, 0, 1]] * 2)
+        >>> ahead.converted("camera-world").position_m.tolist()
+        [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
+        """
+        checks.choice("pose_axes", pose_axes, POSE_AXES)
+        rotation_xyzw, world = turned_axes(self.rotation_xyzw, pose_axes)
+        covariance = self.covariance
+        if covariance is not None:
+            both = np.kron(np.eye(2), world)
+            covariance = both @ covariance @ both.T
+        return self.replace(position_m=self.position_m @ world.T, rotation_xyzw=rotation_xyzw, covariance=covariance)
 
     def at(self, time_ns: ArrayLike) -> "Trajectory":
         """Return the poses interpolated at other times.

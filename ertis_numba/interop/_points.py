@@ -115,7 +115,7 @@ def _rows(cloud: PointCloud, number: int, mountings: Mountings) -> NDArray[np.vo
         cloud = cloud.replace(translation_m=translation_m, rotation_xyzw=rotation_xyzw)
         position_m = cloud.on_platform_m()
     else:
-        position_m = cloud.position_m
+        position_m = cloud.position_m.astype(np.float64)
     made["x"], made["y"], made["z"] = position_m.T
     made["intensity"] = cloud.amplitude
     unknown_m = np.full((len(cloud), 2), np.nan, dtype=np.float32)

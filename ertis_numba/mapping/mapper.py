@@ -15,6 +15,7 @@ from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.fusion.fuser import EMITTER_DIAMETER_M
 from ertis_numba.fusion.rig import Mountings, mounted_sensors
 from ertis_numba.geometry import mounting
+from ertis_numba.mapping.attitude_check import AttitudeCheck
 from ertis_numba.mapping.cell_grid import CellGrid
 from ertis_numba.mapping.coverage import Coverage
 from ertis_numba.mapping.echoes import LocatedEchoes, UsualAmplitude, View, displaced_covariance, echoes_of
@@ -101,6 +102,7 @@ class Mapper:
         self._usual = UsualAmplitude()
         self._coverages: dict[tuple[tuple[str, float, float], ...], Coverage] = {}
         self._n_groups, self._time_ns, self._n_points = 0, 0, 0
+        self._attitude = AttitudeCheck()
 
     @property
     def map(self) -> OccupancyMap:
@@ -136,6 +138,11 @@ class Mapper:
         DataError
             The images are not from the same pulse, no sensor emitted, the trajectory is too fast, or with a half-life,
             the time of the images is before that of earlier ones.
+
+        Warns
+        -----
+        PoseWarning
+            Most poses tilt the platform by more than 30°, or the path is steeper than 30°. Issued once.
         """
         group = tuple(checks.items("images", images, Energyscape, "Pipeline.process returns"))
         if self._dimensions == 3 and any(image.is_planar for image in group):
@@ -146,6 +153,7 @@ class Mapper:
         fused = self._fuser(group) if fused is None else fused
         time_ns = fused.image.stamp.timestamp_ns
         translation_m, rotation, covariance = _pose(pose, time_ns)
+        self._attitude(pose, translation_m, rotation)
         coverage = self._coverage(group)
         view = self._view(translation_m, rotation, covariance)
         window = self._grid.window(view.place_m, coverage.reach_m)

@@ -1,0 +1,55 @@
+"""Options of commands that read the poses of a platform from a file."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ertis_cli import options
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ertis_numba.frames import Trajectory
+
+__all__ = ["print_notes", "reading", "trajectory_of"]
+
+
+def reading(command: "Callable[..., Any]") -> "Callable[..., Any]":
+    """Add the options of `trajectory_of`."""
+    for option in (
+        click.option(
+            "--pose-axes",
+            type=click.Choice(("platform", "camera", "camera-world")),
+            default="platform",
+            show_default=True,
+            help="Axes of the poses in a file: platform has x forward and z up. camera has z forward and y down, in a "
+            "world with z up. In camera-world, the world has the axes of a camera as well.",
+        ),
+        click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Times of poses of KITTI."),
+        click.option(
+            "--time-unit",
+            type=click.Choice(("s", "ms", "us", "ns")),
+            help="Unit of times in a file of poses that states none; found from their magnitude by default.",
+        ),
+        click.option(
+            "--topic", metavar="NAME", help="Topic of an MCAP file of poses; the only one with poses by default."
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def trajectory_of(path: Path, *, quiet: bool, **chosen: Any) -> "Trajectory":
+    """Return the trajectory in a file, and print its notes."""
+    from ertis_numba import read_trajectory
+
+    found = read_trajectory(path, **chosen)
+    print_notes(path, found.notes, quiet=quiet)
+    return found
+
+
+def print_notes(path: Path, notes: tuple[str, ...], *, quiet: bool) -> None:
+    """Print the notes of a trajectory."""
+    for note in notes:
+        options.say(f"note: {path}: {note}", quiet=quiet)

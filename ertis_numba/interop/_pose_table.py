@@ -1,0 +1,262 @@
+"""Poses in text files: TUM, tables with a header such as those of EuRoC, and KITTI."""
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import DataError
+from ertis_numba.interop._pose_rows import PoseRows
+from ertis_numba.interop._pose_times import times_of
+
+__all__ = ["TUM", "read_table"]
+
+Floats = NDArray[np.float64]
+Row = tuple[int, list[str]]
+"""Number of a line, and its cells."""
+
+TUM: Final = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
+"""Columns of a text file of TUM."""
+_N_KITTI: Final = 12
+_DIGITS_OF_NS: Final = 17
+_COLUMNS: Final = "time_ns or time_s, x_m, y_m, z_m (optional), and either qx, qy, qz, qw or yaw_deg"
+_TIME: Final = re.compile(r"(?:time|timestamp|stamp|t)(?:_(s|ms|us|ns))?")
+_POSITION: Final = re.compile(r"(?:([xyz])_m|t([xyz])|p_([xyz])|p_rs_r_([xyz]))")
+_IN_METRES: Final = re.compile(r"(?:p|pos|position|t)?_?([xyz])")
+_ROTATION: Final = re.compile(r"(?:q|q_|q_rs_|quat_|rot_|rotation_|orientation_)([xyzw])")
+_NAMED: Final = re.compile(r"([^\[(]+?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?")  # name [unit]
+_SENSORS: Final = {"w_rs_s_x": "an IMU", "a_rs_s_x": "an IMU", "filename": "a camera"}
+
+
+class _Columns(NamedTuple):
+    """Places of the columns in a row."""
+
+    time: int
+    unit: str | None
+    axes: dict[str, int]
+    quaternion: dict[str, int]
+    yaw_deg: int | None
+    n_fields: int
+
+    @property
+    def is_complete(self) -> bool:
+        has_rotation = len(self.quaternion) == len("xyzw") or (self.yaw_deg is not None and not self.quaternion)
+        return self.time >= 0 and {*"xy"} <= self.axes.keys() and has_rotation
+
+
+_ORDER_OF_TUM: Final = _Columns(0, None, {"x": 1, "y": 2, "z": 3}, {"x": 4, "y": 5, "z": 6, "w": 7}, None, len(TUM))
+
+
+def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: str | None = None) -> PoseRows:
+    """Return the poses of a text.
+
+    Parameters
+    ----------
+    text : str
+    needs_header : bool
+        Refuse rows without a line that names the columns, instead of reading them as TUM or KITTI.
+    time_unit : {"s", "ms", "us", "ns"} or None
+        Unit of times whose column states none; by their magnitude if None.
+    times : str, optional
+        Text with one time per pose, for poses of KITTI.
+
+    Raises
+    ------
+    DataError
+        The text contains no poses, or a line is not understood.
+    """
+    columns, rows = _header(text, needs_header=needs_header)
+    if not rows:
+        raise DataError("there are no poses; give at least one")
+    n_fields = len(rows[0][1])
+    if columns is None and n_fields == _N_KITTI and not needs_header:
+        return _kitti(rows, time_unit, times)
+    if times is not None:
+        raise DataError(f"a file of times is for poses of KITTI, but the rows have {n_fields} fields; leave it out")
+    if columns is None:
+        columns = _without_header(rows[0], text, needs_header=needs_header)
+    for number, row in rows:
+        if len(row) != columns.n_fields:
+            is_tum = columns is _ORDER_OF_TUM
+            wanted = f"{len(TUM)}: {' '.join(TUM)}" if is_tum else f"{columns.n_fields} as in the first line"
+            raise DataError(f"line {number} has {len(row)} fields; give {wanted}")
+    if time_unit is not None and columns.unit is not None and time_unit != columns.unit:
+        raise DataError(f"the file states times in {columns.unit}, but time_unit is {time_unit}; leave it out")
+    time_ns, notes = times_of([(number, row[columns.time]) for number, row in rows], columns.unit or time_unit)
+    position_m = np.zeros((len(rows), 3))
+    for axis, place in columns.axes.items():
+        position_m[:, "xyz".index(axis)] = _numbers(rows, place)
+    return PoseRows("line", _line_numbers(rows), time_ns, position_m, _rotations(rows, columns), None, notes)
+
+
+def _header(text: str, *, needs_header: bool) -> tuple[_Columns | None, list[Row]]:
+    """Return the columns that a header names, also in a comment, and the rows below it."""
+    columns: _Columns | None = None
+    rows: list[Row] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        content = line.split("#", 1)[0].strip()
+        if not rows and columns is None:
+            names = _cells(line.strip().lstrip("#%").strip())
+            is_stated = bool(content) and (needs_header or not any(map(_is_number, names)))
+            _require_no_sensor(names)
+            found = _columns(names, is_stated=is_stated, in_metres=not needs_header)
+            if found.is_complete or is_stated:
+                columns = _checked(found, names)
+                continue
+        if content and not content.startswith("%"):
+            rows.append((number, _cells(content)))
+    if needs_header and columns is None:
+        raise DataError(f"the first line names the columns none; give {_COLUMNS}")
+    return columns, rows
+
+
+def _cells(line: str) -> list[str]:
+    """Return the cells of a line, which semicolons, commas or spaces separate."""
+    separator = next((each for each in ";," if each in line), None)
+    cells = [cell.strip().strip('"').strip() for cell in line.split(separator)]
+    return [cell.replace(",", ".") for cell in cells] if separator == ";" else cells  # 1,5;2,0 has decimal commas.
+
+
+def _columns(names: Sequence[str], *, is_stated: bool, in_metres: bool) -> _Columns:
+    """Return the places of known columns; refuse ambiguous ones if they are stated to be a header.
+
+    With ``in_metres``, positions without a unit are in metres, as in TUM.
+    """
+    time, unit, yaw = -1, None, None
+    axes: dict[str, int] = {}
+    quaternion: dict[str, int] = {}
+    repeated: list[str] = []
+    for place, full in enumerate(names):
+        named = _NAMED.fullmatch(full)
+        name, bracket = (named[1].lower(), (named[2] or "").lower()) if named else (full.lower(), "")
+        name = name.replace(".", "_")
+        if found := _TIME.fullmatch(name):
+            repeated += [full] * (time >= 0)
+            time, unit = place, found[1] or (bracket if bracket in {"s", "ms", "us", "ns"} else None)
+        elif found := _POSITION.fullmatch(name) or _IN_METRES.fullmatch(name):
+            if bracket != "m" and not in_metres and not _POSITION.fullmatch(name):
+                continue  # Its unit is unknown.
+            if bracket not in {"", "m"}:
+                raise DataError(f"column {full!r} is not in metres; convert it, and name it {name[-1]}_m")
+            axis = next(filter(None, found.groups()))
+            repeated += [full] * (axis in axes)
+            axes[axis] = place
+        elif found := _ROTATION.fullmatch(name):
+            repeated += [full] * (found[1] in quaternion)
+            quaternion[found[1]] = place
+        elif name == "yaw_deg":
+            repeated += [full] * (yaw is not None)
+            yaw = place
+    if repeated and is_stated:
+        raise DataError(f"the first line names the columns {', '.join(names)}; give each once, and one time")
+    return _Columns(-1 if repeated else time, unit, axes, quaternion, yaw, len(names))
+
+
+def _checked(columns: _Columns, names: Sequence[str]) -> _Columns:
+    """Refuse a header without poses."""
+    if not columns.is_complete:
+        raise DataError(f"the first line names the columns {', '.join(names)}; give {_COLUMNS}")
+    return columns
+
+
+def _require_no_sensor(names: Sequence[str]) -> None:
+    """Refuse the header of a sensor of EuRoC."""
+    for name in names:
+        sensor = _SENSORS.get(name.split(" [")[0].lower())
+        if sensor is not None:
+            raise DataError(
+                f"the file holds measurements of {sensor}, but no poses; give the poses of the same data set, such as "
+                "state_groundtruth_estimate0/data.csv of EuRoC"
+            )
+
+
+def _without_header(first: Row, text: str, *, needs_header: bool) -> _Columns:
+    """Return the columns of rows without a header: those of TUM.
+
+    Raises
+    ------
+    DataError
+        The order of the columns is unknown.
+    """
+    number, cells = first
+    if needs_header:
+        raise DataError(f"the first line names the columns {', '.join(cells)}; give {_COLUMNS}")
+    if len(cells) > len(TUM):
+        raise DataError(
+            f"line {number} has {len(cells)} fields; give {len(TUM)}: {' '.join(TUM)}, or name all columns in a first "
+            "line, as in 'timestamp tx ty tz qx qy qz qw other'"
+        )
+    if "," in text.splitlines()[number - 1] and len(cells[0].split(".")[0]) > _DIGITS_OF_NS:
+        raise DataError(
+            f"line {number} may have the order of TUM or that of EuRoC, w x y z; name the columns in a first line, as "
+            "in 'timestamp,tx,ty,tz,qx,qy,qz,qw'"
+        )
+    return _ORDER_OF_TUM
+
+
+def _kitti(rows: list[Row], time_unit: str | None, times: str | None) -> PoseRows:
+    """Return poses of KITTI: the first three rows of a matrix of 4 × 4 in each line."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  importing it takes longer than this package
+
+    if times is None:
+        raise DataError(
+            "the rows have 12 fields, as poses of KITTI, and no times; give the file of their times, such as times.txt "
+            "(times, --times)"
+        )
+    cells = [(number, cells[0]) for number, cells in _lines(times)]
+    if len(cells) != len(rows):
+        raise DataError(f"there are {len(rows)} poses, but {len(cells)} times; give the times of the same drive")
+    time_ns, notes = times_of(cells, time_unit)
+    for number, row in rows:
+        if len(row) != _N_KITTI:
+            raise DataError(f"line {number} has {len(row)} fields; give {_N_KITTI} as in the first line")
+    matrix = np.stack([_numbers(rows, place) for place in range(_N_KITTI)], axis=1).reshape(-1, 3, 4)
+    turns = matrix[:, :, :3]
+    wrong = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 0.05
+    wrong |= np.linalg.det(turns) < 0
+    if wrong.any():
+        raise DataError(f"line {rows[int(np.argmax(wrong))][0]}: the matrix of KITTI is no rotation; correct the pose")
+    is_known = np.isfinite(turns).all(axis=(1, 2))
+    rotation_xyzw = np.full((len(rows), 4), np.nan)
+    rotation_xyzw[is_known] = Rotation.from_matrix(turns[is_known]).as_quat()
+    return PoseRows("line", _line_numbers(rows), time_ns, matrix[:, :, 3].copy(), rotation_xyzw, None, notes)
+
+
+def _lines(text: str) -> Iterator[Row]:
+    for number, line in enumerate(text.splitlines(), 1):
+        content = line.split("#", 1)[0].strip()
+        if content:
+            yield number, _cells(content)
+
+
+def _rotations(rows: list[Row], columns: _Columns) -> Floats:
+    if columns.yaw_deg is None:
+        return np.stack([_numbers(rows, columns.quaternion[axis]) for axis in "xyzw"], axis=1)
+    half_rad = np.radians(_numbers(rows, columns.yaw_deg)) / 2
+    level = np.zeros(len(half_rad))
+    return np.stack([level, level, np.sin(half_rad), np.cos(half_rad)], axis=1)
+
+
+def _numbers(rows: list[Row], place: int) -> Floats:
+    """Return the numbers of a column; NaN for empty cells."""
+    found = []
+    for number, cells in rows:
+        try:
+            found.append(float(cells[place] or "nan"))
+        except ValueError as error:
+            raise DataError(f"line {number}: {error}; give decimal numbers") from None
+    return np.array(found, np.float64)
+
+
+def _line_numbers(rows: list[Row]) -> NDArray[np.int64]:
+    return np.array([number for number, _ in rows], np.int64)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,96 @@
+"""Times of poses in text, and their unit."""
+
+import itertools
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from decimal import Decimal
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.errors import DataError
+
+__all__ = ["TIME_UNITS", "times_of"]
+
+TIME_UNITS: Final = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+"""Nanoseconds in each unit of times."""
+_NAMES: Final = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+_FIRST_S: Final = 10**8  # Year 1973: times before it count from a start. The ranges of units do not overlap.
+_MAX_NS: Final = 2**62  # As for Trajectory.
+_LONG_S: Final = 10.0  # Interval between poses that is doubtful.
+
+
+def times_of(cells: Sequence[tuple[int, str]], unit: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """Return times in nanoseconds, and notes on their unit.
+
+    Parameters
+    ----------
+    cells : sequence of (line, text)
+    unit : {"s", "ms", "us", "ns"} or None
+        None chooses the unit in which the times lie between 1973 and 2116, and seconds for smaller ones.
+
+    Raises
+    ------
+    DataError
+        A time is no number, has no plausible unit, or is beyond the year 2116.
+    """
+    times = [_decimal(*cell) for cell in cells]
+    notes: tuple[str, ...] = ()
+    if unit is None:
+        unit, notes = _unit_of(times)
+    times_ns = []
+    for (line, text), value in zip(cells, times, strict=True):
+        time_ns = int((value * TIME_UNITS[unit]).to_integral_value()) if abs(value) < _MAX_NS else _MAX_NS + 1
+        if abs(time_ns) > _MAX_NS:
+            raise DataError(
+                f"line {line}: time {text} in {_NAMES[unit]} is beyond the year 2116; give seconds or nanoseconds "
+                "since 1970, or choose the unit (time_unit, --time-unit)"
+            )
+        times_ns.append(time_ns)
+    return np.array(times_ns, np.int64), notes
+
+
+def _decimal(line: int, text: str) -> Decimal:
+    """Return a time as a decimal number, which keeps nanoseconds, unlike float64."""
+    try:
+        value = Decimal(text)
+        if value.is_finite() and (not value or abs(value.adjusted()) < 400):
+            return value
+    except ArithmeticError:
+        pass
+    raise DataError(f"line {line}: time {text!r} is not a number; give a decimal number")
+
+
+def _unit_of(times: Sequence[Decimal]) -> tuple[str, tuple[str, ...]]:
+    """Return the unit of times by their magnitude, and notes if it is not that of seconds since 1970."""
+    ordered = sorted(map(abs, times))
+    usual = ordered[len(ordered) // 2]
+    if usual < _FIRST_S:
+        return "s", _relative_notes(times)
+    for unit, ns_per_unit in TIME_UNITS.items():
+        if _FIRST_S * 10**9 <= usual * ns_per_unit <= _MAX_NS:
+            if unit == "s":
+                return unit, ()
+            first = datetime.fromtimestamp(float(times[0] * ns_per_unit) / 1e9, UTC)
+            return unit, (f"times read as {_NAMES[unit]} since 1970; the first is {first:%Y-%m-%d %H:%M:%S} UTC",)
+    raise DataError(
+        f"times such as {usual:g} lie between 1973 and 2116 in no unit; correct them, or choose the unit (time_unit, "
+        f"--time-unit): {', '.join(TIME_UNITS)}"
+    )
+
+
+def _relative_notes(times: Sequence[Decimal]) -> tuple[str, ...]:
+    """Return a note if small times may have another unit than seconds, or may be numbers of frames."""
+    if len(times) < 2:
+        return ()
+    steps = sorted(abs(after - before) for before, after in itertools.pairwise(times))
+    step_s = steps[len(steps) // 2]
+    are_whole = all(int(value.as_tuple().exponent) >= 0 for value in times)  # without a decimal point
+    if step_s <= _LONG_S and not (are_whole and step_s):
+        return ()
+    note = (
+        f"times from {times[0]:f} to {times[-1]:f} read as seconds, {step_s:f} s from row to row; if they have another "
+        "unit, choose it (time_unit, --time-unit)"
+    )
+    return (note,)
