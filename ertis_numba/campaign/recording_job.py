@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from ertis_numba import kernels
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
+from ertis_numba.analysis.emission_time import emission_times_s
+from ertis_numba.analysis.health.emission import describe_shift
 from ertis_numba.campaign.attitudes import unlevelled_image
 from ertis_numba.campaign.echo_measurements import EchoMeasurements, require_images
 from ertis_numba.campaign.sensor_processing import SensorProcessing, describe_faults
@@ -27,7 +30,7 @@ __all__ = ["Pipelines", "RecordingJob", "check_recording", "prepare_recording"]
 
 Pipelines = Callable[[Sequence[Settings]], AbstractContextManager[Sequence[Pipeline]]]
 _Show = Callable[[str, dict[str, Any]], None]
-_Checks = tuple[str, CallMatch | None]
+_Checks = tuple[str, str, CallMatch | None]
 
 
 class RecordingJob:
@@ -232,12 +235,14 @@ def _begin_checks(
 
 
 def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
-    """Return the faults of a sensor's microphones, empty if there are none, and the match of its call."""
+    """Return the faults of a sensor's microphones, the shift of its records, and the match of its call."""
     first = recording[0]
+    some = (replace(recording[index], settings=settings) for index in {0, len(recording) // 2, len(recording) - 1})
+    shift = describe_shift(emission_times_s(some), sound_speed_m_s(settings.air))
     faults = describe_faults(f"{recording.path}: sensor {recording.sensor}", replace(first, settings=settings))
     others = (recording[index] for index in range(1, len(recording)))
     heard = (replace(each, settings=settings) for each in itertools.chain([first], others))
-    return faults, first_call_match(heard)
+    return faults, "; ".join(shift or ()), first_call_match(heard)
 
 
 def _check_sensor(
@@ -249,14 +254,16 @@ def _check_sensor(
     show: _Show,
 ) -> None:
     first = run.with_pipeline_settings(recording[0])
-    faults, match = checks
-    if faults and options.strict:
-        raise DataError(faults)
-    if faults:
-        warn(faults)
+    faults, shift, match = checks
+    place = f"{recording.path}: sensor {recording.sensor}"
+    shift = shift and f"{place}: {shift}"
+    for text in filter(None, (faults, shift)):
+        if options.strict:
+            raise DataError(text)
+        warn(text)
     if match is not None and match.warning:
         run.call_warning = match.warning
-        warn(f"{recording.path}: sensor {recording.sensor}: {match.warning}")
+        warn(f"{place}: {match.warning}")
     heard = None
     if run.pipeline.settings.processing.method != "paper":
         kernel_set = kernels.load(run.pipeline.device)
@@ -268,7 +275,7 @@ def _check_sensor(
             remedy = "give a lower --max-error"
             if not options.verify:
                 remedy = f"measure the error with --verify, or {remedy}"
-            warn(f"{recording.path}: sensor {recording.sensor}: {run.prediction.warning}; {remedy}")
+            warn(f"{place}: {run.prediction.warning}; {remedy}")
     if not (options.explain or options.verify):
         return
     from ertis_numba.campaign.examination import examine  # noqa: PLC0415  slow to import and rarely used

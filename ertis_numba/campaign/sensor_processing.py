@@ -25,8 +25,12 @@ __all__ = ["SensorProcessing", "describe_faults", "require_same_air"]
 
 
 def describe_faults(name: str, measurement: Measurement) -> str:
-    """Return the faults of the microphones with the remedy, in one line; empty if there are none."""
+    """Return the faults of the microphones with the remedy, in one line; empty if there are none.
+
+    `describe_shift` describes a shift of the record, from several measurements.
+    """
     report = health(measurement)
+    report = replace(report, findings=tuple(item for item in report.findings if item.fault != "shifted record"))
     if not report.faults:
         return ""
     if report.record_faults:

@@ -8,8 +8,11 @@ from typing import Final
 import numpy as np
 
 from ertis_numba import checks
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
+from ertis_numba.analysis.emission_time import emission_times_s
 from ertis_numba.analysis.health import Health, health, merge
+from ertis_numba.analysis.health.emission import describe_shift
 from ertis_numba.atomic_files import remedy
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Measurement
@@ -164,11 +167,12 @@ def _check_sensor(
     has_call = report is None or report.has_call
     match = _best_call_match(heard) if has_call else None
     residuals, why = _calibration_residuals(heard, report) if has_call else (None, items.NO_CALL)
+    shift = describe_shift(emission_times_s(heard), sound_speed_m_s(used.air)) if has_call else None
     layout = microphones(used.array)
     found: dict[str, items.CheckResult] = {
         items.MICROPHONES: items.of_microphones(report),
         items.NOISE: items.of_noise(report, used),
-        items.SAMPLES: items.of_samples(report, words),
+        items.SAMPLES: items.of_samples(report, words, shift),
         items.MEASUREMENTS: items.of_storage(stored),
         items.TIMING: items.of_timing(clock),
         items.DRIFT: items.of_drift(clock),

@@ -123,11 +123,13 @@ def of_noise(report: Health | None, used: Settings) -> CheckResult:
     return _result_of([CheckFault(check=NOISE, text=text, remedy=remedy)], detail)
 
 
-def of_samples(report: Health | None, words: LostWords) -> CheckResult:
+def of_samples(report: Health | None, words: LostWords, shift: tuple[str, str] | None) -> CheckResult:
     """Return lost words, and the faults of whole records: repeated blocks, a shift, and another order."""
     if report is None:
         return _NOTHING
     faults = list(record_faults(report))
+    if shift is not None:
+        faults.append(CheckFault(check=SAMPLES, text=shift[0], remedy=shift[1]))
     by_reason: dict[str, list[int]] = {}
     for index, reason in words.reasons.items():
         by_reason.setdefault(reason, []).append(index)

@@ -29,7 +29,6 @@ _RECORDS: Final = {
     "order of channels": "channels are not in the order of the layout",
     "order of bytes": "the bytes of each sample are swapped",
     "repeated blocks": "blocks of samples are repeated",
-    "shifted record": "the record does not begin with the emission",
 }
 _EVERY_REMEDY: Final = "check the cable and the supply of the array, and record again"
 _SATURATED_REMEDY: Final = "emit less, or move the array away from near objects, and record again"
@@ -102,7 +101,7 @@ def _remedy(name: str, excluded: Sequence[int], *, every: bool) -> str:
 
 
 def record_faults(report: Health) -> tuple[CheckFault, ...]:
-    """Return the faults of the whole record."""
+    """Return the faults of the whole record, except for its shift."""
     return tuple(
         CheckFault(
             check=SAMPLES,
@@ -110,4 +109,5 @@ def record_faults(report: Health) -> tuple[CheckFault, ...]:
             remedy=finding.remedy,
         )
         for finding in report.record_faults
+        if finding.fault != "shifted record"
     )

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.health.arrival import Compressed, Fit, compress, fit_delays, fit_emitter, strongest
 from ertis_numba.analysis.health.coherence import aligned, correlate, half_bands, mean_of
+from ertis_numba.analysis.health.emission import describe_shift, fit_emission
 from ertis_numba.analysis.health.levels import gain_findings
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_SHIFT_S
 from ertis_numba.analysis.health.report import Finding
@@ -70,11 +71,13 @@ def by_wavefront(
         return [], (f"{DESCRIPTIONS}: no arrival exceeds the background",)
     times_s, middle_s = arrived
     times_s = times_s - layout.delay_s[list(channels)]
+    emission_s = fit_emission(times_s, positions_m, speed_m_s)
+    shifts = [] if emission_s is None else _shifts(emission_s, channels, speed_m_s)
     path_m = max(middle_s * speed_m_s, _MIN_PATH_M)
     curvatures = (0.0, 1 / path_m, 2 / path_m)
     echo = fit_delays(times_s, positions_m, curvatures, speed_m_s)
     if echo is None:
-        return [], (f"{DESCRIPTIONS}: {len(channels)} microphones are too few to fit a wavefront",)
+        return shifts, (f"{DESCRIPTIONS}: {len(channels)} microphones are too few to fit a wavefront",)
     direct = fit_emitter(times_s, positions_m, speed_m_s)
     from_centre_m = np.linalg.norm(positions_m, axis=1)
     is_direct = (
@@ -83,25 +86,32 @@ def by_wavefront(
         and float(np.ptp(from_centre_m)) > _MIN_DEPTH_M
     )
     if not is_direct and middle_s * speed_m_s < _MIN_PATH_M:
-        return [], (f"{DESCRIPTIONS}: the strongest arrival is too near to fit a wavefront",)
+        return shifts, (f"{DESCRIPTIONS}: the strongest arrival is too near to fit a wavefront",)
     fit = direct if is_direct else echo
     if fit.share < _COMPACT_SHARE:
         enough = len(channels) >= _MIN_RECORD_CHANNELS
         ordered = _other_order(times_s, channels, layout, fit, curvatures, speed_m_s) if enough else []
-        return (ordered, ()) if ordered else ([], (f"{DESCRIPTIONS}: no single wavefront fits the strongest arrival",))
-    findings = []
-    if is_direct and len(channels) >= _MIN_RECORD_CHANNELS and abs(direct.emission_s) > MAX_SHIFT_S:
-        findings.append(
-            Finding(
-                fault="shifted record",
-                channels=tuple(channels),
-                measured=1e6 * direct.emission_s,
-                limit=1e6 * MAX_SHIFT_S,
-                detail=f"emission at {1e3 * direct.emission_s:.2f} ms",
-            )
+        return (
+            (ordered, ()) if ordered else (shifts, (f"{DESCRIPTIONS}: no single wavefront fits the strongest arrival",))
         )
-    findings += _of_channels(found, times_s, fit, channels, layout)
+    findings = [*shifts, *_of_channels(found, times_s, fit, channels, layout)]
     return findings, () if is_direct else ("a shift of the record: the strongest arrival is not the direct sound",)
+
+
+def _shifts(emission_s: float, channels: Sequence[int], speed_m_s: float) -> list[Finding]:
+    """Return a finding if the record does not begin with the emission."""
+    described = describe_shift([emission_s], speed_m_s)
+    if described is None:
+        return []
+    return [
+        Finding(
+            fault="shifted record",
+            channels=tuple(channels),
+            measured=1e6 * emission_s,
+            limit=1e6 * MAX_SHIFT_S,
+            detail=described[0],
+        )
+    ]
 
 
 def _loudest(
