@@ -13,12 +13,12 @@ from ertis_numba.settings import Processing, Settings
 from ertis_numba.waveform import matched_filter_spectrum
 
 
-def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, errors_m=0.0):
+def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, errors_m=0.0, settings=None):
     """Return the image of ideal far reflectors: (azimuth, elevation in degrees, range in m, amplitude).
 
     Microphone positions have errors with standard deviation ``errors_m``.
     """
-    settings = Settings(processing=Processing(directions=directions, range_m=range_m))
+    settings = (settings or Settings()).replace(processing=Processing(directions=directions, range_m=range_m))
     grid = direction_grid(settings.processing)
     looks = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
     positions_m = microphones(settings.array).enabled_positions_m

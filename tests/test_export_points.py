@@ -140,17 +140,6 @@ def test_silence_gives_an_empty_cloud(tmp_path, kind, read, text):
     assert "frame sensor" in comments
 
 
-@pytest.mark.parametrize("text", [False, True])
-@pytest.mark.parametrize(("kind", "read"), [("ply", read_ply), ("pcd", read_pcd)])
-def test_single_microphone_has_infinite_angular_uncertainty(tmp_path, kind, read, text):
-    given = images(sequence=1, count=1)[0]
-    array = given.settings.array.replace(positions_m=((0.0, 0.0, 0.0),))
-    export(tmp_path / f"a.{kind}", [given.replace(settings=given.settings.replace(array=array))], text=text)
-    points, _ = read(tmp_path / f"a.{kind}")
-    assert np.isfinite(points["uncertainty_range"]).all()
-    assert np.isinf(points["uncertainty_across"]).all()
-
-
 def test_unknown_mounting_gives_points_in_the_sensor_frame(tmp_path):
     given = images("left", 1)
     export(tmp_path / "a.ply", given, **FINDING)

@@ -256,7 +256,6 @@ def test_uncertainty_is_nan_without_noise():
 @pytest.mark.parametrize(
     ("positions_m", "directions", "is_finite"),
     [
-        (((0.0, 0.0, 0.0),), "2d:31", False),
         (((0.0, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.02, 0.0)), "2d:31", True),
         (((0.0, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.02, 0.0)), "3d:99", False),
         (((0.0, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.02)), "3d:99", True),

@@ -17,6 +17,7 @@ from ertis_numba.constants import MAX_MICROPHONES
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
+    from ertis_numba.geometry import Grid
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Array, Settings
     from ertis_numba.stages.costs import PlanCosts
@@ -44,6 +45,7 @@ __all__ = [
     "measurement",
     "min_level",
     "note_layout",
+    "note_unknown_angles",
     "note_unlisted_directions",
     "note_when_slow",
     "output",
@@ -428,16 +430,22 @@ def note_layout(array: "Array") -> None:
 
 
 def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
-    """Print a note for each sensor with a single microphone, whose images have no directions."""
-    from ertis_numba.geometry import microphones
+    """Print a note for each sensor whose array cannot observe some angles, which are not listed."""
+    from ertis_numba.geometry import Grid
     from ertis_numba.storage import open_energyscapes
 
     for name in sensors:
         with open_energyscapes(path, sensor=name) as images:
-            if microphones(images.settings.array).enabled.sum() == 1:
-                click.echo(
-                    f"note: sensor {name} has one microphone; its images show ranges but no directions", err=True
-                )
+            note_unknown_angles(name, images.settings, Grid(images.azimuth_rad, images.elevation_rad))
+
+
+def note_unknown_angles(sensor: str, settings: "Settings", grid: "Grid") -> None:
+    """Print a note if the array of a sensor cannot observe some angles."""
+    from ertis_numba.geometry import observable_angles
+
+    note = observable_angles(settings.array, grid).note
+    if note is not None:
+        click.echo(f"note: sensor {sensor} {note}", err=True)
 
 
 def say(text: str, *, quiet: bool) -> None:

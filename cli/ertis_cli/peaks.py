@@ -92,7 +92,8 @@ def peaks(
     peak, and level_dbfs to a full-scale echo in every microphone. Maxima that noise alone may cause in
     one of 1000 images are omitted unless --all is given. This limit exists only for delay-and-sum. grid_error_deg is
     the standard deviation of directions that cannot be interpolated, as at the edge of the grid; other directions have
-    0. No level is more than 1 dB above its image or map.
+    0. No level is more than 1 dB above its image or map. Angles that the array cannot observe are shown as –, and as
+    null in JSON: both for one microphone, the elevation for microphones on a horizontal line.
 
     With --detector cfar, a reflector exceeds the noise around it in range, at any level, and is at most 10 dB below the
     strongest echo at its range. The noise is estimated from 32 bins of the same direction (OS-CFAR), so that
@@ -177,6 +178,7 @@ def _list_sources(
     as_json: bool,
 ) -> None:
     """Print the sources in each band of acoustic maps."""
+    from ertis_numba.geometry import Grid
     from ertis_numba.passive import find_sound_sources
     from ertis_numba.storage import open_acoustic_maps
 
@@ -189,6 +191,7 @@ def _list_sources(
     rows: list[dict[str, Any]] = []
     for name in sensors:
         with open_acoustic_maps(path, sensor=name) as maps:
+            options.note_unknown_angles(name, maps.settings, Grid(maps.azimuth_rad, maps.elevation_rad))
             for index in options.places(measurement, len(maps)):
                 found = find_sound_sources(maps[index], top=top, min_level_db=min_level_db)
                 rows += [{"sensor": name, "map": index, **each.as_dict()} for each in found]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.analysis.detect import peaks_of_grid
 from ertis_numba.frames import Energyscape, Peak, Reflector
 from ertis_numba.geometry import array_weights, microphones, unit_vectors
 from ertis_numba.settings import Settings
@@ -154,7 +154,7 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     # A reflector that does not count may still be the strongest in the image, or leak into it.
     above_db = float(np.max(levels_db, where=in_range, initial=strongest_db)) - strongest_db if counted else 0.0
     floor_db = max(_MIN_DB, min_level_db - above_db - _SLACK_DB)
-    peaks = find_peaks(image, top=len(reflectors) + _MAX_FALSE, min_level_db=floor_db)
+    peaks = peaks_of_grid(image, top=len(reflectors) + _MAX_FALSE, min_level_db=floor_db)
     pairs = _assign(image, counted, peaks, lobe)
     # Levels of peaks are relative to the strongest peak, those of reflectors to the strongest reflector. A matched pair
     # determines the offset between the two references.

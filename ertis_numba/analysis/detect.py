@@ -1,6 +1,7 @@
 """Detection of reflectors in images."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import scipy
@@ -12,9 +13,9 @@ from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
 from ertis_numba.analysis.side_lobes import SideLobes
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak
-from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
 
-__all__ = ["find_peaks", "neighbours_of", "spacing_of"]
+__all__ = ["find_peaks", "neighbours_of", "peaks_of_grid", "spacing_of"]
 
 _NEIGHBOURS = 8  # Number of directions around each direction of a dense grid.
 
@@ -33,6 +34,9 @@ def find_peaks(
     there: see `ertis_numba.analysis.side_lobes.SideLobes`. Each reflector therefore yields one entry, not one per bin
     of its main lobe or per side lobe. Direction, range and level are interpolated: see
     `ertis_numba.analysis.peak_interpolation.PeakInterpolator`.
+
+    Angles that the array cannot observe are NaN: both for one microphone, and the elevation for a horizontal line of
+    microphones. See `ertis_numba.geometry.observable_angles`.
 
     Parameters
     ----------
@@ -68,6 +72,34 @@ def find_peaks(
         for peak in ertis.find_peaks(image, top=3):
             print(f"{peak.range_m:.2f} m at {peak.azimuth_deg:.0f}°, {peak.level_db:.1f} dB")
     """
+    peaks = peaks_of_grid(image, top=top, min_level_db=min_level_db, where=where, false_alarm=false_alarm)
+    seen = observable_angles(image.settings.array)
+    return [_observed(peak, seen, is_planar=image.is_planar) for peak in peaks]
+
+
+def _observed(peak: Peak, seen: ObservableAngles, *, is_planar: bool) -> Peak:
+    """Return a peak without the angles that the array cannot observe."""
+    azimuth_deg = peak.azimuth_deg
+    if seen.line is not None and not is_planar:
+        azimuth_deg = math.degrees(
+            seen.in_plane_rad(unit_vectors(np.array([peak.azimuth_rad]), np.array([peak.elevation_rad]))[0])
+        )
+    return replace(
+        peak,
+        azimuth_deg=azimuth_deg if seen.azimuth else math.nan,
+        elevation_deg=peak.elevation_deg if seen.elevation else math.nan,
+    )
+
+
+def peaks_of_grid(
+    image: Energyscape,
+    *,
+    top: int | None = 10,
+    min_level_db: float = -30.0,
+    where: NDArray[np.bool_] | None = None,
+    false_alarm: float | None = None,
+) -> list[Peak]:
+    """Return the result of `find_peaks` with directions of the grid instead of angles that the array cannot observe."""
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     top = image.amplitude.size if top is None else checks.integer("top", top, 1)
     checks.between("min_level_db", min_level_db, -1000.0, 0.0)

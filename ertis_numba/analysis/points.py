@@ -9,7 +9,7 @@ from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
 from ertis_numba.analysis.side_lobes import side_lobe_floor
 from ertis_numba.analysis.uncertainty import PositionUncertainty
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.geometry import Grid, direction_grid, unit_vectors
+from ertis_numba.geometry import Grid, direction_grid, observable_angles, unit_vectors
 from ertis_numba.settings import Settings
 
 __all__ = ["PointExtractor"]
@@ -29,7 +29,8 @@ class PointExtractor:
 
     Main lobes are not parabolas, so the extractor predicts the error of the parabolas from array and call, and
     subtracts it. Each point has standard deviations of its position: see
-    `ertis_numba.analysis.uncertainty.PositionUncertainty`.
+    `ertis_numba.analysis.uncertainty.PositionUncertainty`. Microphones in one place observe no directions, and hence
+    yield no points.
 
     Parameters
     ----------
@@ -62,6 +63,7 @@ class PointExtractor:
         self, settings: Settings, grid: Grid | None = None, *, top: int = 256, min_level_db: float = -20.0
     ) -> None:
         checks.instance("settings", settings, Settings, "an image or a recording holds")
+        self._has_directions = any(observable_angles(settings.array)[:2])
         self._top = checks.integer("top", top, 1)
         self._smallest = 10 ** (checks.between("min_level_db", min_level_db, -1000.0, 0.0) / 20)
         grid = grid or direction_grid(settings.processing)
@@ -81,7 +83,7 @@ class PointExtractor:
         checks.instance("image", image, Energyscape, "Pipeline.process returns")
         amplitude = image.amplitude
         checks.shape("amplitude", amplitude.shape, (len(self._directions), len(image.range_m)))
-        directions, ranges = self._maxima(amplitude, image.range_m)
+        directions, ranges = self._maxima(amplitude if self._has_directions else amplitude[:, :0], image.range_m)
         tops = self._interpolator(image, directions, ranges)
         position_m, levels = (
             (tops.direction * tops.range_m[:, None]).astype(np.float32),

@@ -19,6 +19,7 @@ from ertis_numba.campaign.echo_measurements import EchoMeasurements, require_ima
 from ertis_numba.campaign.sensor_processing import SensorProcessing, describe_faults
 from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.errors import DataError
+from ertis_numba.geometry import observable_angles
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
 from ertis_numba.settings import Settings
@@ -264,6 +265,9 @@ def _check_sensor(
     if match is not None and match.warning:
         run.call_warning = match.warning
         warn(f"{place}: {match.warning}")
+    unknown = observable_angles(run.pipeline.settings.array, run.pipeline.grid).note
+    if unknown is not None:
+        warn(f"{place} {unknown}")
     heard = None
     if run.pipeline.settings.processing.method != "paper":
         kernel_set = kernels.load(run.pipeline.device)

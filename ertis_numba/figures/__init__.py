@@ -36,6 +36,7 @@ from ertis_numba.figures._page import compose
 from ertis_numba.figures._pareto_front import Rated
 from ertis_numba.figures.style import StyleOptions, parameters, style_of
 from ertis_numba.frames import AcousticMap, Energyscape, Measurement, OccupancyMap, Peak
+from ertis_numba.geometry import observable_angles
 from ertis_numba.settings import Array, Settings
 
 __all__ = [
@@ -91,7 +92,8 @@ def plot(
 ) -> Figure | Axes:
     """Draw an energyscape on a page with a heading, a colour bar and a list of reflectors, or into given axes.
 
-    A planar image becomes a sector in metres. An image of one direction becomes a curve over range. An image with
+    A planar image becomes a sector in metres. An image of one direction, or of an array that observes no directions,
+    becomes a curve over range. An image with
     elevations becomes a map of azimuth and elevation, which shows the maximum over range. A page also shows its
     maximum over elevation as a sector.
 
@@ -141,7 +143,7 @@ def plot(
     if ax is not None:
         look = {"theme": "light", **look}
     canvas = _canvas_of(image, dynamic_range_db, look, peaks)
-    if len(image.azimuth_rad) == 1:
+    if len(image.azimuth_rad) == 1 or not _has_direction(image):
         panels = [_images.curve(canvas, image)]
     elif image.is_planar:
         panels = [_images.sector(canvas, image)]
@@ -166,7 +168,7 @@ def polar(
 
     Arguments are those of `plot`.
     """
-    canvas = _canvas_of(image, dynamic_range_db, look, peaks)
+    canvas = _canvas_with_directions(image, dynamic_range_db, look, peaks)
     shown, hidden = _seen(image, side_lobes=side_lobes)
     return compose(canvas, _captions.of_image(image), [_images.sector(canvas, shown, hidden=hidden)])
 
@@ -180,7 +182,7 @@ def projection(
     **look: Unpack[StyleOptions],
 ) -> Figure:
     """Draw the maximum over range as a map of azimuth and elevation; arguments are those of `plot`."""
-    canvas = _canvas_of(image, dynamic_range_db, look, peaks)
+    canvas = _canvas_with_directions(image, dynamic_range_db, look, peaks)
     shown, hidden = _seen(image, side_lobes=side_lobes)
     return compose(canvas, _captions.of_image(image), [_images.direction_map(canvas, shown, hidden=hidden)])
 
@@ -217,7 +219,9 @@ def slices(
     checks.finite("height_m", height_m)
     if left_m is not None:
         checks.finite("left_m", left_m)
-    return _slices.draw(_canvas_of(image, dynamic_range_db, look, peaks), image, height_m=height_m, left_m=left_m)
+    return _slices.draw(
+        _canvas_with_directions(image, dynamic_range_db, look, peaks), image, height_m=height_m, left_m=left_m
+    )
 
 
 def signals(
@@ -539,6 +543,24 @@ def _seen(image: Energyscape, *, side_lobes: bool) -> tuple[Energyscape, bool]:
     """Return the image to draw, and whether its side lobes are hidden."""
     hidden = not (image.is_planar or side_lobes)
     return (without_side_lobes(image) if hidden else image), hidden
+
+
+def _has_direction(image: Energyscape) -> bool:
+    return observable_angles(image.settings.array).has_direction(is_planar=image.is_planar)
+
+
+def _canvas_with_directions(
+    image: Energyscape, dynamic_range_db: float, look: StyleOptions, peaks: Sequence[Peak] | None
+) -> Canvas:
+    """Return the canvas of a picture over directions; refuse images without directions."""
+    canvas = _canvas_of(image, dynamic_range_db, look, peaks)
+    if not _has_direction(image):
+        note = observable_angles(image.settings.array).note
+        raise ArgumentError(
+            f"the array of sensor {image.stamp.sensor} {note}; draw a curve over range with 'ertis plot --kind image' "
+            "or ertis.plot"
+        )
+    return canvas
 
 
 def _canvas_of(image: Energyscape, dynamic_range_db: float, look: StyleOptions, peaks: Sequence[Peak] | None) -> Canvas:

@@ -19,7 +19,7 @@ from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures._sampling import PIXELS, centres, look_raster
 from ertis_numba.figures.style import angle, minus
 from ertis_numba.frames import AcousticMap, LevelReference, SoundDirection
-from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry import Grid, observable_angles, unit_vectors
 
 __all__ = ["draw", "draw_bands", "draw_on_photo"]
 
@@ -134,7 +134,8 @@ def _levels(
     canvas: Canvas, found: AcousticMap, band_hz: tuple[float, float] | None
 ) -> tuple[Canvas, NDArray[np.float32], SoundDirection]:
     """Return the levels of a band in all directions, a canvas with their scale, and the loudest source in them."""
-    from ertis_numba.passive import find_sound_sources, gathered  # noqa: PLC0415  few plots need it
+    from ertis_numba.passive import gathered  # noqa: PLC0415  few plots need it, and it imports kernels
+    from ertis_numba.passive.sound_sources import sources_of_grid  # noqa: PLC0415
 
     if band_hz is not None:
         found.in_band(*band_hz)  # raises an error if there is none
@@ -145,7 +146,7 @@ def _levels(
     limits_hz = np.array([[found.band_hz.min(), found.band_hz.max()]])
     combined = gathered(found.replace(power=power[:, None].astype(np.float32), band_hz=limits_hz))
     is_narrow = found.settings.passive.method in _NARROW
-    sources = find_sound_sources(combined, top=None if is_narrow else 1, min_level_db=_ALL_DB if is_narrow else None)
+    sources = sources_of_grid(combined, top=None if is_narrow else 1, min_level_db=_ALL_DB if is_narrow else None)
     directions = unit_vectors(*np.transpose([(each.azimuth_rad, each.elevation_rad) for each in sources]))
     brightest = int(combined.power.argmax())
     drawn = unit_vectors(found.azimuth_rad[[brightest]], found.elevation_rad[[brightest]])[0]
@@ -177,6 +178,8 @@ def _heading(canvas: Canvas, found: AcousticMap, loudest: SoundDirection, *parts
     low_khz, high_khz = (_captions.number(edge_hz / 1e3) for edge_hz in loudest.band_hz)
     towards = f"azimuth {angle(math.degrees(loudest.azimuth_rad))}, elevation "
     towards += angle(math.degrees(loudest.elevation_rad))
+    note = observable_angles(found.settings.array, Grid(found.azimuth_rad, found.elevation_rad)).note
+    parts = (*parts, f"array {note}") if note else parts
     return _captions.of_acoustic_map(
         "Acoustic map",
         found,

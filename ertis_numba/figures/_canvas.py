@@ -70,6 +70,7 @@ class Canvas:
         style = self.style
         frame, stroke = axes.bbox.padded(1.0), [withStroke(linewidth=2.0 * style.line_pt, foreground=style.page)]
         places = [(number, at) for number, peak in enumerate(self.peaks, 1) if (at := place(peak)) is not None]
+        places = [(number, at) for number, at in places if not math.isnan(sum(at))]  # of unknown angles
         seen = [(number, at) for number, at in places if frame.contains(*axes.transData.transform(at))]
         ring: dict[str, Any] = {"markersize": 2 * _RING_PT * style.line_pt, "color": style.mark}
         for _, at in reversed(seen):
@@ -97,10 +98,15 @@ class Canvas:
         rows = [f" #  azimuth {'elevat. ' if spatial else ''}  {'range':>{width}}    dB"]
         for number, peak in enumerate(self.peaks, 1):
             angles = (peak.azimuth_deg, peak.elevation_deg) if spatial else (peak.azimuth_deg,)
-            directions = " ".join(f"{_tenth(angle_deg):+6.1f}°" for angle_deg in angles)
+            directions = " ".join(map(_angle, angles))
             row = f"{number:>2}  {directions}  {peak.range_m:{width}.{decimals}f} m {_tenth(peak.level_db):5.1f}"
             rows.append(minus(row))
         return rows
+
+
+def _angle(angle_deg: float) -> str:
+    """Return an angle of seven characters; a dash if it is unknown."""
+    return f"{'–':>6} " if math.isnan(angle_deg) else f"{_tenth(angle_deg):+6.1f}°"
 
 
 def _tenth(value: float) -> float:

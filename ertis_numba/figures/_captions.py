@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.figures.style import angle, minus
 from ertis_numba.frames import AcousticMap, Energyscape, Stamp
-from ertis_numba.geometry import microphones
+from ertis_numba.geometry import Grid, microphones, observable_angles
 from ertis_numba.method_titles import METHOD_TITLES
 from ertis_numba.settings import Settings
 
@@ -43,7 +43,10 @@ def of_image(image: Energyscape) -> Heading:
     """Return the words above an energyscape."""
     settings = image.settings
     processing = settings.processing
-    if len(image.azimuth_rad) == 1:
+    seen = observable_angles(settings.array, Grid(image.azimuth_rad, image.elevation_rad))
+    if not seen.has_direction(is_planar=image.is_planar):
+        directions = "no direction"
+    elif len(image.azimuth_rad) == 1:
         azimuth_deg, elevation_deg = np.degrees([image.azimuth_rad[0], image.elevation_rad[0]])
         directions = f"azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}"
     else:
@@ -57,6 +60,7 @@ def of_image(image: Energyscape) -> Heading:
         (
             *_of_sensor(settings),
             directions,
+            *((f"array {seen.note}",) if seen.note else ()),
             *level,
             f"{span(image.range_m)} m in {len(image.range_m)} range{'s' if len(image.range_m) > 1 else ''}",
             f"method {processing.method}{adaptive}",

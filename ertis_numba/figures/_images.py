@@ -108,10 +108,10 @@ def level_map(
 
 
 def curve(canvas: Canvas, image: Energyscape) -> Panel:
-    """Return the level of the only direction over range."""
+    """Return the level over range, of the only direction or of the highest."""
 
     def paint(axes: Axes) -> None:
-        axes.plot(image.range_m, canvas.level_db(image.amplitude)[0], color=canvas.style.mark)
+        axes.plot(image.range_m, canvas.level_db(image.amplitude.max(axis=0)), color=canvas.style.mark)
         axes.margins(x=0.01)
         axes.set_ylim(-canvas.dynamic_range_db, 3.0)
         axes.set_xlabel("range (m)")

@@ -26,7 +26,7 @@ class SoundDirection(NamedTuple):
     band_hz : (low, high)
         Edges of the band in hertz.
     azimuth_rad, elevation_rad : float
-        Direction in the sensor frame.
+        Direction in the sensor frame; NaN for an angle that the array cannot observe.
     level_dbfs : float or None
         Level at the array in dBFS; None for the method ``music``.
     level_db : float or None
@@ -80,8 +80,8 @@ class SoundDirection(NamedTuple):
         """Return the direction in degrees and the levels for JSON; unknown or infinite numbers are null."""
         return {
             "band_hz": [round(edge_hz, 3) for edge_hz in self.band_hz],
-            "azimuth_deg": round(math.degrees(self.azimuth_rad), 4),
-            "elevation_deg": round(math.degrees(self.elevation_rad), 4),
+            "azimuth_deg": _rounded(math.degrees(self.azimuth_rad)),
+            "elevation_deg": _rounded(math.degrees(self.elevation_rad)),
             **{name: _rounded(getattr(self, name)) for name in reversed(LEVEL_UNITS)},
             "grid_error_deg": _rounded(math.degrees(self.grid_error_rad)),
         }

@@ -55,7 +55,7 @@ class Peak(RadiansFromDegrees):
     Attributes
     ----------
     azimuth_deg, elevation_deg : float
-        Interpolated direction in degrees.
+        Interpolated direction in degrees; NaN for an angle that the array cannot observe.
     range_m : float
         Interpolated range in metres.
     level_db : float

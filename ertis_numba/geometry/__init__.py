@@ -23,6 +23,7 @@ from ertis_numba.geometry.layouts import (
 from ertis_numba.geometry.levelling import levelled_grid
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
+from ertis_numba.geometry.observable import ObservableAngles, observable_angles
 from ertis_numba.geometry.position_files import SENSOR_FRAME
 from ertis_numba.geometry.sector import Fan, plan_m, round_step
 from ertis_numba.geometry.untrusted_settings import received_settings
@@ -37,6 +38,7 @@ __all__ = [
     "Fan",
     "Grid",
     "Layout",
+    "ObservableAngles",
     "array_weights",
     "azimuth_columns",
     "delay_matrix",
@@ -52,6 +54,7 @@ __all__ = [
     "load_layout",
     "microphones",
     "mounting",
+    "observable_angles",
     "plan_m",
     "plane_delays",
     "reach_rad",

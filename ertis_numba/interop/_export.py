@@ -11,6 +11,7 @@ from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target, remedy
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Beams, Energyscape, Measurement, MicrophoneSignals
+from ertis_numba.geometry import observable_angles
 from ertis_numba.interop._drive import Drive
 from ertis_numba.interop._mountings import Mountings, validated
 
@@ -200,7 +201,7 @@ def export(
             elif name == "batslam":
                 _write_drive(parts[0], items, validated(mounting), drive)
             else:
-                _write_points(name, parts[0], _energyscapes(items), validated(mounting), chosen, finding, text=text)
+                _write_points(name, parts[0], _located(items, name), validated(mounting), chosen, finding, text=text)
     except OSError as error:
         if isinstance(error, ErtisError):  # Errors of the images' source pass unchanged.
             raise
@@ -284,6 +285,17 @@ def _energyscapes(items: Iterable[Exported]) -> Iterator[Energyscape]:
                 f"{type(item).__name__} is given, but this format holds images; write npz, or call Pipeline.process"
             )
         yield item
+
+
+def _located(items: Iterable[Exported], name: str) -> Iterator[Energyscape]:
+    """Yield energyscapes; refuse those of an array that observes no directions."""
+    for image in _energyscapes(items):
+        seen = observable_angles(image.settings.array)
+        if not seen.has_direction(is_planar=image.is_planar):
+            raise ArgumentError(
+                f"sensor {image.stamp.sensor} {seen.note}, so format {name!r} cannot place points; write npz"
+            )
+        yield image
 
 
 def _results(items: Iterable[Exported]) -> Iterator[Energyscape | Beams | MicrophoneSignals]:

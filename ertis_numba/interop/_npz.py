@@ -13,7 +13,7 @@ import numpy as np
 
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Beams, Energyscape, MicrophoneSignals, Stamp
-from ertis_numba.geometry import self_contained
+from ertis_numba.geometry import observable_angles, self_contained
 
 __all__ = ["Result", "write_npz"]
 
@@ -21,7 +21,8 @@ Result: TypeAlias = Energyscape | Beams | MicrophoneSignals
 """Result of a stage of processing."""
 
 _STAMPS = ("session_id", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns")
-_AXES = ("azimuth_rad", "elevation_rad", "range_m")
+_ANGLES = ("azimuth_rad", "elevation_rad")
+_AXES = (*_ANGLES, "range_m")
 _SIGNAL_AXES = ("time_s", "positions_m", "delay_s")
 
 
@@ -29,7 +30,7 @@ def write_npz(path: Path, results: Iterable[Result], count: int | None) -> None:
     """Write the results of one sensor; one at a time if ``count`` is given, otherwise collect them first.
 
     The samples have the shape (time, direction, range) or (time, microphone, sample), and the fields of the stamps
-    (time,). The axes, and sensor and settings as texts, follow.
+    (time,). The axes, and sensor and settings as texts, follow. Angles are NaN if the array observes no directions.
 
     Raises
     ------
@@ -47,6 +48,8 @@ def write_npz(path: Path, results: Iterable[Result], count: int | None) -> None:
         with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
             stamps = _write_samples(member, itertools.chain([first], rest), first, count)
         arrays: dict[str, Any] = {axis: getattr(first, axis) for axis in axes}
+        if not any(observable_angles(first.settings.array)[:2]):
+            arrays |= {axis: np.full_like(arrays[axis], np.nan) for axis in _ANGLES if axis in axes}
         arrays |= {field: np.array([getattr(stamp, field) for stamp in stamps], dtype=np.int64) for field in _STAMPS}
         arrays["behaviour"] = np.array([stamp.behaviour for stamp in stamps])
         arrays["sensor"] = np.array(first.stamp.sensor)

@@ -12,12 +12,12 @@ from ertis_numba import checks
 from ertis_numba.analysis.detect import neighbours_of
 from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.frames import AcousticMap, SoundDirection
-from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
 from ertis_numba.passive.components import COMPONENT_METHODS, strongest_first
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.settings import Passive
 
-__all__ = ["find_sound_sources"]
+__all__ = ["find_sound_sources", "sources_of_grid"]
 
 Floats = NDArray[np.float64]
 _LossOf = Callable[[Floats, Floats], Floats]
@@ -77,7 +77,8 @@ def find_sound_sources(
 
     An interpolated maximum stays within half of the way to each neighbour, and within the main lobe through its
     direction. It exceeds the maximum of the map by less than 1 dB. At the edge of a grid, it is interpolated along the
-    edge only, and in a corner not at all; `SoundDirection.grid_error_rad` states the error.
+    edge only, and in a corner not at all; `SoundDirection.grid_error_rad` states the error. Angles that the array
+    cannot observe are NaN: see `ertis_numba.geometry.observable_angles`.
 
     Errors are small if the main lobe is at least two spacings of the grid wide. The peaks of Capon are often narrower;
     their levels are then too low.
@@ -109,6 +110,27 @@ def find_sound_sources(
     >>> len(sources) == len(found.band_hz)
     True
     """
+    sources = sources_of_grid(found, top=top, min_level_db=min_level_db)
+    seen = observable_angles(found.settings.array)
+    is_planar = np.ptp(found.elevation_rad) == 0
+    return [_observed(each, seen, is_planar=bool(is_planar)) for each in sources]
+
+
+def _observed(source: SoundDirection, seen: ObservableAngles, *, is_planar: bool) -> SoundDirection:
+    """Return a source without the angles that the array cannot observe."""
+    azimuth_rad = source.azimuth_rad
+    if seen.line is not None and not is_planar:
+        azimuth_rad = seen.in_plane_rad(unit_vectors(np.array([azimuth_rad]), np.array([source.elevation_rad]))[0])
+    return source._replace(
+        azimuth_rad=azimuth_rad if seen.azimuth else math.nan,
+        elevation_rad=source.elevation_rad if seen.elevation else math.nan,
+    )
+
+
+def sources_of_grid(
+    found: AcousticMap, *, top: int | None = 10, min_level_db: float | None = None
+) -> list[SoundDirection]:
+    """Return the result of `find_sound_sources` with directions of the grid instead of angles that are not observed."""
     checks.instance("found", found, AcousticMap, "AcousticCamera.map returns")
     top = len(found.azimuth_rad) if top is None else checks.integer("top", top, 1)
     passive = found.settings.passive

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.analysis.detect import peaks_of_grid
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.stages.interpolation_fit import one_thread
@@ -69,7 +69,7 @@ def measure(image: Energyscape, measurement: Measurement) -> Measured:
     return Measured(
         error_db=error_db(image.amplitude, wanted),
         n_directions=len(wanted),
-        peaks=peak_errors(image, find_peaks(image.replace(amplitude=wanted.astype(np.float32)), top=PEAKS)),
+        peaks=peak_errors(image, peaks_of_grid(image.replace(amplitude=wanted.astype(np.float32)), top=PEAKS)),
     )
 
 

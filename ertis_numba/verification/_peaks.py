@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.analysis.detect import peaks_of_grid
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import unit_vectors
 
@@ -49,7 +49,7 @@ def peak_errors(image: Energyscape, wanted: Sequence[Peak]) -> PeakErrors:
         Strongest reflectors of the exact image.
     """
     # Reflectors of nearly the same level may change order. Twice the number ensures that the last are included.
-    found = find_peaks(image, top=2 * PEAKS, min_level_db=-1000.0)
+    found = peaks_of_grid(image, top=2 * PEAKS, min_level_db=-1000.0)
     errors = [error for peak in wanted if (error := _nearest(peak, found)) is not None]
     level_db, range_m, angle_deg = np.max(np.abs(errors), axis=0).tolist() if errors else (None, None, None)
     return PeakErrors(

@@ -1,0 +1,129 @@
+"""Angles that an array can observe."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.geometry.delays import unit_vectors
+from ertis_numba.geometry.grids import Grid
+from ertis_numba.geometry.layouts import microphones
+from ertis_numba.settings import Array
+
+__all__ = ["ObservableAngles", "observable_angles"]
+
+_FLAT: Final = 1e-3  # Width of an array relative to its length, below which it has no width.
+_POINT_M: Final = 1e-6  # Microphones closer than this are in one place.
+_UPRIGHT: Final = 0.05  # Component of a unit vector, below which it is 0: 3°.
+
+
+class ObservableAngles(NamedTuple):
+    """Angles that an array can observe.
+
+    Attributes
+    ----------
+    azimuth, elevation : bool
+        False if echoes from all values of the angle sound alike.
+    note : str or None
+        Predicate of the sensor that names unknown or ambiguous angles, and the reason; None if there are none.
+    line : (axis,) float64 or None
+        Unit vector along an array on a line; None for others.
+    """
+
+    azimuth: bool
+    elevation: bool
+    note: str | None = None
+    line: NDArray[np.float64] | None = None
+
+    def has_direction(self, *, is_planar: bool) -> bool:
+        """Return True if images differ between directions, which may all lie at one elevation."""
+        is_upright = self.elevation and not self.azimuth
+        return self.azimuth or (self.line is not None and not (is_planar and is_upright))
+
+    def in_plane_rad(self, direction: NDArray[np.float64]) -> float:
+        """Return the azimuth of the direction in the horizontal plane that sounds like a given one.
+
+        Parameters
+        ----------
+        direction : (axis,) float64
+            Unit vector.
+        """
+        x, y, _ = direction
+        if self.line is None or not self.azimuth:
+            return float(np.arctan2(y, x))
+        along = float(np.arctan2(self.line[1], self.line[0]))
+        angle = float(np.arccos(np.clip(direction @ self.line, -1.0, 1.0)))
+        both = np.array([along + angle, along - angle])
+        nearest = int(np.argmax(np.cos(both) * x + np.sin(both) * y))
+        return float(np.angle(np.exp(1j * both[nearest])))
+
+
+def observable_angles(array: Array, grid: Grid | None = None) -> ObservableAngles:
+    """Return the angles that the enabled microphones of an array can observe.
+
+    Microphones in one place observe no angle. Those on a line observe the angle to this line only: the azimuth of
+    echoes in the horizontal plane, if the line is horizontal, or the elevation, if it is vertical. Those in a plane
+    cannot tell its two sides apart, which matters for grids with directions on both.
+
+    Parameters
+    ----------
+    array : Array
+    grid : Grid, optional
+        Directions to compare; without them, the sides of a plane are not noted.
+
+    Returns
+    -------
+    ObservableAngles
+
+    Examples
+    --------
+    >>> from ertis_numba.geometry import observable_angles
+    >>> from ertis_numba.settings import Array
+    >>> observable_angles(Array()).elevation
+    True
+    >>> observable_angles(Array(positions_m=((0, 0, 0), (0, 0.01, 0), (0, 0.02, 0)))).elevation
+    False
+    """
+    positions_m = microphones(array).enabled_positions_m
+    count = len(positions_m)
+    beside_m = positions_m - positions_m.mean(axis=0)  # An array may have lost microphones.
+    _, sizes, axes = np.linalg.svd(np.concatenate([beside_m, np.zeros((3, 3))]), full_matrices=False)
+    if sizes[0] < _POINT_M:
+        which = "one microphone" if count == 1 else f"{count} microphones in one place"
+        return ObservableAngles(
+            azimuth=False, elevation=False, note=f"has {which}; its images show ranges but no directions"
+        )
+    if sizes[1] < _FLAT * sizes[0]:
+        return _of_line(axes[0])
+    if sizes[2] < _FLAT * sizes[0] and grid is not None:
+        heights = unit_vectors(grid.azimuth_rad, grid.elevation_rad) @ axes[2]
+        if heights.min() < -_UPRIGHT and heights.max() > _UPRIGHT:
+            return ObservableAngles(
+                azimuth=True,
+                elevation=True,
+                note="has its microphones in a plane; directions on both sides of this plane sound alike",
+            )
+    return ObservableAngles(azimuth=True, elevation=True)
+
+
+def _of_line(axis: NDArray[np.float64]) -> ObservableAngles:
+    """Return the angles that microphones along an axis observe."""
+    if abs(axis[2]) < _UPRIGHT:
+        text = "the elevation is unknown, and the azimuth is that of echoes at elevation 0"
+        text += "; left and right sound alike" if abs(axis[1]) < _UPRIGHT else ""
+        return ObservableAngles(
+            azimuth=True, elevation=False, note=f"has its microphones on a horizontal line; {text}", line=axis
+        )
+    if np.hypot(axis[0], axis[1]) < _UPRIGHT:
+        return ObservableAngles(
+            azimuth=False,
+            elevation=True,
+            note="has its microphones on a vertical line; the azimuth is unknown",
+            line=axis,
+        )
+    return ObservableAngles(
+        azimuth=False,
+        elevation=False,
+        note="has its microphones on an inclined line; only the angle to this line is known",
+        line=axis,
+    )
