@@ -44,6 +44,9 @@ def written(tmp_path, name, text, encoding="utf-8"):
         ("german.csv", "time_s;x_m;y_m;z_m;qx;qy;qz;qw\n1403715524,907143168;1;2;3;0;0;0,6;0,8\n", "utf-8"),
         ("nanoseconds.tum", "1403715524907143168 1 2 3 0 0 0.6 0.8\n", "utf-8"),
         ("microseconds.csv", "time_us,x_m,y_m,z_m,qx,qy,qz,qw\n1403715524907143.168,1,2,3,0,0,0.6,0.8\n", "utf-8"),
+        ("ends.tum", "1403715524.907143168,1,2,3,0,0,0.6,0.8,\n", "utf-8"),
+        ("spaced.txt", "#timestamp [ns] x [m] y [m] z [m] qw qx qy qz\n1403715524907143168 1 2 3 .8 0 0 .6\n", "utf-8"),
+        ("slashes.txt", "// t x y z qw qx qy qz\n// start\n1403715524.907143168 1 2 3 .8 0 0 .6\n", "utf-8"),
         ("exponents.tum", "1.403715524907143168e+09 1.0e0 2.0e0 3.0e0 0 0 6e-1 8e-1\n", "utf-8"),
         (
             "named_units.csv",
@@ -125,10 +128,10 @@ def test_rows_that_are_left_out_or_changed_are_noted(tmp_path, text, n_poses, no
 
 
 def test_empty_cells_of_tables_are_rows_without_a_pose(tmp_path):
-    text = "time_s,x_m,y_m,yaw_deg\n1.0,0,0,0\n1.1,,,\n1.2,1,0,90\n"
+    text = "time_s,x_m,y_m,yaw_deg\n1.0,0,0,0\n1.1,,,\n1.15,-nan(ind),NULL,NA\n1.2,1,0,90\n"
     read = read_trajectory(written(tmp_path, "a.csv", text))
     assert read.position_m[:, 0].tolist() == [0.0, 1.0]
-    assert read.notes == ("1 line of 3 without numbers (NaN) left out, the first is line 3",)
+    assert read.notes == ("2 lines of 4 without numbers (NaN) left out, the first is line 3",)
 
 
 KITTI = "1 0 0 0 0 1 0 0 0 0 1 0\n0 0 1 1 0 1 0 0 -1 0 0 2\n"
@@ -202,6 +205,16 @@ def test_poses_of_kitti_that_do_not_fit_are_refused(tmp_path, text, times, messa
             "a.csv",
             "#timestamp [ns],w_RS_S_x [rad s^-1],a_RS_S_x [m s^-2]\n1,2,3\n",
             r"holds measurements of an IMU, but no poses; give .*state_groundtruth",
+        ),
+        (
+            "a.csv",
+            "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m]\n1403636858601666560,4.6,-1.7,0.8\n",
+            r"line 1 names the columns timestamp \[ns\], p_RS_R_x .* which include no rotation; give qx, qy, qz, qw",
+        ),
+        (
+            "a.tum",
+            rows(*(f"{k // 5}.0 0.0{k} 0 0 0 0 0 1" for k in range(10))),
+            r"8 lines of 10 have the time of an earlier one, but other poses; give times with all of their digits",
         ),
         ("a.csv", "#timestamp [ns],filename\n1,1.png\n", r"holds measurements of a camera, but no poses"),
         (

@@ -53,7 +53,10 @@ def in_world_of_camera(place_m, rotation):
             "its −y axis points up, as that of a camera (z forward, y down); choose the axes camera",
         ),
         (drive(pitch_deg=90.0), "its z axis is 90° from vertical, and its −x axis points up"),
-        (drive(roll_deg=180.0), "its z axis is 180° from vertical, and its −z axis points up"),
+        (
+            drive(roll_deg=180.0),
+            "and its −z axis points up; poses of the platform have x forward, y left and z up, and quaternions",
+        ),
         (
             of_camera(*drive()),
             "its −y axis points up, as that of a camera (z forward, y down); choose the axes camera (",

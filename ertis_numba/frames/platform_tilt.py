@@ -95,7 +95,8 @@ def _axis_up(up: Floats, along_y: float) -> str:
     if axis == 1 and up[axis] < 0:
         return f"{found}, as that of a camera (z forward, y down); choose the axes camera {_HOW}"
     turned = "" if axis == len(up) - 1 and up[axis] > 0 else found
-    return f"{turned}; {wanted}, so turn them, or ignore this if the platform really moves so"
+    order = ", and quaternions the order x, y, z, w" if axis == len(up) - 1 and turned else ""
+    return f"{turned}; {wanted}{order}, so correct them, or ignore this if the platform really moves so"
 
 
 def _product(one: Floats, other: Floats) -> Floats:

@@ -175,6 +175,11 @@ def _one_per_time(rows: PoseRows) -> PoseRows:
             f"{between} have the same time, but poses {away_m[worst]:.3g} m and {away_deg[worst]:.3g}° apart; give one "
             "pose for each time, and times with all of their digits"
         )
+    if 2 * np.count_nonzero(away_m > 0) > len(rows):
+        raise DataError(
+            f"{rows.count(len(repeated))} of {len(rows)} have the time of an earlier one, but other poses; give times "
+            "with all of their digits"
+        )
     differences = "the same pose"
     if away_m.any() or away_deg.any():
         differences = f"poses up to {away_m.max():.2g} m and {away_deg.max():.2g}° apart ({between})"

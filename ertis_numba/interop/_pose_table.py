@@ -1,5 +1,6 @@
 """Poses in text files: TUM, tables with a header such as those of EuRoC, and KITTI."""
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
@@ -27,6 +28,8 @@ _POSITION: Final = re.compile(r"(?:([xyz])_m|t([xyz])|p_([xyz])|p_rs_r_([xyz]))"
 _IN_METRES: Final = re.compile(r"(?:p|pos|position|t)?_?([xyz])")
 _ROTATION: Final = re.compile(r"(?:q|q_|q_rs_|quat_|rot_|rotation_|orientation_)([xyzw])")
 _NAMED: Final = re.compile(r"([^\[(]+?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?")  # name [unit]
+_SPACED_UNIT: Final = re.compile(r"\s+(?=[\[(])")
+_UNKNOWN: Final = ("", "null", "none", "na", "n/a", "nan(ind)", "-nan(ind)")
 _SENSORS: Final = {"w_rs_s_x": "an IMU", "a_rs_s_x": "an IMU", "filename": "a camera"}
 
 
@@ -70,6 +73,8 @@ def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: s
     columns, rows = _header(text, needs_header=needs_header)
     if not rows:
         raise DataError("there are no poses; give at least one")
+    if columns is None and all(not cells[-1] for _, cells in rows):
+        rows = [(number, cells[:-1]) for number, cells in rows]  # Each line ends with a separator.
     n_fields = len(rows[0][1])
     if columns is None and n_fields == _N_KITTI and not needs_header:
         return _kitti(rows, time_unit, times)
@@ -98,14 +103,15 @@ def _header(text: str, *, needs_header: bool) -> tuple[_Columns | None, list[Row
     for number, line in enumerate(text.splitlines(), 1):
         content = line.split("#", 1)[0].strip()
         if not rows and columns is None:
-            names = _cells(line.strip().lstrip("#%").strip())
+            names = _names(line.strip().lstrip("#%/").strip())
             is_stated = bool(content) and (needs_header or not any(map(_is_number, names)))
             _require_no_sensor(names)
             found = _columns(names, is_stated=is_stated, in_metres=not needs_header)
+            _require_rotations(number, found, names)
             if found.is_complete or is_stated:
                 columns = _checked(found, names)
                 continue
-        if content and not content.startswith("%"):
+        if content and not content.startswith(("%", "//")):
             rows.append((number, _cells(content)))
     if needs_header and columns is None:
         raise DataError(f"the first line names the columns none; give {_COLUMNS}")
@@ -117,6 +123,11 @@ def _cells(line: str) -> list[str]:
     separator = next((each for each in ";," if each in line), None)
     cells = [cell.strip().strip('"').strip() for cell in line.split(separator)]
     return [cell.replace(",", ".") for cell in cells] if separator == ";" else cells  # 1,5;2,0 has decimal commas.
+
+
+def _names(line: str) -> list[str]:
+    """Return the names in a header. Between spaces, a unit in brackets belongs to the name before it."""
+    return _cells(line if {*",;"} & {*line} else _SPACED_UNIT.sub("", line))
 
 
 def _columns(names: Sequence[str], *, is_stated: bool, in_metres: bool) -> _Columns:
@@ -161,10 +172,19 @@ def _checked(columns: _Columns, names: Sequence[str]) -> _Columns:
     return columns
 
 
+def _require_rotations(number: int, columns: _Columns, names: Sequence[str]) -> None:
+    """Refuse a header with times and positions, but without rotations."""
+    if columns.time >= 0 and {*"xy"} <= columns.axes.keys() and not columns.quaternion and columns.yaw_deg is None:
+        raise DataError(
+            f"line {number} names the columns {', '.join(names)}, which include no rotation; give qx, qy, qz, qw or "
+            "yaw_deg as well"
+        )
+
+
 def _require_no_sensor(names: Sequence[str]) -> None:
     """Refuse the header of a sensor of EuRoC."""
     for name in names:
-        sensor = _SENSORS.get(name.split(" [")[0].lower())
+        sensor = _SENSORS.get(name.split("[")[0].strip().lower())
         if sensor is not None:
             raise DataError(
                 f"the file holds measurements of {sensor}, but no poses; give the poses of the same data set, such as "
@@ -240,11 +260,11 @@ def _rotations(rows: list[Row], columns: _Columns) -> Floats:
 
 
 def _numbers(rows: list[Row], place: int) -> Floats:
-    """Return the numbers of a column; NaN for empty cells."""
+    """Return the numbers of a column; NaN for empty cells and for other words that programs write for NaN."""
     found = []
     for number, cells in rows:
         try:
-            found.append(float(cells[place] or "nan"))
+            found.append(math.nan if cells[place].lower() in _UNKNOWN else float(cells[place]))
         except ValueError as error:
             raise DataError(f"line {number}: {error}; give decimal numbers") from None
     return np.array(found, np.float64)

@@ -59,7 +59,7 @@ def _decimal(line: int, text: str) -> Decimal:
             return value
     except ArithmeticError:
         pass
-    raise DataError(f"line {line}: time {text!r} is not a number; give a decimal number")
+    raise DataError(f"line {line}: time {text!r} is not a number; give a decimal number, such as seconds since 1970")
 
 
 def _unit_of(times: Sequence[Decimal]) -> tuple[str, tuple[str, ...]]:

@@ -129,11 +129,14 @@ def _text(path: Path) -> str:
     """Return a text in UTF-8, or in UTF-16 with its byte-order mark, as PowerShell writes it."""
     try:
         content = path.read_bytes()
-        return content.decode("utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"trajectory {path} is not a text file; give {_KINDS}") from error
+        text = content.decode("utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error}); give an existing file") from error
+    if "\0" in text:
+        raise DataError(f"trajectory {path} is not a text file; give {_KINDS}")
+    return text
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, *, overwrite: bool = False) -> None:
