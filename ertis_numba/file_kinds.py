@@ -1,6 +1,7 @@
 """Formats of other programs, recognized by the first bytes of a file, and commands that convert them."""
 
 import shlex
+import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -154,13 +155,14 @@ def kind_of(path: str | Path) -> FileKind | None:
     for kind, magic in _MAGICS:
         if all(content in head[30:120] if place < 0 else head.startswith(content, place) for place, content in magic):
             return kind
-    if _is_mpeg(head):
-        return _audio("an MP3 or AAC file")
-    if head[:1] == b"\x80" and head[1:2] in {b"\2", b"\3", b"\4", b"\5"} and last == b".":
-        return _data("a Python pickle")
-    if head[:2] == b"MZ" and b"This program" in head:
-        return _other("a program (Windows)")
-    return _TEXT if _is_text(head) else None
+    checks = (
+        (_is_matlab_4(head), _MATLAB),
+        (_is_mpeg(head), _audio("an MP3 or AAC file")),
+        (head[:1] == b"\x80" and head[1:2] in {b"\2", b"\3", b"\4", b"\5"} and last == b".", _data("a Python pickle")),
+        (head[:2] == b"MZ" and b"This program" in head, _other("a program (Windows)")),
+        (_is_text(head), _TEXT),
+    )
+    return next((kind for fits, kind in checks if fits), None)
 
 
 def problem_of(path: str | Path) -> str:
@@ -171,6 +173,16 @@ def problem_of(path: str | Path) -> str:
     stem = str(path.with_suffix(""))
     names = {"file": shlex.quote(str(path)), "path": str(path), "stem": stem, "target": shlex.quote(f"{stem}_pcm.wav")}
     return f"is {kind.name}; {kind.remedy.format(**names)}"
+
+
+def _is_matlab_4(head: bytes) -> bool:
+    """Return True for a little-endian matrix with a name."""
+    if len(head) < 24:
+        return False
+    kind, n_rows, n_columns, is_complex, n_bytes = struct.unpack_from("<5i", head)
+    name = head[20 : 19 + n_bytes] if 2 <= n_bytes <= 64 else b""
+    fits = 0 <= kind < 60 and n_rows > 0 and n_columns > 0 and is_complex in {0, 1}
+    return fits and name.isascii() and name.decode().isidentifier() and head[19 + n_bytes] == 0
 
 
 def _is_mpeg(head: bytes) -> bool:
@@ -195,8 +207,10 @@ def _is_text(head: bytes) -> bool:
         return True
     try:
         text = head.decode("utf-8-sig", "ignore" if len(head) == _HEAD_BYTES else "strict")
-    except UnicodeDecodeError:
-        return False
+    except UnicodeDecodeError:  # text of an older code page, with few letters outside of ASCII
+        text = head.decode("latin-1")
+        if sum(each > "~" for each in text) * 10 > len(text):
+            return False
     lines = text.split("\n")
     has_lines = len(lines) > 1 or text[:1] in {"{", "[", "<"}
     return has_lines and len(set(text)) > 4 and all(each.isprintable() or each in "\t\r\n\f" for each in text)

@@ -522,4 +522,4 @@ def test_pcm_options_are_refused_for_pdm(tmp_path):
     for option, value in (("--skip", "1"), ("--length", "1"), ("--start", "2026-05-04T12:30:00")):
         done = CliRunner().invoke(cli, ["import", str(tmp_path / "a.bin"), option, value])
         assert done.exit_code == 2
-        assert f"{option} is for PCM (.wav, .h5); remove it" in done.stderr
+        assert f"{option} is for PCM (.wav, .h5), but {tmp_path / 'a.bin'} contains raw words" in done.stderr

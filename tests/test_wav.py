@@ -117,7 +117,6 @@ def test_read_wav_reads_all_samples_despite_wrong_lengths(tmp_path, name):
     wav = read(tmp_path, content)
     assert np.array_equal(wav.samples[:], VALUES)
     assert not note or any(note in each for each in wav.notes), wav.notes
-    assert all(each.startswith("take.wav: ") for each in wav.notes)
 
 
 def test_read_wav_reads_relatives(tmp_path):
@@ -159,11 +158,11 @@ REFUSED = {
     "half float": (riff(form(code=3), DATA_CHUNK), r"states 8 bytes for 4 channels of 16 bits"),
     "A-law": (riff(form(8, 6), DATA_CHUNK), r"contains A-law \(format 0x0006\), .*'ffmpeg -i take.wav -c:a pcm_f32le"),
     "ADPCM": (riff(form(4, 0x11, sample_bytes=256), DATA_CHUNK), r"contains IMA ADPCM \(format 0x0011\)"),
-    "unknown": (riff(form(code=0x1234), DATA_CHUNK), r"contains an unknown encoding \(format 0x1234\)"),
+    "unknown": (riff(form(code=0x1234), DATA_CHUNK), r"contains samples of an unknown format, 0x1234"),
     "extended µ-law": (riff(extensible(8, 8, b"\7" + PCM_GUID[1:]), DATA_CHUNK), r"contains µ-law \(format 0x0007\)"),
-    "unknown GUID": (riff(extensible(16, 16, b"\1" * 16), DATA_CHUNK), r"contains an unknown encoding"),
-    "other form": (b"RIFF\x00\x10\0\0AVI LIST", r"is not a WAV file: it begins with b'RIFF"),
-    "only a start": (b"RIFF", r"is not a WAV file"),
+    "unknown GUID": (riff(extensible(16, 16, b"\1" * 16), DATA_CHUNK), r"contains samples of an unknown format"),
+    "other form": (b"RIFF\x00\x10\0\0AVI LIST", r"is an AVI video; convert it with"),
+    "only a start": (b"RIF", r"is not a WAV file: it begins with b'RIF'"),
     "nothing": (b"", r"is not a WAV file"),
 }
 
@@ -245,8 +244,7 @@ def test_read_wav_unwraps_lengths_above_4_gib(tmp_path, n_bytes, trailer):
     assert wav.samples.shape == (n_bytes // 16, 8)
     assert last.tolist() == [[1, 2, 3, 4, 5, 6, 7, 8]]
     assert wav.notes[0] == (
-        f"long.wav: the data chunk at byte 36 states {n_bytes % 2**32} bytes, but {n_bytes} fit the file; these were "
-        "read"
+        f"the data chunk at byte 36 states {n_bytes % 2**32} bytes, but {n_bytes} fit the file; these were read"
     )
     assert most < 100e6
 

@@ -17,6 +17,7 @@ __all__ = ["import_raw"]
 
 _END_NS = 2**63  # in the year 2262
 _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
+_RAW = {".bin", ".dat", ".pdm", ".raw"}
 _OF_PCM = {
     "--skip": "skip_s",
     "--length": "length_s",
@@ -84,6 +85,7 @@ _UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
     metavar="N",
     help="PCM: channel with the emitted call or its trigger, which is left out; measurements begin at its emissions.",
 )
+@click.option("--raw", "is_raw", is_flag=True, help="Read files of any content and ending as raw eRTIS words.")
 @click.option("--sensor", metavar="NAME", default="sensor", show_default=True, help="Name of the sensor.")
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
 @click.option("--humidity", type=float, metavar="PCT", help="Relative humidity in percent; 50 by default.")
@@ -104,6 +106,7 @@ def import_raw(
     join: bool,
     time_expansion: float | None,
     sync_channel: int | None,
+    is_raw: bool,
     sensor: str,
     temperature: float | None,
     humidity: float | None,
@@ -120,7 +123,9 @@ def import_raw(
     Instead of files, give a folder to which a program based on RTIS Dev has saved. It contains NAME<number>.bin
     for each measurement, and the settings of recording and processing as JSON.
 
-    Files that end in .wav contain multichannel PCM, as do .h5 files with the time_data of Acoular. Their channels are
+    Files of raw data end in .bin, .raw, .dat or .pdm; others need --raw. The content decides about other formats.
+
+    WAV files contain multichannel PCM, as do .h5 files with the time_data of Acoular. Their channels are
     the rows of the layout, and their sample rate becomes that of the recording. With --passive, the files
     contain sound without a call, for acoustic maps. A folder of .wav files is imported in the order of their times.
     Notes state the source of the times, and what was assumed or left out.
@@ -129,18 +134,22 @@ def import_raw(
     from ertis_numba.storage import check_target, write_recording
 
     folder = raw[0] if len(raw) == 1 and raw[0].is_dir() else None
-    is_pcm = all(path.suffix.lower() in _PCM for path in raw) if folder is None else is_wav_folder(folder)
+    if target is None:
+        target = _beside(raw[0]) if folder is None else Path(f"{folder.resolve()}.h5")
+    check_target(target, overwrite=force, sources=raw)
+    are_pcm = [_is_pcm(path, is_raw=is_raw) for path in raw] if folder is None else [is_wav_folder(folder)]
+    is_pcm = all(are_pcm)
     for name, parameter in _OF_PCM.items():
         if typed(parameter) and not is_pcm:
-            raise click.UsageError(f"{name} is for PCM (.wav, .h5); remove it", click.get_current_context())
-    if not is_pcm and any(path.suffix.lower() in _PCM for path in raw):
+            raise click.UsageError(
+                f"{name} is for PCM (.wav, .h5), but {raw[0]} contains raw words; remove it, or choose another file",
+                click.get_current_context(),
+            )
+    if not is_pcm and any(are_pcm):
         raise click.UsageError(
             "some files are PCM (.wav, .h5) and others are raw data; import each kind separately",
             click.get_current_context(),
         )
-    if target is None:
-        target = _beside(raw[0]) if folder is None else Path(f"{folder.resolve()}.h5")
-    check_target(target, overwrite=force, sources=raw)
     given = {"temperature_c": temperature, "humidity_percent": humidity}
     air = {name: value for name, value in given.items() if value is not None}
     measurements: PcmReader | RawReader
@@ -158,7 +167,7 @@ def import_raw(
         }
         measurements = _opened_pcm(raw, layout, preset, settings_file, options_of_reader)
     else:
-        measurements = _opened_raw(raw, folder, layout, preset, settings_file, sensor)
+        measurements = _opened_raw(raw, folder, layout, preset, settings_file, sensor, check_kind=not is_raw)
         settings = measurements.settings
         measurements.settings = settings.replace(air=settings.air.replace(**air))
     source = ", ".join(path.name for path in raw)
@@ -171,6 +180,25 @@ def import_raw(
     _report_obstacle(measurements.settings, quiet=quiet)
     if as_json:
         options.print_json({"output": str(target), "measurements": len(measurements), "notes": list(notes)})
+
+
+def _is_pcm(path: Path, *, is_raw: bool) -> bool:
+    """Return True for PCM by the content of a file, otherwise by its ending; refuse other formats and endings."""
+    from ertis_numba.errors import DataError
+    from ertis_numba.file_kinds import kind_of, problem_of
+
+    kind, suffix = None if is_raw else kind_of(path), path.suffix.lower()
+    if kind is not None and not (kind.is_wav or kind.is_hdf5):
+        raise DataError(f"{path} {problem_of(path)}; if it contains raw words all the same, use --raw")
+    if is_raw or kind is not None or suffix in _PCM:
+        return not is_raw
+    if suffix not in _RAW and path.is_file():
+        raise click.UsageError(
+            f"{path} has no known content, and an unknown ending; use --raw if it contains raw eRTIS words without a "
+            f"header, as in {', '.join(sorted(_RAW))}",
+            click.get_current_context(),
+        )
+    return False
 
 
 def _beside(first: Path) -> Path:
@@ -190,6 +218,8 @@ def _opened_raw(
     preset: str | None,
     settings_file: Path | None,
     sensor: str,
+    *,
+    check_kind: bool,
 ) -> "RawReader":
     from ertis_numba.interop import open_raw, open_rtis_folder
 
@@ -202,7 +232,7 @@ def _opened_raw(
         return open_rtis_folder(folder, layout=layout, preset=preset, sensor=sensor)
     if settings_file is None and (layout is None or preset is None):
         _require("--layout" if layout is None else "--preset")
-    return open_raw(raw, _settings(layout, preset, settings_file), sensor=sensor)
+    return open_raw(raw, _settings(layout, preset, settings_file), sensor=sensor, check_kind=check_kind)
 
 
 def _opened_pcm(
@@ -220,7 +250,7 @@ def _opened_pcm(
             _require("--layout" if layout is None else "--preset")
         settings = _settings(layout, preset, settings_file, {"processing.range_m": _UNSTATED_M})
         whole_range = settings.processing.range_m == _UNSTATED_M
-    elif raw[0].is_dir() or raw[0].suffix.lower() == ".wav":
+    elif raw[0].is_dir() or raw[0].suffix.lower() not in _PCM - {".wav"}:
         _require("--settings")
     return open_pcm(raw, settings, whole_range=whole_range, **given)
 

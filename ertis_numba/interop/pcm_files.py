@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.file_kinds import kind_of, problem_of
 from ertis_numba.interop._acoular import read_acoular
 from ertis_numba.interop.recorder_metadata import RecorderMetadata, read_metadata
 from ertis_numba.interop.recorder_names import MAX_DIFFERENCE_S, StatedTime, times_in_names
@@ -245,10 +246,17 @@ def _read(path: Path) -> tuple[float, Any, Settings | None, dict[str, bytes], tu
             pass
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; give a PCM file") from error
-    if path.suffix.lower() in _ACOULAR:
+    kind = kind_of(path)
+    if kind is None:
+        is_acoular = path.suffix.lower() in _ACOULAR
+    else:
+        is_acoular = kind.is_hdf5
+        if not (kind.is_wav or is_acoular):
+            raise DataError(f"{path} {problem_of(path)}")
+    if is_acoular:
         return *read_acoular(path), {}, ()
     wav = read_wav(path)
-    return wav.rate_hz, wav.samples, None, wav.chunks, tuple(note.removeprefix(f"{path.name}: ") for note in wav.notes)
+    return wav.rate_hz, wav.samples, None, wav.chunks, wav.notes
 
 
 def _converted(

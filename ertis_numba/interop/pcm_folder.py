@@ -7,6 +7,8 @@ from ertis_numba.interop.pcm_files import first_stated_times, inspect, natural_o
 
 __all__ = ["is_wav_folder", "wav_files"]
 
+_WAV = {".wav", ".wave"}
+
 
 def is_wav_folder(path: str | Path) -> bool:
     """Return True for a folder with WAV files, unless it contains .bin files of RTIS Dev.
@@ -21,7 +23,7 @@ def is_wav_folder(path: str | Path) -> bool:
         suffixes = {each.suffix.lower() for each in Path(path).iterdir()} if Path(path).is_dir() else set()
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; give a folder that can be read") from error
-    return ".wav" in suffixes and ".bin" not in suffixes
+    return bool(suffixes & _WAV) and ".bin" not in suffixes
 
 
 def wav_files(folder: Path, *, by_time: bool) -> list[Path]:
@@ -34,7 +36,7 @@ def wav_files(folder: Path, *, by_time: bool) -> list[Path]:
     DataError
         A file cannot be read.
     """
-    visible = [each for each in folder.iterdir() if not each.name.startswith(".") and each.suffix.lower() == ".wav"]
+    visible = [each for each in folder.iterdir() if not each.name.startswith(".") and each.suffix.lower() in _WAV]
     paths = sorted(visible, key=lambda path: natural_order(path.name))
     if not by_time:
         return paths

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.file_kinds import problem_of
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.sample_format import SampleFormat, sample_format
 from ertis_numba.settings import PRESETS, Settings
@@ -30,19 +31,29 @@ class RawReader:
     sensor : str
     first : sequence of int, optional
         Sequence number of the first measurement of each file, rising. By default, measurements are counted from 0.
+    check_kind : bool
+        See `open_raw`.
 
     Raises
     ------
     ArgumentError
         No file is given.
     DataError
-        A file is missing, empty, contains an incomplete measurement, or has more measurements than free numbers.
+        A file is missing, empty, has another format, contains an incomplete measurement, or has more measurements than
+        free numbers.
     """
 
     def __init__(
-        self, paths: Sequence[Path], settings: Settings, *, sensor: str = "sensor", first: Sequence[int] | None = None
+        self,
+        paths: Sequence[Path],
+        settings: Settings,
+        *,
+        sensor: str = "sensor",
+        first: Sequence[int] | None = None,
+        check_kind: bool = True,
     ) -> None:
         self.settings = settings
+        self._check_kind = check_kind
         self._sensor = sensor
         self._format = sample_format(settings)
         counts = [self._count(path) for path in paths]
@@ -83,6 +94,9 @@ class RawReader:
                 n_bytes = file.seek(0, 2)
         except OSError as error:
             raise DataError(f"{path}: {error.strerror}; give a file of raw words") from error
+        found = problem_of(path) if self._check_kind else ""
+        if found:
+            raise DataError(f"{path} {found}; if it contains raw words all the same, use --raw (check_kind=False)")
         count, rest = divmod(n_bytes, self._format.n_bytes)
         if count and not rest:
             return count
@@ -108,7 +122,13 @@ def _remedy(n_bytes: int, words: SampleFormat) -> str:
     return f"its length fits the presets {', '.join(fitting)}" if fitting else _LENGTH_REMEDY
 
 
-def open_raw(paths: Sequence[str | Path] | str | Path, settings: Settings, *, sensor: str = "sensor") -> RawReader:
+def open_raw(
+    paths: Sequence[str | Path] | str | Path,
+    settings: Settings,
+    *,
+    sensor: str = "sensor",
+    check_kind: bool = True,
+) -> RawReader:
     """Open raw files of complete measurements.
 
     Parameters
@@ -119,6 +139,8 @@ def open_raw(paths: Sequence[str | Path] | str | Path, settings: Settings, *, se
         Array, call and length of a measurement, such as ``Settings.from_preset("default_25_50")``.
     sensor : str
         Name of the sensor.
+    check_kind : bool
+        Refuse files whose first bytes are those of another format, such as WAV, FLAC, NumPy or text.
 
     Returns
     -------
@@ -128,7 +150,7 @@ def open_raw(paths: Sequence[str | Path] | str | Path, settings: Settings, *, se
     Raises
     ------
     DataError
-        A file is missing, empty, or contains an incomplete measurement.
+        A file is missing, empty, has another format, or contains an incomplete measurement.
 
     Examples
     --------
@@ -139,4 +161,4 @@ def open_raw(paths: Sequence[str | Path] | str | Path, settings: Settings, *, se
     1
     """
     several = [paths] if isinstance(paths, str | Path) else paths
-    return RawReader([Path(path) for path in several], settings, sensor=sensor)
+    return RawReader([Path(path) for path in several], settings, sensor=sensor, check_kind=check_kind)

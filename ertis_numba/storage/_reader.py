@@ -13,6 +13,7 @@ from typing import ClassVar, Self, TypeVar, overload
 import h5py
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
+from ertis_numba.file_kinds import kind_of, problem_of
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
@@ -227,7 +228,7 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
     if isinstance(kind, str) and kind == "occupancy_map":
         raise DataError(f"{path} is an occupancy map; give {wanted}")
     if not isinstance(kind, str) or kind not in _KIND_NAMES or not isinstance(version, int):
-        raise DataError(f"{path} is HDF5, but not of this package; {_remedy(file, path, wanted)}")
+        raise DataError(f"{path} {_problem(file, path, wanted)}")
     if version > FORMAT_VERSION:
         raise FormatVersionError(
             f"{path} has format version {version}, but this package reads up to {FORMAT_VERSION}; update ertis-numba"
@@ -235,11 +236,16 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
     return str(kind)
 
 
-def _remedy(file: h5py.File, path: Path, wanted: str) -> str:
-    """Return the remedy for an HDF5 file of another program."""
+def _problem(file: h5py.File, path: Path, wanted: str) -> str:
+    """Return the kind of an HDF5 file of another program, and the remedy."""
+    kind = kind_of(path)
+    if kind is not None and not kind.is_hdf5:  # MATLAB puts its name before the HDF5.
+        return problem_of(path)
+    remedy = f"give {wanted}"
     if "time_data" in file:
-        return f"import its signals with 'ertis import {shlex.quote(str(path))} --settings FILE.toml --output FILE.h5'"
-    return f"give {wanted}"
+        name = shlex.quote(str(path))
+        remedy = f"import its signals with 'ertis import {name} --settings FILE.toml --output FILE.h5'"
+    return f"is HDF5, but not of this package; {remedy}"
 
 
 def _attributes(file: h5py.File) -> dict[str, object]:

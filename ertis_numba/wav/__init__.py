@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
+from ertis_numba.file_kinds import problem_of
 from ertis_numba.wav._chunks import lengths_notes, read_chunks
 from ertis_numba.wav._form import Form
 from ertis_numba.wav._lengths import Content
@@ -59,8 +60,7 @@ def read_wav(path: Path) -> WavFile:
     view = content.view[chunks.start : chunks.start + chunks.n_bytes]
     samples = samples_of(view, form.n_channels, form.sample_bytes, form.kind, content.order)
     notes = [*chunks.notes, *lengths_notes(content, chunks, form), *_alignment_notes(samples, form)]
-    named = tuple(f"{path.name}: {note}" for note in notes)
-    return WavFile(float(form.rate_hz), samples, named, chunks.metadata())
+    return WavFile(float(form.rate_hz), samples, tuple(notes), chunks.metadata())
 
 
 def _alignment_notes(samples: Samples, form: Form) -> list[str]:
@@ -105,5 +105,8 @@ def _opened(path: Path) -> Content:
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; give a WAV file") from error
     if start[:4] not in _ORDERS or start[8:] != b"WAVE":
+        found = problem_of(path)
+        if found:
+            raise DataError(f"{path} {found}")
         raise DataError(f"{path} is not a WAV file: it begins with {start[:4]!r}; give WAV, or HDF5 of Acoular (.h5)")
     return Content(path, np.asarray(np.memmap(path, np.uint8, "r")), _ORDERS[start[:4]])

@@ -142,5 +142,9 @@ def _require_pcm(code: int, path: Path) -> None:
     """Refuse compressed samples by name."""
     if code in {_PCM, _FLOAT}:
         return
-    name = _ENCODINGS.get(code, "an unknown encoding")
-    raise DataError(f"{path} contains {name} (format {code:#06x}), but PCM is needed; {convert(path)}")
+    if code not in _ENCODINGS:
+        raise DataError(
+            f"{path} contains samples of an unknown format, {code:#06x}, but PCM is needed; save them as PCM with the "
+            "program that wrote them"
+        )
+    raise DataError(f"{path} contains {_ENCODINGS[code]} (format {code:#06x}), but PCM is needed; {convert(path)}")
