@@ -134,6 +134,16 @@ def test_empty_cells_of_tables_are_rows_without_a_pose(tmp_path):
     assert read.notes == ("2 lines of 4 without numbers (NaN) left out, the first is line 3",)
 
 
+def test_gaps_between_poses_are_noted(tmp_path):
+    text = "".join(f"{1.0 + 0.1 * number + 30 * (number >= 5)} 0 0 0 0 0 0 1\n" for number in range(9))
+    read = read_trajectory(written(tmp_path, "a.tum", text))
+    assert read.notes == (
+        "1 interval between poses longer than 1 s, in which poses are interpolated; the longest is 30.1 s after line 5",
+    )
+    steady = "".join(f"{2.5 * number} 0 0 0 0 0 0 1\n" for number in range(9))
+    assert read_trajectory(written(tmp_path, "b.tum", steady)).notes == ()
+
+
 KITTI = "1 0 0 0 0 1 0 0 0 0 1 0\n0 0 1 1 0 1 0 0 -1 0 0 2\n"
 
 

@@ -18,6 +18,8 @@ _MAX_NORM_ERROR: Final = 0.05  # Quaternions with two digits have such errors; o
 _ROUNDING: Final = 1e-3  # Error in the length of a quaternion that needs no note.
 _SAME_M: Final = 0.2  # Largest difference between two rows for one time. A platform at 2 m/s moves by it in 0.1 s.
 _SAME_DEG: Final = 10.0
+_LONG_S: Final = 1.0  # Interval in which a platform may have gone anywhere.
+_UNUSUAL: Final = 5.0  # Ratio of a gap to the median interval.
 _MAX_POSITION_M: Final = 1e8  # As for Trajectory.
 
 
@@ -98,7 +100,23 @@ def trajectory_of(rows: PoseRows, pose_axes: PoseAxes = "platform") -> Trajector
     except ArgumentError as error:
         raise DataError(str(error)) from error
     made = made.converted(pose_axes)
-    return made.replace(notes=(*rows.notes, *filter(None, [tilt_note(made.rotation_xyzw, made.position_m)])))
+    found = (_gap_note(rows), tilt_note(made.rotation_xyzw, made.position_m))
+    return made.replace(notes=(*rows.notes, *filter(None, found)))
+
+
+def _gap_note(rows: PoseRows) -> str | None:
+    """Return a note if some intervals between poses are long, and longer than usual."""
+    steps_s = np.diff(rows.time_ns) / 1e9
+    if not len(steps_s):
+        return None
+    gaps = np.flatnonzero((steps_s > _LONG_S) & (steps_s > _UNUSUAL * np.median(steps_s)))
+    if not gaps.size:
+        return None
+    worst = gaps[np.argmax(steps_s[gaps])]
+    return (
+        f"{len(gaps)} interval{'s' * (len(gaps) != 1)} between poses longer than {_LONG_S:g} s, in which poses are "
+        f"interpolated; the longest is {steps_s[worst]:.3g} s after {rows.name(worst)}"
+    )
 
 
 def _complete(rows: PoseRows) -> PoseRows:
