@@ -17,14 +17,16 @@
     └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
         └── RefusedError                 it denies access or rejects a request
 
-Each class also inherits the built-in exception in brackets. Three warnings, all ``UserWarning``, complete them:
+Each class also inherits the built-in exception in brackets. Four warnings, all ``UserWarning``, complete them:
 ``ErrorBudgetWarning`` for images that may exceed their error budget, ``CallMismatchWarning`` for echoes that do not
-match the call, and ``PoseWarning`` for poses that tilt a platform by more than 30°.
+match the call, ``CoarseGridWarning`` for directions that miss sources between them, and ``PoseWarning`` for poses that
+tilt a platform by more than 30°.
 """
 
 __all__ = [
     "ArgumentError",
     "CallMismatchWarning",
+    "CoarseGridWarning",
     "DamagedError",
     "DataError",
     "DeviceError",
@@ -105,6 +107,10 @@ class ErrorBudgetWarning(UserWarning):
 
 class CallMismatchWarning(UserWarning):
     """Echoes do not match the call in the settings, so that ranges in images are wrong."""
+
+
+class CoarseGridWarning(UserWarning):
+    """Directions are so far apart that acoustic maps show sources between them too weak, or elsewhere."""
 
 
 class PoseWarning(UserWarning):

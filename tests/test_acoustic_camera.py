@@ -19,6 +19,8 @@ from ertis_numba.passive.parallel_bins import in_parts
 from ertis_numba.settings import MAP_METHODS, Settings
 from tests.on_device import KERNELS
 
+pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")  # Small grids save time.
+
 SMALL = {
     "array.layout": "six",
     "array.positions_m": [

@@ -19,6 +19,8 @@ from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
 from ertis_numba.passive.source_search import _inverse
 from tests.test_acoustic_camera import settings_of, sound
 
+pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")  # Small grids save time.
+
 SPACE = {"processing__directions": "3d:400", "passive__bands_hz": [[30e3, 45e3]]}
 
 

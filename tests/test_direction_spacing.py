@@ -27,17 +27,42 @@ def blank(directions, sensor="sensor"):
     )
 
 
+def warning_of(directions, **changes):
+    image = blank(directions)
+    return spacing_warning(image.settings.replace(**changes), image)
+
+
 @pytest.mark.parametrize("directions", ["2d:30", "90", "1850", "3d:1000", ((0.0, 0.0),)])
 def test_fine_grids_cause_no_warning(directions):
-    assert spacing_warning(blank(directions)) is None
+    assert warning_of(directions) is None
 
 
 @pytest.mark.parametrize(("directions", "spacing"), [("2d:20", "9.5"), ("3d:400", "7.1")])
 def test_coarse_grids_cause_a_warning_with_a_grid_that_is_fine(directions, spacing):
-    text = spacing_warning(blank(directions))
+    text = warning_of(directions)
     assert text.startswith(f"directions are {spacing}° apart")
     finer = text.removesuffix(" directions").split()[-1]
-    assert spacing_warning(blank(finer)) is None
+    assert warning_of(finer) is None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"processing.weighting": "coherence_factor"},
+        {"processing.beamformer": "dmas", "processing.dmas_order": 4},
+        {"processing.beamformer": "capon"},
+    ],
+)
+def test_narrower_beamformers_need_finer_grids(changes):
+    assert warning_of("2d:30") is None
+    text = warning_of("2d:30", **changes)
+    assert f"in images with {next(iter(changes.values()))}; process with at least 2d:" in text
+    assert warning_of(text.removesuffix(" directions").split()[-1], **changes) is None
+
+
+def test_no_grid_is_named_if_none_suffices():
+    narrow = {"processing.beamformer": "capon", "processing.diagonal_loading": 1e-6}
+    assert "no grid of up to 200000 directions suffices" in warning_of("3d:400", **narrow)
 
 
 def test_commands_warn_once_of_the_first_sensor_with_a_coarse_grid(capsys):

@@ -21,7 +21,7 @@ def suggested(text):
     return text.removesuffix(" directions").split()[-1]
 
 
-@pytest.mark.parametrize("directions", ["1850", "3000", "3d:2000"])
+@pytest.mark.parametrize("directions", ["1850", "3000", "3d:2400"])
 def test_fine_grids_cause_no_warning_and_no_change(directions):
     settings = settings_with(directions)
     assert search_warning(settings) is None
@@ -36,7 +36,7 @@ def test_one_elevation_causes_a_warning_with_a_grid_that_is_fine(directions):
 
 
 @pytest.mark.parametrize(
-    ("directions", "words"), [("3d:10", "above 8.9 kHz"), ("3d:100", "above 17.8 kHz"), ("3d:1500", "above 70.8 kHz")]
+    ("directions", "words"), [("3d:10", "above 8.9 kHz"), ("3d:100", "above 17.8 kHz"), ("3d:2000", "above 70.8 kHz")]
 )
 def test_coarse_grids_cause_a_warning_with_a_grid_that_is_fine(directions, words):
     text = search_warning(settings_with(directions))

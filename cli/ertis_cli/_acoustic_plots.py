@@ -116,11 +116,13 @@ def draw(
 ) -> "tuple[Figure, str]":
     """Return the figure of a kind, and the name of its sensor."""
     from ertis_numba import figures
+    from ertis_numba.passive.search_grid import coarse_map_warning
     from ertis_numba.storage import file_kind
 
     if kind == "acoustic_map":
         _require_pair(photo, photo_fov_deg)
         found = _map(path, sensor, index, quiet=quiet)
+        options.warn_of(found.stamp.sensor, coarse_map_warning(found.settings, found))
         figure = figures.acoustic_map(found, band_hz=band_hz, photo=photo, photo_fov_deg=photo_fov_deg, **look)
         return figure, found.stamp.sensor
     if kind == "spectrum":
@@ -153,7 +155,7 @@ def _map(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "Acousti
     with options.note_when_slow(options.PREPARING, quiet=quiet):
         from ertis_numba.passive import AcousticCamera
 
-        with AcousticCamera(heard.settings) as camera:
+        with AcousticCamera(heard.settings, check=False) as camera:
             return camera.process(heard)
 
 

@@ -51,9 +51,7 @@ def listen_bearings(
     def show(found: "AcousticMap") -> None:
         if (sensor := found.stamp.sensor) not in checked:
             checked.add(sensor)
-            text = search_warning(found.settings)
-            if text is not None:
-                click.echo(f"ertis: warning: sensor {sensor}: {text}", err=True)
+            options.warn_of(sensor, search_warning(found.settings))
         _show(found, subscribers[0].bearings, _age_ms(subscribers[0]), as_json=as_json)
 
     def report_active(subscriber: AcousticMapSubscriber) -> None:

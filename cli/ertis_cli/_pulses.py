@@ -241,7 +241,7 @@ class PipelinesBySensor:
         image = self._image(measurement)
         if not self.warnings and image.stamp.sensor not in self._checked:
             self._checked.add(image.stamp.sensor)
-            text = spacing_warning(image)
+            text = spacing_warning(image.settings, image)
             if text is not None:
                 self.warnings.append(text)
                 click.echo(f"ertis: warning: {text}", err=True)

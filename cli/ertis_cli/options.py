@@ -17,6 +17,7 @@ from ertis_numba.constants import MAX_MICROPHONES
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
+    from ertis_numba.angles import DegreesFromRadians
     from ertis_numba.geometry import Grid
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Array, Settings
@@ -452,6 +453,21 @@ def say(text: str, *, quiet: bool) -> None:
     """Print a line on stderr, unless ``quiet``."""
     if not quiet:
         click.echo(text, err=True)
+
+
+def warn_of(sensor: str, text: str | None) -> None:
+    """Print a warning about the results of a sensor, if there is any."""
+    if text:
+        click.echo(f"ertis: warning: sensor {sensor}: {text}", err=True)
+
+
+def warn_of_spacing(sensor: str, settings: "Settings", grid: "DegreesFromRadians") -> None:
+    """Print a warning if a sensor's images have directions too far apart; fused images have no array of their own."""
+    from ertis_numba.analysis.direction_spacing import spacing_warning
+    from ertis_numba.fusion import PLATFORM
+
+    if sensor != PLATFORM:
+        warn_of(sensor, spacing_warning(settings, grid))
 
 
 def counted(count: int, noun: str) -> str:

@@ -180,6 +180,7 @@ def _list_sources(
     """Print the sources in each band of acoustic maps."""
     from ertis_numba.geometry import Grid
     from ertis_numba.passive import find_sound_sources
+    from ertis_numba.passive.search_grid import coarse_map_warning
     from ertis_numba.storage import open_acoustic_maps
 
     for name in _OF_IMAGES:
@@ -192,6 +193,7 @@ def _list_sources(
     for name in sensors:
         with open_acoustic_maps(path, sensor=name) as maps:
             options.note_unknown_angles(name, maps.settings, Grid(maps.azimuth_rad, maps.elevation_rad))
+            options.warn_of(name, coarse_map_warning(maps.settings, maps))
             for index in options.places(measurement, len(maps)):
                 found = find_sound_sources(maps[index], top=top, min_level_db=min_level_db)
                 rows += [{"sensor": name, "map": index, **each.as_dict()} for each in found]
@@ -243,6 +245,7 @@ def _found(
     from ertis_numba.storage import open_energyscapes
 
     with open_energyscapes(path, sensor=sensor) as images:
+        options.warn_of_spacing(sensor, images.settings, images)
         return [
             {"sensor": sensor, "measurement": index, **_rounded(peak)}
             for index in options.places(measurement, len(images))

@@ -278,13 +278,17 @@ def _reflectors(image: "Energyscape", top: int) -> "list[Peak] | None":
 
 
 def _image(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "Energyscape":
+    """Return an image, and warn if its directions are too far apart."""
     from ertis_numba.storage import file_kind, open_energyscapes
 
     if file_kind(path) == "energyscape":
         with open_energyscapes(path, sensor=sensor) as images:
-            return images[options.place(index, len(images))]
-    measurement = _measurement(path, sensor, index)
-    return options.pipeline(measurement.settings, quiet=quiet).process(measurement)
+            image = images[options.place(index, len(images))]
+    else:
+        measurement = _measurement(path, sensor, index)
+        image = options.pipeline(measurement.settings, quiet=quiet).process(measurement)
+    options.warn_of_spacing(image.stamp.sensor, image.settings, image)
+    return image
 
 
 def _measurement(path: Path, sensor: str | None, index: int) -> "Measurement":

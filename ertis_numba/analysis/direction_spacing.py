@@ -1,65 +1,287 @@
-"""Comparison of the spacing of directions with the main lobe of the array."""
+"""Comparison of the directions of a grid with the main lobe of the array."""
 
+import functools
 import math
-from typing import Final
+from collections.abc import Callable, Iterator
+from typing import Final, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
-from ertis_numba.analysis.detect import neighbours_of, spacing_of
-from ertis_numba.analysis.point_spread import PointSpread
-from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import unit_vectors
-from ertis_numba.settings import Settings
+from ertis_numba.analysis.array_response import ArrayAxes, CallResponse, Response
+from ertis_numba.analysis.between_directions import Between, farthest_places
+from ertis_numba.angles import DegreesFromRadians
+from ertis_numba.geometry import (
+    PAPER_GRIDS,
+    Grid,
+    array_weights,
+    direction_grid,
+    grid_count,
+    microphones,
+    spacing_rad,
+    unit_vectors,
+)
+from ertis_numba.settings import Processing, Settings
 
-__all__ = ["spacing_warning"]
+__all__ = ["LARGEST_GRID", "MAX_LOSS_DB", "GridCheck", "Lobe", "Peak", "image_peak", "rounded_down", "spacing_warning"]
 
-_MIN_AMPLITUDE: Final = math.sqrt(0.5)  # Relative to a reflector in a direction.
-_N_TURNS: Final = 16  # Orientations of the line between two directions.
-_FINER: Final = 0.97  # Factor by which each attempt reduces the spacing.
+MAX_LOSS_DB: Final = 3.0
+"""Largest loss of a source between the directions of a sufficient grid, in dB."""
+
+LARGEST_GRID: Final = 200_000
+"""Number of directions of the largest grid that warnings name, for its time and memory."""
+
+Floats = NDArray[np.float64]
+Peak = Callable[[Floats], Floats]
+
+_MARGIN_DB: Final = 0.03  # The weakest source is searched, and the search may miss it by a little.
+_NEAREST: Final = 6
+_ABOVE: Final = 1.03  # Least amplitude of the weakest source relative to the highest side lobe …
+_AS_STRONG: Final = 0.94  # … up to this one, -0.5 dB, which no grid tells from a source.
+_STEP: Final = 1.12
+_MOST_DB: Final = 40.0
+_LEAST: Final = 1e-9
 
 
-def spacing_warning(image: Energyscape) -> str | None:
-    """Return a warning if a reflector between the directions of an image may lose half of its power.
+class Lobe(NamedTuple):
+    """Main lobe of an array at one frequency, or of a call, for one method.
+
+    Attributes
+    ----------
+    response : Response
+        Response of delay-and-sum.
+    axes : ArrayAxes
+    peak : callable
+        Returns the amplitudes of the method from those of delay-and-sum.
+    max_loss_db : float
+        Largest loss of a source between directions.
+    """
+
+    response: Response
+    axes: ArrayAxes
+    peak: Peak
+    max_loss_db: float = MAX_LOSS_DB
+
+    def loss_db(self, amplitude: float) -> float:
+        """Return the loss of a source with an amplitude of delay-and-sum, in dB."""
+        return -20 * math.log10(max(float(self.peak(np.array([amplitude]))[0]), _LEAST))
+
+    def suffices(self, amplitude: float, side_lobe: float) -> bool:
+        """Return True if the weakest source loses little, and exceeds the side lobes of others.
+
+        Parameters
+        ----------
+        amplitude : float
+            Amplitude of delay-and-sum of the weakest source.
+        side_lobe : float
+            Amplitude of the highest side lobe; one that is as strong as a source does not count.
+        """
+        is_loud = self.loss_db(amplitude) <= self.max_loss_db - _MARGIN_DB
+        return is_loud and (side_lobe > _AS_STRONG or amplitude >= _ABOVE * side_lobe)
+
+    def largest_rad(self, side_lobe: float) -> float:
+        """Return the angle, along the longest axis of the array, at which a source is as weak as it may be."""
+        away_rad = np.linspace(0.0, math.pi / 2, 8001)[1:, None]
+        along = self.axes.longest
+        ahead = np.eye(3)[int(np.abs(along).argmin())]
+        ahead = ahead - (ahead @ along) * along
+        ahead /= np.linalg.norm(ahead)
+        amplitude = self.response(
+            np.cos(away_rad) * ahead + np.sin(away_rad) * along, np.repeat(ahead[None], len(away_rad), 0)
+        )
+        least = _ABOVE * side_lobe if side_lobe <= _AS_STRONG else 0.0
+        loss_db = -20 * np.log10(np.maximum(self.peak(amplitude), _LEAST))
+        is_weak = (loss_db > self.max_loss_db - _MARGIN_DB) | (amplitude < least)
+        return float(away_rad[int(is_weak.argmax()), 0]) if is_weak.any() else math.pi / 2
+
+
+class GridCheck:
+    """Sources between the directions of a grid, for lobes of one array.
 
     Parameters
     ----------
-    image : Energyscape
+    grid : Grid
+    processing : Processing
+        Source of the grid's name and limits.
+    side_lobes : dict of Response to float, optional
+        Results of `side_lobe` in the same limits.
+    """
+
+    def __init__(self, grid: Grid, processing: Processing, *, side_lobes: dict[Response, float] | None = None) -> None:
+        self._directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+        self._processing, self._between = processing, Between(self._directions, processing)
+        self._farthest: tuple[Floats, NDArray[np.intp]] | None = None
+        self._side_lobes = {} if side_lobes is None else side_lobes
+        self.is_single = not len(self._between.places)
+
+    @classmethod
+    def of(cls, processing: Processing) -> Self:
+        """Return the check of the grid that settings name or list."""
+        return cls(direction_grid(processing), processing)
+
+    @functools.cached_property
+    def spacing_rad(self) -> float:
+        """Spacing of the directions in radians."""
+        return spacing_rad(self._directions)
+
+    def weakest(self, lobe: Lobe) -> float:
+        """Return the amplitude of delay-and-sum in the direction nearest to the weakest source."""
+        if self._farthest is None:
+            tree, count = KDTree(lobe.axes.scaled_m(self._directions)), min(_NEAREST, len(self._directions))
+            sources = farthest_places(
+                self._between, lambda places: tree.query(lobe.axes.scaled_m(places))[0], self.spacing_rad
+            )
+            near = tree.query(lobe.axes.scaled_m(sources), k=count)[1].reshape(len(sources), count)
+            self._farthest = sources, near
+        sources, near = self._farthest
+        directions = self._directions[near].reshape(-1, 3)
+        amplitude = lobe.response(np.repeat(sources, near.shape[1], axis=0), directions)
+        return float(amplitude.reshape(near.shape).max(axis=1).min())
+
+    def side_lobe(self, lobe: Lobe) -> float:
+        """Return the highest side lobe between the directions, 0 to 1."""
+        if lobe.response not in self._side_lobes:
+            self._side_lobes[lobe.response] = lobe.response.side_lobe(self._between.everywhere())
+        return self._side_lobes[lobe.response]
+
+    def suffices(self, lobe: Lobe) -> bool:
+        """Return True if no source between the directions is too weak, or weaker than side lobes."""
+        return self.is_single or lobe.suffices(self.weakest(lobe), self.side_lobe(lobe))
+
+    def is_ambiguous(self, lobe: Lobe) -> bool:
+        """Return True if side lobes are as strong as a source."""
+        return self.side_lobe(lobe) > _AS_STRONG
+
+    def exceeds_side_lobes(self, lobe: Lobe) -> bool:
+        """Return True if the weakest source exceeds the side lobes of others."""
+        return self.weakest(lobe) >= self.side_lobe(lobe)
+
+    def loss_db(self, lobe: Lobe) -> str:
+        """Return the loss of the weakest source in words."""
+        loss_db = lobe.loss_db(self.weakest(lobe))
+        return f"{loss_db:.1f}" if loss_db < 10 else f"{min(loss_db, _MOST_DB):.0f}"
+
+    def remedy(self, lobe: Lobe, verb: str = "use") -> str | None:
+        """Return the advice to use a grid with which the check succeeds; None if there is none."""
+        named = self.finer(lobe)
+        return None if named is None else self._worded(named, lobe.largest_rad(self.side_lobe(lobe)), verb)
+
+    def finer(self, lobe: Lobe) -> Processing | None:
+        """Return settings with a grid of the same kind and limits with which the check succeeds; None without any."""
+        kind, processing = self._kind_and_limits()
+        largest_rad = lobe.largest_rad(self.side_lobe(lobe))
+        width_rad = float(np.ptp(processing.azimuth_limits_rad))
+        area = width_rad * float(np.ptp(np.sin(processing.elevation_limits_rad)))
+        # A square whose middle is as far from its corners has twice the area of the square of this distance.
+        count = max(width_rad / 8, area / (4 * largest_rad)) if kind == "3d" else width_rad / 2
+        side_lobes: dict[Response, float] = {}
+        for tried in _counts(count / largest_rad):
+            named = processing.replace(directions=f"{kind}:{tried}")
+            shared = side_lobes if kind == "3d" else None  # Their places depend on the limits only.
+            if GridCheck(direction_grid(named), named, side_lobes=shared).suffices(lobe):
+                return named
+        return None
+
+    def _kind_and_limits(self) -> tuple[str, Processing]:
+        """Return the kind of the grid, and settings with its limits."""
+        name = self._processing.directions
+        if not self._is_named:
+            return "2d" if self._between.is_planar else "3d", self._processing
+        text, azimuth_deg, elevation_deg = PAPER_GRIDS.get(
+            str(name), (str(name), self._processing.azimuth_limits_deg, self._processing.elevation_limits_deg)
+        )
+        limits = {"azimuth_limits_deg": azimuth_deg, "elevation_limits_deg": elevation_deg}
+        return text[:2], self._processing.replace(**limits if text[:2] == "3d" else {"azimuth_limits_deg": azimuth_deg})
+
+    @property
+    def _is_named(self) -> bool:
+        name = self._processing.directions
+        return isinstance(name, str) and grid_count(name) is not None
+
+    def _worded(self, named: Processing, largest_rad: float, verb: str) -> str:
+        """Return the name of a grid, with its limits unless they are those of the settings, or a spacing."""
+        words, ours = f"{verb} at least {named.directions} directions", self._processing
+        (west, east), (low, high) = named.azimuth_limits_deg, named.elevation_limits_deg
+        if (west, east) != ours.azimuth_limits_deg or (low, high) != ours.elevation_limits_deg:
+            words += f" within azimuths {west:g}:{east:g} and elevations {low:g}:{high:g}"
+        if self._is_named:
+            return words
+        factor = 2.0 if self._between.is_planar else math.sqrt(2)
+        closer = f"list directions at most {rounded_down(math.degrees(factor * largest_rad)):g}° apart"
+        is_aside = self._between.is_planar and np.ptp(self._directions[:, 2]) > 0  # No grid has a name.
+        return closer if is_aside else f"{words}, or {closer}"
+
+
+def rounded_down(number: float) -> float:
+    """Return a number with two significant digits, rounded down."""
+    digits = 1 - math.floor(math.log10(number))
+    return round(math.floor(number * 10.0**digits + _LEAST) / 10.0**digits, max(digits, 0))
+
+
+def _counts(first: float) -> Iterator[int]:
+    """Yield numbers of directions with two digits and zeros, from the first upwards; none if it is too large."""
+    count, last = max(2.0, first), 0
+    while last < LARGEST_GRID and count <= 4 * LARGEST_GRID:
+        unit = 10 ** max(0, math.floor(math.log10(count)) - 1)
+        last = min(max(last + 1, unit * math.ceil(count / unit)), LARGEST_GRID)
+        yield last
+        count = _STEP * max(count, last)
+
+
+def image_peak(settings: Settings) -> Peak:
+    """Return the function from amplitudes of delay-and-sum to those of the beamformer of images, for one echo.
+
+    ``ρ`` becomes ``ρ^n`` for DMAS of order n, and ``ρ δ / (δ + M (1 − ρ²))`` for Capon with the loading δ and M
+    microphones. The coherence factor multiplies by ``ρ²``.
+    """
+    processing = settings.processing
+    n_mics = len(microphones(settings.array).enabled_positions_m)
+
+    def peak(rho: Floats) -> Floats:
+        rho = np.clip(rho, 0.0, 1.0)
+        out = rho**processing.dmas_order if processing.beamformer == "dmas" else rho
+        if processing.beamformer == "capon":
+            loading = processing.diagonal_loading
+            out = rho * loading / (loading + n_mics * (1 - rho**2))
+        return np.asarray(out * rho**2 if processing.weighting == "coherence_factor" else out)
+
+    return peak
+
+
+def spacing_warning(settings: Settings, grid: DegreesFromRadians) -> str | None:
+    """Return a warning if a reflector between the directions of images may lose half of its power.
+
+    Parameters
+    ----------
+    settings : Settings
+        Settings of the images.
+    grid : Grid, Energyscape or EnergyscapeReader
+        Directions, or a result with them.
 
     Returns
     -------
     str or None
-        None for fine grids, and for grids of a single direction.
+        None for fine grids, and for grids of a single direction. The warning names a grid that suffices.
 
     Examples
     --------
     >>> import ertis_numba as ertis
     >>> from ertis_numba.analysis.direction_spacing import spacing_warning
     >>> with ertis.open_recording("reflectors.h5") as recording:
-    ...     spacing_warning(ertis.Pipeline(recording.settings).process(recording[0])) is None
+    ...     spacing_warning(recording.settings, ertis.Pipeline(recording.settings).grid) is None
     True
     """
-    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
-    spacing_rad = float(np.median(spacing_of(directions, neighbours_of(directions))))
-    if not math.isfinite(spacing_rad):
+    lobe = Lobe(CallResponse(settings), ArrayAxes(settings, array_weights(settings)), image_peak(settings))
+    check = GridCheck(Grid(grid.azimuth_rad, grid.elevation_rad), settings.processing)
+    if check.suffices(lobe):
         return None
-    amplitude = _amplitude_between(image.settings, spacing_rad, is_planar=image.is_planar)
-    if amplitude >= _MIN_AMPLITUDE:
-        return None
-    finer = _FINER
-    while _amplitude_between(image.settings, finer * spacing_rad, is_planar=image.is_planar) < _MIN_AMPLITUDE:
-        finer *= _FINER
-    kind, n_dimensions = ("2d", 1) if image.is_planar else ("3d", 2)
-    n_directions = 10 * math.ceil(len(directions) / finer**n_dimensions / 10)
+    processing = settings.processing
+    methods = [name for name in (processing.beamformer, processing.weighting) if name not in {"delay_and_sum", "none"}]
+    narrower = f" in images with {' and '.join(methods)}" if methods else ""
+    remedy = check.remedy(lobe, "process with")
     return (
-        f"directions are {math.degrees(spacing_rad):.1f}° apart, so a reflector between them appears up to "
-        f"{-20 * math.log10(amplitude):.0f} dB too weak; process with at least {kind}:{n_directions} directions"
+        f"directions are {math.degrees(check.spacing_rad):.1f}° apart, so a reflector between them appears up to "
+        f"{check.loss_db(lobe)} dB too weak{narrower}; "
+        + (remedy or f"no grid of up to {LARGEST_GRID} directions suffices, so use narrower limits, or delay_and_sum")
     )
-
-
-def _amplitude_between(settings: Settings, spacing_rad: float, *, is_planar: bool) -> float:
-    """Return the lowest relative amplitude of a reflector ahead of the array, midway between directions."""
-    turn_rad = np.zeros(1) if is_planar else np.arange(_N_TURNS) * (math.pi / _N_TURNS)
-    # The middle of a square is farther from its corners than that of a line from its ends.
-    away_rad = spacing_rad / 2 * (1.0 if is_planar else math.sqrt(2))
-    offsets = away_rad * np.stack([np.zeros(len(turn_rad)), np.cos(turn_rad), np.sin(turn_rad)], axis=1)
-    return float(PointSpread(settings)(offsets, np.zeros(len(offsets))).min())

@@ -153,8 +153,8 @@ def prepare_maps(
     settings : mapping of str to Settings, optional
         Settings for each sensor. By default, ``options.settings`` derives them from the recorded settings.
     warn : callable
-        Called with a line for each sensor that has faulty microphones or bands of noise only, and after the processing
-        of a sensor that emitted its call.
+        Called with a line for each sensor that has faulty microphones, bands of noise only or coarse directions, and
+        after the processing of a sensor that emitted its call.
 
     Yields
     ------
@@ -178,6 +178,7 @@ def prepare_maps(
                     options.settings(recording.settings) if settings is None else settings[recording.sensor],
                     options.device,
                     options.threads,
+                    check=False,
                 )
             )
             for recording in recordings
@@ -186,6 +187,8 @@ def prepare_maps(
             _check_sensor(recording, camera.settings, options, warn)
             if noisy := shaped_noise_warning(camera.settings, camera.band_hz):
                 warn(f"{path}: {noisy}")
+            if camera.warning:
+                warn(f"{path}: sensor {recording.sensor}: {camera.warning}")
         yield MapJob(recordings, cameras, writer, warn)
 
 

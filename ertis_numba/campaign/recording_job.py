@@ -12,6 +12,7 @@ from typing import Any
 from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
+from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.analysis.emission_time import emission_times_s
 from ertis_numba.analysis.health.emission import describe_shift
 from ertis_numba.campaign.attitudes import unlevelled_image
@@ -268,6 +269,9 @@ def _check_sensor(
     unknown = observable_angles(run.pipeline.settings.array, run.pipeline.grid).note
     if unknown is not None:
         warn(f"{place} {unknown}")
+        warn(f"{recording.path}: sensor {recording.sensor}: {match.warning}")
+    if coarse := spacing_warning(run.pipeline.settings, run.pipeline.grid):
+        warn(f"{recording.path}: sensor {recording.sensor}: {coarse}")
     heard = None
     if run.pipeline.settings.processing.method != "paper":
         kernel_set = kernels.load(run.pipeline.device)

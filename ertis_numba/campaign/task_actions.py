@@ -112,7 +112,7 @@ def _plan(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
 
 def _plan_maps(settings: Settings, device: str, threads: int | None, *, warm: bool) -> dict[str, Any]:
     """Return the settings of acoustic maps as they are; ``warm`` compiles the kernels with a map of silence."""
-    with AcousticCamera(settings, device, threads) as camera:
+    with AcousticCamera(settings, device, threads, check=False) as camera:
         if warm:
             words = sample_format(settings)
             camera.process(Measurement(np.zeros(words.shape, words.dtype), camera.settings))

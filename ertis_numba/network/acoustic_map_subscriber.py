@@ -132,7 +132,7 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
         changed, alarm = settings.replace(**self._changes), self._false_alarm
         if alarm is not None and "processing.directions" not in self._changes:
             changed = changed.replace(**search_changes(changed))
-        camera = AcousticCamera(changed, self._device, self._threads)
+        camera = AcousticCamera(changed, self._device, self._threads, check=False)
         return _Hearer(settings, camera, None if alarm is None else BearingFinder(camera, false_alarm=alarm))
 
 

@@ -1,5 +1,7 @@
 """Acoustic camera: maps of sound power over direction and frequency, from passive measurements."""
 
+import functools
+import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Self
@@ -8,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.errors import ArgumentError, CoarseGridWarning, DataError
 from ertis_numba.frames import AcousticMap, Measurement, Stamp
 from ertis_numba.geometry import (
     Grid,
@@ -21,6 +23,7 @@ from ertis_numba.passive.block_spectra import BlockSpectra
 from ertis_numba.passive.components import gathered
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.methods import METHODS
+from ertis_numba.passive.search_grid import coarse_map_warning
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.passive.waves import Waves
 from ertis_numba.settings import Settings
@@ -47,6 +50,8 @@ class AcousticCamera:
         Compute device, as for `Pipeline`.
     threads : int, optional
         Number of threads; all cores by default.
+    check : bool, default True
+        Issue a `CoarseGridWarning` if ``warning`` is not None.
 
     Attributes
     ----------
@@ -81,7 +86,14 @@ class AcousticCamera:
     True
     """
 
-    def __init__(self, settings: Settings | str | Path, device: str = "auto", threads: int | None = None) -> None:
+    def __init__(
+        self,
+        settings: Settings | str | Path,
+        device: str = "auto",
+        threads: int | None = None,
+        *,
+        check: bool = True,
+    ) -> None:
         if isinstance(settings, str | Path):
             settings = Settings.load(settings)
         checks.instance("settings", settings, Settings, "a recording holds, or Settings.from_preset returns")
@@ -105,6 +117,16 @@ class AcousticCamera:
         self._masked_s = 0.0
         self._shape = len(self.frequency_hz), delay_s.shape[1], delay_s.shape[1]
         self.reset()
+        if check and self.warning is not None:
+            warnings.warn(self.warning, CoarseGridWarning, stacklevel=2)
+
+    @functools.cached_property
+    def warning(self) -> str | None:
+        """Warning that sources between the directions are too weak, or weaker than side lobes; None if they are not.
+
+        It names a grid that suffices in all bands.
+        """
+        return coarse_map_warning(self.settings, self.grid)
 
     def add(self, measurement: Measurement) -> None:
         """Add a measurement to the mean.

@@ -1,26 +1,107 @@
-"""Grids of directions that are fine enough to find the bearings of sources."""
+"""Grids of directions that are fine enough for acoustic maps, and to find the bearings of sources."""
 
+import functools
 import math
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.geometry import direction_grid, microphones, spacing_rad, unit_vectors
+from ertis_numba.analysis.array_response import ArrayAxes, ToneResponse
+from ertis_numba.analysis.direction_spacing import LARGEST_GRID, MAX_LOSS_DB, GridCheck, Lobe, Peak, rounded_down
+from ertis_numba.angles import DegreesFromRadians
+from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.passive.heard_signals import heard_bands
 from ertis_numba.passive.scan_extent import is_level
-from ertis_numba.settings import Processing, Settings
+from ertis_numba.passive.wave_delays import WaveDelays
+from ertis_numba.settings import Settings
 
-__all__ = ["search_changes", "search_warning"]
+__all__ = ["coarse_map_warning", "search_changes", "search_warning"]
 
-_LOSS: Final = 0.5  # Amplitude of a source between directions, relative to one in a direction: 6 dB.
+_SEARCH_LOSS_DB: Final = 6.0  # Bearings are refined beyond the grid, and so are their levels.
 _LINE: Final = 1e-6  # Width of an array relative to its length, below which it is a line.
+_NARROWER: Final = ("functional", "capon")  # Methods whose peaks are narrower than those of delay-and-sum.
 _STEP: Final = 1.02
 _HALF_SPACE: Final[dict[str, object]] = {
     "processing.azimuth_limits_deg": (-90.0, 90.0),
     "processing.elevation_limits_deg": (-90.0, 90.0),
 }
+
+
+def coarse_map_warning(settings: Settings, grid: DegreesFromRadians | None = None) -> str | None:
+    """Return a warning if sources between the directions of acoustic maps are too weak, or weaker than side lobes.
+
+    Parameters
+    ----------
+    settings : Settings
+        Their directions, array, bands and method are compared.
+    grid : Grid, AcousticMap or AcousticMapReader, optional
+        Directions, or a result with them; those of the settings by default.
+
+    Returns
+    -------
+    str or None
+        None if a source anywhere between the directions loses at most 3 dB in all bands, and exceeds the side lobes of
+        the array. The warning names a grid that suffices, or frequencies that the grid resolves.
+
+    Raises
+    ------
+    ArgumentError
+        The settings have no band, or their directions cannot be used.
+
+    Examples
+    --------
+    >>> import ertis_numba as ertis
+    >>> from ertis_numba.passive.search_grid import coarse_map_warning
+    >>> settings = ertis.Settings().replace("passive.bands_hz", ((40e3, 60e3),))
+    >>> coarse_map_warning(settings.replace("processing.directions", "3d:1000")).split("; ")[-1]
+    'use at least 3d:1300 directions'
+    >>> coarse_map_warning(settings.replace("processing.directions", "3d:1300")) is None
+    True
+    """
+    grid = direction_grid(settings.processing) if grid is None else Grid(grid.azimuth_rad, grid.elevation_rad)
+    check = GridCheck(grid, settings.processing)
+    if check.is_single:
+        return None
+    bands_hz, lobe_at = _bands_hz(settings), _lobes(settings, _map_peak(settings))
+    coarse_hz = _lowest(bands_hz, lambda high_hz: check.suffices(lobe_at(high_hz)))
+    ambiguous_hz = _lowest(bands_hz, lambda high_hz: not check.is_ambiguous(lobe_at(high_hz)))
+    found = "" if coarse_hz is None else _coarse(settings, check, lobe_at, coarse_hz, float(bands_hz.max()))
+    if ambiguous_hz is None:
+        return found or None
+    limit_hz = _highest_hz(lambda high_hz: not check.is_ambiguous(lobe_at(high_hz)), float(bands_hz.max()))
+    return (f"{found}; also, " if found else "") + (
+        f"above {limit_hz / 1e3:g} kHz, side lobes of this array are as strong as its main lobe, so a source may "
+        f"appear in another direction on any grid; use bands_hz up to {limit_hz:g} Hz, or narrower limits of azimuth "
+        "and elevation"
+    )
+
+
+def _coarse(
+    settings: Settings, check: GridCheck, lobe_at: Callable[[float], Lobe], above_hz: float, highest_hz: float
+) -> str:
+    """Return the warning of a grid that is too coarse from some band upwards."""
+    lobe, method = lobe_at(highest_hz), settings.passive.method
+    wide = lobe._replace(peak=np.asarray)
+    is_narrow = method in _NARROWER and check.suffices(wide)
+    text = (
+        f"directions are {math.degrees(check.spacing_rad):.1f}° apart; above {above_hz / 1e3:.3g} kHz, a source "
+        f"between them appears up to {check.loss_db(lobe)} dB too weak"
+        + (f" in maps of {method}, whose peaks are narrow" if method in _NARROWER else "")
+        + ("" if check.exceeds_side_lobes(lobe) else ", or in the direction of a side lobe")
+    )
+    if named := check.remedy(lobe):
+        return f"{text}; {named}"
+    if is_narrow:
+        return f"{text}; use method delay_and_sum or clean_sc for levels"
+    if named := check.remedy(wide) if method in _NARROWER else None:
+        return f"{text}; {named}, and method delay_and_sum or clean_sc for levels"
+    resolved_hz = _highest_hz(lambda high_hz: check.suffices(lobe_at(high_hz)), highest_hz)
+    return (
+        f"{text}; no grid of up to {LARGEST_GRID} directions suffices, so use narrower limits of azimuth and "
+        f"elevation, or bands_hz up to {resolved_hz:g} Hz, which these directions resolve"
+    )
 
 
 def search_changes(settings: Settings) -> dict[str, object]:
@@ -51,14 +132,15 @@ def search_changes(settings: Settings) -> dict[str, object]:
     if search_warning(settings) is None:
         return {}
     wide = settings.replace(**_HALF_SPACE)
-    return _HALF_SPACE | {"processing.directions": _sufficient(wide, _bands_hz(settings))}
+    fine = _search_check(wide).finer(_search_lobe(wide))
+    return _HALF_SPACE | {"processing.directions": f"3d:{LARGEST_GRID}" if fine is None else fine.directions}
 
 
 def search_warning(settings: Settings) -> str | None:
     """Return a warning if sources between or beside the directions yield wrong bearings, or none.
 
-    A source in the middle between directions may lose 6 dB at the mean square frequency of its band. An array that is
-    not a horizontal line resolves elevations, so its directions need several.
+    Bearings and their levels are refined beyond the grid, so a source in the middle between directions may lose 6 dB.
+    An array that is not a horizontal line resolves elevations, so its directions need several.
 
     Parameters
     ----------
@@ -81,28 +163,51 @@ def search_warning(settings: Settings) -> str | None:
     >>> from ertis_numba.passive.search_grid import search_warning
     >>> settings = ertis.Settings().replace("passive.bands_hz", ((20e3, 30e3),))
     >>> search_warning(settings.replace("processing.directions", "3d:100")).split("; ")[-1]
-    'search at least 3d:200 directions'
-    >>> search_warning(settings.replace("processing.directions", "3d:200")) is None
+    'search at least 3d:210 directions'
+    >>> search_warning(settings.replace("processing.directions", "3d:210")) is None
     True
     """
-    bands_hz = _bands_hz(settings)
     grid = direction_grid(settings.processing)
-    directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
-    is_planar = is_level(directions)
-    if is_planar and not _is_line(settings):
+    if is_level(unit_vectors(grid.azimuth_rad, grid.elevation_rad)) and not _is_line(settings):
         elevation_deg = math.degrees(grid.elevation_rad[0])
         return (
             f"directions lie at one elevation, {elevation_deg:g}°, so a source above or below has a wrong azimuth and "
-            f"level; search at least {_sufficient(settings, bands_hz)} directions"
+            f"level; {_sufficient(settings)}"
         )
-    apart_rad = spacing_rad(directions)
-    for band_hz in bands_hz:
-        if apart_rad > _largest_spacing_rad(settings, band_hz, is_planar=is_planar):
-            return (
-                f"directions are {math.degrees(apart_rad):.1f}° apart; above {band_hz[0] / 1e3:.1f} kHz, sources "
-                f"between them may have wrong bearings; search at least {_sufficient(settings, bands_hz)} directions"
-            )
-    return None
+    check, lobe_at = GridCheck(grid, settings.processing), _lobes(settings, np.asarray, _SEARCH_LOSS_DB)
+    above_hz = _lowest(_bands_hz(settings), lambda high_hz: check.suffices(lobe_at(high_hz)))
+    if above_hz is None:
+        return None
+    return (
+        f"directions are {math.degrees(check.spacing_rad):.1f}° apart; above {above_hz / 1e3:.1f} kHz, sources between "
+        f"them may have wrong bearings; {_sufficient(settings)}"
+    )
+
+
+def _sufficient(settings: Settings) -> str:
+    """Return the advice to search a grid within the limits of settings that suffices for bearings in all bands."""
+    if _is_flat(settings):
+        settings = settings.replace(**_HALF_SPACE)
+    advice = _search_check(settings).remedy(_search_lobe(settings), "search")
+    return advice or f"search narrower limits or lower bands: no grid of up to {LARGEST_GRID} directions suffices"
+
+
+def _is_flat(settings: Settings) -> bool:
+    """Return True if the limits of directions contain no area."""
+    processing = settings.processing
+    return not (
+        np.ptp(processing.azimuth_limits_deg) and (_is_line(settings) or np.ptp(processing.elevation_limits_deg))
+    )
+
+
+def _search_check(settings: Settings) -> GridCheck:
+    """Return the check of a small grid of the kind that suits the array."""
+    return GridCheck.of(settings.processing.replace(directions="2d:2" if _is_line(settings) else "3d:2"))
+
+
+def _search_lobe(settings: Settings) -> Lobe:
+    """Return the main lobe at the upper edge of the highest band."""
+    return _lobes(settings, np.asarray, _SEARCH_LOSS_DB)(float(_bands_hz(settings).max()))
 
 
 def _bands_hz(settings: Settings) -> NDArray[np.float64]:
@@ -110,56 +215,61 @@ def _bands_hz(settings: Settings) -> NDArray[np.float64]:
     return np.sort(heard_bands(settings), axis=0)  # They do not overlap.
 
 
-def _sufficient(settings: Settings, bands_hz: NDArray[np.float64]) -> str:
-    """Return the name of a grid within the limits of settings that suffices in all bands."""
-    processing, is_line = settings.processing, _is_line(settings)
-    largest_rad = _largest_spacing_rad(settings, bands_hz[-1], is_planar=is_line)
-    width_rad = float(np.ptp(processing.azimuth_limits_rad))
-    if is_line:
-        return f"2d:{_tens(width_rad / largest_rad + 1)}"
-    area = width_rad * float(np.ptp(np.sin(processing.elevation_limits_rad)))
-    if not area:
-        return _sufficient(settings.replace(**_HALF_SPACE), bands_hz)
-    n_directions = _tens(area / largest_rad**2)
-    while _spacing_of(processing, f"3d:{n_directions}") > largest_rad:
-        n_directions = _tens(n_directions * _STEP)
-    return f"3d:{n_directions}"
+def _lowest(bands_hz: NDArray[np.float64], is_fine: Callable[[float], bool]) -> float | None:
+    """Return the lower edge of the first band whose upper edge is not fine; None if all are."""
+    if is_fine(float(bands_hz[-1, 1])):
+        return None
+    fine, coarse = -1, len(bands_hz) - 1
+    while coarse - fine > 1:
+        middle = (fine + coarse) // 2
+        fine, coarse = (middle, coarse) if is_fine(float(bands_hz[middle, 1])) else (fine, middle)
+    return float(bands_hz[coarse, 0])
 
 
-def _tens(count: float) -> int:
-    return 10 * max(1, math.ceil(count / 10))
+def _highest_hz(is_fine: Callable[[float], bool], highest_hz: float) -> float:
+    """Return the highest frequency that is fine, with two digits."""
+    tried_hz = rounded_down(highest_hz)
+    while tried_hz > 1.0 and not is_fine(tried_hz):
+        tried_hz = rounded_down(tried_hz / _STEP)
+    return tried_hz
 
 
-def _spacing_of(processing: Processing, directions: str) -> float:
-    """Return the spacing of a grid in radians."""
-    grid = direction_grid(processing.replace(directions=directions))
-    return spacing_rad(unit_vectors(grid.azimuth_rad, grid.elevation_rad))
+def _lobes(settings: Settings, peak: Peak, max_loss_db: float = MAX_LOSS_DB) -> Callable[[float], Lobe]:
+    """Return a function that returns the main lobe at a frequency in hertz."""
+    axes, delays = ArrayAxes(settings, np.ones(_n_mics(settings))), WaveDelays(settings)
+    return functools.cache(
+        lambda frequency_hz: Lobe(ToneResponse(settings, frequency_hz, delays), axes, peak, max_loss_db)
+    )
+
+
+def _n_mics(settings: Settings) -> int:
+    return len(microphones(settings.array).enabled_positions_m)
+
+
+def _map_peak(settings: Settings) -> Peak:
+    """Return the function from amplitudes of delay-and-sum to those of the method of maps, for one source.
+
+    ``ρ²`` becomes ``(M ρ² − 1) / (M − 1)`` without the diagonal, ``ρ^(2ν)`` for ``functional`` of the order ν, and
+    ``ε / (ε + M (1 − ρ²))`` for ``capon`` with the loading ε and M microphones. Maps of ``music`` have no level.
+    """
+    passive, n_mics = settings.passive, _n_mics(settings)
+
+    def peak(rho: NDArray[np.float64]) -> NDArray[np.float64]:
+        power = np.clip(rho, 0.0, 1.0) ** 2
+        if passive.diagonal_removal:
+            power = np.maximum(n_mics * power - 1, 0.0) / max(n_mics - 1, 1)
+        elif passive.method == "functional":
+            power = power**passive.functional_order
+        elif passive.method == "capon":
+            power = passive.diagonal_loading / (passive.diagonal_loading + n_mics * (1 - power))
+        return np.asarray(np.sqrt(power))
+
+    return peak
 
 
 def _is_line(settings: Settings) -> bool:
     """Return True if microphones lie on a horizontal line, which resolves one angle."""
-    sizes, _ = _axes(settings)
-    height_m = float(np.ptp(microphones(settings.array).enabled_positions_m[:, 2]))
-    return bool(max(sizes[1], height_m) <= _LINE * sizes[0])
-
-
-def _axes(settings: Settings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the sizes of the array along its axes, largest first, and the places along the longest axis in metres."""
     places_m = microphones(settings.array).enabled_positions_m
-    places_m = places_m - places_m.mean(axis=0)
-    _, sizes, axes = np.linalg.svd(np.concatenate([places_m, np.zeros((3, 3))]), full_matrices=False)
-    return sizes, places_m @ axes[0]
-
-
-def _largest_spacing_rad(settings: Settings, band_hz: NDArray[np.float64], *, is_planar: bool) -> float:
-    """Return the spacing of directions in radians at which a source in their middle has the least permitted level."""
-    _, places_m = _axes(settings)
-    # The mean square frequency of a band.
-    frequency_hz = math.sqrt(float((band_hz**2).sum() + band_hz.prod()) / 3)
-    phase_per_rad = 2 * math.pi * frequency_hz / sound_speed_m_s(settings.air) * places_m
-    away_rad = np.linspace(0.0, math.pi / 2, 4001)[1:]
-    amplitude = np.abs(np.exp(1j * away_rad[:, None] * phase_per_rad).mean(axis=1))
-    is_low = amplitude < _LOSS
-    largest_rad = float(away_rad[int(is_low.argmax())]) if is_low.any() else math.pi / 2
-    # The middle of a square is farther from its corners than that of a line from its ends.
-    return 2 * largest_rad if is_planar else math.sqrt(2) * largest_rad
+    sizes = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)
+    height_m = float(np.ptp(places_m[:, 2]))
+    return bool(max([*sizes[1:], height_m]) <= _LINE * sizes[0])

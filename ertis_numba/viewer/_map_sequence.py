@@ -23,7 +23,7 @@ class MapSequence:
 
     def __init__(self, reader: RecordingReader, *, device: Literal["auto", "cpu", "cuda", "numpy"]) -> None:
         self._reader = reader
-        self._camera = AcousticCamera(reader.settings, device)
+        self._camera = AcousticCamera(reader.settings, device, check=False)
         self._next = 0  # Number of the measurement that continues the mean.
 
     def __call__(self, number: int) -> AcousticMap:

@@ -1,0 +1,122 @@
+"""Response of delay-and-sum in one direction to a source in another."""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.geometry import microphones
+from ertis_numba.settings import Settings
+
+__all__ = ["ArrayAxes", "CallResponse", "Response", "ToneResponse"]
+
+Floats = NDArray[np.float64]
+
+_FAR: Final = 2.0  # Standard deviation of phases in radians beyond which a maximum is a side lobe.
+_N_SOURCES: Final = 48
+_N_TARGETS: Final = 3072
+
+
+class Response(Protocol):
+    """Response of an array to a kind of sound."""
+
+    def __call__(self, sources: Floats, directions: Floats) -> Floats:
+        """Return amplitudes relative to that of a source in the direction: (n,) float64.
+
+        Parameters
+        ----------
+        sources, directions : (n, axis) float64
+            Unit vectors.
+        """
+
+    def side_lobe(self, places: Floats) -> float:
+        """Return the highest side lobe in some places of sources in others, 0 to 1; 0 if it does not matter."""
+
+
+class ArrayAxes:
+    """Axes of an array, with its extent along each.
+
+    Parameters
+    ----------
+    settings : Settings
+    weights : (mic,) float64
+
+    Attributes
+    ----------
+    longest : (axis,) float64
+        Unit vector along the longest axis.
+    """
+
+    def __init__(self, settings: Settings, weights: Floats) -> None:
+        places_m, shares = microphones(settings.array).enabled_positions_m, weights / weights.sum()
+        places_m = places_m - shares @ places_m
+        variance_m2, axes = np.linalg.eigh((places_m * shares[:, None]).T @ places_m)
+        self._sizes_m, self._axes = np.sqrt(np.maximum(variance_m2, 0)), axes
+        self.longest = np.asarray(axes[:, -1])
+
+    def scaled_m(self, directions: Floats) -> Floats:
+        """Return points whose distance is the standard deviation of differences of paths: (n, axis) float64."""
+        return np.asarray((directions @ self._axes) * self._sizes_m)
+
+
+class ToneResponse:
+    """Response to a tone.
+
+    Parameters
+    ----------
+    settings : Settings
+    frequency_hz : float
+    delays : callable
+        Returns the delays in seconds, (n, mic), of unit vectors, (n, axis).
+    """
+
+    def __init__(self, settings: Settings, frequency_hz: float, delays: Callable[[Floats], Floats]) -> None:
+        n_mics = len(microphones(settings.array).enabled_positions_m)
+        self._axes, self._delays = ArrayAxes(settings, np.ones(n_mics)), delays
+        self._omega_rad_s = 2 * math.pi * frequency_hz
+        self._wave_1_m = self._omega_rad_s / sound_speed_m_s(settings.air)
+
+    def __call__(self, sources: Floats, directions: Floats) -> Floats:
+        """Return amplitudes of a tone: (n,) float64."""
+        phases_rad = self._omega_rad_s * (self._delays(sources) - self._delays(directions))
+        return np.asarray(np.abs(np.exp(1j * phases_rad).mean(axis=1)))
+
+    def side_lobe(self, places: Floats) -> float:
+        """Return the highest amplitude in some places outside of the main lobes of others; 0 without any."""
+        targets = np.random.default_rng(0).permutation(places)[:_N_TARGETS]
+        waves = np.exp(1j * self._omega_rad_s * self._delays(targets)).astype(np.complex64)
+        amplitude = np.abs(waves[:_N_SOURCES].conj() @ waves.T) / waves.shape[1]
+        scaled = self._wave_1_m * self._axes.scaled_m(targets)
+        squares = (scaled**2).sum(axis=1)
+        far = squares[:_N_SOURCES, None] + squares - 2 * scaled[:_N_SOURCES] @ scaled.T > _FAR**2
+        return float(amplitude.max(initial=0.0, where=far))
+
+
+class CallResponse:
+    """Response to an echo of the call, at its range.
+
+    Parameters
+    ----------
+    settings : Settings
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+
+    @functools.cached_property
+    def _point_spread(self) -> PointSpread:
+        return PointSpread(self._settings)
+
+    def __call__(self, sources: Floats, directions: Floats) -> Floats:
+        """Return amplitudes of an echo: (n,) float64."""
+        return self._point_spread(directions - sources, np.zeros(len(sources)))
+
+    def side_lobe(self, places: Floats) -> float:
+        """Return 0: side lobes of a call of some bandwidth lie at other ranges, or are low."""
+        del places
+        return 0.0
