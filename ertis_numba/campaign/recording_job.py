@@ -247,6 +247,15 @@ def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
     return faults, "; ".join(shift or ()), first_call_match(heard)
 
 
+def _grid_notes(pipeline: Pipeline) -> Iterator[str]:
+    """Yield the ends of lines on angles that the array does not observe, and on directions that are too far apart."""
+    unknown = observable_angles(pipeline.settings.array, pipeline.grid).note
+    if unknown is not None:
+        yield f" {unknown}"
+    if coarse := spacing_warning(pipeline.settings, pipeline.grid):
+        yield f": {coarse}"
+
+
 def _check_sensor(
     run: SensorProcessing,
     recording: EchoMeasurements,
@@ -266,12 +275,8 @@ def _check_sensor(
     if match is not None and match.warning:
         run.call_warning = match.warning
         warn(f"{place}: {match.warning}")
-    unknown = observable_angles(run.pipeline.settings.array, run.pipeline.grid).note
-    if unknown is not None:
-        warn(f"{place} {unknown}")
-        warn(f"{recording.path}: sensor {recording.sensor}: {match.warning}")
-    if coarse := spacing_warning(run.pipeline.settings, run.pipeline.grid):
-        warn(f"{recording.path}: sensor {recording.sensor}: {coarse}")
+    for text in _grid_notes(run.pipeline):
+        warn(f"{place}{text}")
     heard = None
     if run.pipeline.settings.processing.method != "paper":
         kernel_set = kernels.load(run.pipeline.device)
