@@ -10,7 +10,7 @@ import ertis_numba as ertis
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Settings
+from ertis_numba.settings import Call, Settings
 from tests.rings import PCM, RATE_HZ
 
 SETTINGS = Settings(array=PCM.array).replace("processing.directions", "2d:31")
@@ -93,6 +93,28 @@ def test_emissions_in_a_loopback_set_the_ranges(tmp_path, name):
     )
     if range_m:
         assert ranges_m(reader) == pytest.approx([range_m] * len(emissions_s), abs=2e-3)
+
+
+def test_noise_of_a_narrow_band_is_no_emission(tmp_path):
+    tone = SETTINGS.replace("call", Call(start_frequency_hz=40_500.0, stop_frequency_hz=39_500.0, duration_s=1e-3))
+    noise = np.random.default_rng(2).normal(0, 0.1, (40_000, 9))
+    with pytest.raises(DataError, match=r"channel 8 contains no emission"):
+        ertis.open_pcm(write(tmp_path / "a.wav", noise), tone, sync_channel=8)
+
+
+def test_doubtful_loopbacks_are_noted(tmp_path):
+    """Another sweep than that of the settings, and a sweep in the opposite direction."""
+
+    def linear(time_s):
+        inside = (time_s >= 0) & (time_s <= CALL_S)
+        return np.where(inside, np.sin(2 * np.pi * (START_HZ * time_s - 5e6 * time_s**2)), 0)
+
+    path = write(tmp_path / "a.wav", record([1e-3], 0.02, loopback=linear))
+    notes = " ".join(ertis.open_pcm(path, SETTINGS, sync_channel=8).notes)
+    assert "the call in channel 8 resembles that of the settings by only 0." in notes
+    path = write(tmp_path / "b.wav", record([1e-3], 0.02, loopback=lambda time_s: call(CALL_S - time_s)))
+    notes = " ".join(ertis.open_pcm(path, SETTINGS, sync_channel=8).notes)
+    assert "the onsets of its pulses, which rise in 1.8e+02 µs, are taken as the emissions" in notes
 
 
 def test_notes_state_the_emissions(tmp_path):

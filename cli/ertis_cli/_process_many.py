@@ -69,7 +69,8 @@ def summary(target: Path, rows: Sequence[dict[str, Any]], device: str) -> Iterat
         yield (
             f"{target}: {options.counted(row['measurements'], 'measurement')}{of}, "
             f"{options.counted(row['directions'], 'direction')} × {options.counted(row['ranges'], 'range')} "
-            f"on {device}, {row['median_ms']:.1f} ms each (median)"
+            f"from {row['range_m'][0]:.4g} to {row['range_m'][1]:.4g} m on {device}, "
+            f"{row['median_ms']:.1f} ms each (median)"
         )
 
 

@@ -137,6 +137,7 @@ class SensorProcessing:
             "measurements": len(self.times_ms),
             "directions": len(self.pipeline.grid),
             "ranges": len(self.pipeline.range_m),
+            "range_m": [round(float(self.pipeline.range_m[index]), 4) for index in (0, -1)],
             "median_ms": round(statistics.median(self.times_ms), 3),
             **(self.prediction.as_dict() if self.prediction else {}),
             **({"call_warning": self.call_warning} if self.call_warning else {}),

@@ -173,4 +173,7 @@ def _shortest(files: Sequence[PcmFile], several: Sequence[NDArray[np.int64]]) ->
 def _intervals(several: Sequence[NDArray[np.float64]]) -> str:
     """Return the intervals between emissions in words."""
     intervals_s = np.concatenate([np.diff(times_s) for times_s in several])
-    return f", {intervals_s.min():.6g} to {intervals_s.max():.6g} s apart" if len(intervals_s) else ""
+    if not len(intervals_s):
+        return ""
+    extremes = dict.fromkeys(f"{edge_s:.6g}" for edge_s in (intervals_s.min(), intervals_s.max()))
+    return f", {' to '.join(extremes)} s apart"

@@ -1,6 +1,7 @@
 """Emissions in a loopback channel: times of the call, or of the pulses of a trigger, to a fraction of a sample."""
 
 import math
+import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +19,12 @@ __all__ = ["Emissions", "find_emissions"]
 
 _BLOCK: Final = 2**18
 _MIN_MATCH: Final = 0.5  # Correlation coefficient with the call; noise of a band with 60 degrees of freedom has 0.3.
+_GOOD_MATCH: Final = 0.8
+_MIN_PEAK: Final = 5.0  # Peak relative to the median after the matched filter; noise reaches 4.5.
 _SAME_LEVEL: Final = 0.5  # Emissions of one file differ by less; crosstalk and echoes are weaker.
 _MIN_HEARD: Final = 0.2  # Minimum share of a call that the start of the file cuts off.
 _MIN_SNR: Final = 10.0  # Minimum peak of pulses relative to the median deviation.
-_ONSET: Final = 0.1  # Level of an onset relative to the peak.
+_ONSET, _RISEN = 0.1, 0.9  # Levels of an onset and at the end of the rise, relative to the peak.
 _MIN_PAUSE_S: Final = 0.5e-3  # Minimum silence before a pulse.
 _IRREGULAR: Final = 1.5  # Ratio of an interval to the median beyond which an emission may be missing.
 
@@ -67,8 +70,13 @@ def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, 
     """
     times, match = _of_call(read, n_samples, call_samples(call, rate_hz=rate_hz), call.start_s * rate_hz)
     notes = []
-    if match < _MIN_MATCH:
-        times = _onsets(read, n_samples, rate_hz)
+    if len(times) and match < _GOOD_MATCH:
+        notes.append(
+            f"the call in channel {channel} resembles that of the settings by only {match:.2f} of 1; the emissions are "
+            "shifted if another call was emitted"
+        )
+    if not len(times):
+        times, rise = _onsets(read, n_samples, rate_hz)
         if not len(times):
             raise DataError(
                 f"{path}: channel {channel} contains no emission: at most {max(match, 0.0):.2f} of 1 matches the call, "
@@ -76,8 +84,8 @@ def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, 
                 "emitted call as [call]"
             )
         notes.append(
-            f"channel {channel} does not contain the call (correlation {match:.2f}); the onsets of its pulses are "
-            "taken as the emissions"
+            f"channel {channel} does not contain the call (correlation {match:.2f}); the onsets of its pulses, which "
+            f"rise in {1e6 * rise / rate_hz:.2g} µs, are taken as the emissions"
         )
     complete = times[times >= -0.5]
     if len(complete) < len(times):
@@ -110,6 +118,7 @@ def _of_call(
     """Return the times of the call in samples, negative if cut off by the start, and the highest correlation."""
     found: list[tuple[float, float, float]] = []
     length = len(replica)
+    medians: list[float] = []
     cumulative = np.cumsum(replica**2)
     for first in range(-length, n_samples, _BLOCK):
         last = min(first + _BLOCK, n_samples)
@@ -120,6 +129,7 @@ def _of_call(
         match = np.where(lags < 0, match / np.sqrt(np.maximum(heard, _MIN_HEARD)), match)
         match[(lags < 0) & (heard < _MIN_HEARD)] = 0
         level = np.where(lags < 0, level / np.maximum(heard, _MIN_HEARD), level)
+        medians.append(float(np.median(level)))
         peaks = 1 + np.flatnonzero((level[1:-1] > level[:-2]) & (level[1:-1] >= level[2:]))
         peaks = peaks[(match[peaks] >= _MIN_MATCH / 2) & (lags[peaks] >= first) & (lags[peaks] < last)]
         for peak in peaks.tolist():
@@ -128,17 +138,18 @@ def _of_call(
             found.append((float(lags[peak]) + offset, here, float(match[peak])))
     if not found:
         return np.zeros(0), 0.0
-    best = max(match for *_, match in found)
-    sure = [(time, level) for time, level, match in found if match >= _MIN_MATCH]
-    loudest = max((level for _, level in sure), default=0.0)
+    best = max(correlation for *_, correlation in found)
+    sure = [(time, peak_level) for time, peak_level, correlation in found if correlation >= _MIN_MATCH]
+    audible = _MIN_PEAK * float(np.median(medians))
+    loudest = max((peak_level for _, peak_level in sure), default=0.0)
     kept: list[tuple[float, float]] = []
-    for time, level in sure:
-        if level < _SAME_LEVEL * loudest:
+    for peak_of_call in sure:
+        if peak_of_call[1] < max(_SAME_LEVEL * loudest, audible):
             continue
-        if kept and time - kept[-1][0] < length - lead:
-            kept[-1] = max(kept[-1], (time, level), key=lambda each: each[1])
+        if kept and peak_of_call[0] - kept[-1][0] < length - lead:
+            kept[-1] = max(kept[-1], peak_of_call, key=operator.itemgetter(1))
         else:
-            kept.append((time, level))
+            kept.append(peak_of_call)
     return np.array([time for time, _ in kept]), best
 
 
@@ -168,8 +179,11 @@ def _read_padded(read: Reader, first: int, last: int, n_samples: int) -> NDArray
     return np.pad(inside, (max(-first, 0), max(last - n_samples, 0)))
 
 
-def _onsets(read: Reader, n_samples: int, rate_hz: float) -> NDArray[np.float64]:
-    """Return the times of the onsets of pulses in samples; −1 for one that began before the first sample."""
+def _onsets(read: Reader, n_samples: int, rate_hz: float) -> tuple[NDArray[np.float64], float]:
+    """Return the times of the onsets of pulses in samples, and the rise time of the first pulse.
+
+    The time is −1 for a pulse that began before the first sample.
+    """
     blocks = [slice(first, min(first + _BLOCK, n_samples)) for first in range(0, n_samples, _BLOCK)]
     middles = [float(np.median(read(block))) for block in blocks]
     middle = float(np.median(middles))
@@ -177,10 +191,10 @@ def _onsets(read: Reader, n_samples: int, rate_hz: float) -> NDArray[np.float64]
     noise = float(np.median([np.median(np.abs(read(block) - middle)) for block in blocks]))
     limit = max(_ONSET * peak, _MIN_SNR * noise)
     if peak <= limit or not peak:
-        return np.zeros(0)
+        return np.zeros(0), 0.0
     pause = math.ceil(_MIN_PAUSE_S * rate_hz)
     times: list[float] = []
-    previous, sign, before = -pause, 0.0, 0.0
+    previous, sign, before, rise_time = -pause, 0.0, 0.0, 0.0
     for block in blocks:
         signal = read(block) - middle
         above = np.flatnonzero(np.abs(signal) > limit)
@@ -191,7 +205,8 @@ def _onsets(read: Reader, n_samples: int, rate_hz: float) -> NDArray[np.float64]
                 earlier = abs(signal[start - 1]) if start else before
                 rise = (limit - earlier) / max(abs(signal[start]) - earlier, 1e-300)
                 time = block.start + start - 1 + float(np.clip(rise, 0, 1))
+                rise_time = rise_time or 1.0 + int(np.argmax(np.abs(signal[start:]) > _RISEN * peak))
                 times.append(time if block.start + start else -1.0)
         previous = int(above[-1]) + block.start if len(above) else previous
         before = abs(float(signal[-1]))
-    return np.array(times)
+    return np.array(times), rise_time
