@@ -1,12 +1,12 @@
 """Formats of other programs, recognized by the first bytes of a file, and commands that convert them."""
 
-import shlex
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-__all__ = ["FileKind", "kind_of", "problem_of"]
+__all__ = ["FileKind", "kind_of", "problem_of", "quoted"]
 
 _HEAD_BYTES = 4096
 _HDF5_PLACES: Final = (0, 512, 1024, 2048)  # behind a block of the user, such as that of MATLAB
@@ -170,9 +170,18 @@ def problem_of(path: str | Path) -> str:
     kind, path = kind_of(path), Path(path)
     if kind is None:
         return ""
-    stem = str(path.with_suffix(""))
-    names = {"file": shlex.quote(str(path)), "path": str(path), "stem": stem, "target": shlex.quote(f"{stem}_pcm.wav")}
+    names = {
+        "file": quoted(path),
+        "path": str(path),
+        "stem": str(path.with_suffix("")),
+        "target": quoted(path.with_name(f"{path.stem}_pcm.wav")),
+    }
     return f"is {kind.name}; {kind.remedy.format(**names)}"
+
+
+def quoted(path: Path) -> str:
+    """Return a path as an argument of a command within single quotation marks, for any shell."""
+    return str(path) if re.fullmatch(r"[\w./\\:@%+=,-]+", str(path)) else f'"{path}"'
 
 
 def _is_matlab_4(head: bytes) -> bool:

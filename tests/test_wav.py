@@ -144,7 +144,7 @@ REFUSED = {
     "empty data before metadata": (riff(form(), chunk(b"data"), INFO), r"its data chunk at byte 36 is empty"),
     "two data": (
         riff(form(), DATA_CHUNK, DATA_CHUNK),
-        r"data chunks at bytes 36 and 3884; keep .* 'sox take.wav take_",
+        r"data chunks at bytes 36 and 3884; keep .* 'sox /.*/take.wav /.*/take_",
     ),
     "two files": (riff(form(), DATA_CHUNK) * 2, r"second WAV file from byte 3884 on; separate them with 'head -c 3884"),
     "beyond": (riff(form(), chunk(b"LIST", b"INFO", 99_999)), r"no data chunk follows the chunk 'LIST' at byte 36"),
@@ -156,7 +156,10 @@ REFUSED = {
     "no rate": (riff(chunk(b"fmt ", struct.pack("<HHIIHH", 1, 4, 0, 0, 8, 16)), DATA_CHUNK), r"4 channels and 0 Hz"),
     "no bits": (riff(form(bits=0, sample_bytes=2), DATA_CHUNK), r"states 8 bytes for 4 channels of 0 bits"),
     "half float": (riff(form(code=3), DATA_CHUNK), r"states 8 bytes for 4 channels of 16 bits"),
-    "A-law": (riff(form(8, 6), DATA_CHUNK), r"contains A-law \(format 0x0006\), .*'ffmpeg -i take.wav -c:a pcm_f32le"),
+    "A-law": (
+        riff(form(8, 6), DATA_CHUNK),
+        r"contains A-law \(format 0x0006\), .*'ffmpeg -i /.*/take.wav -c:a pcm_f32le",
+    ),
     "ADPCM": (riff(form(4, 0x11, sample_bytes=256), DATA_CHUNK), r"contains IMA ADPCM \(format 0x0011\)"),
     "unknown": (riff(form(code=0x1234), DATA_CHUNK), r"contains samples of an unknown format, 0x1234"),
     "extended µ-law": (riff(extensible(8, 8, b"\7" + PCM_GUID[1:]), DATA_CHUNK), r"contains µ-law \(format 0x0007\)"),
@@ -214,6 +217,13 @@ def test_read_wav_notes_samples_in_low_bits(tmp_path):
     wav = read(tmp_path, riff(extensible(32, 24), chunk(b"data", values.tobytes())))
     assert np.array_equal(wav.samples[:], values)
     assert wav.notes[0].endswith("if levels are 48 dB too low, multiply them by 256")
+
+
+def test_read_wav_is_fast_for_chains_of_odd_chunks(tmp_path):
+    """Each chunk of one byte may be padded or not, so that there are 2 ** 5000 chains."""
+    content = riff(form(), chunk(b"data", DATA, 8)) + b"a\1\0\0" * 20_000
+    with pytest.raises(DataError, match="no chunk begins"):
+        read(tmp_path, content)
 
 
 def big_wav(path, n_bytes, chunks=b"", stated=None, n_channels=8):

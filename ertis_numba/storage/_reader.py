@@ -2,7 +2,6 @@
 
 import hashlib
 import operator
-import shlex
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
@@ -13,7 +12,7 @@ from typing import ClassVar, Self, TypeVar, overload
 import h5py
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
-from ertis_numba.file_kinds import kind_of, problem_of
+from ertis_numba.file_kinds import kind_of, problem_of, quoted
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
@@ -243,7 +242,7 @@ def _problem(file: h5py.File, path: Path, wanted: str) -> str:
         return problem_of(path)
     remedy = f"give {wanted}"
     if "time_data" in file:
-        name = shlex.quote(str(path))
+        name = quoted(path)
         remedy = f"import its signals with 'ertis import {name} --settings FILE.toml --output FILE.h5'"
     return f"is HDF5, but not of this package; {remedy}"
 

@@ -2,7 +2,6 @@
 
 import errno
 import re
-import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Final
 import h5py
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, SettingsError
-from ertis_numba.file_kinds import problem_of
+from ertis_numba.file_kinds import problem_of, quoted
 
 __all__ = ["RESULT_OR_RECORDING", "open_file", "reading"]
 
@@ -81,7 +80,7 @@ def open_file(path: Path, wanted: str = RESULT_OR_RECORDING) -> h5py.File:
         if _is_left_open(path):
             raise DataError(
                 f"{path} was not closed: its writer was killed, or still has it open; close it there, or if no "
-                f"program uses it, run 'h5clear -s {shlex.quote(str(path))}' (part of the HDF5 tools: package "
+                f"program uses it, run 'h5clear -s {quoted(path)}' (part of the HDF5 tools: package "
                 "hdf5-tools, hdf5 in conda and Homebrew)"
             ) from error
         stored = _STORED_END.search(str(error))

@@ -1,10 +1,10 @@
 """Chunks of a WAV file: encoding, samples and metadata."""
 
-import shlex
 import struct
 from dataclasses import dataclass, field
 
 from ertis_numba.errors import DataError
+from ertis_numba.file_kinds import quoted
 from ertis_numba.wav._form import Form, read_form
 from ertis_numba.wav._lengths import (
     HEADER_BYTES,
@@ -129,16 +129,16 @@ def _require_single(content: Content, chunks: Chunks, name: bytes, place: int) -
     """Refuse samples in several places."""
     path = content.path
     if name == b"data" and name in chunks.places:
-        first = shlex.quote(f"{path.stem}_first.wav")
+        first = quoted(path.with_name(f"{path.stem}_first.wav"))
         raise DataError(
             f"{path} has data chunks at bytes {chunks.places[name]} and {place}; keep the samples of the first with "
-            f"'sox {shlex.quote(path.name)} {first}'"
+            f"'sox {quoted(path)} {first}'"
         )
     if name in _FILES:
         raise DataError(
             f"{path} contains a second WAV file from byte {place} on; separate them with "
-            f"'head -c {place} {shlex.quote(path.name)} > first.wav' and "
-            f"'tail -c +{place + 1} {shlex.quote(path.name)} > second.wav'"
+            f"'head -c {place} {quoted(path)} > first.wav' and "
+            f"'tail -c +{place + 1} {quoted(path)} > second.wav'"
         )
 
 

@@ -1,12 +1,12 @@
 """The fmt chunk of a WAV file: encoding, sample rate and sizes."""
 
-import shlex
 import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from ertis_numba.errors import DataError
+from ertis_numba.file_kinds import quoted
 
 __all__ = ["Form", "convert", "read_form"]
 
@@ -128,7 +128,8 @@ def read_form(content: bytes, order: str, place: int, path: Path) -> Form:
 
 def convert(path: Path) -> str:
     """Return the remedy for a file in another encoding: a command."""
-    return f"convert it with 'ffmpeg -i {shlex.quote(path.name)} -c:a pcm_f32le {shlex.quote(f'{path.stem}_pcm.wav')}'"
+    target = path.with_name(f"{path.stem}_pcm.wav")
+    return f"convert it with 'ffmpeg -i {quoted(path)} -c:a pcm_f32le {quoted(target)}'"
 
 
 def _sub_format(guid: bytes, order: str) -> int:

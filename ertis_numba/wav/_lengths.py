@@ -5,7 +5,6 @@ mark. Therefore each length that a header can mean is compared with the file: it
 complete chunks, ends there.
 """
 
-import shlex
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
+from ertis_numba.file_kinds import quoted
 
 __all__ = [
     "HEADER_BYTES",
@@ -59,7 +59,7 @@ _TRAILERS: Final = (
     b"plst",
 )
 _TAIL_BYTES = 2**24
-_MAX_CHUNKS = 256
+_MAX_CHUNKS = 4096
 _MAX_LEFT_BYTES = 2**16  # between the last chunk and the end of the file
 _PIECE_BYTES = 2**24
 
@@ -110,14 +110,19 @@ def is_chunk(content: Content, place: int) -> bool:
     return place + HEADER_BYTES <= len(content) and name.isascii() and name.decode().isprintable()
 
 
-def chain_fits(content: Content, place: int, depth: int = _MAX_CHUNKS) -> bool:
+def chain_fits(content: Content, place: int) -> bool:
     """Return True if complete chunks fill the file from a place to its end, give or take one byte."""
-    if -1 <= place - len(content) <= 1:
-        return True
-    if not depth or not is_chunk(content, place):
-        return False
-    _, n_bytes = content.header(place)
-    return any(chain_fits(content, start, depth - 1) for start in places_after(place + HEADER_BYTES, n_bytes))
+    seen: set[int] = set()
+    places = [place]
+    while places and len(seen) < _MAX_CHUNKS:
+        place = places.pop()
+        if -1 <= place - len(content) <= 1:
+            return True
+        if place not in seen and is_chunk(content, place):
+            seen.add(place)
+            _, n_bytes = content.header(place)
+            places += reversed(places_after(place + HEADER_BYTES, n_bytes))
+    return False
 
 
 def sample_bytes(content: Content, place: int, wide: int | None, frame_bytes: int) -> Length:
@@ -185,7 +190,7 @@ def _of_misfit(content: Content, start: int, stated: int, room: int, where: str)
 
 def _read_on(path: Path) -> str:
     """Return a command that reads samples to the end of a file."""
-    source, target = shlex.quote(path.name), shlex.quote(f"{path.stem}_complete.wav")
+    source, target = quoted(path), quoted(path.with_name(f"{path.stem}_complete.wav"))
     return f"'ffmpeg -ignore_length 1 -i {source} -c copy -rf64 auto {target}'"
 
 
