@@ -1,6 +1,7 @@
 """Invalid input ends in one line with the value, the accepted values and the remedy, and writes no file."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -311,8 +312,30 @@ def test_full_disk_behind_stdout_is_reported_in_one_line(folder, more):
     )
 
 
-def test_program_errors_keep_their_traceback(monkeypatch):
-    monkeypatch.setattr("ertis_cli.info.options.print_json", None)
-    monkeypatch.setattr("ertis_numba.storage.file_kind", None)
-    done = CliRunner().invoke(cli, ["info", "x"])
-    assert isinstance(done.exception, TypeError)
+BUG = """
+import sys
+from ertis_cli import _tables
+from ertis_cli.main import main
+def fail(*_):
+    raise KeyError("gain")
+_tables.TextTable.print = fail
+sys.argv[1:] = ["presets"]
+main()
+"""
+
+
+@pytest.mark.parametrize("mode", ["", "1"])
+def test_unexpected_error_is_one_line_that_blames_no_file_and_a_traceback_in_development_mode(mode):
+    done = subprocess.run(
+        [sys.executable, "-c", BUG],
+        env=os.environ | {"PYTHONDEVMODE": mode},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    if mode:
+        assert "Traceback" in done.stderr
+    else:
+        line = r"ertis: error: unexpected KeyError: 'gain' \(\w+\.py, line \d+\); report this as a bug, .*MODE=1\n"
+        assert re.fullmatch(line, done.stderr), done.stderr

@@ -171,8 +171,26 @@ def test_doctor_continues_after_a_failing_check(doctor, monkeypatch):
 
     monkeypatch.setitem(_diagnosis.CHECKS, "gpu", breaks)
     found = doctor()
-    assert found["gpu"] == [("bad", "check failed: of all things", "report this as a bug")]
+    assert found["gpu"] == [("bad", "check failed: RuntimeError: of all things", "report this as a bug")]
     assert "disk" in found
+
+
+def test_doctor_repeats_the_remedy_of_an_error_of_the_package(doctor, monkeypatch):
+    def refuses(_):
+        raise DeviceError("no folder for compiled kernels is writable (full; read-only); set NUMBA_CACHE_DIR")
+        yield
+
+    monkeypatch.setitem(_diagnosis.CHECKS, "processor", refuses)
+    text = "no folder for compiled kernels is writable (full; read-only)"
+    assert doctor()["processor"] == [("bad", text, "set NUMBA_CACHE_DIR")]
+
+
+def test_doctor_names_a_kernel_cache_that_is_lost(doctor, monkeypatch, tmp_path):
+    monkeypatch.setattr("ertis_numba.kernels._cpu.cache_folder", lambda: str(tmp_path / "kernels"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    assert doctor()["kernel cache"] == [
+        ("note", str(tmp_path / "kernels"), "set NUMBA_CACHE_DIR to a writable folder that is kept")
+    ]
 
 
 def test_doctor_prints_a_table_and_rejects_missing_folder(tmp_path):

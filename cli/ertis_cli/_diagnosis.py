@@ -126,6 +126,7 @@ def _processor(_folder: Path) -> Iterator[InstallationFinding]:
     )
     speed = _INSTRUCTION_SETS[kernel_set.instruction_set]
     yield InstallationFinding("instructions", "good", f"{kernel_set.instruction_set}: {speed}")
+    yield _kernel_cache()
     settings = Settings()
     with Pipeline(settings, device="cpu", predict=False) as pipeline:
         silence = Measurement(_silence(settings.recording.n_samples), settings)
@@ -146,6 +147,15 @@ def _processor(_folder: Path) -> Iterator[InstallationFinding]:
         f"Numba's {layer} layer" + (", which computes only one image at a time" if slow else ""),
         "pip install tbb, or install OpenMP (libgomp1 on Debian, libomp on macOS)" if slow else "",
     )
+
+
+def _kernel_cache() -> InstallationFinding:
+    from ertis_numba.kernels import _cpu
+
+    folder = _cpu.cache_folder()
+    lost = Path(tempfile.gettempdir()) in Path(folder).parents
+    remedy = "set NUMBA_CACHE_DIR to a writable folder that is kept" if lost else ""
+    return InstallationFinding("kernel cache", "note" if lost else "good", folder, remedy)
 
 
 def _silence(n_samples: int) -> "NDArray[np.uint32]":

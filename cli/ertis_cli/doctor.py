@@ -39,7 +39,7 @@ def doctor(
     """
     from ertis_cli._diagnosis import CHECKS, InstallationFinding
     from ertis_cli._ros_diagnosis import ros_findings
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.errors import ArgumentError, ErtisError
 
     if not ros and (domain is not None or interface is not None):
         raise click.UsageError("--domain and --interface are for --ros; add it")
@@ -52,8 +52,11 @@ def doctor(
         for name, look in checks.items():
             try:
                 found += look(folder)
+            except ErtisError as error:
+                text, _, remedy = " ".join(str(error).split()).rpartition("; ")
+                found.append(InstallationFinding(name, "bad", text or remedy, remedy if text else ""))
             except Exception as error:  # noqa: BLE001  one broken check must not hide the others
-                reason = " ".join(str(error).split()) or type(error).__name__
+                reason = " ".join(f"{type(error).__name__}: {error}".split())
                 found.append(InstallationFinding(name, "bad", f"check failed: {reason}", "report this as a bug"))
     n_bad = sum(each.state == "bad" for each in found)
     if as_json:

@@ -4,12 +4,14 @@ import errno
 import gc
 import importlib
 import sys
+import traceback
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NoReturn, cast
 
 import click
 
-from ertis_cli import _config, _naming, _supervisor
+from ertis_cli import _config, _naming, _output, _supervisor
 from ertis_cli._stop_signals import interruption, obey_signals
 
 __all__ = ["COMMANDS", "cli", "main"]
@@ -125,7 +127,7 @@ def _is_interruption(error: Exception) -> bool:
 
 
 def _reported(error: Exception) -> tuple[int, str]:
-    """Return the exit code and the message of an error; raise a programming error again."""
+    """Return the exit code and the message of an error; in development mode, raise a programming error again."""
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx else "ertis"
         return _USAGE, f"{error.format_message().rstrip('.')}{_config.origin(error)}; see '{path} --help'"
@@ -135,7 +137,20 @@ def _reported(error: Exception) -> tuple[int, str]:
         return _INTERRUPTED, "interrupted"
     if _is_expected(error):
         return _FAILED, _of_system(error) or str(error) or type(error).__name__
-    raise error
+    if sys.flags.dev_mode:
+        raise error
+    return _FAILED, _unexpected(error)
+
+
+def _unexpected(error: Exception) -> str:
+    """Return the type, text and place of a programming error; its cause is unknown, so nothing is blamed."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if "ertis_" in frame.filename] or frames
+    place = f"{Path(own[-1].filename).name}, line {own[-1].lineno}"
+    return (
+        f"unexpected {type(error).__name__}: {error} ({place}); report this as a bug, with the files that cause it and "
+        "the output of the same command with PYTHONDEVMODE=1"
+    )
 
 
 def _of_system(error: Exception) -> str:
@@ -194,6 +209,9 @@ def cli(ctx: click.Context) -> None:
 
 def main() -> None:
     """Run the command line."""
+    _output.open_closed_streams()
+    _output.replace_unencodable()
+    _output.draw_without_display()
     obey_signals()
     _supervisor.allow()
     # Imports create a hundred thousand permanent objects. Scanning them would take a twentieth of the run time.

@@ -9,7 +9,7 @@ from types import TracebackType
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _output, options
 
 __all__ = ["rtisdev"]
 
@@ -51,6 +51,7 @@ def rtisdev(*, port: str | None, device: str, method: str | None, script: Path, 
     for name in ("SIGTERM", "SIGHUP"):
         if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:
             signal.signal(getattr(signal, name), signal.SIG_DFL)
+    _output.restore_display()
     sys.argv = [str(script), *arguments]
     sys.path.insert(0, str(script.resolve().parent))
     try:

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from ertis_numba import checks
 from ertis_numba.errors import DeviceError
+from ertis_numba.kernels import _numba_setup
 from ertis_numba.kernels._contract.fusion import FusionKernels
 from ertis_numba.kernels._contract.mapping import MappingKernels
 from ertis_numba.kernels._contract.steering import SteeringKernels
@@ -58,6 +59,8 @@ def load(device: str = "auto") -> KernelSet:
         _LOG.info("device 'auto' is %r", chosen)
         return load(chosen)
     try:
+        if device != "numpy":
+            _numba_setup.prepare()
         kernels: KernelSet = importlib.import_module(DEVICES[device]).KERNELS
     except DeviceError:
         raise
@@ -67,10 +70,6 @@ def load(device: str = "auto") -> KernelSet:
         # Numba will drop its own CUDA target; the package numba-cuda continues it.
         raise DeviceError(
             f"device {device!r} cannot be loaded ({error}); use device 'cpu', or install ertis-numba[cu12] or [cu13]"
-        ) from error
-    except RuntimeError as error:  # raised by Numba if no folder for its cache is writable
-        raise DeviceError(
-            f"device {device!r} cannot be set up ({error}); set NUMBA_CACHE_DIR to a writable folder"
         ) from error
     return kernels
 

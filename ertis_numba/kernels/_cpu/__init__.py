@@ -25,7 +25,7 @@ from ertis_numba.kernels._cpu.loading import load_without_compiler
 from ertis_numba.kernels._host import HostMemory
 from ertis_numba.kernels._kernel_set import KernelSet, twins_in
 
-__all__ = ["KERNELS", "threading_layer"]
+__all__ = ["KERNELS", "cache_folder", "threading_layer"]
 
 if numba.config.DISABLE_JIT:
     raise DeviceError(
@@ -58,6 +58,11 @@ def threading_layer() -> str:
         return str(numba.threading_layer())
     except ValueError:  # no parallel kernel has run yet, so no layer is chosen
         return ""
+
+
+def cache_folder() -> str:
+    """Return the folder of the compiled kernels."""
+    return str(next(iter(_TWINS.values())).stats.cache_path)
 
 
 def _layer_is_reentrant() -> bool:

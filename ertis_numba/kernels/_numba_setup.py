@@ -1,0 +1,102 @@
+"""Check of Numba's environment variables, and a folder for its cache, before kernels are loaded."""
+
+import importlib
+import logging
+import os
+import stat
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any, Final
+
+from ertis_numba.errors import DeviceError
+
+__all__ = ["prepare"]
+
+_LOG = logging.getLogger("ertis_numba")
+_REMEDY: Final = "set NUMBA_CACHE_DIR to a writable folder"
+_POOLS: Final = {
+    "default": "",
+    "forksafe": "",
+    "omp": "omppool",
+    "safe": "tbbpool",
+    "tbb": "tbbpool",
+    "threadsafe": "omppool",
+    "workqueue": "",
+}
+"""Modules that Numba's threading layers need."""
+
+
+def prepare() -> None:
+    """Import Numba, and ensure that it can start threads and store compiled kernels.
+
+    Raises
+    ------
+    DeviceError
+        Numba refuses an environment variable, or no folder for compiled kernels is writable.
+    """
+    config = _imported().config
+    layer = str(config.THREADING_LAYER).lower()
+    if layer not in _POOLS:
+        raise DeviceError(f"NUMBA_THREADING_LAYER is {layer!r}; use one of {', '.join(_POOLS)}, or unset it")
+    if set(config.THREADING_LAYER_PRIORITY) != {"tbb", "omp", "workqueue"}:
+        raise DeviceError("NUMBA_THREADING_LAYER_PRIORITY must list tbb, omp and workqueue in any order; unset it")
+    try:
+        importlib.import_module(f"numba.np.ufunc.{_POOLS[layer]}" if _POOLS[layer] else "numba")
+    except ImportError as error:
+        raise DeviceError(
+            f"NUMBA_THREADING_LAYER is {layer!r}, but its library is missing ({error}); unset it"
+        ) from error
+    _require_cache_folder()
+
+
+def _imported() -> Any:
+    """Return Numba; raise DeviceError if it cannot interpret its environment variables."""
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", r"\s*Environment variable", RuntimeWarning)
+            return importlib.import_module("numba")
+    except (ValueError, RuntimeWarning) as error:
+        given = ", ".join(f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("NUMBA_"))
+        reason = str(error).split("\n")[0].strip()
+        raise DeviceError(f"Numba refuses one of its environment variables {given} ({reason}); unset it") from error
+
+
+def _require_cache_folder() -> None:
+    """Let Numba store compiled kernels in a private temporary folder if neither the package nor the home is writable.
+
+    Raises
+    ------
+    DeviceError
+        The temporary folder is not writable either.
+    """
+    numba = _imported()
+    if _is_cacheable(numba):
+        return
+    try:
+        folder = _private_folder()
+    except OSError as error:
+        raise DeviceError(f"no folder for compiled kernels is writable ({error}); {_REMEDY}") from error
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)  # for child processes as well
+    numba.config.reload_config()
+    _LOG.warning("compiled kernels are stored in %s, as no other folder is writable; to keep them, %s", folder, _REMEDY)
+
+
+def _is_cacheable(numba: Any) -> bool:
+    """Return True if Numba finds a folder for the kernels of this package."""
+    try:
+        numba.njit(cache=True)(_private_folder)
+    except RuntimeError:
+        return False
+    return True
+
+
+def _private_folder() -> Path:
+    """Return a temporary folder that no other user can write to, because Numba runs the code in its cache."""
+    if not hasattr(os, "getuid"):
+        return Path(tempfile.mkdtemp(prefix="ertis-numba-"))
+    folder = Path(tempfile.gettempdir(), f"ertis-numba-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    is_private = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
+    return folder if is_private else Path(tempfile.mkdtemp(prefix="ertis-numba-"))
