@@ -14,8 +14,9 @@ from click.testing import CliRunner
 from ertis_cli import options
 from ertis_cli.main import cli
 
+from ertis_numba.errors import DataError
 from ertis_numba.frames import Stamp
-from ertis_numba.storage import GroundTruth, write_energyscapes, write_recording
+from ertis_numba.storage import GroundTruth, open_recording, write_energyscapes, write_recording
 from tests.files import image, noise
 
 N_BYTES = 4 * 65_536
@@ -339,3 +340,44 @@ def test_unexpected_error_is_one_line_that_blames_no_file_and_a_traceback_in_dev
     else:
         line = r"ertis: error: unexpected KeyError: 'gain' \(\w+\.py, line \d+\); report this as a bug, .*MODE=1\n"
         assert re.fullmatch(line, done.stderr), done.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+@pytest.mark.parametrize(
+    "words",
+    [
+        "info PIPE",
+        "verify PIPE",
+        "check PIPE",
+        "peaks PIPE",
+        "process PIPE -o out.energy.h5",
+        "process rec.h5 --settings PIPE -o out.energy.h5",
+        "plot PIPE -o out.png",
+        "export PIPE -o out.csv",
+        "map rec.h5 --poses PIPE -o out.map.h5",
+        "odometry PIPE -o out.tum",
+        "import PIPE -o out.h5 --layout eRTIS_v2 --preset short_25_50",
+        "simulate PIPE -o out.h5",
+        "view PIPE --save-html out.html",
+    ],
+)
+def test_named_pipe_is_refused_instead_of_waiting_for_a_writer(words, folder, monkeypatch, tmp_path):
+    monkeypatch.chdir(folder)
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    done = CliRunner().invoke(cli, words.replace("PIPE", str(pipe)).split())
+    assert done.exit_code == 1
+    assert done.stderr == f"ertis: error: {pipe} is a named pipe; write its content to a file, and use that file\n"
+
+
+def test_unreadable_file_and_pipe_of_a_shell_get_their_own_remedies(folder, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    ours, theirs = os.pipe()
+    os.close(theirs)
+    with os.fdopen(ours, "rb"), pytest.raises(DataError, match="is a pipe; write its content to a file, and use that"):
+        open_recording(f"/dev/fd/{ours}")
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(DataError, match="Permission denied; ask its owner for permission to read it"):
+        open_recording(folder / "rec.h5")

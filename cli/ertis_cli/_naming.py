@@ -9,6 +9,7 @@ from typing import Any, Final
 import click
 
 from ertis_cli._config import long_name
+from ertis_cli._pipes import require_no_pipes
 
 __all__ = ["name_options", "named"]
 
@@ -51,6 +52,7 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(callback)
     def call(*arguments: Any, **options: Any) -> Any:
         _require_finite(click.get_current_context())
+        require_no_pipes(options)
         try:
             return callback(*arguments, **options)
         except ValueError as error:  # a builtin, so that the package need not be imported

@@ -1,6 +1,7 @@
 """Opening of HDF5 files, and errors that name their cause."""
 
 import errno
+import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -62,6 +63,10 @@ def open_file(path: Path, wanted: str = RESULT_OR_RECORDING) -> h5py.File:
     try:
         with path.open("rb") as file:
             n_bytes = file.seek(0, 2)
+    except io.UnsupportedOperation as error:
+        raise DataError(f"{path} is a pipe; write its content to a file, and use that file") from error
+    except PermissionError as error:
+        raise DataError(f"{path}: {error.strerror}; ask its owner for permission to read it") from error
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; give {wanted}") from error
     if n_bytes == 0:
