@@ -56,19 +56,24 @@ def reading(file: h5py.File, path: Path) -> Iterator[None]:
         ) from error
 
 
-def open_file(path: Path, wanted: str = RESULT_OR_RECORDING) -> h5py.File:
-    """Open an HDF5 file for reading; errors name the kind of file that is wanted."""
-    if path.is_dir():
-        raise DataError(f"{path} is a folder; give {wanted}")
+def _n_bytes(path: Path, wanted: str) -> int:
+    """Return the size of a file that can be read at any place."""
     try:
         with path.open("rb") as file:
-            n_bytes = file.seek(0, 2)
+            return file.seek(0, 2)
     except io.UnsupportedOperation as error:
         raise DataError(f"{path} is a pipe; write its content to a file, and use that file") from error
     except PermissionError as error:
         raise DataError(f"{path}: {error.strerror}; ask its owner for permission to read it") from error
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; give {wanted}") from error
+
+
+def open_file(path: Path, wanted: str = RESULT_OR_RECORDING) -> h5py.File:
+    """Open an HDF5 file for reading; errors name the kind of file that is wanted."""
+    if path.is_dir():
+        raise DataError(f"{path} is a folder; give {wanted}")
+    n_bytes = _n_bytes(path, wanted)
     if n_bytes == 0:
         raise DataError(f"{path} is empty; give {wanted}")
     if not h5py.is_hdf5(path):
