@@ -1,5 +1,6 @@
 """``ertis import-poses``: add the poses of a platform to recordings."""
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -61,6 +62,7 @@ def import_poses(
     """
     from ertis_numba import checks
     from ertis_numba.atomic_files import make_folder
+    from ertis_numba.errors import PoseWarning
     from ertis_numba.storage import add_poses, check_target, recorded_trajectory, require_fitting_poses
     from ertis_numba.storage.poses import count_in_gaps
 
@@ -77,7 +79,8 @@ def import_poses(
         make_folder(target)
     reports: list[dict[str, Any]] = []
     for recording, output in zip(recordings, outputs, strict=True):
-        written = add_poses(recording, shifted, output=output, overwrite=force, replace=force)
+        with warnings.catch_warnings(category=PoseWarning, action="ignore"):  # A note says the same.
+            written = add_poses(recording, shifted, output=output, overwrite=force, replace=force)
         poses = cast("Trajectory", recorded_trajectory(written))
         count = options.counted(len(poses), "pose")
         options.say(f"{written}: {count}, {poses.length_m:.2f} m", quiet=quiet)

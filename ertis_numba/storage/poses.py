@@ -3,6 +3,7 @@
 import filecmp
 import os
 import shutil
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ertis_numba.atomic_files import atomic_write, check_target, reason, remedy, require_free_space
-from ertis_numba.errors import ArgumentError, DataError, ErtisError
+from ertis_numba.errors import ArgumentError, DataError, ErtisError, PoseWarning
 from ertis_numba.frames import Trajectory
+from ertis_numba.frames.platform_tilt import tilt_note
 from ertis_numba.storage._poses import MAX_GAP_S, checked_poses, remove_poses, require_times, write_poses
 from ertis_numba.storage._reader import file_kind, sensor_names
 from ertis_numba.storage.acoustic_maps import AcousticMapReader, open_acoustic_maps
@@ -84,6 +86,11 @@ def add_poses(
     DataError
         The recording cannot be read, or the output cannot be written.
 
+    Warns
+    -----
+    PoseWarning
+        Most poses tilt the platform by more than 30°, or the path is steeper than 30°.
+
     Examples
     --------
     >>> import ertis_numba as ertis
@@ -102,6 +109,9 @@ def add_poses(
     if not isinstance(trajectory, Trajectory):
         raise ArgumentError(f"trajectory is of type {type(trajectory).__name__}; give a Trajectory")
     checked_poses(trajectory)
+    note = tilt_note(trajectory.rotation_xyzw, trajectory.position_m)
+    if note is not None:
+        warnings.warn(note, PoseWarning, stacklevel=2)
     target = source if output is None else Path(output)
     if output is None:
         check_target(source, overwrite=True)
