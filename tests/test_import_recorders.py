@@ -80,7 +80,7 @@ NOT_JOINED = {
         {},
         r"as all 4 files have together; use --join \(join=True\) if they are",
     ),
-    "too few files": ({"count": 3}, {"join": True}, r"has 3 channels, but array 'line' has 4; give a layout"),
+    "too few files": ({"count": 3}, {"join": True}, r"has 3 channels, but array 'line' has 4; correct array"),
     "rates": (
         {"count": 4, "rates_hz": (RATE_HZ, 96_000)},
         {"join": True},

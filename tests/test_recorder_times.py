@@ -276,7 +276,7 @@ REFUSED = {
         ["a.wav", "b.wav"],
         {"start_ns": [1, 2, 3]},
         ArgumentError,
-        r"start_ns has 3 times for 2 files; use one for the first file, or one for each file",
+        r"--start \(start_ns\) is used 3 times for 2 files; use it once for the first file, or once for each",
     ),
     "before 1970": (["19691231_042637.WAV"], {}, DataError, r"states a time before 1970 \(1969-12-31 04:26:37\); use"),
     "expansion": (["a.wav"], {"time_expansion": 1e9}, ArgumentError, r"time_expansion is 1e\+09; give a number from"),
@@ -364,6 +364,27 @@ def test_folder_without_times_has_the_order_of_numbers(tmp_path):
     for number in (2, 10, 1):
         write(tmp_path / f"R_{number}.wav", seconds=0.01 * number)
     assert times_s(opened(tmp_path)) == pytest.approx([0, 0.01, 0.03])
+
+
+@pytest.mark.parametrize(
+    ("made", "named", "message"),
+    [
+        (
+            (),
+            ("card",),
+            "contains no files to import; choose a folder with .wav files, or with .bin files of RTIS",
+        ),
+        (("Data/a.wav",), ("card",), "contains no files to import; import "),
+        (("a.wav",), ("card", "card/a.wav"), "card is a folder; import one folder at a time, or list its files"),
+    ],
+)
+def test_folders_without_files_are_refused(tmp_path, made, named, message):
+    (tmp_path / "card" / "Data").mkdir(parents=True)
+    for name in made:
+        write(tmp_path / "card" / name)
+    done = command("import", *(tmp_path / name for name in named), "--layout", "one.csv", "--passive")
+    assert done.exit_code == 2
+    assert message in done.stderr
 
 
 def test_start_may_be_repeated(tmp_path):

@@ -18,6 +18,7 @@ __all__ = ["import_raw"]
 _END_NS = 2**63  # in the year 2262
 _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
 _RAW = {".bin", ".dat", ".pdm", ".raw"}
+_WAV = {".wav", ".wave"}
 _OF_PCM = {
     "--skip": "skip_s",
     "--length": "length_s",
@@ -133,7 +134,7 @@ def import_raw(
     from ertis_numba.interop import is_wav_folder
     from ertis_numba.storage import check_target, write_recording
 
-    folder = raw[0] if len(raw) == 1 and raw[0].is_dir() else None
+    folder = _folder(raw)
     if target is None:
         target = _beside(raw[0]) if folder is None else Path(f"{folder.resolve()}.h5")
     check_target(target, overwrite=force, sources=raw)
@@ -180,6 +181,21 @@ def import_raw(
     _report_obstacle(measurements.settings, quiet=quiet)
     if as_json:
         options.print_json({"output": str(target), "measurements": len(measurements), "notes": list(notes)})
+
+
+def _folder(raw: tuple[Path, ...]) -> Path | None:
+    """Return the folder to import, if any; refuse folders without measurements, and folders beside other files."""
+    several = [path for path in raw if path.is_dir()]
+    if several and len(raw) > 1:
+        raise click.UsageError(
+            f"{several[0]} is a folder; import one folder at a time, or list its files", click.get_current_context()
+        )
+    if not several or any(path.suffix.lower() in {".bin", *_WAV} for path in raw[0].iterdir()):
+        return several[0] if several else None
+    inner = [path for path in sorted(raw[0].iterdir()) if path.is_dir()]
+    found = next((each for each in inner if any(path.suffix.lower() in _WAV for path in each.iterdir())), None)
+    remedy = f"import {found}" if found else "choose a folder with .wav files, or with .bin files of RTIS Dev"
+    raise click.UsageError(f"{raw[0]} contains no files to import; {remedy}", click.get_current_context())
 
 
 def _is_pcm(path: Path, *, is_raw: bool) -> bool:

@@ -1,13 +1,14 @@
 """Folders of WAV files, such as the card of a recorder."""
 
 from pathlib import Path
+from typing import Final
 
 from ertis_numba.errors import DataError
 from ertis_numba.interop.pcm_files import first_stated_times, inspect, natural_order
 
 __all__ = ["is_wav_folder", "wav_files"]
 
-_WAV = {".wav", ".wave"}
+_WAV: Final = {".wav", ".wave"}
 
 
 def is_wav_folder(path: str | Path) -> bool:

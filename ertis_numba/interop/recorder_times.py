@@ -47,8 +47,8 @@ def file_times(
     """
     if len(starts_ns) not in {0, 1, len(files)}:
         raise ArgumentError(
-            f"start_ns has {len(starts_ns)} times for {len(files)} files; use one for the first file, or one for each "
-            "file (--start)"
+            f"--start (start_ns) is used {len(starts_ns)} times for {len(files)} files; use it once for the first "
+            "file, or once for each file"
         )
     if len(starts_ns) == len(files) and files:
         _require_order(files, starts_ns)
@@ -66,7 +66,7 @@ def file_times(
         with_time = next(file.path for file, time in zip(files, best, strict=True) if time)
         raise DataError(
             f"{without} states no time in its metadata or name, but {with_time.name} does; use --start once for each "
-            "file (start_ns), or import the files separately"
+            "file (start_ns), or import such files separately"
         )
     times_ns = [time.since_1970_ns for time in known]
     if min(times_ns) < 0:
