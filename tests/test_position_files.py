@@ -376,11 +376,13 @@ def test_array_given_by_positions_has_a_name_of_its_own(tmp_path):
     assert Settings().updated_from_file(tmp_path / "mine.toml").array.layout == "mine.toml"
     assert Settings.load(tmp_path / "named.toml").array.layout == "pair"
     assert Array(positions_m=rows).layout == Array().replace(positions_m=rows).layout == "own array"
-    assert Settings().replace("array.positions_m", rows).array.layout == "own array"
+    assert Settings().replace("array.positions_m", np.array(rows)).array.layout == "own array"
+    with pytest.raises(ArgumentError, match=r"positions_m\[1\] has shape \(2,\); give shape \(3,\)"):
+        Array().replace(positions_m=[[0.0, 0.0, 0.0], [0.0, 1.0]])
     assert Array().layout == Settings().array.layout == "eRTIS_v3D1"
     assert Array(layout="pair", positions_m=rows).replace(word_bits=8).layout == "pair"
     shipped = written_out(Array())
-    assert shipped.layout == shipped.replace(positions_m=shipped.positions_m).layout == "eRTIS_v3D1"
+    assert shipped.layout == shipped.replace(positions_m=np.array(shipped.positions_m)).layout == "eRTIS_v3D1"
     assert microphones(shipped.replace(positions_m=rows, enabled=None, gain=None, delay_s=None)).name == "own array"
 
 

@@ -21,6 +21,9 @@ __all__ = ["CallMatch", "call_match", "first_call_match"]
 
 MIN_LOSS: Final = 2.8
 """Ratio of the peak power of another sweep to that of the call, above which the call does not match."""
+_MIN_LOSS_OF_MODULATION: Final = 1.25
+"""The same ratio for a sweep of equal duration and other modulation, whose peak after the call's filter is sharper."""
+_EQUAL_SLOPE: Final = 0.1  # Deviation of the duration of a sweep of equal duration.
 _MAX_CREST: Final = 12.0  # Peak to mean power around the call's own strongest peak; higher values indicate the call.
 _MIN_SNR: Final = 40.0  # Peak to median power after the best filter; noise reaches about 20.
 _MIN_SMEAR: Final = 0.2  # Minimum extent of the peak of another sweep, relative to the call's duration.
@@ -139,7 +142,9 @@ def call_match(measurement: Measurement) -> CallMatch | None:
         return None
     smear_s = max(abs(best_slope - 1), _MIN_SMEAR) * call.duration_s
     crest = _crest(before, max(2, round(smear_s / spacing_s)))
-    wrong = best_ratio > MIN_LOSS and abs(best_slope) >= _MIN_SLOPE and crest < _MAX_CREST
+    is_of_same_duration = abs(best_slope - 1) < _EQUAL_SLOPE and best_linear != (call.modulation == "linear")
+    least = _MIN_LOSS_OF_MODULATION if is_of_same_duration else MIN_LOSS
+    wrong = best_ratio > least and abs(best_slope) >= _MIN_SLOPE and crest < _MAX_CREST
     return CallMatch(
         10 * math.log10(best_ratio), best_slope, "linear" if best_linear else "hyperbolic", matches=not wrong
     )

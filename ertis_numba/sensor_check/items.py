@@ -1,6 +1,7 @@
 """Results of single checks: measured values, faults and remedies."""
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
@@ -60,8 +61,10 @@ COPY: Final = "copy the file again, or record again"
 """Remedy for damaged files."""
 NO_CALL: Final = "no call was emitted"
 
+_FITS_ANOTHER: Final = re.compile(r"does not fit the recordings .*, but layout \S+ does; ")
 _DEVIATIONS: Final = 4.0
 _WORTH_S: Final = 1e-6  # 18 degrees of a period at 50 kHz.
+_OTHER_LAYOUT: Final = "name that layout as array.layout in a settings file (--settings)"
 _CALIBRATE: Final = "calibrate the array (ertis calibrate), or give its own layout (--settings)"
 
 
@@ -204,6 +207,9 @@ def of_call(match: CallMatch | None, *, has_call: bool) -> CheckResult:
 
 def of_calibration(residuals: CalibrationResiduals | None, why: str, report: Health | None) -> CheckResult:
     """Return the deviations from the layout; faults that the health of the microphones names are left out."""
+    if residuals is None and _FITS_ANOTHER.search(why):
+        text = why.rpartition("; ")[0]
+        return _result_of([CheckFault(check=CALIBRATION, text=text, remedy=_OTHER_LAYOUT)], "")
     if residuals is None:
         return CheckResult("not known", why)
     faulty = report.faults if report else {}

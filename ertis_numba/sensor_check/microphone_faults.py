@@ -27,6 +27,8 @@ _ADJECTIVES: Final = {"inverted polarity": "inverted", "duplicate": "identical"}
 _IN_PAIRS: Final = ("swapped", "duplicate")
 _RECORDS: Final = {
     "order of channels": "channels are not in the order of the layout",
+    "size of the array": "the positions of the microphones have another unit",
+    "half late": "the channels of two converters are out of step",
     "order of bytes": "the bytes of each sample are swapped",
     "repeated blocks": "blocks of samples are repeated",
 }

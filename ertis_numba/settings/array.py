@@ -98,8 +98,10 @@ class Array(TomlTable, frozen=True, kw_only=True):
 
     def _completed(self, changes: dict[str, Any]) -> dict[str, Any]:
         """Other positions need another name."""
-        is_other = changes.get("positions_m", self.positions_m) != self.positions_m
-        return {"layout": OWN_ARRAY, **changes} if is_other and changes["positions_m"] is not None else changes
+        given = changes.get("positions_m")
+        if given is None or np.array_equal(np.asarray(given, object), np.asarray(self.positions_m, object)):
+            return changes
+        return {"layout": OWN_ARRAY, **changes}
 
     def _check_positions(self, positions_m: tuple[tuple[float, float, float], ...]) -> None:
         checks.integer("number of array.positions_m", len(positions_m), 1, MAX_MICROPHONES)

@@ -181,7 +181,7 @@ def fit_delays(
     _, extent, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=False)
     used = extent / np.sqrt(len(positions_m)) > _DEGENERATE_M
     places_m = positions_m @ axes[used].T
-    if len(places_m) < 2 * (places_m.shape[1] + 1) + 1:
+    if not used.any() or len(places_m) < 2 * (places_m.shape[1] + 1) + 1:
         return None
     squared_m2 = np.sum(positions_m**2, axis=1)
     fits = []

@@ -51,6 +51,12 @@ KINDS = {
     "swapped": FaultKind(unit="µs", remedy=_LAYOUT),
     "late": FaultKind(unit="µs", remedy="give their delay as array.delay_s, or disable them in a layout file"),
     "order of channels": FaultKind(unit="µs", remedy=_LAYOUT, of_record=True),
+    "size of the array": FaultKind(
+        remedy="correct the unit of the positions, in the layout file or as array.positions_m", of_record=True
+    ),
+    "half late": FaultKind(
+        unit="µs", remedy="synchronise the converters, or set their delays as array.delay_s", of_record=True
+    ),
     "order of bytes": FaultKind(unit="dB", remedy="swap the bytes of every number when importing", of_record=True),
     "repeated blocks": FaultKind(
         unit="samples", remedy="record again, and check the link to the sensor", of_record=True

@@ -7,21 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.health.array_match import SIZE, find_other_array
 from ertis_numba.analysis.health.arrival import Compressed, Fit, compress, fit_delays, fit_emitter, strongest
 from ertis_numba.analysis.health.coherence import aligned, correlate, half_bands, mean_of
 from ertis_numba.analysis.health.emission import describe_shift, fit_emission
 from ertis_numba.analysis.health.levels import gain_findings
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_SHIFT_S
 from ertis_numba.analysis.health.report import Finding
-from ertis_numba.geometry import Layout, layout_names, load_layout, microphones
+from ertis_numba.geometry import Layout, microphones
 from ertis_numba.settings import Settings
 
 __all__ = ["DESCRIPTIONS", "by_wavefront"]
 
 DESCRIPTIONS = "polarity, order and delay of channels, and a shift of the record"
 _COMPACT_SHARE = 0.75  # Minimum share of the microphones that a wavefront must fit.
-_PERMUTED_SHARE = 0.9  # Minimum share of the microphones that it must fit in another order.
-_MIN_INCOMPATIBLE = 0.25  # Minimum additional share that the other order must fit.
 _MIN_PATH_M = 0.2  # Minimum path of an echo; shorter paths are indistinguishable from the direct sound.
 _MIN_DEPTH_M = 0.01  # Minimum spread of distances from the emitter. On a ring, its sound equals an echo from ahead.
 _DIRECT_SPREAD = 0.75  # Maximum spread relative to that of an echo, which has two more unknowns.
@@ -87,13 +86,12 @@ def by_wavefront(
     )
     if not is_direct and middle_s * speed_m_s < _MIN_PATH_M:
         return shifts, (f"{DESCRIPTIONS}: the strongest arrival is too near to fit a wavefront",)
+    other = find_other_array(found, times_s, channels, layout, path_m, speed_m_s)
+    if other is not None and not (shifts and other.fault == SIZE):  # A shift changes the expected curvature.
+        return [other], ()
     fit = direct if is_direct else echo
     if fit.share < _COMPACT_SHARE:
-        enough = len(channels) >= _MIN_RECORD_CHANNELS
-        ordered = _other_order(times_s, channels, layout, fit, curvatures, speed_m_s) if enough else []
-        return (
-            (ordered, ()) if ordered else (shifts, (f"{DESCRIPTIONS}: no single wavefront fits the strongest arrival",))
-        )
+        return shifts, (f"{DESCRIPTIONS}: no single wavefront fits the strongest arrival",)
     findings = [*shifts, *_of_channels(found, times_s, fit, channels, layout)]
     return findings, () if is_direct else ("a shift of the record: the strongest arrival is not the direct sound",)
 
@@ -128,54 +126,6 @@ def _loudest(
     middle_s = pilot.start_s + int(np.argmax(np.median(pilot.envelope, axis=0))) * pilot.step_s
     middle = round((middle_s + call.start_s) * rate_hz)
     return max(0, middle - length), min(n_samples, middle + 2 * length)
-
-
-def _other_order(
-    times_s: NDArray[np.float64],
-    channels: Sequence[int],
-    layout: Layout,
-    fit: Fit,
-    curvatures: tuple[float, ...],
-    speed_m_s: float,
-) -> list[Finding]:
-    """Return a finding if the arrival fits another order of the channels."""
-    best: tuple[float, float, str] | None = None
-    for name, positions_m in _orders(layout):
-        other_m = positions_m[list(channels)]
-        candidates = [fit_delays(times_s, other_m, curvatures, speed_m_s), fit_emitter(times_s, other_m, speed_m_s)]
-        for item in candidates:
-            if item is not None and (best is None or (item.share, -item.spread_s) > (best[0], -best[1])):
-                best = item.share, item.spread_s, name
-    if best is None or best[0] < max(_PERMUTED_SHARE, fit.share + _MIN_INCOMPATIBLE):
-        return []
-    return [
-        Finding(
-            fault="order of channels",
-            channels=tuple(channels),
-            measured=1e6 * fit.spread_s,
-            limit=1e6 * MAX_DELAY_S,
-            detail=f"{best[2]} fits {best[0]:.0%} of the microphones, the given order fits {fit.share:.0%}",
-        )
-    ]
-
-
-def _orders(layout: Layout) -> list[tuple[str, NDArray[np.float64]]]:
-    """Return the channel positions for common orders: shipped layouts, and words with reversed bits or bytes."""
-    n_channels = len(layout.enabled)
-    octets = [channel ^ 7 for channel in range(n_channels)]
-    orders = [("the reversed order", layout.positions_m[::-1])]
-    if n_channels % 8 == 0:
-        swapped = np.arange(n_channels).reshape(-1, 8)[::-1].ravel()
-        orders += [
-            ("the order of reversed bits in each byte", layout.positions_m[octets]),
-            ("the order of reversed bytes", layout.positions_m[swapped]),
-        ]
-    for name in layout_names():
-        other = load_layout(name)
-        same = len(other.enabled) == n_channels and np.allclose(other.positions_m, layout.positions_m, atol=1e-6)
-        if len(other.enabled) == n_channels and not same:
-            orders.append((f"layout {name}", other.positions_m))
-    return orders
 
 
 def _of_channels(

@@ -1,0 +1,257 @@
+"""Comparison of the strongest arrival with other arrays: other layouts, orders, sizes, and converters out of step.
+
+A fault of the array as a whole is certain only relative to an alternative. Tolerances of microphones spread the
+arrival over all candidates alike, so that the ratio of their residuals decides, which needs no limit in seconds and
+holds for arrays of any size.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.analysis.health.arrival import Compressed, strongest
+from ertis_numba.analysis.health.report import Finding
+from ertis_numba.geometry import Layout, layout_names, load_layout
+
+__all__ = ["SIZE", "find_other_array"]
+
+SIZE: Final = "size of the array"
+
+_MIN_CHANNELS: Final = 12  # Fewer channels fit another order by chance.
+_MIN_CURVED: Final = 3.0  # Residuals with the curvature of an echo relative to those with the best curvature.
+_MIN_RATIO: Final = 5.0  # Residuals of the array in use relative to those of another one.
+_MIN_SPREAD_S: Final = 0.3e-6  # Residuals below it are errors of the times.
+_KEPT: Final = 0.9  # Share of the microphones whose residuals count, so that a single one does not decide.
+_WIDE_S: Final = 0.4e-3  # Delay across the largest shipped layout, on either side.
+_WIDER: Final = 12.0  # Centimetres in place of millimetres delay sound ten times as much.
+_MAX_SLOWNESS: Final = 1.1  # Slowness across the array relative to that of sound; a larger one is impossible.
+_CLEAR: Final = 0.05  # Residuals of a clear arrival relative to its delays across the array.
+_DEVIATIONS: Final = 8.0
+_CURVATURES: Final = (1.0, 2.0)  # A wall and a point at the same path, times the path.
+# Limits of the size relative to the given one; a record that begins before the emission explains a larger one, too.
+_MAX_GROWTH: Final = 2.5
+_MIN_SHRINKAGE: Final = 0.67
+_DEGENERATE_M: Final = 1e-3
+_ITERATIONS: Final = 6
+_LEAST_CURVATURE: Final = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class _Match:
+    """Fit of a wavefront to times of arrival.
+
+    Attributes
+    ----------
+    spread_s : float
+        Root mean square of the residuals, without the largest ones.
+    slowness : float
+        Slowness across the array relative to that of sound.
+    delay_s : float
+        Delay of some channels relative to the others, if it is fitted.
+    """
+
+    spread_s: float
+    slowness: float
+    delay_s: float = 0.0
+
+
+def find_other_array(
+    found: Compressed,
+    times_s: NDArray[np.float64],
+    channels: Sequence[int],
+    layout: Layout,
+    path_m: float,
+    speed_m_s: float,
+) -> Finding | None:
+    """Return the finding of an array that fits the strongest arrival much better than the layout; None without one.
+
+    Parameters
+    ----------
+    found : Compressed
+        Signals after the matched filter.
+    times_s : (mic,) float64
+        Times of arrival as the layout expects them.
+    channels : sequence of int
+        Channels of the microphones.
+    layout : Layout
+    path_m : float
+        Way of the sound since the emission.
+    speed_m_s : float
+    """
+    picked = list(channels)
+    if len(picked) < _MIN_CHANNELS:
+        return None
+    own = _best(times_s, layout.positions_m[picked], path_m, speed_m_s)
+    every = [times_s]
+    if own is None or own.spread_s >= _MIN_SPREAD_S or own.slowness > _MAX_SLOWNESS:
+        # The sound may take longer across the array than its positions suggest.
+        across_s = float(2 * np.linalg.norm(layout.positions_m[picked], axis=1).max()) / speed_m_s
+        wide = (strongest(found, width_s) for width_s in (_WIDE_S, _WIDER * across_s))
+        every += [arrived[0] - layout.delay_s[picked] for arrived in wide if arrived is not None]
+    for check in (_other_order, _other_size):
+        for times in every[::-1]:
+            finding = check(times, picked, layout, path_m, speed_m_s)
+            if finding is not None:
+                return finding
+    return None
+
+
+def _other_order(
+    times_s: NDArray[np.float64], channels: list[int], layout: Layout, path_m: float, speed_m_s: float
+) -> Finding | None:
+    """Return the finding of another order or layout, or of a late half, if it fits much better."""
+    positions_m = layout.positions_m[channels]
+    own = _best(times_s, positions_m, path_m, speed_m_s)
+    if own is None or own.spread_s < _MIN_SPREAD_S:
+        return None
+    within = f"within {1e6 * own.spread_s:.2g} µs"
+    found: list[tuple[_Match | None, str, float, str]] = []
+    for name, other_m in _orders(layout):
+        match = _best(times_s, other_m[channels], path_m, speed_m_s)
+        found.append((match, "order of channels", own.spread_s, f"{name} fits far better than the given one, {within}"))
+    for name, late in _halves(len(layout.enabled)):
+        match = _best(times_s, positions_m, path_m, speed_m_s, late=late[channels])
+        delay_s = 0.0 if match is None else match.delay_s
+        found.append((match, "half late", delay_s, f"{name} by {1e6 * delay_s:.1f} µs"))
+    possible = [(match, *rest) for match, *rest in found if match is not None and match.slowness <= _MAX_SLOWNESS]
+    match, fault, measured_s, detail = min(possible, key=lambda each: each[0].spread_s, default=(own, "", 0.0, ""))
+    limit_s = own.spread_s / _MIN_RATIO
+    if match.spread_s >= limit_s:
+        return None
+    return Finding(fault=fault, channels=tuple(channels), measured=1e6 * measured_s, limit=1e6 * limit_s, detail=detail)
+
+
+def _other_size(
+    times_s: NDArray[np.float64], channels: list[int], layout: Layout, path_m: float, speed_m_s: float
+) -> Finding | None:
+    """Return the finding of positions in another unit, by the slowness or the curvature of a clear wavefront."""
+    positions_m = layout.positions_m[channels]
+    own = _best(times_s, positions_m, path_m, speed_m_s)
+    if own is None:
+        return None
+    low, high, spread_s = _scales(times_s, positions_m, path_m, speed_m_s)
+    is_possible = own.slowness <= _MAX_SLOWNESS
+    if spread_s > _CLEAR * float(np.ptp(times_s)) or (is_possible and own.spread_s < _MIN_CURVED * spread_s):
+        return None
+    low = max(low, own.slowness)
+    if is_possible and low <= _MAX_GROWTH and high >= _MIN_SHRINKAGE:
+        return None
+    factor, about = (low, "at least") if low > 1 else (high, "at most")
+    return Finding(
+        fault=SIZE,
+        channels=tuple(channels),
+        measured=factor,
+        limit=_MAX_SLOWNESS if factor > 1 else _MIN_SHRINKAGE,
+        detail=f"the wavefront suits an array {about} {factor:.2g} times as large",
+    )
+
+
+def _places(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return positions along the axes in which the array extends: (mic, used axis) float64."""
+    _, extent, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=False)
+    return np.asarray(positions_m @ axes[extent / np.sqrt(len(positions_m)) > _DEGENERATE_M].T)
+
+
+def _best(
+    times_s: NDArray[np.float64],
+    positions_m: NDArray[np.float64],
+    path_m: float,
+    speed_m_s: float,
+    *,
+    late: NDArray[np.bool_] | None = None,
+) -> _Match | None:
+    """Return the best fit of a reflector, a wall or the direct sound; None if the array has too few microphones."""
+    places_m = _places(positions_m)
+    n_axes = places_m.shape[1]
+    if n_axes == 0 or len(positions_m) < 2 * (n_axes + 2):
+        return None
+    columns = [np.ones(len(places_m)), *places_m.T] + ([] if late is None else [late.astype(np.float64)])
+    matrix, matches = np.column_stack(columns), []
+    for curvature in _CURVATURES:
+        curved_s = np.zeros(len(places_m))
+        for _ in range(_ITERATIONS):
+            solution, spread_s = _solve(times_s - curved_s, matrix)
+            slope_m = places_m @ solution[1 : 1 + n_axes] * speed_m_s
+            curved_s = _curved_m(positions_m, slope_m, curvature / path_m) / speed_m_s
+        solution, spread_s = _solve(times_s - curved_s, matrix)
+        slowness = float(np.linalg.norm(solution[1 : 1 + n_axes])) * speed_m_s
+        matches.append(_Match(spread_s, slowness, 0.0 if late is None else float(solution[-1])))
+    travel_s = np.linalg.norm(positions_m, axis=1) / speed_m_s
+    of_emitter = matrix[:, [0] if late is None else [0, -1]]
+    solution, spread_s = _solve(times_s - travel_s, of_emitter)
+    matches.append(_Match(spread_s, 0.0, 0.0 if late is None else float(solution[-1])))
+    return min(matches, key=lambda match: match.spread_s)
+
+
+def _solve(times_s: NDArray[np.float64], matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return the solution by least squares without the largest residuals, and the root mean square of the others."""
+    count = max(matrix.shape[1] + 1, round(_KEPT * len(times_s)))
+    kept = np.arange(len(times_s))
+    for _ in range(3):
+        solution = np.linalg.lstsq(matrix[kept], times_s[kept], rcond=None)[0]
+        kept = np.argsort(np.abs(times_s - matrix @ solution))[:count]
+    residual_s = (times_s - matrix @ solution)[kept]
+    return solution, float(np.sqrt(np.sum(residual_s**2) / max(1, count - matrix.shape[1])))
+
+
+def _curved_m(positions_m: NDArray[np.float64], slope_m: NDArray[np.float64], curvature: float) -> NDArray[np.float64]:
+    """Return the way of a spherical wave relative to a plane one of the same direction: (mic,) float64.
+
+    For the distance R of the source in direction u, and p·u = -slope, it is sqrt(R² + 2 R slope + p²) - R - slope.
+    """
+    radius_m = 1 / curvature
+    squared_m2 = np.maximum(0.0, radius_m**2 + 2 * radius_m * slope_m + np.sum(positions_m**2, axis=1))
+    return np.asarray(np.sqrt(squared_m2) - radius_m - slope_m)
+
+
+def _scales(
+    times_s: NDArray[np.float64], positions_m: NDArray[np.float64], path_m: float, speed_m_s: float
+) -> tuple[float, float, float]:
+    """Return the range of the true size relative to the given one by the curvature of the wavefront, and its residual.
+
+    A wavefront whose source is a path P away has the curvature 1 / P, or 2 / P after a reflector of half the path.
+    Positions that are too small by k have a curvature that is too large by k squared.
+    """
+    places_m, curvature = _places(positions_m), 1 / path_m
+    slope_m, bent_m = np.zeros(len(places_m)), np.zeros(len(places_m))
+    for _ in range(_ITERATIONS):
+        step = 0.01 * curvature
+        bent_m = _curved_m(positions_m, slope_m, curvature)
+        change_s = (_curved_m(positions_m, slope_m, curvature + step) - bent_m) / step / speed_m_s
+        matrix = np.column_stack([np.ones(len(places_m)), places_m, change_s])
+        solution, spread_s = _solve(times_s - bent_m / speed_m_s, matrix)
+        error = _DEVIATIONS * spread_s * float(np.sqrt(np.linalg.pinv(matrix.T @ matrix)[-1, -1]))
+        slope_m = places_m @ solution[1:-1] * speed_m_s
+        estimate = curvature + float(solution[-1])
+        curvature = min(
+            max(estimate, _LEAST_CURVATURE / path_m), 0.5 / float(np.linalg.norm(positions_m, axis=1).max())
+        )
+    low, high = max(0.0, estimate - error), max(0.0, estimate + error)
+    return float(np.sqrt(low * path_m / _CURVATURES[1])), float(np.sqrt(high * path_m / _CURVATURES[0])), spread_s
+
+
+def _orders(layout: Layout) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Yield the channel positions for common orders: shipped layouts, and words with reversed bits or bytes."""
+    count = len(layout.enabled)
+    yield "the reversed order", layout.positions_m[::-1]
+    if count % 8 == 0:
+        yield "the order of reversed bits in each byte", layout.positions_m[np.arange(count) ^ 7]
+        yield "the order of reversed bytes", layout.positions_m[np.arange(count).reshape(-1, 8)[::-1].ravel()]
+    if count % 2 == 0:
+        yield "the order of swapped halves", np.roll(layout.positions_m, count // 2, axis=0)
+        yield "the order of swapped neighbours", layout.positions_m[np.arange(count) ^ 1]
+    for name in layout_names():
+        other = load_layout(name)
+        same = len(other.enabled) == count and np.allclose(other.positions_m, layout.positions_m, atol=1e-6)
+        if len(other.enabled) == count and not same:
+            yield f"layout {name}", other.positions_m
+
+
+def _halves(count: int) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """Yield the channels of one of two converters, which share the channels by halves or alternately."""
+    channel = np.arange(count)
+    yield f"channels {count // 2} to {count - 1} are late", channel >= count // 2
+    yield "channels with odd numbers are late", channel % 2 == 1
