@@ -108,19 +108,21 @@ def _other_order(
     if own is None or own.spread_s < _MIN_SPREAD_S:
         return None
     within = f"within {1e6 * own.spread_s:.2g} µs"
-    found: list[tuple[_Match | None, str, float, str]] = []
+    found: list[tuple[_Match, str, float, str]] = []
     for name, other_m in _orders(layout):
         match = _best(times_s, other_m[channels], path_m, speed_m_s)
-        found.append((match, "order of channels", own.spread_s, f"{name} fits far better than the given one, {within}"))
+        if match is not None:
+            detail = f"{name} fits far better than the given one, {within}"
+            found.append((match, "order of channels", own.spread_s, detail))
     for name, late in _halves(len(layout.enabled)):
         match = _best(times_s, positions_m, path_m, speed_m_s, late=late[channels])
-        delay_s = 0.0 if match is None else match.delay_s
-        found.append((match, "half late", delay_s, f"{name} by {1e6 * delay_s:.1f} µs"))
-    possible = [(match, *rest) for match, *rest in found if match is not None and match.slowness <= _MAX_SLOWNESS]
-    match, fault, measured_s, detail = min(possible, key=lambda each: each[0].spread_s, default=(own, "", 0.0, ""))
+        if match is not None:
+            found.append((match, "half late", match.delay_s, f"{name} by {1e6 * match.delay_s:.1f} µs"))
     limit_s = own.spread_s / _MIN_RATIO
-    if match.spread_s >= limit_s:
+    better = [each for each in found if each[0].slowness <= _MAX_SLOWNESS and each[0].spread_s < limit_s]
+    if not better:
         return None
+    _, fault, measured_s, detail = min(better, key=lambda each: each[0].spread_s)
     return Finding(fault=fault, channels=tuple(channels), measured=1e6 * measured_s, limit=1e6 * limit_s, detail=detail)
 
 
@@ -194,7 +196,7 @@ def _solve(times_s: NDArray[np.float64], matrix: NDArray[np.float64]) -> tuple[N
         solution = np.linalg.lstsq(matrix[kept], times_s[kept], rcond=None)[0]
         kept = np.argsort(np.abs(times_s - matrix @ solution))[:count]
     residual_s = (times_s - matrix @ solution)[kept]
-    return solution, float(np.sqrt(np.sum(residual_s**2) / max(1, count - matrix.shape[1])))
+    return np.asarray(solution), float(np.sqrt(np.sum(residual_s**2) / max(1, count - matrix.shape[1])))
 
 
 def _curved_m(positions_m: NDArray[np.float64], slope_m: NDArray[np.float64], curvature: float) -> NDArray[np.float64]:
