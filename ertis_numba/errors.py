@@ -17,9 +17,10 @@
     └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
         └── RefusedError                 it denies access or rejects a request
 
-Each class also inherits the built-in exception in brackets. Four warnings, all ``UserWarning``, complete them:
+Each class also inherits the built-in exception in brackets. Five warnings, all ``UserWarning``, complete them:
 ``ErrorBudgetWarning`` for images that may exceed their error budget, ``CallMismatchWarning`` for echoes that do not
-match the call, ``CoarseGridWarning`` for directions that miss sources between them, and ``PoseWarning`` for poses that
+match the call, ``CoarseGridWarning`` for directions that miss sources between them,
+``OutsideBandsWarning`` for sound that the bands of acoustic maps leave out, and ``PoseWarning`` for poses that
 tilt a platform by more than 30°.
 """
 
@@ -37,6 +38,7 @@ __all__ = [
     "FormatVersionError",
     "JournalInUseError",
     "NetworkError",
+    "OutsideBandsWarning",
     "PoseWarning",
     "RefusedError",
     "SettingsError",
@@ -111,6 +113,10 @@ class CallMismatchWarning(UserWarning):
 
 class CoarseGridWarning(UserWarning):
     """Directions are so far apart that acoustic maps show sources between them too weak, or elsewhere."""
+
+
+class OutsideBandsWarning(UserWarning):
+    """Sound outside of the bands of acoustic maps is louder than that inside."""
 
 
 class PoseWarning(UserWarning):

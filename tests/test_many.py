@@ -104,8 +104,7 @@ def test_single_recording_is_reported_like_many(runs, out, monkeypatch):
     arguments = [str(runs / "a.h5"), "--range", "0.5:0.8", "--explain", "--verify", "--json"]
     single = json.loads(CliRunner().invoke(cli, ["process", *arguments]).stdout)
     many = found["a.h5"].made
-    (coarse,) = many.pop("warnings")
-    assert "directions are 30.0° apart" in coarse
+    assert any("directions are 30.0° apart" in each for each in many.pop("warnings"))
     assert single.pop("output") == str(runs / "a.energy.h5")
     assert list(single) == list(many)
     for each in (single, many):

@@ -37,6 +37,7 @@ def listen_bearings(
 
     subscribers: list[AcousticMapSubscriber] = []
     checked: set[str] = set()
+    outside: set[str] = set()
 
     def connect(on_note: Callable[[str], None]) -> AcousticMapSubscriber:
         wanted = {"passive.averages": average, "processing.directions": directions}
@@ -52,6 +53,9 @@ def listen_bearings(
         if (sensor := found.stamp.sensor) not in checked:
             checked.add(sensor)
             options.warn_of(sensor, search_warning(found.settings))
+        if subscribers[0].outside_note is not None and sensor not in outside:
+            outside.add(sensor)
+            options.warn_of(sensor, subscribers[0].outside_note)
         _show(found, subscribers[0].bearings, _age_ms(subscribers[0]), as_json=as_json)
 
     def report_active(subscriber: AcousticMapSubscriber) -> None:

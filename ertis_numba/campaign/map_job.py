@@ -99,6 +99,8 @@ class _MapsOfSensor:
                 camera.reset()
                 elapsed_s = 0.0
             yield
+        if camera.outside_note is not None:
+            self._warn(f"{recording.path}: sensor {recording.sensor}: {camera.outside_note}")
         if self._masked_s:
             n_emitted = sum(stamp.behaviour == "active" for stamp in recording.stamps())
             self._warn(

@@ -25,6 +25,7 @@ __all__ = ["draw_spectrogram", "draw_spectrum", "power_spectra"]
 _RATIO = 0.5
 _SPARE_DB = 3.0
 _SPACING_HZ = 1e3
+_LEAST_SIZE = 90  # Samples of a spectrum at low rates.
 _MAX_COLUMNS = 1000
 _CHUNK = 2**20  # samples of spectra at a time, so that memory stays bounded
 
@@ -74,8 +75,9 @@ def power_spectra(
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
     """Return mean squares within bins of about 1 kHz: (bin, time) float32, their frequencies and times.
 
-    The window is Hann's, and spectra overlap by three quarters (P. D. Welch, 1967). Sums over all bins are the mean
-    square of the signals, of which the mean is taken. In a long record, a column is the mean of several spectra.
+    Bins are narrower at sample rates below 90 kHz. The window is Hann's, and spectra overlap by three quarters (P. D.
+    Welch, 1967). Sums over all bins are the mean square of the signals, of which the mean is taken. In a long record, a
+    column is the mean of several spectra.
 
     Parameters
     ----------
@@ -87,7 +89,7 @@ def power_spectra(
     ArgumentError
         The record is shorter than a window.
     """
-    size = scipy.fft.next_fast_len(round(rate_hz / _SPACING_HZ), real=True)
+    size = scipy.fft.next_fast_len(round(rate_hz / min(_SPACING_HZ, rate_hz / _LEAST_SIZE)), real=True)
     size += size % 2
     if values.shape[1] < size:
         raise ArgumentError(f"the record has {values.shape[1]} samples, but a spectrum needs {size}; record longer")
@@ -115,7 +117,9 @@ def _spectra(
     measurement: Measurement, direction_deg: tuple[float, float] | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64], float]:
     """Return powers, frequencies and times, and the time that is left out because of a call."""
-    with HeardSignals(measurement.settings) as signals:
+    recording = measurement.settings.recording
+    highest_hz = None if recording.is_pdm else recording.sample_rate_hz / 2
+    with HeardSignals(measurement.settings, highest_hz=highest_hz) as signals:
         if direction_deg is None:
             values = signals(measurement)
         else:

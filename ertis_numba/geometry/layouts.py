@@ -329,7 +329,7 @@ def require_plausible_size(settings: Settings) -> None:
     span_m = float(np.ptp(layout.enabled_positions_m, axis=0).max())
     highest_hz = settings.call.high_frequency_hz
     if settings.processing.mode == "passive":
-        highest_hz = min(settings.passive.extent_hz[1], recording.sample_rate_hz / 2)
+        highest_hz = min(settings.passive.extent_of(settings.recording)[1], recording.sample_rate_hz / 2)
     if not layout.unit_is_stated and 0 < span_m < speed_m_s / highest_hz / 3:
         reason = f", less than a third of the wavelength at {highest_hz / 1e3:g} kHz"
         raise ArgumentError(unclear_unit(f"layout {settings.array.layout}", 1e3 * span_m, reason))

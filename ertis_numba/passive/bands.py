@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.constants import SHAPED_NOISE_SHARE
 from ertis_numba.errors import ArgumentError
-from ertis_numba.settings import Passive, Settings
+from ertis_numba.settings import HIGHEST_SHARE, Passive, Recording, Settings
 
 __all__ = ["band_edges", "bin_shares", "octave_bands", "shaped_noise_warning"]
 
@@ -45,14 +45,14 @@ def octave_bands(low_hz: float, high_hz: float, *, fraction: int = 3) -> NDArray
     return np.stack([centres * 10 ** (-step / 2), centres * 10 ** (step / 2)], axis=1)
 
 
-def band_edges(passive: Passive, *, highest_hz: float) -> NDArray[np.float64]:
+def band_edges(passive: Passive, recording: Recording) -> NDArray[np.float64]:
     """Return the edges of the bands that settings describe.
 
     Parameters
     ----------
     passive : Passive
-    highest_hz : float
-        Highest frequency of the record, in hertz. Named bands above it are left out.
+    recording : Recording
+        Named bands beyond 0.8 of half of its sample rate are left out.
 
     Returns
     -------
@@ -63,10 +63,12 @@ def band_edges(passive: Passive, *, highest_hz: float) -> NDArray[np.float64]:
     ArgumentError
         A listed band reaches beyond the highest frequency, or no named band remains.
     """
-    given = passive.bands_hz
+    given, highest_hz = passive.bands_hz, HIGHEST_SHARE * recording.sample_rate_hz / 2
     if isinstance(given, str):
-        low_hz, high_hz = passive.limits_hz
+        low_hz, high_hz = passive.limits_of(recording)
         bands = octave_bands(low_hz, min(high_hz, highest_hz), fraction=1 if given == "octaves" else 3)
+        if passive.limits_hz is None and not recording.is_pdm:
+            bands = _widened(bands, low_hz, high_hz)
         if not len(bands):
             raise ArgumentError(
                 f"passive.limits_hz {low_hz:g} to {high_hz:g} contains none of the {given.replace('_', ' ')} up to "
@@ -80,6 +82,14 @@ def band_edges(passive: Passive, *, highest_hz: float) -> NDArray[np.float64]:
                 "lower the upper edge of this band"
             )
     return np.array(given, np.float64)
+
+
+def _widened(bands_hz: NDArray[np.float64], low_hz: float, high_hz: float) -> NDArray[np.float64]:
+    """Return bands whose outermost edges are the limits; at least one band."""
+    if not len(bands_hz):
+        return np.array([[low_hz, high_hz]])
+    bands_hz[0, 0], bands_hz[-1, 1] = low_hz, high_hz
+    return bands_hz
 
 
 def shaped_noise_warning(settings: Settings, bands_hz: NDArray[np.float64]) -> str:

@@ -18,6 +18,7 @@ __all__ = ["BlockSpectra"]
 
 _MAX_SPACING_HZ: Final = 1e3
 _BINS_OF_A_BAND: Final = 3
+_LEAST_BLOCKS: Final = 4.0  # in a short record, unless bands are narrow
 
 
 class BlockSpectra:
@@ -126,7 +127,10 @@ def _spacing(settings: Settings, bands_hz: NDArray[np.float64], rate_hz: float) 
     """Return the spacing of the bins, and the number of samples of a block."""
     widest_hz = settings.passive.resolution_hz
     if widest_hz is None:
-        widest_hz = min(float(np.diff(bands_hz).min()) / _BINS_OF_A_BAND, _MAX_SPACING_HZ)
+        widest_hz = min(
+            float(np.diff(bands_hz).min()) / _BINS_OF_A_BAND,
+            max(_MAX_SPACING_HZ, _LEAST_BLOCKS / settings.recording.duration_s),
+        )
     n_block = _block_length(max(8, math.ceil(rate_hz / widest_hz)))
     return rate_hz / n_block, n_block
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
-from ertis_numba.errors import ArgumentError, CoarseGridWarning, DataError
+from ertis_numba.errors import ArgumentError, CoarseGridWarning, DataError, OutsideBandsWarning
 from ertis_numba.frames import AcousticMap, Measurement, Stamp
 from ertis_numba.geometry import (
     Grid,
@@ -23,6 +23,7 @@ from ertis_numba.passive.block_spectra import BlockSpectra
 from ertis_numba.passive.components import gathered
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.methods import METHODS
+from ertis_numba.passive.outside_bands import OutsideBands
 from ertis_numba.passive.search_grid import coarse_map_warning
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.passive.waves import Waves
@@ -51,7 +52,8 @@ class AcousticCamera:
     threads : int, optional
         Number of threads; all cores by default.
     check : bool, default True
-        Issue a `CoarseGridWarning` if ``warning`` is not None.
+        Issue a `CoarseGridWarning` if ``warning`` is not None, and an `OutsideBandsWarning`, once, if ``outside_note``
+        is not None when a map is made.
 
     Attributes
     ----------
@@ -114,6 +116,7 @@ class AcousticCamera:
         directions = unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad)
         delay_s = WaveDelays(settings)(directions)
         self.waves = Waves(delay_s, self._blocks.bins, self._blocks.spacing_hz, kernel_set, threads=self._threads)
+        self._outside, self._check = OutsideBands(settings, self.band_hz), check
         self._masked_s = 0.0
         self._shape = len(self.frequency_hz), delay_s.shape[1], delay_s.shape[1]
         self.reset()
@@ -127,6 +130,15 @@ class AcousticCamera:
         It names a grid that suffices in all bands.
         """
         return coarse_map_warning(self.settings, self.grid)
+
+    @property
+    def outside_note(self) -> str | None:
+        """Note on sound outside of the default bands in all measurements so far; None if none is louder than inside.
+
+        It states the share of the power, and the frequency and level of its maximum. Bands or limits of your own, PDM,
+        and measurements with a call yield no note.
+        """
+        return self._outside.note
 
     def add(self, measurement: Measurement) -> None:
         """Add a measurement to the mean.
@@ -143,6 +155,8 @@ class AcousticCamera:
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         masked = measurement.stamp.behaviour == "active"
         products, n_blocks = self._blocks.products(measurement, masked=masked)
+        if self.settings.passive.follows_record and not masked:
+            self._outside.add(measurement)
         self._sums += products
         self._n_blocks += n_blocks
         self._masked_s = max(self._masked_s, self._blocks.masked_s if masked else 0.0)
@@ -190,6 +204,9 @@ class AcousticCamera:
         DataError
             There is no measurement, or too few blocks for the method.
         """
+        if self._check and self.outside_note is not None:
+            self._check = False
+            warnings.warn(self.outside_note, OutsideBandsWarning, stacklevel=3)
         with one_thread():
             power = (self._shares @ self.powers()).T
         found = AcousticMap(

@@ -32,7 +32,7 @@ def heard_bands(settings: Settings) -> NDArray[np.float64]:
     ArgumentError
         The bands exceed the highest frequency of the record.
     """
-    return band_edges(settings.passive, highest_hz=settings.recording.sample_rate_hz / _RATE)
+    return band_edges(settings.passive, settings.recording)
 
 
 class HeardSignals:
@@ -76,7 +76,7 @@ class HeardSignals:
         if highest_hz is None:
             bands_hz = heard_bands(settings)
             lowest_hz, highest_hz = float(bands_hz.min()), float(bands_hz.max())
-        checks.between("highest_hz", highest_hz, 1.0, recording.sample_rate_hz / _RATE)
+        checks.between("highest_hz", highest_hz, 1.0, recording.sample_rate_hz / (_RATE if recording.is_pdm else 2))
         self.band_hz = lowest_hz, highest_hz
         factor = min(max(1, math.floor(recording.sample_rate_hz / (_RATE * highest_hz))), _MAX_FACTOR)
         self.rate_hz = recording.sample_rate_hz / factor
@@ -89,9 +89,9 @@ class HeardSignals:
         self._memory = self._kernels.memory()
         self._lane = self._memory.lane()
         n_samples = recording.n_samples // factor
-        taps = decimation_taps(sample_rate_hz=recording.sample_rate_hz, decimation=factor, pass_hz=highest_hz)
-        if factor == 1 and not recording.is_pdm:
-            taps = taps[len(taps) // 2 :][:1]  # The other taps are 0.
+        taps = np.ones(1)
+        if factor > 1 or recording.is_pdm:
+            taps = decimation_taps(sample_rate_hz=recording.sample_rate_hz, decimation=factor, pass_hz=highest_hz)
         window = TimeWindow.from_start(n_samples, n_fft=n_samples)
         self._demodulate = demodulation(
             settings, layout, window, self._kernels, self._memory, taps=integer_taps(taps), factor=factor

@@ -112,7 +112,7 @@ def of_noise(report: Health | None, used: Settings) -> CheckResult:
     low_hz, high_hz = used.call.low_frequency_hz, used.call.high_frequency_hz
     detail = f"{report.noise_dbfs:.1f} dBFS in the call's band, dynamic range {report.dynamic_range_db or 0.0:.1f} dB"
     if report.dynamic_range_db is None:
-        low_hz, high_hz = used.passive.extent_hz
+        low_hz, high_hz = used.passive.extent_of(used.recording)
         high_hz = min(high_hz, used.recording.sample_rate_hz / 2)
         detail = (
             f"{report.noise_dbfs:.1f} dBFS from {low_hz / 1e3:g} to {high_hz / 1e3:g} kHz, including the sound of "

@@ -9,7 +9,7 @@ from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, MAX_FOCAL_ZONES, Acc
 from ertis_numba.settings.array import LAYOUT_SUFFIXES, LENGTH_UNITS_M, MAX_SPAN_M, MIN_SPAN_M, OWN_ARRAY, Array
 from ertis_numba.settings.array_windows import ArrayWindow, parse_window
 from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
-from ertis_numba.settings.passive import MAP_METHODS, MAX_BANDS, MapMethod, Passive
+from ertis_numba.settings.passive import HIGHEST_SHARE, MAP_METHODS, MAX_BANDS, MapMethod, Passive
 from ertis_numba.settings.presets import PRESETS, PresetKind, preset_tables, preset_text, presets
 from ertis_numba.settings.processing import STAGES, Processing
 from ertis_numba.settings.ranges import fit_ranges, record_range_m
@@ -20,6 +20,7 @@ from ertis_numba.settings.waveform import MAX_WAVEFORM_SAMPLES
 __all__ = [
     "ENCODINGS",
     "ERROR_PRESETS_DB",
+    "HIGHEST_SHARE",
     "LAYOUT_SUFFIXES",
     "LENGTH_UNITS_M",
     "MAP_METHODS",

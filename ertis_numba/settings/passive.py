@@ -6,8 +6,9 @@ from typing import Final, Literal
 from ertis_numba import checks
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
+from ertis_numba.settings.recording import Recording
 
-__all__ = ["MAP_METHODS", "MAX_BANDS", "MapMethod", "Passive"]
+__all__ = ["HIGHEST_SHARE", "MAP_METHODS", "MAX_BANDS", "MapMethod", "Passive"]
 
 MapMethod = Literal["delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc"]
 
@@ -15,6 +16,14 @@ MAP_METHODS: Final[tuple[MapMethod, ...]] = ("delay_and_sum", "functional", "cap
 """Methods of acoustic maps; ``docs/explanation/acoustic-maps.md`` has their equations."""
 
 MAX_BANDS: Final = 100
+
+HIGHEST_SHARE: Final = 0.8
+"""Highest frequency of bands relative to half of the sample rate; filters attenuate beyond."""
+
+_PDM_LIMITS_HZ: Final = (8_900.0, 89_500.0)
+_BLOCK: Final = 1024  # Samples of a block, whose spacing is a third of the lowest band …
+_BLOCKS: Final = 4.0  # … and least number of blocks in a record.
+_SPACINGS: Final = 13.0  # A third octave at 13 spacings of bins is three of them wide.
 
 _WITHOUT_DIAGONAL: Final = ("delay_and_sum", "clean_sc", "hr_clean_sc")
 
@@ -26,8 +35,10 @@ class Passive(TomlTable, frozen=True, kw_only=True):
     ----------
     bands_hz : "third_octaves", "octaves" or list of (low, high), default "third_octaves"
         Bands in hertz, up to 100, which must not overlap: those of IEC 61260-1 within ``limits_hz``, or your own.
-    limits_hz : (low, high), default (8900, 89500)
-        Limits of third octaves and octaves, in hertz; the default has those from 10 to 80 kHz.
+    limits_hz : (low, high), optional, default None
+        Limits of third octaves and octaves, in hertz. By default, they follow the record: for PCM, up to 0.8 of half of
+        the sample rate, from the frequency that blocks of 1024 samples resolve, or shorter ones of short records. The
+        bands at both ends reach to the limits. For PDM, whose noise dominates beyond, 8.9 to 89.5 kHz.
     method : {"delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc"}, default "delay_and_sum"
         Estimate of the power from each direction. ``music`` finds directions, and has no level. ``hr_clean_sc`` is
         CLEAN-SC for sources within one main lobe.
@@ -50,7 +61,7 @@ class Passive(TomlTable, frozen=True, kw_only=True):
     """
 
     bands_hz: str | tuple[tuple[float, float], ...] = "third_octaves"
-    limits_hz: tuple[float, float] = (8_900.0, 89_500.0)
+    limits_hz: tuple[float, float] | None = None
     method: MapMethod = "delay_and_sum"
     diagonal_removal: bool = False
     functional_order: float = 8.0
@@ -64,7 +75,8 @@ class Passive(TomlTable, frozen=True, kw_only=True):
         super().__post_init__()
         checks.choice("passive.method", self.method, MAP_METHODS)
         self._check_bands()
-        checks.interval("passive.limits_hz", self.limits_hz, 1.0, 1e9)
+        if self.limits_hz is not None:
+            checks.interval("passive.limits_hz", self.limits_hz, 1.0, 1e9)
         checks.between("passive.functional_order", self.functional_order, 1.0, 100.0)
         checks.integer("passive.n_sources", self.n_sources, 1)
         checks.between("passive.diagonal_loading", self.diagonal_loading, 1e-6, 1e6)
@@ -80,10 +92,24 @@ class Passive(TomlTable, frozen=True, kw_only=True):
             )
 
     @property
-    def extent_hz(self) -> tuple[float, float]:
-        """Lowest and highest frequency of all bands, in hertz."""
-        if isinstance(self.bands_hz, str):
+    def follows_record(self) -> bool:
+        """True if neither bands nor limits are given."""
+        return isinstance(self.bands_hz, str) and self.limits_hz is None
+
+    def limits_of(self, recording: Recording) -> tuple[float, float]:
+        """Return the limits of third octaves and octaves for a record, in hertz."""
+        if self.limits_hz is not None:
             return self.limits_hz
+        if recording.is_pdm:
+            return _PDM_LIMITS_HZ
+        high_hz = HIGHEST_SHARE * recording.sample_rate_hz / 2
+        spacing_hz = max(recording.sample_rate_hz / _BLOCK, _BLOCKS / recording.duration_s)
+        return max(1.0, min(_SPACINGS * spacing_hz, high_hz / 2)), high_hz
+
+    def extent_of(self, recording: Recording) -> tuple[float, float]:
+        """Return the lowest and the highest frequency of all bands, in hertz."""
+        if isinstance(self.bands_hz, str):
+            return self.limits_of(recording)
         return min(low_hz for low_hz, _ in self.bands_hz), max(high_hz for _, high_hz in self.bands_hz)
 
     def _check_bands(self) -> None:

@@ -45,7 +45,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
     accuracy : Accuracy
         Error budget of the image, -35 dB by default, and parts of the plan that the planner shall not choose.
     passive : Passive
-        Maps of sound that the sensor did not emit; third octaves from 10 to 80 kHz by default.
+        Maps of sound that the sensor did not emit; third octaves that follow the record by default.
 
     Raises
     ------

@@ -110,7 +110,9 @@ def health(measurement: Measurement) -> Health:
     found = {item.channel: item for item in reported}
     moving = [item for item in reported if not any(name.startswith("stuck") for name in item.faults)]
     band_hz = (
-        (settings.call.low_frequency_hz, settings.call.high_frequency_hz) if has_call else settings.passive.extent_hz
+        (settings.call.low_frequency_hz, settings.call.high_frequency_hz)
+        if has_call
+        else settings.passive.extent_of(settings.recording)
     )
     reported, tones_hz, unknown, findings = by_spectra(signal_of, len(words), moving, settings, band_hz)
     found |= {item.channel: item for item in reported}
