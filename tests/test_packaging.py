@@ -8,9 +8,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from ertis_cli import _examples
+from ertis_cli.main import cli
 
 ROOT = Path(__file__).parents[1]
+IN_THE_REPOSITORY_ONLY = {f"ertis_bench.{name}" for name in ("health_trials", "passive", "peers")}
 
 
 def test_every_package_is_listed():
@@ -29,7 +32,8 @@ def test_every_package_is_listed():
         for name, place in places.items()
         for init in (ROOT / place).rglob("__init__.py")
     }
-    assert listed == found
+    assert found - listed == IN_THE_REPOSITORY_ONLY
+    assert listed <= found
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +59,18 @@ def test_wheel_contains_every_example(wheel):
     assert {item.name: len(item.read_bytes()) for item in examples.values()}.items() <= sizes.items()
     assert {f"{Path(name).stem}.json" for name in examples if name.endswith(".h5")} <= set(sizes)
     assert {path.name for path in (ROOT / "ertis_numba" / "layouts").glob("*.toml")} <= layouts
+
+
+@pytest.mark.parametrize("name", ["health", "passive", "peers"])
+def test_benchmark_that_the_wheel_lacks_names_the_source_folder(monkeypatch, name):
+    for package in IN_THE_REPOSITORY_ONLY:
+        monkeypatch.setitem(sys.modules, package, None)
+    done = CliRunner().invoke(cli, ["bench", name])
+    assert done.exit_code == 1
+    assert (
+        done.stderr
+        == f"ertis: error: 'ertis bench {name}' is in the source folder only; run pip install --editable . there\n"
+    )
 
 
 def test_wheel_is_small_and_contains_no_recording_and_no_test(wheel):

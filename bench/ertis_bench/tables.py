@@ -12,7 +12,6 @@ from ertis_bench.campaign_scaling import many
 from ertis_bench.delay_interpolation import form as interpolation
 from ertis_bench.fusion import form as fusion
 from ertis_bench.gpu_tables import gpu, gpu_short
-from ertis_bench.health_trials.table import health
 from ertis_bench.machine import sentence
 from ertis_bench.mapping import form as mapping
 from ertis_bench.markdown import table as _table
@@ -20,8 +19,6 @@ from ertis_bench.motion import form as motion
 from ertis_bench.network.latency import latency
 from ertis_bench.network.table import network
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RESTRICTED
-from ertis_bench.passive import form as passive
-from ertis_bench.peers.table import peers
 from ertis_bench.point_errors import form as points
 from ertis_bench.ptx_tables import ptx
 from ertis_bench.verify_trials import form as verification
@@ -36,15 +33,12 @@ __all__ = [
     "fusion",
     "gpu",
     "gpu_short",
-    "health",
     "latency",
     "many",
     "mapping",
     "motion",
     "network",
     "paper",
-    "passive",
-    "peers",
     "points",
     "ptx",
     "scaling",
@@ -295,7 +289,6 @@ def _or_dash(value: float | None, digits: int) -> str:
 
 FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "paper": {"paper": paper},
-    "peers": {"peers": peers},
     "scaling": {"scaling": scaling},
     "simulation": {"simulation": simulation},
     "many": {"many": many},
@@ -305,7 +298,6 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "latency": {"latency": latency},
     "network": {"network": network},
     "gpu": {"gpu": gpu, "gpu short": gpu_short},
-    "health": {"health": health},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
     "beamformers": {"beamformers": beamformers},
     "verification": {"verification": verification},
@@ -315,6 +307,5 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "fusion": {"fusion": fusion},
     "motion": {"motion": motion},
     "map": {"map": mapping},
-    "passive": {"passive": passive},
 }
 """Forms of the table of each command, by the name in the markers. The markers of a file select the form."""

@@ -1,5 +1,6 @@
 """``ertis bench``: benchmarks that produce the tables of the documentation."""
 
+import importlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -85,9 +86,7 @@ def peers(**given: Any) -> None:
 
     Libraries that are not installed are left out: pip install 'ertis-numba[peers]'.
     """
-    from ertis_bench import peers as benchmark
-
-    _run("peers", benchmark, **given)
+    _run("peers", _in_source_folder("peers"), **given)
 
 
 @bench.command()
@@ -369,9 +368,7 @@ def passive(**given: Any) -> None:
 
     Compares them with Acoular if it is installed: pip install 'ertis-numba[peers]'.
     """
-    from ertis_bench import passive as benchmark
-
-    _run("passive", benchmark, **given)
+    _run("passive", _in_source_folder("passive"), **given)
 
 
 @bench.command()
@@ -502,9 +499,7 @@ def ptx(**given: Any) -> None:
 @options.as_json
 def of_health(**given: Any) -> None:
     """Count false alarms and named faults of health checks."""
-    from ertis_bench import health_trials as benchmark
-
-    _run("health", benchmark, **given)
+    _run("health", _in_source_folder("health", "health_trials"), **given)
 
 
 @bench.command()
@@ -593,13 +588,28 @@ def gpu(*, newest: bool, **given: Any) -> None:
     _run("gpu", benchmark, measure=not newest, **given)
 
 
+def _in_source_folder(name: str, package: str | None = None) -> ModuleType:
+    """Return a benchmark that the wheel lacks."""
+    module = f"ertis_bench.{package or name}"
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module:
+            raise
+        from ertis_numba.errors import ArgumentError
+
+        raise ArgumentError(
+            f"'ertis bench {name}' is in the source folder only; run pip install --editable . there"
+        ) from None
+
+
 def _run(
     name: str, benchmark: ModuleType, *, targets: tuple[Path, ...], quiet: bool, as_json: bool, **given: Any
 ) -> dict[str, Any]:
     from ertis_bench import markdown, tables
 
     parts = given.get("only", ())
-    forms = tables.FORMS[name]
+    forms = getattr(benchmark, "FORMS", None) or tables.FORMS[name]
     # Files without a place are refused before minutes of work.
     places = [(target, *markdown.place(target, "ertis bench", forms, parts)) for target in targets]
     report: dict[str, Any] = benchmark.run(say=lambda text: options.say(text, quiet=quiet), **given)

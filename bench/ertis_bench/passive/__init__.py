@@ -2,4 +2,6 @@
 
 from ertis_bench.passive.table import PARTS, form, run
 
-__all__ = ["PARTS", "form", "run"]
+__all__ = ["FORMS", "PARTS", "form", "run"]
+
+FORMS = {"passive": form}
