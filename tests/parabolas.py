@@ -125,3 +125,34 @@ def opposite(offsets):
             if min(lengths) > 1e-9 and a @ b < -0.87 * lengths[0] * lengths[1]:
                 found.append((sum(lengths), [first, second]))
     return min(found)[1] if found else None
+
+
+def edge_floor(image, directions):
+    """Lowest amplitude of a maximum at each range that cannot be part of an echo beyond the first or last range."""
+    samples = np.unique(np.linspace(0, len(directions) - 1, min(len(directions), 64)).astype(int))
+    floor = np.zeros(len(image.range_m))
+    if len(samples) < 8 or len(floor) < 3:
+        return floor
+    positions_m = microphones(image.settings.array).enabled_positions_m
+    reach_m = 0.04 + max(np.linalg.norm(each) for each in positions_m)
+    reach_m = min(reach_m, (image.range_m[-1] - image.range_m[0]) / 4)
+    middle = directions[np.argmax(directions @ directions.mean(axis=0))]
+    own = np.quantile([amplitude(image.settings, directions[each] - middle, 0.0) for each in samples], 0.75)
+    highest = image.amplitude.max(axis=0)
+    for place, range_m in enumerate(image.range_m):
+        for edge, step in ((0, 1), (-1, -1)):
+            offset_m = abs(range_m - image.range_m[edge])
+            if offset_m < reach_m:
+                floor[place] = max(
+                    floor[place], np.quantile(image.amplitude[samples, place], 0.75) * min(0.7 / own, 10)
+                )
+            offsets_m = np.abs(image.range_m - image.range_m[edge])[::step]
+            if offset_m >= 0.1:
+                continue
+            pulse = np.array([amplitude(image.settings, np.zeros(3), each) for each in offsets_m[offsets_m < 0.1]])
+            width, here = int(np.argmax(pulse < 0.18)), int(np.argmin(np.abs(offsets_m - offset_m)))
+            last = max(0, min(width, here - width))
+            falls = max(0.18, pulse[here - last :].max())
+            skirt = highest[::step][: last + 1].max() / (10 ** (3 / 20) * falls)
+            floor[place] = math.inf if pulse[here] > 0.65 else max(floor[place], skirt)
+    return floor

@@ -19,7 +19,7 @@ from ertis_numba.simulation import Point, Scene, Sensor
 from ertis_numba.stages import planner
 from ertis_numba.stages.fast_chain import FastChain
 from tests.cases import noise as words_of_noise
-from tests.parabolas import interpolated
+from tests.parabolas import edge_floor, interpolated
 from tests.scenes import heard
 from tests.test_detect import image_of
 
@@ -42,10 +42,12 @@ def reference(image, *, top, min_level_db):
     energy, spacing_m = image.amplitude, image.range_m[1] - image.range_m[0]
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     neighbours = neighbours_of(directions)
-    reach, found = round(0.04 / spacing_m), []
+    reach, found, floor = round(0.04 / spacing_m), [], edge_floor(image, directions)
     for direction, range_index in np.ndindex(energy.shape):
         here = energy[direction, range_index]
         if not 0 < range_index < energy.shape[1] - 1 or here < energy.max() * np.float32(10 ** (min_level_db / 20)):
+            continue
+        if here < floor[range_index]:
             continue
         row = energy[direction, range_index - 1 : range_index + 2]
         if not row[0] <= here > row[2]:

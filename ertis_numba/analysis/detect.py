@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.analysis.noise import threshold_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
-from ertis_numba.analysis.side_lobes import SideLobes
+from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.side_lobes import EdgeFloor, SideLobes
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
@@ -33,7 +34,8 @@ def find_peaks(
     A reflector is a local maximum over directions and ranges that exceeds the side lobes of all stronger reflectors
     there: see `ertis_numba.analysis.side_lobes.SideLobes`. Each reflector therefore yields one entry, not one per bin
     of its main lobe or per side lobe. Direction, range and level are interpolated: see
-    `ertis_numba.analysis.peak_interpolation.PeakInterpolator`.
+    `ertis_numba.analysis.peak_interpolation.PeakInterpolator`. Near the first and the last range, a reflector must also
+    exceed the side lobes of a possible echo beyond: see `ertis_numba.analysis.side_lobes.EdgeFloor`.
 
     Angles that the array cannot observe are NaN: both for one microphone, and the elevation for a horizontal line of
     microphones. See `ertis_numba.geometry.observable_angles`.
@@ -114,7 +116,8 @@ def peaks_of_grid(
         checks.shape("where", where.shape, image.amplitude.shape)
         if where.dtype != np.bool_:
             raise ArgumentError(f"where has dtype {where.dtype}; give bool, such as image.amplitude > 0.01")
-    places = _local_maxima(image.amplitude, neighbours, floor, where)
+    edges = EdgeFloor(directions, PointSpread(image.settings))(image)
+    places = _local_maxima(image.amplitude, neighbours, np.maximum(floor, edges), where)
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
     order = np.argsort(-levels, kind="stable")
     side_lobes = SideLobes(image, directions, places[order])
@@ -185,9 +188,12 @@ def spacing_of(directions: NDArray[np.float64], neighbours: NDArray[np.int64]) -
 
 
 def _local_maxima(
-    amplitude: NDArray[np.float32], neighbours: NDArray[np.int64], floor: float, where: NDArray[np.bool_] | None
+    amplitude: NDArray[np.float32],
+    neighbours: NDArray[np.int64],
+    floor: NDArray[np.float64],
+    where: NDArray[np.bool_] | None,
 ) -> NDArray[np.int64]:
-    """Return the local maxima that reach ``floor``: (peak, [direction, range]) int64.
+    """Return the local maxima that reach ``floor``, (range,): (peak, [direction, range]) int64.
 
     The first and the last range contain no maxima, because an amplitude that rises towards them peaks outside of the
     image.
@@ -195,7 +201,7 @@ def _local_maxima(
     inner = slice(1, -1) if amplitude.shape[1] > 2 else slice(None)
     start = inner.start or 0
     here = amplitude[:, inner]
-    is_peak = (here >= floor) & (here > 0)
+    is_peak = (here >= floor[inner]) & (here > 0)
     if where is not None:
         is_peak &= where[:, inner]
     if start:

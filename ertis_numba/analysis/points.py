@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.analysis.detect import neighbours_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
-from ertis_numba.analysis.side_lobes import side_lobe_floor
+from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.analysis.side_lobes import EdgeFloor, side_lobe_floor
 from ertis_numba.analysis.uncertainty import PositionUncertainty
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import Grid, direction_grid, observable_angles, unit_vectors
@@ -70,6 +71,7 @@ class PointExtractor:
         self._directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         self._neighbours = neighbours_of(self._directions)
         self._interpolator = PeakInterpolator(settings, self._directions, self._neighbours)
+        self._edges = EdgeFloor(self._directions, PointSpread(settings))
         self._uncertainty = PositionUncertainty(settings, is_planar=bool(np.ptp(self._directions[:, 2]) == 0))
 
     def __call__(self, image: Energyscape) -> PointCloud:
@@ -83,7 +85,7 @@ class PointExtractor:
         checks.instance("image", image, Energyscape, "Pipeline.process returns")
         amplitude = image.amplitude
         checks.shape("amplitude", amplitude.shape, (len(self._directions), len(image.range_m)))
-        directions, ranges = self._maxima(amplitude if self._has_directions else amplitude[:, :0], image.range_m)
+        directions, ranges = self._maxima(image)
         tops = self._interpolator(image, directions, ranges)
         position_m, levels = (
             (tops.direction * tops.range_m[:, None]).astype(np.float32),
@@ -95,20 +97,19 @@ class PointExtractor:
             position_m[order], levels[order], image.settings, image.stamp, uncertainty_m=uncertainty_m[order]
         )
 
-    def _maxima(
-        self, amplitude: NDArray[np.float32], range_m: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _maxima(self, image: Energyscape) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the direction and range indices of all maxima.
 
         The first and the last range contain no maxima, because an amplitude that rises towards them peaks outside of
         the image.
         """
-        n_ranges = amplitude.shape[1]
+        amplitude, n_ranges = image.amplitude, len(image.range_m)
         none = np.empty(0, dtype=np.int64)
         profile = amplitude.max(axis=0)
-        if n_ranges < 3 or not profile.max() > 0:
+        if not self._has_directions or n_ranges < 3 or not profile.max() > 0:
             return none, none
-        floor = np.maximum(side_lobe_floor(profile, range_m), profile.max() * np.float32(self._smallest))
+        floor = np.maximum(side_lobe_floor(profile, image.range_m), profile.max() * np.float32(self._smallest))
+        floor = np.maximum(floor, self._edges(image))
         floor[[0, -1]] = np.inf
         # This pass over the whole image and that of the profile dominate the time. Few bins remain.
         above = amplitude >= floor

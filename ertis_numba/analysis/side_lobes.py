@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.point_spread import PULSE_M, PointSpread
 from ertis_numba.frames import Energyscape
 
-__all__ = ["SIDE_LOBE_DB", "SideLobes", "side_lobe_floor", "without_side_lobes"]
+Floats = NDArray[np.float64]
+
+__all__ = ["SIDE_LOBE_DB", "EdgeFloor", "SideLobes", "side_lobe_floor", "without_side_lobes"]
 
 SIDE_LOBE_DB = 10.0
 """Level in dB below the strongest direction of the same range at which side lobes are expected.
@@ -25,6 +27,13 @@ _N_DIRECTIONS: Final = 64  # Number of directions in which the prediction and th
 _N_COMPARED: Final = 8  # Number of reflectors that serve to assess the prediction.
 # Deviations relative to the mean side lobe. Below the first, the prediction is trusted; above the second, it is not.
 _TRUSTED: Final = (0.25, 0.4)
+_OWN: Final = 0.7  # Share of a reflector's level that it must have by comparison with its side lobes.
+_LEAST_OWN: Final = 0.1
+_SHARE: Final = 0.25  # Share of the ranges that count as near an edge, at most, for large arrays.
+_SKIRT_M: Final = 2.5 * PULSE_M
+_OPEN: Final = 0.65  # Amplitude of a pulse at an edge, above which its maximum may lie beyond the edge.
+_SKIRT: Final = 0.18  # Amplitude at an edge relative to a maximum near it, above which both may be parts of one skirt.
+_LEAST_DIRECTIONS: Final = 8
 _N_OFFSETS: Final = 9  # Number of range offsets with a tabulated mean of the side lobes.
 # Upper quartiles of the magnitude of a complex normal variable of power 1, and of the magnitude of one component. The
 # main lobes of reflectors cover less than a quarter of the directions, so upper quartiles ignore them.
@@ -163,6 +172,58 @@ class SideLobes:
 def _deviation_of(measured: NDArray[np.float32], predicted: NDArray[np.float64]) -> float:
     """Return the standard deviation between complex amplitudes, estimated from their magnitudes."""
     return float(np.quantile(np.abs(measured - predicted), _QUARTILE)) / _QUARTILE_OF_COMPONENT
+
+
+class EdgeFloor:
+    """Amplitudes below which maxima near the first or the last range may belong to an echo beyond it.
+
+    Side lobes of such an echo extend into the image by `PointSpread.reach_m`, and the skirt of its pulse in all
+    directions. At the range of a reflector, the image consists of its own side lobes, which are much weaker. At the
+    range of side lobes alone, it consists of many maxima of about the same level. A reflector near an edge must
+    therefore exceed the level that its own side lobes would have by comparison with the image, and its pulse must fall
+    towards the edge.
+
+    Parameters
+    ----------
+    directions : (direction, axis) float64
+        Unit vectors of the image's directions.
+    spread : PointSpread
+    """
+
+    def __init__(self, directions: NDArray[np.float64], spread: PointSpread) -> None:
+        count = len(directions)
+        self._samples = np.unique(np.linspace(0, count - 1, min(count, _N_DIRECTIONS)).astype(np.int64))
+        middle = directions[np.argmax(directions @ directions.mean(axis=0))]
+        own = spread(directions[self._samples] - middle, np.zeros(len(self._samples)))
+        self._own, self._spread = float(np.quantile(own, _QUARTILE)), spread
+
+    def __call__(self, image: Energyscape) -> NDArray[np.float32]:
+        """Return the amplitudes: (range,) float32; 0 far from both edges."""
+        floor = np.zeros(len(image.range_m), np.float32)
+        if len(floor) < 3 or len(self._samples) < _LEAST_DIRECTIONS:
+            return floor
+        reach_m = min(self._spread.reach_m, _SHARE * float(image.range_m[-1] - image.range_m[0]))
+        ends = (image.range_m - image.range_m[0] < reach_m) | (image.range_m[-1] - image.range_m < reach_m)
+        places = np.flatnonzero(ends)
+        level = np.quantile(image.amplitude[np.ix_(self._samples, places)], _QUARTILE, axis=0)
+        floor[places] = level * min(_OWN / self._own, 1 / _LEAST_OWN)
+        highest = image.amplitude.max(axis=0)
+        for inwards in (slice(None), slice(None, None, -1)):
+            self._raise_skirt(
+                floor[inwards], highest[inwards], np.abs(image.range_m - image.range_m[inwards][0])[inwards]
+            )
+        return floor
+
+    def _raise_skirt(self, floor: NDArray[np.float32], highest: NDArray[np.float32], offset_m: Floats) -> None:
+        """Raise the floor near the first range, unless amplitudes fall towards it as the pulse of a reflector does."""
+        near = int(np.count_nonzero(offset_m < _SKIRT_M))
+        pulse = self._spread(np.zeros((near, 3)), offset_m[:near])
+        width = int(np.argmax(pulse < _SKIRT)) or near
+        envelope = np.maximum.accumulate(pulse[::-1])[::-1]
+        for place in range(near):
+            last = max(0, min(width, place - width))  # Between this bin and the edge, there is at most a skirt.
+            skirt = highest[: last + 1].max() / (_MARGIN * max(float(envelope[place - last]), _SKIRT))
+            floor[place] = np.inf if pulse[place] > _OPEN else max(float(floor[place]), float(skirt))
 
 
 def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) -> NDArray[np.float32]:
