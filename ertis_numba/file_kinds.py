@@ -44,6 +44,11 @@ class FileKind:
     is_wav: bool = False
     is_hdf5: bool = False
 
+    @property
+    def is_sound(self) -> bool:
+        """True for formats that are sound and nothing else."""
+        return self.is_wav or self.remedy == _FFMPEG
+
 
 _WAV = FileKind("a WAV file", _IMPORT, is_wav=True)
 _MATLAB = FileKind("a MATLAB file", "save its signals with audiowrite('{stem}.wav', signals, rate_hz), and import that")
@@ -89,7 +94,13 @@ _MAGICS: Final[tuple[tuple[FileKind, tuple[tuple[int, bytes], ...]], ...]] = (
     (_audio("a NIST SPHERE file"), ((0, b"NIST_1A"),)),
     (_audio("a DSF file"), ((0, b"DSD "),)),
     (_audio("a DSDIFF file"), ((0, b"FRM8"),)),
-    (_audio("an IRCAM file"), ((0, bytes.fromhex("64a30100")),)),
+    *(
+        (_audio("an IRCAM file"), ((0, bytes.fromhex(mark)),))
+        for mark in ("64a30100", "64a30200", "64a30300", "64a30400")
+    ),
+    (_audio("a PVF file"), ((0, b"PVF1\n"),)),
+    (_audio("an AVR file"), ((0, b"2BIT"),)),
+    (_audio("a FastTracker instrument"), ((0, b"Extended Instrument: "),)),
     (_audio("an MP4 file"), ((4, b"ftyp"),)),
     (_audio("a Matroska or WebM file"), ((0, bytes.fromhex("1a45dfa3")),)),
     (_audio("an ASF or WMA file"), ((0, bytes.fromhex("3026b2758e66cf11")),)),

@@ -1,5 +1,7 @@
 """Import of WAV and Acoular files: all sample types, consecutive emissions, and refusals."""
 
+import errno
+import itertools
 import json
 import tracemalloc
 import wave
@@ -195,6 +197,11 @@ REFUSED = {
     ),
     "skip": (lambda folder: write_wav(folder / "a.wav", numbers()), {"skip_s": 1.0}, r"skip less \(--skip\)"),
     "length": (lambda folder: write_wav(folder / "a.wav", numbers()), {"length_s": 1.0}, r"give a shorter --length"),
+    "length of less than a sample": (
+        lambda folder: write_wav(folder / "a.wav", numbers()),
+        {"length_s": 1e-7},
+        r"--length is 1e-07 s, less than a sample at 192000 Hz; use a longer --length",
+    ),
     "nan": (
         lambda folder: write_wav(folder / "a.wav", np.where(np.arange(8) == 3, np.nan, numbers()).astype("f4")),
         {},
@@ -281,6 +288,28 @@ def test_pcm_import_refuses_invalid_input(tmp_path, name):
     given, options, message = REFUSED[name]
     with pytest.raises((DataError, ArgumentError), match=message):
         list(ertis.open_pcm(given(tmp_path), PCM, **options))
+
+
+@pytest.mark.parametrize("name", ["a.wav", "a.h5"])
+def test_denied_permission_is_named(tmp_path, monkeypatch, name):
+    def denied(*_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    (tmp_path / name).write_bytes(b"RIFF")
+    monkeypatch.setattr(type(tmp_path), "open", denied)
+    with pytest.raises(DataError, match=rf"{name}: Permission denied; ask its owner for permission to read it"):
+        ertis.open_pcm(tmp_path / name, PCM)
+
+
+def test_acoular_files_are_read_in_slices(tmp_path):
+    path = write_acoular(tmp_path / "a.h5", np.zeros((600_000, 8)), float(RATE_HZ))
+    reader = ertis.open_pcm(path, PCM, length_s=0.02)
+    tracemalloc.start()
+    try:
+        assert len(list(itertools.islice(reader, 3))) == 3
+        assert tracemalloc.get_traced_memory()[1] < 10_000_000  # of 38 MB
+    finally:
+        tracemalloc.stop()
 
 
 def test_wav_without_settings_is_refused(tmp_path):

@@ -150,6 +150,18 @@ LEVELS = {
         "reach 3.* full scale is 1, so levels are up to 90 dB too",
     ),
     "float of 24 bits": ((2.0**22 * SINE).astype("f4"), "divide the samples by 8.38861e"),
+    "pascals": (
+        (6 * SINE).astype("f4"),
+        "or if they are pascals, set array.sensitivity_dbfs = 3 for levels in dB re 20",
+    ),
+    "silence": (np.zeros(6_000, "<i2"), "all samples are 0; choose another input of the recorder"),
+    "silent bytes": (np.full(6_000, 128, "u1"), "all samples are 0; choose"),
+    "16 bits in 32": (
+        (30_000 * SINE).round().astype("<i4"),
+        r"32 bits reach only 30000, as those of 16 bits do; if they are such, levels are 96 dB too low; .* by 65536",
+    ),
+    "24 bits in 32": ((2.0**22 * SINE).round().astype("<i4"), r"24 bits do; .* 48 dB too low; multiply .* by 256"),
+    "24 bits in 64": ((2.0**22 * SINE).round().astype("<i8"), r"24 bits do; .* 241 dB too low; .* by 1099511627776"),
     "clipped int16": ((60_000 * SINE).clip(-32_768, 32_767).astype("<i2"), r"samples of channel 0 are at full scale"),
     "clipped float": ((2 * SINE).clip(-1, 1).astype("f4"), r"samples of channel 0 are at full scale"),
     "clipped bytes": (((400 * SINE).clip(-128, 127) + 128).astype("u1"), r"samples of channel 0 are at full scale"),
@@ -172,13 +184,16 @@ def test_unusual_levels_are_noted(tmp_path, name):
         (1.5 * SINE).astype("f4"),  # A converter of floating-point samples does not clip at 1.
         (0.99 * SINE).astype("f4"),
         noise(),
+        (2.0**20 * SINE).round().astype("<i4") * 256,
+        (2.0**13 * SINE).round().astype("<i4") * 256,
+        (2.0**24 * SINE).round().astype("<i4"),
     ],
-    ids=["normalised", "float beyond 1", "float", "noise"],
+    ids=["normalised", "float beyond 1", "float", "noise", "24 bits, high", "24 bits, quiet", "32 bits"],
 )
 def test_usual_levels_need_no_note(tmp_path, samples):
     reader = ertis.open_pcm(write(tmp_path / "a.wav", samples), ONE, passive=True)
     assert len(list(reader)) == 1
-    assert not any("full scale" in note for note in reader.notes)
+    assert not any("full scale" in note or "levels" in note for note in reader.notes)
 
 
 def test_short_file_among_longer_ones_is_named(tmp_path):

@@ -162,6 +162,9 @@ UNUSED = {
     "date only": (chunk(b"LIST", b"INFO" + chunk(b"ICRD", b"2024-05-18\0")),),
     "other comment": (comment("Recorded yesterday"),),
     "impossible day": (comment("Recorded at 19:17:30 32/13/2023 (UTC) by AudioMoth"),),
+    "bext of year 9999": (bext("9999-12-31", "00:00:00"),),
+    "AudioMoth of year 9999": (comment("Recorded at 19:17:30 02/03/9999 (UTC-12) by AudioMoth"),),
+    "AudioMoth of year 1": (comment("Recorded at 00:17:30 01/01/0001 (UTC+14) by AudioMoth"),),
     "day of wamd": (wamd((5, b"2014-04-02")),),
 }
 
@@ -171,6 +174,13 @@ def test_unknown_time_is_noted(tmp_path, name):
     reader = opened(write(tmp_path / "M00123.WAV", *UNUSED[name]))
     assert times_s(reader) == [0]
     assert reader.notes == ("M00123.WAV states no time, so its time is unknown; use --start for the first file",)
+
+
+@pytest.mark.parametrize("time", ["9999-12-31T23:59:59+00:00", "0001-01-01T00:00:00+14:00", "2262-05-01T00:00:00"])
+def test_years_of_no_recorder_are_not_used(tmp_path, time):
+    reader = opened(write(tmp_path / "20240518_042537.wav", guano(f"Timestamp: {time}")))
+    assert times_s(reader) == [seconds("2024-05-18T04:25:37")]
+    assert f"20240518_042537.wav: GUANO Timestamp '{time}' is no time and is not used" in reader.notes
 
 
 def test_invalid_guano_fields_are_noted(tmp_path):
@@ -229,7 +239,18 @@ def test_names_of_whole_seconds_never_overlap(tmp_path):
     reader = opened(*paths)
     first = seconds("2024-05-18T04:25:37")
     assert times_s(reader) == pytest.approx([first, first + 0.25], abs=1e-6)
-    assert not any("before the end" in note for note in reader.notes)
+    assert any(
+        "files begin up to 0.25 s before the end of the previous one, as their times are accurate to 1 s; they are "
+        "stamped at its end; use --join (join=True) if files of one time are the microphones" in note
+        for note in reader.notes
+    )
+
+
+def test_times_to_the_millisecond_are_not_moved(tmp_path):
+    paths = [write(tmp_path / f"20240518_042537_{ms}.WAV", seconds=0.5) for ms in ("000", "200")]
+    reader = opened(*paths)
+    assert np.diff(times_s(reader)) == pytest.approx([0.2], abs=1e-6)
+    assert any("begins 0.3 s before the end of" in note for note in reader.notes)
 
 
 def test_overlapping_files_are_noted(tmp_path):
@@ -265,6 +286,13 @@ REFUSED = {
         DataError,
         r"042537.WAV begins at 2024-05-18 04:25:37 UTC, before 20240518_042637.WAV at 2024-05-18 04:26:37 UTC; list",
     ),
+    "clock set back": (
+        ["20241027_025900.WAV", "20241027_020100.WAV"],
+        {},
+        DataError,
+        r"use --start once for each file",
+    ),
+    "twice": (["a.wav", "b.wav", "a.wav"], {}, ArgumentError, r"a\.wav is listed twice; list each file once"),
     "starts backwards": (["a.wav", "b.wav"], {"start_ns": [10, 5]}, DataError, r"b.wav begins at 1970-01-01"),
     "one without a time": (
         ["20240518_042637.WAV", "b.wav"],
@@ -360,6 +388,22 @@ def test_folder_is_imported_in_the_order_of_times(tmp_path):
     assert times == [seconds("2024-05-18T04:25:37"), seconds("2024-05-18T04:26:37")]
 
 
+def test_recordings_that_a_folder_leaves_out_are_noted(tmp_path):
+    (tmp_path / "Data").mkdir()
+    for name in ("a.wav", "Data/b.wav", "._c.flac"):
+        write(tmp_path / name)
+    (tmp_path / "d.flac").write_bytes(b"fLaC\0\0\0\x22" + bytes(99))
+    (tmp_path / "notes.txt").write_text("wind")
+    assert opened_folder(tmp_path).notes[0] == (
+        f"{tmp_path.name} contains more recordings, which were left out: d.flac, Data/; import them separately"
+    )
+    assert not any("left out" in note for note in opened_folder(tmp_path / "Data").notes)
+
+
+def opened_folder(path):
+    return ertis.open_pcm(path, ONE, passive=True)
+
+
 def test_folder_without_times_has_the_order_of_numbers(tmp_path):
     for number in (2, 10, 1):
         write(tmp_path / f"R_{number}.wav", seconds=0.01 * number)
@@ -374,6 +418,7 @@ def test_folder_without_times_has_the_order_of_numbers(tmp_path):
             ("card",),
             "contains no files to import; choose a folder with .wav files, or with .bin files of RTIS",
         ),
+        (("a.wav", "b.bin"), ("card",), "card contains .wav and .bin files; list those of one kind instead"),
         (("Data/a.wav",), ("card",), "contains no files to import; import "),
         (("a.wav",), ("card", "card/a.wav"), "card is a folder; import one folder at a time, or list its files"),
     ],

@@ -1,5 +1,7 @@
 """Import with a loopback channel. The truth is a call of closed form at times between the samples."""
 
+import re
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -115,6 +117,21 @@ def test_doubtful_loopbacks_are_noted(tmp_path):
     path = write(tmp_path / "b.wav", record([1e-3], 0.02, loopback=lambda time_s: call(CALL_S - time_s)))
     notes = " ".join(ertis.open_pcm(path, SETTINGS, sync_channel=8).notes)
     assert "the onsets of its pulses, which rise in 1.8e+02 µs, are taken as the emissions" in notes
+
+
+@pytest.mark.parametrize("channel", [0, 8])
+def test_channel_of_a_microphone_is_noted(tmp_path, channel):
+    path = write(tmp_path / "a.wav", record([3e-3, 33e-3], 0.06))
+    notes = " ".join(ertis.open_pcm(path, SETTINGS, sync_channel=channel).notes)
+    expected = (
+        r"channel 8 contains the call 6\.9\d ms before channel 0, and louder; use --sync-channel 8 \(sync_channel\)"
+    )
+    assert bool(re.search(expected, notes)) == (channel == 0)
+
+
+def test_late_echo_before_the_first_emission_is_no_loopback(tmp_path):
+    path = write(tmp_path / "a.wav", record([-5e-3, 25e-3, 55e-3], 0.09, gain=0.02))
+    assert "louder" not in " ".join(ertis.open_pcm(path, SETTINGS, sync_channel=8).notes)
 
 
 def test_notes_state_the_emissions(tmp_path):

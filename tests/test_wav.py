@@ -166,7 +166,11 @@ REFUSED = {
     "unknown GUID": (riff(extensible(16, 16, b"\1" * 16), DATA_CHUNK), r"contains samples of an unknown format"),
     "other form": (b"RIFF\x00\x10\0\0AVI LIST", r"is an AVI video; convert it with"),
     "only a start": (b"RIF", r"is not a WAV file: it begins with b'RIF'"),
-    "nothing": (b"", r"is not a WAV file"),
+    "nothing": (b"", r"is empty, with 0 bytes; copy it again, or leave it out"),
+    "16 bits in 4 bytes": (
+        riff(chunk(b"fmt ", struct.pack("<HHIIHH", 1, 1, RATE_HZ, 2 * RATE_HZ, 4, 16)), DATA_CHUNK),
+        r"states frames of 4 bytes, but 1 channels of 16 bits and 192000 bytes per second need 2; save the file again",
+    ),
 }
 
 

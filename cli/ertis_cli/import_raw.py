@@ -190,8 +190,16 @@ def _folder(raw: tuple[Path, ...]) -> Path | None:
         raise click.UsageError(
             f"{several[0]} is a folder; import one folder at a time, or list its files", click.get_current_context()
         )
-    if not several or any(path.suffix.lower() in {".bin", *_WAV} for path in raw[0].iterdir()):
-        return several[0] if several else None
+    if not several:
+        return None
+    found_suffixes = {path.suffix.lower() for path in raw[0].iterdir() if not path.name.startswith(".")}
+    if ".bin" in found_suffixes and found_suffixes & _WAV:
+        raise click.UsageError(
+            f"{raw[0]} contains .wav and .bin files; list those of one kind instead of the folder",
+            click.get_current_context(),
+        )
+    if found_suffixes & {".bin", *_WAV}:
+        return several[0]
     inner = [path for path in sorted(raw[0].iterdir()) if path.is_dir()]
     found = next((each for each in inner if any(path.suffix.lower() in _WAV for path in each.iterdir())), None)
     remedy = f"import {found}" if found else "choose a folder with .wav files, or with .bin files of RTIS Dev"

@@ -3,7 +3,7 @@
 The files follow `acoular.TimeSamples` and `acoular.MicGeom` of Acoular 24 to 26 (https://www.acoular.org).
 """
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from ertis_numba.stages.signals import signals_of
 from ertis_numba.storage.opening import open_file, reading
 from ertis_numba.storage.schema import to_python
 from ertis_numba.storage.structure import local_member, require_attributes, stored_bytes
+from ertis_numba.wav import Samples
 
 __all__ = ["read_acoular", "write_acoular"]
 
@@ -50,11 +51,12 @@ def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
             facts[name] = value
 
 
-def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
+def read_acoular(path: Path) -> tuple[float, Samples, Settings | None]:
     """Return the sample rate in Hz, the signals, (sample, channel), and the settings of a file from `write_acoular`.
 
-    The settings describe the file's content: only enabled microphones, without gains, because the signals are divided
-    by them, and ranges counted in its samples. For other files they are None.
+    Signals are read from the file when they are sliced. The settings describe the file's content: only enabled
+    microphones, without gains, because the signals are divided by them, and ranges counted in its samples. For other
+    files they are None.
 
     Raises
     ------
@@ -63,7 +65,8 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
     """
     with open_file(path, _WANTED) as file, reading(file, path):
         data = _time_data(file, path)
-        numbers = np.asarray(data[()])
+        shape = (*data.shape, 1) if data.ndim == 1 else data.shape
+        samples = _Stored(path, shape, data.dtype)
         rates_hz = _numbers(data.attrs["sample_freq"])
         reported = _settings(file)
     if rates_hz is None or rates_hz.size != 1:
@@ -72,13 +75,26 @@ def read_acoular(path: Path) -> tuple[float, NDArray[Any], Settings | None]:
             "rate in Hz"
         )
     rate_hz = float(rates_hz.item())
-    numbers = numbers[:, None] if numbers.ndim == 1 else numbers
-    if numbers.ndim != 2 or not numbers.size or numbers.dtype.kind not in "fi":
+    if len(shape) != 2 or not all(shape) or samples.dtype.kind not in "fi":
         raise DataError(
-            f"{path}: time_data is {numbers.dtype} of shape {numbers.shape}; give floating or signed numbers of shape "
+            f"{path}: time_data is {samples.dtype} of shape {shape}; give floating or signed numbers of shape "
             "(sample, channel)"
         )
-    return rate_hz, numbers, _of_signals(received_settings(reported, str(path)), rate_hz) if reported else None
+    return rate_hz, samples, _of_signals(received_settings(reported, str(path)), rate_hz) if reported else None
+
+
+@dataclass(frozen=True, slots=True)
+class _Stored:
+    """Signals in a file, which is opened for each slice."""
+
+    path: Path
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    def __getitem__(self, samples: slice) -> NDArray[Any]:
+        with open_file(self.path, _WANTED) as file, reading(file, self.path):
+            numbers = np.asarray(_time_data(file, self.path)[samples])
+        return numbers[:, None] if numbers.ndim == 1 else numbers
 
 
 def _time_data(file: h5py.File, path: Path) -> h5py.Dataset:

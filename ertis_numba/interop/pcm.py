@@ -10,7 +10,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.geometry import microphones
 from ertis_numba.interop.pcm_cuts import cut_at_emissions, cut_regularly
 from ertis_numba.interop.pcm_files import PcmFile, inspect, joined, per_file, require_alike
-from ertis_numba.interop.pcm_folder import is_wav_folder, wav_files
+from ertis_numba.interop.pcm_folder import is_wav_folder, left_out, wav_files
 from ertis_numba.interop.pcm_reader import PcmReader
 from ertis_numba.interop.recorder_times import TimedFile, file_times
 from ertis_numba.settings import Processing, Recording, Settings, fit_ranges, record_range_m
@@ -81,7 +81,8 @@ def open_pcm(
     Returns
     -------
     PcmReader
-        Iterable of measurements with a length.
+        Iterable of measurements with a length. Its ``notes`` state what was assumed or left out, and after iteration
+        also doubtful levels, such as clipping, zeros, or numbers of another scale.
 
     Raises
     ------
@@ -91,7 +92,8 @@ def open_pcm(
         the call that was emitted. Files are not in the order of their times, or only some of them state one. The
         metadata contradict the sample rate.
     ArgumentError
-        No file is given, a value is invalid, or neither the argument nor the file contains settings.
+        No file is given, a file is listed twice, a value is invalid, or neither the argument nor the file contains
+        settings.
 
     Examples
     --------
@@ -102,10 +104,13 @@ def open_pcm(
     1
     """
     several = [Path(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
+    others: list[str] = []
     if len(several) == 1 and is_wav_folder(several[0]):
+        others = left_out(several[0])
         several = wav_files(several[0], by_time=not join)
     if not several:
         raise ArgumentError("no PCM file is given; give at least one")
+    _require_different(several)
     if time_expansion is not None:
         checks.between("time_expansion", time_expansion, 1 / _MAX_EXPANSION, _MAX_EXPANSION)
     files = [inspect(path, time_expansion) for path in several]
@@ -140,8 +145,15 @@ def open_pcm(
         behaviour="passive" if passive else "unknown",
         firsts_ns=firsts_ns,
         without=sync_channel,
-        notes=[*times, *of_files, *([] if fitted.processing.mode == "passive" else cuts.notes), *ranges],
+        notes=[*others, *times, *of_files, *([] if fitted.processing.mode == "passive" else cuts.notes), *ranges],
     )
+
+
+def _require_different(paths: Sequence[Path]) -> None:
+    resolved = [path.resolve() for path in paths]
+    for number, path in enumerate(resolved):
+        if path in resolved[:number]:
+            raise ArgumentError(f"{paths[number]} is listed twice; list each file once")
 
 
 def _require_emissions(skip_s: float, *, passive: bool) -> None:

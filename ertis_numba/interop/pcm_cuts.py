@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import DataError
 from ertis_numba.interop.pcm_files import PcmFile, per_file
-from ertis_numba.interop.sync_channel import find_emissions
+from ertis_numba.interop.sync_channel import find_emissions, louder_and_earlier
 from ertis_numba.settings import Call
 
 __all__ = ["Cuts", "cut_at_emissions", "cut_regularly"]
@@ -68,12 +68,17 @@ def cut_regularly(files: Sequence[PcmFile], *, skip_s: float, length_s: float | 
     if length_s is not None:
         period = _checked_length_s(length_s) * rate_hz
     n_samples = math.floor(period * (1 + 1e-12))
+    if length_s is not None and n_samples < 1:
+        raise DataError(
+            f"--length is {length_s:g} s, less than a sample at {rate_hz:g} Hz; use a longer --length (length_s)"
+        )
     counts = [1 if length_s is None else _count(file.n_samples - skipped, period, n_samples) for file in files]
     for file, count in zip(files, counts, strict=True):
         if count < 1 or n_samples < 1:
             raise DataError(
                 f"{file.path} lasts {file.duration_s:.4g} s, but {skipped / rate_hz:.4g} s to skip and a measurement "
-                f"of {max(n_samples, 1) / rate_hz:.4g} s are needed; skip less (--skip) or give a shorter --length"
+                f"of {max(n_samples, 1) / rate_hz:.4g} s are needed; skip less (--skip)"
+                + (" or give a shorter --length" if length_s is not None else "")
             )
     several = [period * np.arange(count, dtype=np.float64) for count in counts]
     return Cuts(
@@ -128,6 +133,10 @@ def cut_at_emissions(
         f"{1e3 * rounding / rate_hz * sound_speed_m_s / 2:.2g} mm"
     )
     notes = [(file.path, note) for file, each in zip(files, found, strict=True) for note in each.notes]
+    warning = louder_and_earlier(
+        files[0].open().channel_or_nan, found[0], call, rate_hz=rate_hz, channel=channel, n_channels=files[0].n_channels
+    )
+    notes += [(files[0].path, warning)] * bool(warning)
     n_left = sum(map(len, several)) - len(cuts)
     left = [f"emissions left out because their file ends too early: {n_left}"] * bool(n_left)
     return Cuts(cuts.n_samples, cuts.samples, cuts.times_s, (summary, *per_file(notes), *left))

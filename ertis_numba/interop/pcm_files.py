@@ -1,10 +1,11 @@
 """Single files of PCM, and files of single microphones that are joined: properties and samples."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from types import MappingProxyType
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from ertis_numba.interop.recorder_metadata import RecorderMetadata, read_metadat
 from ertis_numba.interop.recorder_names import MAX_DIFFERENCE_S, StatedTime, times_in_names
 from ertis_numba.interop.time_expansion import true_rate_hz
 from ertis_numba.settings import Recording, Settings
-from ertis_numba.wav import read_wav
+from ertis_numba.wav import Samples, read_wav
 
 __all__ = ["PcmFile", "first_stated_times", "inspect", "joined", "natural_order", "per_file", "require_alike"]
 
@@ -41,6 +42,8 @@ class PcmFile:
     kind : dtype
         Type of the samples in the file.
     metadata : RecorderMetadata
+    is_wide : bool
+        True for integers of 32 or 64 bits, all of which are used according to the file.
     notes : tuple of str
     settings : Settings or None
         Settings in the file.
@@ -52,6 +55,7 @@ class PcmFile:
     counts: tuple[int, ...]
     kind: np.dtype[Any]
     metadata: RecorderMetadata
+    is_wide: bool
     notes: tuple[str, ...] = ()
     settings: Settings | None = None
 
@@ -77,7 +81,7 @@ class PcmFile:
 
     def open(self, *, without: int | None = None) -> "PcmSamples":
         """Return the samples, without one of the channels if desired."""
-        return PcmSamples(self, [_read(path)[1] for path in self.paths], without)
+        return PcmSamples(self, [_read(path).samples for path in self.paths], without)
 
 
 class PcmSamples:
@@ -109,10 +113,14 @@ class PcmSamples:
         DataError
             A sample is not finite.
         """
-        numbers = self._numbers(samples)[:, channel].astype(np.float64)
+        numbers = self.channel_or_nan(channel, samples)
         if not np.isfinite(numbers).all():
             raise DataError(f"{self._file.path} contains numbers that are not finite in channel {channel}; remove them")
         return numbers
+
+    def channel_or_nan(self, channel: int, samples: slice) -> NDArray[np.float64]:
+        """Return samples of one channel, in units of the file, as they are."""
+        return self._numbers(samples)[:, channel].astype(np.float64)
 
     def _numbers(self, samples: slice) -> NDArray[Any]:
         several = [part[samples] for part in self._parts]
@@ -127,23 +135,25 @@ def inspect(path: Path, expansion: float | None = None) -> PcmFile:
     DataError
         The file cannot be read, or its rate is unknown or out of range.
     """
-    header_hz, numbers, settings, chunks, notes = _read(path)
+    read = _read(path)
     try:
-        Recording(sample_rate_hz=header_hz)
+        Recording(sample_rate_hz=read.rate_hz)
     except ArgumentError as error:
         raise DataError(f"{path}: {error}") from error
-    metadata = read_metadata(chunks, header_hz)
-    rate_hz, expanded = true_rate_hz(path, header_hz, metadata, expansion)
-    n_samples, n_channels = numbers.shape
+    metadata = read_metadata(read.chunks, read.rate_hz)
+    rate_hz, expanded = true_rate_hz(path, read.rate_hz, metadata, expansion)
+    n_samples, n_channels = read.samples.shape
+    kind = read.samples.dtype
     return PcmFile(
         paths=(path,),
         rate_hz=rate_hz,
         n_samples=n_samples,
         counts=(n_channels,),
-        kind=numbers.dtype,
+        kind=kind,
         metadata=metadata,
-        notes=(*notes, *metadata.notes, *expanded),
-        settings=settings,
+        is_wide=kind.kind == "i" and kind.itemsize >= 4 and (read.valid_bits or 8 * kind.itemsize) == 8 * kind.itemsize,
+        notes=(*read.notes, *metadata.notes, *expanded),
+        settings=read.settings,
     )
 
 
@@ -240,10 +250,23 @@ def _channels(files: Sequence[PcmFile]) -> str:
     return f"channel 0 first: {', '.join(names)}"
 
 
-def _read(path: Path) -> tuple[float, Any, Settings | None, dict[str, bytes], tuple[str, ...]]:
+class _Read(NamedTuple):
+    """Content of a file; ``valid_bits`` is None if the file does not state how many bits are used."""
+
+    rate_hz: float
+    samples: Samples
+    settings: Settings | None = None
+    valid_bits: int | None = None
+    chunks: Mapping[str, bytes] = MappingProxyType({})
+    notes: tuple[str, ...] = ()
+
+
+def _read(path: Path) -> _Read:
     try:
         with path.open("rb"):
             pass
+    except PermissionError as error:
+        raise DataError(f"{path}: {error.strerror}; ask its owner for permission to read it") from error
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; give a PCM file") from error
     kind = kind_of(path)
@@ -254,9 +277,9 @@ def _read(path: Path) -> tuple[float, Any, Settings | None, dict[str, bytes], tu
         if not (kind.is_wav or is_acoular):
             raise DataError(f"{path} {problem_of(path)}")
     if is_acoular:
-        return *read_acoular(path), {}, ()
+        return _Read(*read_acoular(path))
     wav = read_wav(path)
-    return wav.rate_hz, wav.samples, None, wav.chunks, wav.notes
+    return _Read(wav.rate_hz, wav.samples, None, wav.valid_bits, wav.chunks, wav.notes)
 
 
 def _converted(

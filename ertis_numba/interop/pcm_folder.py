@@ -4,9 +4,10 @@ from pathlib import Path
 from typing import Final
 
 from ertis_numba.errors import DataError
+from ertis_numba.file_kinds import kind_of
 from ertis_numba.interop.pcm_files import first_stated_times, inspect, natural_order
 
-__all__ = ["is_wav_folder", "wav_files"]
+__all__ = ["is_wav_folder", "left_out", "wav_files"]
 
 _WAV: Final = {".wav", ".wave"}
 
@@ -46,3 +47,19 @@ def wav_files(folder: Path, *, by_time: bool) -> list[Path]:
     if len(times_ns) < len(paths):
         return paths
     return [paths[place] for place in sorted(range(len(paths)), key=times_ns.__getitem__)]
+
+
+def left_out(folder: Path) -> list[str]:
+    """Return the note on recordings in a folder that `wav_files` leaves out: other formats, and inner folders."""
+    names = []
+    for each in sorted(folder.iterdir(), key=lambda path: natural_order(path.name)):
+        if each.name.startswith(".") or each.suffix.lower() in _WAV:
+            continue
+        if each.is_dir() and is_wav_folder(each):
+            names.append(f"{each.name}/")
+        elif each.is_file() and (kind := kind_of(each)) and kind.is_sound:
+            names.append(each.name)
+    if not names:
+        return []
+    listed = ", ".join(names[:4]) + ", …" * (len(names) > 4)
+    return [f"{folder.name} contains more recordings, which were left out: {listed}; import them separately"]

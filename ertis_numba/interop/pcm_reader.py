@@ -69,7 +69,7 @@ class PcmReader:
         for number, (file, starts, times_s, first_ns) in enumerate(parts):
             samples = file.open(without=self._without)
             levels = self._levels[number] = SampleLevels(
-                self.settings.recording.full_scale, is_bytes=file.kind.itemsize == 1, is_float=file.kind.kind == "f"
+                self.settings.recording.full_scale, file.kind, is_wide=file.is_wide
             )
             later_ns = np.rint(1e9 * (times_s - times_s[0])).astype(np.int64)
             for start, time_ns in zip(starts.tolist(), (first_ns + later_ns).tolist(), strict=True):

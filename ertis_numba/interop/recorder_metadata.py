@@ -141,7 +141,7 @@ def _bext(content: bytes, rate_hz: float) -> Iterator[StatedTime]:
         return
     with suppress(ValueError):
         clock = datetime(*map(int, parts.groups()))  # type: ignore[arg-type]  # noqa: DTZ001  six whole numbers
-        time = StatedTime(clock, None, "bext metadata")
+        time = StatedTime.of(clock, "bext metadata")
         if len(content) >= 346:
             midnight = clock.replace(hour=0, minute=0, second=0)
             with suppress(OverflowError):

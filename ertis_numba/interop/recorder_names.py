@@ -12,11 +12,12 @@ _STAMP: Final = re.compile(
     r"(?<!\d)(?P<year>(?:19|20|21|22)\d\d|\d\d)(?P<between>[-_.]?)(?P<month>\d\d)(?P=between)(?P<day>\d\d)"
     r"[-_T $~]{0,3}"
     r"(?P<hour>\d\d)(?P<gap>[-_.:]?)(?P<minute>\d\d)(?P=gap)(?P<second>\d\d)"
-    r"(?:[-_.,]?(?P<ms>\d{3})(?!\d))?" + _ZONE + r"(?!\d)"
+    r"(?:[-_.,]?(?P<fraction>\d{3}(?:\d{3})?)(?!\d))?" + _ZONE + r"(?!\d)"
 )
 _HEX: Final = re.compile(r"[0-9A-F]{8}", re.IGNORECASE)
 MAX_DIFFERENCE_S: Final = 2.0
 """Largest difference of times that agree: recorders state times before or after the first sample."""
+_YEARS: Final = range(1900, 2262)  # 64 bits of nanoseconds end in 2262.
 _HEX_S: Final = range(round(datetime(2014, 1, 1, tzinfo=UTC).timestamp()), 2**31)
 
 
@@ -42,7 +43,9 @@ class StatedTime(NamedTuple):
 
     @classmethod
     def of(cls, stated: datetime, source: str) -> "StatedTime":
-        """Return the stated time for a time with or without a zone."""
+        """Return the stated time for a time with or without a zone; raise ValueError if no recorder can state it."""
+        if stated.year not in _YEARS:
+            raise ValueError(stated)
         resolution_s = 1e-3 if stated.microsecond else 1.0
         return cls(stated.replace(tzinfo=None), stated.utcoffset(), source, resolution_s)
 
@@ -67,7 +70,7 @@ def times_in_names(names: Sequence[str]) -> list[StatedTime | None]:
 
 def _stamp(stem: str) -> StatedTime | None:
     for found in _STAMP.finditer(stem):
-        part = {name: int(found[name] or 0) for name in ("year", "month", "day", "hour", "minute", "second", "ms")}
+        part = {name: int(found[name] or 0) for name in ("year", "month", "day", "hour", "minute", "second")}
         if part["year"] < 100 and (found["between"] or found["gap"]):
             continue  # 24-05-18 may be any order of day, month and year.
         try:
@@ -78,12 +81,12 @@ def _stamp(stem: str) -> StatedTime | None:
                 part["hour"],
                 part["minute"],
                 part["second"],
-                1000 * part["ms"],
+                round(1e6 * float(f"0.{found['fraction'] or 0}")),
             )
-            offset = _offset(found["zone"])
+            time = StatedTime.of(clock, "file names")
+            return time._replace(offset=_offset(found["zone"]), resolution_s=1e-3 if found["fraction"] else 1.0)
         except ValueError:  # Digits that are no date.
             continue
-        return StatedTime(clock, offset, "file names", 1e-3 if found["ms"] else 1.0)
     return None
 
 

@@ -13,6 +13,7 @@ from ertis_numba.interop.recorder_names import MAX_DIFFERENCE_S, StatedTime, tim
 
 __all__ = ["TimedFile", "file_times"]
 
+_NEGLIGIBLE_S: Final = 1e-3
 _UNKNOWN: Final = "use --start for the first file, or once for each file (start_ns)"
 
 
@@ -98,34 +99,52 @@ def _require_order(files: Sequence[TimedFile], times_ns: Sequence[int]) -> None:
         if after_ns < before_ns:
             raise DataError(
                 f"{files[number + 1].path} begins at {_text(after_ns)}, before {files[number].path.name} at "
-                f"{_text(before_ns)}; list the files in the order of their times, or import their folder"
+                f"{_text(before_ns)}; list the files in the order of their times, import their folder, or use "
+                "--start once for each file (start_ns) if a clock was set back"
             )
 
 
 def _without_overlaps(
     files: Sequence[TimedFile], times_ns: list[int], resolution_s: float
 ) -> tuple[list[int], list[str]]:
-    """Return times in which files begin after the end of the previous one, and a note on those that overlap by more.
+    """Return times in which files begin after the end of the previous one, and notes on overlaps.
 
     Times of a whole second may be up to a second too early.
     """
-    found, overlaps = list(times_ns), []
+    found, overlaps, moved_s = list(times_ns), [], [0.0]
     for number in range(1, len(files)):
         end_ns = found[number - 1] + round(1e9 * files[number - 1].duration_s)
         overlap_s = (end_ns - found[number]) / 1e9
         if 0 < overlap_s <= resolution_s:
             found[number] = end_ns
+            moved_s.append(overlap_s)
         elif overlap_s > resolution_s:
             overlaps.append((number, overlap_s))
+    return found, [*_moved(moved_s, resolution_s, times_ns), *_overlapping(files, overlaps)]
+
+
+def _moved(moved_s: Sequence[float], resolution_s: float, times_ns: Sequence[int]) -> list[str]:
+    """Return the note on files that were stamped at the end of the previous one."""
+    if max(moved_s) < _NEGLIGIBLE_S:
+        return []
+    same = "; use --join (join=True) if files of one time are the microphones of one measurement"
+    note = (
+        f"files begin up to {max(moved_s):.3g} s before the end of the previous one, as their times are accurate to "
+        f"{resolution_s:g} s; they are stamped at its end{same if len(set(times_ns)) < len(times_ns) else ''}"
+    )
+    return [note]
+
+
+def _overlapping(files: Sequence[TimedFile], overlaps: Sequence[tuple[int, float]]) -> list[str]:
     if not overlaps:
-        return found, []
+        return []
     number, overlap_s = overlaps[0]
     more = f" (and {len(overlaps) - 1} more)" if len(overlaps) > 1 else ""
     note = (
         f"{files[number].path.name} begins {overlap_s:.3g} s before the end of {files[number - 1].path.name}{more}; "
         "check the times, and import each recorder separately"
     )
-    return found, [note]
+    return [note]
 
 
 def _contradictions(files: Sequence[TimedFile], named: Sequence[StatedTime | None]) -> list[str]:

@@ -15,7 +15,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.settings import Call
 from ertis_numba.waveform import call_samples
 
-__all__ = ["Emissions", "find_emissions"]
+__all__ = ["Emissions", "find_emissions", "louder_and_earlier"]
 
 _BLOCK: Final = 2**18
 _MIN_MATCH: Final = 0.5  # Correlation coefficient with the call; noise of a band with 60 degrees of freedom has 0.3.
@@ -27,6 +27,9 @@ _MIN_SNR: Final = 10.0  # Minimum peak of pulses relative to the median deviatio
 _ONSET, _RISEN = 0.1, 0.9  # Levels of an onset and at the end of the rise, relative to the peak.
 _MIN_PAUSE_S: Final = 0.5e-3  # Minimum silence before a pulse.
 _IRREGULAR: Final = 1.5  # Ratio of an interval to the median beyond which an emission may be missing.
+
+_MAX_EARLIER_S: Final = 0.05
+_MIN_EARLIER: Final = 3.0  # in samples
 
 Reader = Callable[[slice], NDArray[np.float64]]
 
@@ -96,6 +99,48 @@ def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, 
             "the emission"
         )
     return Emissions(np.maximum(complete, 0.0), (*notes, *_interval_notes(complete / rate_hz)))
+
+
+def louder_and_earlier(
+    read: Callable[[int, slice], NDArray[np.float64]],
+    emissions: Emissions,
+    call: Call,
+    *,
+    rate_hz: float,
+    channel: int,
+    n_channels: int,
+) -> str:
+    """Return a note if another channel contains the call more loudly and up to half an interval earlier.
+
+    Nothing contains a call before the loopback does, so ``channel`` may be that of a microphone.
+
+    Parameters
+    ----------
+    read : callable
+        Function that returns samples of a channel.
+    emissions : Emissions
+        Those in ``channel``.
+    """
+    at = float(emissions.times[0])
+    interval = float(np.diff(emissions.times).min()) if len(emissions.times) > 1 else math.inf
+    first = max(0, math.ceil(at - min(_MAX_EARLIER_S * rate_hz, interval / 2)))
+    replica = call_samples(call, rate_hz=rate_hz)
+    if at - first < _MIN_EARLIER:
+        return ""
+    around = slice(first, math.ceil(at) + len(replica))
+    loudest = float(np.ptp(read(channel, around)))
+    for other in range(n_channels):
+        signal = read(other, around)
+        if other == channel or not np.isfinite(signal).all() or np.ptp(signal) < loudest:
+            continue
+        times, match = _of_call(signal.__getitem__, len(signal), replica, call.start_s * rate_hz)
+        if match >= _GOOD_MATCH and len(times) and 0 <= times[0] < at - first - _MIN_EARLIER:
+            early_s = (at - first - times[0]) / rate_hz
+            return (
+                f"channel {other} contains the call {1e3 * early_s:.3g} ms before channel {channel}, and louder; "
+                f"use --sync-channel {other} (sync_channel) if it is the loopback"
+            )
+    return ""
 
 
 def _interval_notes(times_s: NDArray[np.float64]) -> Iterator[str]:
@@ -205,7 +250,8 @@ def _onsets(read: Reader, n_samples: int, rate_hz: float) -> tuple[NDArray[np.fl
                 earlier = abs(signal[start - 1]) if start else before
                 rise = (limit - earlier) / max(abs(signal[start]) - earlier, 1e-300)
                 time = block.start + start - 1 + float(np.clip(rise, 0, 1))
-                rise_time = rise_time or 1.0 + int(np.argmax(np.abs(signal[start:]) > _RISEN * peak))
+                pulse = np.abs(signal[start : start + pause])
+                rise_time = rise_time or 1.0 + int(np.argmax(pulse >= _RISEN * pulse.max()))
                 times.append(time if block.start + start else -1.0)
         previous = int(above[-1]) + block.start if len(above) else previous
         before = abs(float(signal[-1]))

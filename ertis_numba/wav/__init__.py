@@ -33,6 +33,8 @@ class WavFile:
     samples : Samples
         (sample, channel); slices along the first axis are arrays. The file is mapped into memory. Integers have the
         full scale of their type, and bytes are unsigned.
+    valid_bits : int
+        Bits of a sample that the header states to be used; the samples may have more.
     notes : tuple of str
         Contradictions in the file, and how they were resolved.
     chunks : dict of str to bytes
@@ -42,6 +44,7 @@ class WavFile:
 
     rate_hz: float
     samples: Samples
+    valid_bits: int
     notes: tuple[str, ...]
     chunks: dict[str, bytes]
 
@@ -60,7 +63,7 @@ def read_wav(path: Path) -> WavFile:
     view = content.view[chunks.start : chunks.start + chunks.n_bytes]
     samples = samples_of(view, form.n_channels, form.sample_bytes, form.kind, content.order)
     notes = [*chunks.notes, *lengths_notes(content, chunks, form), *_alignment_notes(samples, form)]
-    return WavFile(float(form.rate_hz), samples, tuple(notes), chunks.metadata())
+    return WavFile(float(form.rate_hz), samples, form.valid_bits, tuple(notes), chunks.metadata())
 
 
 def _alignment_notes(samples: Samples, form: Form) -> list[str]:
@@ -104,6 +107,8 @@ def _opened(path: Path) -> Content:
             start = file.read(12)
     except OSError as error:
         raise DataError(f"{path}: {error.strerror}; give a WAV file") from error
+    if not start:
+        raise DataError(f"{path} is empty, with 0 bytes; copy it again, or leave it out")
     if start[:4] not in _ORDERS or start[8:] != b"WAVE":
         found = problem_of(path)
         if found:

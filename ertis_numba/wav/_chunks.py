@@ -74,7 +74,8 @@ def _require_complete(content: Content, chunks: Chunks, last: bytes, place: int)
         )
     if not chunks.n_bytes:
         raise DataError(
-            f"{path} has no samples: its data chunk at byte {chunks.places[b'data']} is empty; record it again"
+            f"{path} has no samples: its data chunk at byte {chunks.places[b'data']} is empty; record it again, "
+            "or leave it out"
         )
     if chunks.n_bytes % form.frame_bytes:
         raise DataError(

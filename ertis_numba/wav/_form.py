@@ -112,6 +112,11 @@ def read_form(content: bytes, order: str, place: int, path: Path) -> Form:
         notes.append(f"the fmt chunk at byte {place} states frames of {frame_bytes} bytes, but all else needs {wanted}")
         frame_bytes = wanted
     sample_bytes, rest = divmod(frame_bytes, n_channels)
+    if frame_bytes != wanted and byte_rate == rate_hz * wanted:
+        raise DataError(
+            f"{where} states frames of {frame_bytes} bytes, but {n_channels} channels of {bits} bits and {byte_rate} "
+            f"bytes per second need {wanted}; save the file again as WAV"
+        )
     fits = sample_bytes in _FLOAT_SIZES if code == _FLOAT else 1 <= sample_bytes <= _MAX_SAMPLE_BYTES
     if rest or not fits or not 1 <= bits <= 8 * sample_bytes:
         raise DataError(
