@@ -79,8 +79,8 @@ def test_files_of_many_programs_have_the_same_pose(tmp_path, name, text, encodin
         ("1700000000000000000", "1700000000100000001", None, 1_700_000_000_100_000_001, "2023-11-14 22:13:20 UTC"),
         ("0.0", "0.1", None, 100_000_000, None),
         ("0.000000000", "1.000000000", None, 1_000_000_000, None),
-        ("0", "100", None, 100_000_000_000, "times from 0 to 100 read as seconds, 100 s from row to row"),
-        ("0", "1", None, 1_000_000_000, "times from 0 to 1 read as seconds, 1 s from row to row"),
+        ("0", "100", None, 100_000_000_000, "times from 0 to 100 are read as seconds, 100 s from row to row"),
+        ("0", "1", None, 1_000_000_000, "times from 0 to 1 are read as seconds, 1 s from row to row"),
         ("0", "33.3", None, 33_300_000_000, "read as seconds"),
         ("0", "100", "ms", 100_000_000, None),
         ("0", "100000000", "ns", 100_000_000, None),
@@ -102,18 +102,18 @@ def rows(*cells):
 @pytest.mark.parametrize(
     ("text", "n_poses", "note"),
     [
-        (rows(START, START, END), 2, "1 line left out, because an earlier one has the same time and the same pose"),
+        (rows(START, START, END), 2, "1 line left out because an earlier line has the same time and the same pose"),
         (rows(START, "1.0 0.001 0 0 0 0 0 1", END), 2, "poses up to 0.001 m and 0° apart (line 1 and line 2)"),
         (rows(START, "1.0 0 0 0 0 0 0 -1", END), 2, "the same pose"),
         (
             rows(START, "# lost", "1.1 nan nan nan nan nan nan nan", "1.2 0 0 0 NaN 0 0 1", "1.3 0 0 0 0 0 0 1"),
             2,
-            "2 lines of 4 without numbers (NaN) left out, the first is line 3",
+            "2 of 4 lines left out because numbers are missing, first line 3",
         ),
         (
             rows("1.0 0 0 0 0 0 0 1.04", "1.5 0 0 0 0 0 0 1.0005"),
             2,
-            "quaternions of 1 line scaled to length 1; the largest error is 4.0 % in line 1",
+            "quaternions of 1 line were scaled to length 1; the largest deviation is 4.0 % in line 1",
         ),
         (rows("1.0 0 0 0 0 0 0 0.9995", "1.5 0 0 0 0 0 0 1"), 2, None),
     ],
@@ -131,14 +131,14 @@ def test_empty_cells_of_tables_are_rows_without_a_pose(tmp_path):
     text = "time_s,x_m,y_m,yaw_deg\n1.0,0,0,0\n1.1,,,\n1.15,-nan(ind),NULL,NA\n1.2,1,0,90\n"
     read = read_trajectory(written(tmp_path, "a.csv", text))
     assert read.position_m[:, 0].tolist() == [0.0, 1.0]
-    assert read.notes == ("2 lines of 4 without numbers (NaN) left out, the first is line 3",)
+    assert read.notes == ("2 of 4 lines left out because numbers are missing, first line 3",)
 
 
 def test_gaps_between_poses_are_noted(tmp_path):
     text = "".join(f"{1.0 + 0.1 * number + 30 * (number >= 5)} 0 0 0 0 0 0 1\n" for number in range(9))
     read = read_trajectory(written(tmp_path, "a.tum", text))
     assert read.notes == (
-        "1 interval between poses longer than 1 s, in which poses are interpolated; the longest is 30.1 s after line 5",
+        "1 gap of more than 1 s between poses, bridged by interpolation; the longest lasts 30.1 s after line 5",
     )
     steady = "".join(f"{2.5 * number} 0 0 0 0 0 0 1\n" for number in range(9))
     assert read_trajectory(written(tmp_path, "b.tum", steady)).notes == ()
@@ -161,11 +161,11 @@ def test_poses_of_kitti_are_read_with_their_times(tmp_path):
 @pytest.mark.parametrize(
     ("text", "times", "message"),
     [
-        (KITTI, None, r"as poses of KITTI, and no times; give the file of their times, such as times.txt"),
-        (KITTI, "0\n", r"there are 2 poses, but 1 times; give the times of the same drive"),
-        (KITTI + "1 0 0 0\n", "0\n1\n2\n", r"line 3 has 4 fields; give 12 as in the first line"),
-        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "0\n", r"line 1: the matrix of KITTI is no rotation"),
-        ("1 0 0 0 0 0 0 1\n", "0\n", r"a file of times is for poses of KITTI, but the rows have 8 fields"),
+        (KITTI, None, r"as poses of KITTI do, but no times; add the file of their times with --times times.txt"),
+        (KITTI, "0\n", r"there are 2 poses, but 1 times; choose the times of the same drive"),
+        (KITTI + "1 0 0 0\n", "0\n1\n2\n", r"line 3 has 4 fields; write 12, as in the first line"),
+        ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "0\n", r"line 1: the matrix is not a rotation"),
+        ("1 0 0 0 0 0 0 1\n", "0\n", r"is for poses of KITTI, with 12 fields in a row, but the rows have 8; remove"),
     ],
 )
 def test_poses_of_kitti_that_do_not_fit_are_refused(tmp_path, text, times, message):
@@ -182,51 +182,55 @@ def test_poses_of_kitti_that_do_not_fit_are_refused(tmp_path, text, times, messa
         (
             "a.tum",
             rows("2 0 0 0 0 0 0 1", "# here", "1.5 0 0 0 0 0 0 1"),
-            r"line 3 is 0.5 s before the line above it; sort the lines",
+            r"line 3 is 0.5 s before the line before; sort the lines",
         ),
         (
             "a.tum",
             rows(START, "2 0 0 0 0 0 0 1.06"),
-            r"line 2: rotation_xyzw has length 1.06 .* or remove the 1 line without one",
+            r"line 2: rotation_xyzw has length 1.06 .* correct or remove 1 line",
         ),
         ("a.tum", rows(START, "2 0 0 0 0 0 0 0"), r"line 2: rotation_xyzw has length 0 \(0 0 0 0\)"),
-        ("a.tum", rows("1 nan 0 0 0 0 0 1"), r"there are no poses; 1 line of 1 without numbers"),
+        ("a.tum", rows("1 nan 0 0 0 0 0 1"), r"the file contains no complete pose; 1 of 1 line left out"),
         ("a.tum", rows(START, "2 0 inf 0 0 0 0 1"), r"line 2 has position_m 0 inf 0"),
-        ("a.tum", rows("50000000000 0 0 0 0 0 0 1"), r"choose the unit \(time_unit, --time-unit\): s, ms, us, ns"),
-        ("a.tum", rows("1 0 0 0 0 0 0 1 5"), r"line 1 has 9 fields; give 8: .* or name all columns in a first line"),
+        ("a.tum", rows("50000000000 0 0 0 0 0 0 1"), r"choose their unit \(time_unit, --time-unit\): s, ms, us, ns"),
+        ("a.tum", rows("1 0 0 0 0 0 0 1 5"), r"line 1 has 9 fields; write 8: .* or name all columns in the first line"),
         (
             "a.txt",
             "1403715524907143168,1,2,3,0.8,0,0,0.6\n",
-            r"line 1 may have the order of TUM or that of EuRoC, w x y z",
+            r"the order of the quaternion in line 1 is unclear: .* or w x y z as in EuRoC",
         ),
-        ("a.csv", "1,2,3,4,5,6,7,8\n", r"the first line names the columns 1, 2, 3, 4, 5, 6, 7, 8; give time_ns"),
+        (
+            "a.csv",
+            "1,2,3,4,5,6,7,8\n",
+            r"the first line names the columns 1, 2, 3, 4, 5, 6, 7, 8; they must be time_ns",
+        ),
         (
             "a.csv",
             "timestamp,x,y,z,qx,qy,qz,qw\n1,1,2,3,0,0,0,1\n",
-            r"names the columns timestamp, x, y, z, qx, qy, qz, qw; give time_ns or time_s, x_m",
+            r"names the columns timestamp, x, y, z, qx, qy, qz, qw; they must be time_ns or time_s, x_m",
         ),
         ("a.csv", "t,x [mm],y [mm],z [mm],qx,qy,qz,qw\n1,1,2,3,0,0,0,1\n", r"names the columns t, x \[mm\]"),
         (
             "a.csv",
             "t,tx [mm],ty [mm],qx,qy,qz,qw\n1,1,2,0,0,0,1\n",
-            r"column 'tx \[mm\]' is not in metres; convert it, and name it x_m",
+            r"column 'tx \[mm\]' is not in metres; convert the column, and name it x_m",
         ),
         (
             "a.csv",
             "#timestamp [ns],w_RS_S_x [rad s^-1],a_RS_S_x [m s^-2]\n1,2,3\n",
-            r"holds measurements of an IMU, but no poses; give .*state_groundtruth",
+            r"contains measurements of an IMU instead of poses; choose .*state_groundtruth",
         ),
         (
             "a.csv",
             "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m]\n1403636858601666560,4.6,-1.7,0.8\n",
-            r"line 1 names the columns timestamp \[ns\], p_RS_R_x .* which include no rotation; give qx, qy, qz, qw",
+            r"line 1 names the columns timestamp \[ns\], p_RS_R_x .* but none contains a rotation; add qx, qy, qz, qw",
         ),
         (
             "a.tum",
             rows(*(f"{k // 5}.0 0.0{k} 0 0 0 0 0 1" for k in range(10))),
-            r"8 lines of 10 have the time of an earlier one, but other poses; give times with all of their digits",
+            r"8 of 10 lines repeat the time of an earlier line with another pose; write the times with all digits",
         ),
-        ("a.csv", "#timestamp [ns],filename\n1,1.png\n", r"holds measurements of a camera, but no poses"),
+        ("a.csv", "#timestamp [ns],filename\n1,1.png\n", r"contains measurements of a camera instead of poses"),
         (
             "a.csv",
             "time_s,x_m,y_m,yaw_deg\n1700000000000,0,0,0\n",
@@ -245,8 +249,8 @@ def test_doubtful_rows_are_refused_with_their_lines(tmp_path, name, text, messag
     [
         (b"#ROSBAG V2.0\n", r"is a bag of ROS 1; convert it with .*rosbags-convert --src \S+a.bag --dst BAG"),
         (b"SQLite format 3\0", r"is a bag of ROS 2 in SQLite; convert it with"),
-        (b"\x89HDF\r\n\x1a\n", r"is HDF5; give it as a recording"),
-        (b"PK\x03\x04", r"is an archive or a spreadsheet; unpack it, or save it as CSV"),
+        (b"\x89HDF\r\n\x1a\n", r"is HDF5, not text; if it is a recording, write"),
+        (b"PK\x03\x04", r"is an archive or a spreadsheet; unpack it or save it as CSV"),
     ],
 )
 def test_other_formats_are_refused_by_name(tmp_path, start, message):
@@ -258,7 +262,7 @@ def test_other_formats_are_refused_by_name(tmp_path, start, message):
 
 def test_folder_of_a_bag_is_refused_by_name(tmp_path):
     (tmp_path / "metadata.yaml").touch()
-    with pytest.raises(DataError, match=r"is a folder of a bag of ROS 2; give the .mcap file in it"):
+    with pytest.raises(DataError, match=r"is the folder of a bag of ROS 2; use the .mcap file in this folder"):
         read_trajectory(tmp_path)
 
 
@@ -268,13 +272,16 @@ def test_options_that_do_not_fit_are_refused(tmp_path):
         read_trajectory(path, time_unit="h")
     with pytest.raises(ArgumentError, match="pose_axes 'rover' is unknown"):
         read_trajectory(path, pose_axes="rover")
-    with pytest.raises(DataError, match="the file states times in s, but time_unit is ms; leave it out"):
+    with pytest.raises(DataError, match="states that its times are in s, but time_unit is ms; remove time_unit"):
         read_trajectory(path, time_unit="ms")
     with pytest.raises(
-        DataError, match=r"none.txt cannot be read \(No such file or directory\); give an existing file"
+        DataError, match=r"none.txt cannot be read \(No such file or directory\); choose an existing file"
     ):
         read_trajectory(path, times=tmp_path / "none.txt")
-    with pytest.raises(ArgumentError, match=r"time_unit is given, but messages in .* have times; leave it out"):
+    with pytest.raises(
+        ArgumentError,
+        match=r"time_unit \(--time-unit\) is for text, but messages in .* contain times; remove time_unit",
+    ):
         read_trajectory(tmp_path / "a.mcap", time_unit="ms")
 
 
@@ -355,7 +362,9 @@ def test_transforms_are_read_by_their_frames(tmp_path):
     for topic in (None, "/tf"):
         with pytest.raises(ArgumentError, match=re.escape(choices)):
             read_trajectory(path, topic=topic)
-    with pytest.raises(ArgumentError, match=r"has no transform 'map.base_link'; choose one of base_link.camera, odom"):
+    with pytest.raises(
+        ArgumentError, match=r"contains no transform 'map.base_link'; choose one of base_link.camera, odom"
+    ):
         read_trajectory(path, topic="/tf:map.base_link")
 
 
@@ -364,20 +373,22 @@ def test_frames_and_times_of_messages_are_checked(tmp_path):
     with pytest.raises(DataError, match=r"poses are in several frames \(a platform in 'map', a platform in 'odom'\)"):
         read_trajectory(bag(tmp_path / "two.mcap", {"/pose": (*STAMPED, two)}))
     late = [stamped(TIME_NS + 5, 0.0), stamped(TIME_NS, 0.0)]
-    with pytest.raises(DataError, match=r"message 2 is 5e-09 s before the message above it; sort the messages"):
+    with pytest.raises(DataError, match=r"message 2 is 5e-09 s before the message before; sort the messages"):
         read_trajectory(bag(tmp_path / "late.mcap", {"/pose": (*STAMPED, late)}))
     zero = [stamped(0, 0.0), stamped(0, 1.0)]
     read = read_trajectory(bag(tmp_path / "zero.mcap", {"/pose": (*STAMPED, zero)}))
     assert read.time_ns.tolist() == [TIME_NS, TIME_NS + 1]
-    assert read.notes == ("messages state no time (0); the times at which they were recorded are used",)
+    assert read.notes == ("the messages contain no times (0), so the times at which they were recorded are used",)
     empty = bag(tmp_path / "empty.mcap", {"/path": (*PATH, [{"header": header(TIME_NS), "poses": []}])})
-    with pytest.raises(DataError, match="there are no poses; give at least one"):
+    with pytest.raises(DataError, match="the topic contains no poses; choose another topic"):
         read_trajectory(empty)
-    with pytest.raises(ArgumentError, match=r"topic '/path' has poses and no transforms; leave out ':a.b'"):
+    with pytest.raises(ArgumentError, match=r"topic '/path' contains poses instead of transforms; remove ':a.b'"):
         read_trajectory(empty, topic="/path:a.b")
 
 
 def test_frame_of_another_part_of_the_platform_is_noted(tmp_path):
     messages = [{"transforms": [transform(TIME_NS, 0.0, "odom", "lidar")]}]
     read = read_trajectory(bag(tmp_path / "a.mcap", {"/tf": (*TRANSFORMS, messages)}), topic="/tf:odom.lidar")
-    assert read.notes == ("poses are those of the frame 'lidar'; mountings of sensors must be relative to it",)
+    assert read.notes == (
+        "poses are those of the frame 'lidar'; the mountings of sensors must be relative to this frame",
+    )

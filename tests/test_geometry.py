@@ -133,10 +133,10 @@ def test_sound_pressure_level_follows_from_the_sensitivity_of_a_data_sheet():
     ("name", "text", "message"),
     [
         ("eRTIS_v3D", None, r"layout 'eRTIS_v3D' is unknown .did you mean 'eRTIS_v3D1'.*known are eRTIS_v2, "),
-        ("none.toml", None, r"layout .*none\.toml: .*; give a readable file or one of eRTIS_v2, "),
-        ("bytes.csv", b"\xff", r"layout .*bytes\.csv: .*; give a readable file or one of"),
+        ("none.toml", None, r"layout .*none\.toml: .*; choose a readable file or one of eRTIS_v2, "),
+        ("bytes.csv", b"\xff", r"layout .*bytes\.csv: .*; choose a readable file or one of"),
         ("l.toml", b"positions_mm = [", r"layout .*l\.toml: .*; correct it or remove it"),
-        ("l.toml", b"", r"layout .*l\.toml: the file is empty; give a readable file or one of"),
+        ("l.toml", b"", r"layout .*l\.toml: the file is empty; choose a readable file or one of"),
         ("l.toml", b"positions_mm = 3", r"layout .*l\.toml, line 1, positions_mm: Expected `array \| null`, got `int`"),
         (
             "l.toml",
@@ -146,7 +146,7 @@ def test_sound_pressure_level_follows_from_the_sensitivity_of_a_data_sheet():
         (
             "l.toml",
             b"positions_mm = []",
-            r"layout .*l\.toml: positions_mm does not consist of rows of 2 or 3 numbers; give y, z",
+            r"layout .*l\.toml: positions_mm does not consist of rows of 2 or 3 numbers; write y, z",
         ),
         (
             "l.toml",
@@ -175,10 +175,10 @@ def test_sound_pressure_level_follows_from_the_sensitivity_of_a_data_sheet():
         (
             "l.toml",
             b"positions_mm = [[1, 2], [3, 4], [1, 2]]",
-            r"channels 0 and 2 have the same position; correct one, or list it under 'disabled'",
+            r"channels 0 and 2 have the same position; correct one of them, or disable one with the key 'disabled'",
         ),
         ("l.toml", b"gain = [1.0]\npositions_mm = [[1, 2], [3, 4]]", r"l\.toml: array\.gain has shape \(1,\)"),
-        ("l.csv", b"# nothing\n", r"layout .*l\.csv: no positions; use one row per channel, y, z or x, y, z"),
+        ("l.csv", b"# nothing\n", r"layout .*l\.csv: no positions; write one row per channel, y, z or x, y, z"),
         ("l.csv", b"1, nan\n", r"layout .*l\.csv, line 1: z is nan; use a finite number"),
         ("l.csv", b"1, 2\n" * 1025, r"layout .*l\.csv: number of array\.positions_m is 1025; give .* from 1 to 1024"),
     ],

@@ -266,7 +266,7 @@ def test_map_notes_poses_of_a_camera_and_converts_them(folder):
     ertis.write_tum(folder / "camera.tum", of_camera(poses()))
     with pytest.warns(ertis.PoseWarning, match="as that of a camera"):
         add_poses(folder / "both.h5", of_camera(poses()), output=folder / "of_camera.h5")
-    note = "its −y axis points up, as that of a camera (z forward, y down); choose the axes camera (--pose-axes of "
+    note = "its −y axis points up, as that of a camera does (z forward, y down); use --pose-axes camera "
     run(folder, "both.h5 --poses poses.tum -q -o level.h5")
     for number, line in enumerate(("both.h5 --poses camera.tum", "of_camera.h5")):
         done = run(folder, f"{line} -o turned{number}.h5")
@@ -295,10 +295,10 @@ def test_map_notes_poses_of_a_camera_and_converts_them(folder):
 def test_map_reads_poses_of_kitti_with_their_times(folder):
     (folder / "kitti.txt").write_text("".join("1 0 0 0 0 1 0 0 0 0 1 0\n" for _ in range(2)))
     (folder / "times.txt").write_text("0.0\n1.0\n")
-    assert "no times; give the file of their times" in run(folder, "both.h5 --poses kitti.txt -o k.h5", code=1).stderr
+    assert "no times; add the file of their times" in run(folder, "both.h5 --poses kitti.txt -o k.h5", code=1).stderr
     run(folder, "both.h5 --poses kitti.txt -o k.h5 --times times.txt --pose-axes camera-world")
     (folder / "ms.tum").write_text("0 10 0 0 0 0 0 1\n1000 10 0 0 0 0 0 1\n")
-    assert "times from 0 to 1000 read as seconds" in run(folder, "both.h5 --poses ms.tum -o m.h5").stderr
+    assert "times from 0 to 1000 are read as seconds" in run(folder, "both.h5 --poses ms.tum -o m.h5").stderr
     assert "note" not in run(folder, "both.h5 --poses ms.tum -o s.h5 --time-unit ms").stderr
 
 

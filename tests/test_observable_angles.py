@@ -37,13 +37,13 @@ def array_of(positions_m, **changes):
     ("array", "grid", "angles", "note"),
     [
         (array_of(ONE), AHEAD, (False, False), "has one microphone; its images show ranges but no directions"),
-        (array_of([(0, 0.01, 0)] * 3), AHEAD, (False, False), "has 3 microphones in one place"),
+        (array_of([(0, 0.01, 0)] * 3), AHEAD, (False, False), "has 3 microphones at the same position"),
         (array_of(LINES["y"]), AHEAD, (True, False), "on a horizontal line; the elevation is unknown"),
-        (array_of(LINES["x"]), AHEAD, (True, False), "left and right sound alike"),
+        (array_of(LINES["x"]), AHEAD, (True, False), "left and right cannot be distinguished"),
         (array_of(LINES["z"]), AHEAD, (False, True), "on a vertical line; the azimuth is unknown"),
         (array_of(LINES["inclined"]), AHEAD, (False, False), "on an inclined line"),
         (Array(), AHEAD, (True, True), None),
-        (Array(), SPHERE, (True, True), "in a plane; directions on both sides of this plane sound alike"),
+        (Array(), SPHERE, (True, True), "in a plane, so it cannot distinguish the two sides"),
         (array_of([(0, 0, 0), (0.01, 0, 0), (0, 0.01, 0), (0, 0, 0.01)]), SPHERE, (True, True), None),
         (
             Array(disabled=tuple(range(1, len(load_layout("eRTIS_v3D1").enabled)))),

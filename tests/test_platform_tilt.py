@@ -50,7 +50,7 @@ def in_world_of_camera(place_m, rotation):
         (drive(roll_deg=90.0), "its z axis is 90° from vertical, and its y axis points up"),
         (
             drive(roll_deg=-90.0),
-            "its −y axis points up, as that of a camera (z forward, y down); choose the axes camera",
+            "its −y axis points up, as that of a camera does (z forward, y down); use --pose-axes camera",
         ),
         (drive(pitch_deg=90.0), "its z axis is 90° from vertical, and its −x axis points up"),
         (
@@ -59,19 +59,19 @@ def in_world_of_camera(place_m, rotation):
         ),
         (
             of_camera(*drive()),
-            "its −y axis points up, as that of a camera (z forward, y down); choose the axes camera (",
+            "its −y axis points up, as that of a camera does (z forward, y down); use --pose-axes camera of",
         ),
         (
             of_camera(*drive(pitch_deg=20.0)),
-            "choose the axes camera (--pose-axes of 'ertis map' and 'ertis import-poses', Trajectory.converted",
+            "use --pose-axes camera of 'ertis import-poses' or 'ertis map' (in Python, Trajectory.converted('camera'))",
         ),
         (
             in_world_of_camera(*drive()),
-            "its y axis is that of the world, as for a camera that turns; choose the axes camera-world",
+            "as of a camera that turns about the y axis of the world; use --pose-axes camera-world",
         ),
         (in_world_of_camera(*(each[:4] for each in drive(90))), None),
         (drive(climb_m=0.1), None),
-        (drive(climb_m=1.0), "the path extends over 5.24 m in height and 2.82 m along the ground"),
+        (drive(climb_m=1.0), "the path is 5.24 m high and 2.82 m long on the ground"),
     ],
 )
 def test_tilt_of_most_poses_is_noted(poses, note):
@@ -84,7 +84,7 @@ def test_tilt_of_most_poses_is_noted(poses, note):
 def test_straight_path_in_the_world_of_a_camera_is_noted():
     place_m = np.array([[0.0, 0.0, each] for each in np.linspace(0.0, 5.0, 9)])
     found = tilt_note(np.tile(UNTURNED, (9, 1)), place_m)
-    assert found.startswith("the path extends over 5 m in height and 0 m along the ground")
+    assert found.startswith("the path is 5 m high and 0 m long on the ground")
 
 
 def test_minority_of_tilted_poses_is_not_noted():
@@ -131,7 +131,7 @@ def test_mapper_warns_once_of_poses_of_a_camera(as_trajectory):
         for each in images
     ]
     mapper = ertis.Mapper({each.stamp.sensor: ((0.0, 0.0, 0.0), UNTURNED) for each in images})
-    with pytest.warns(ertis.PoseWarning, match="as that of a camera .* choose the axes camera"):
+    with pytest.warns(ertis.PoseWarning, match="as that of a camera does .* use --pose-axes camera"):
         mapper.add(at_start, path if as_trajectory else (place_m[0], rotation[0].as_quat()))
     mapper.add(at_start, path if as_trajectory else (place_m[1], rotation[1].as_quat()))
 

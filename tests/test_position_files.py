@@ -111,7 +111,7 @@ def test_numbers_without_a_unit_are_millimetres_with_a_note(tmp_path):
     require_places(layout, 0.042)
     assert not layout.unit_is_stated
     (note,) = layout.notes
-    assert "states no unit; its numbers are taken for millimetres, so the array spans 21 × 42 × 42 mm" in note
+    assert "states no unit; millimetres are assumed, so the array spans 21 × 42 × 42 mm" in note
     assert not loaded(tmp_path, "5, 6\n").notes  # A single microphone has no size.
 
 
@@ -167,7 +167,7 @@ def test_acoular_array_locates_sources_where_acoular_has_them(tmp_path, depth_m,
     distances_m = np.linalg.norm(places_m - [right_m, up_m, -1.0], axis=1)
     source_m = np.array([1.0, -right_m, up_m]) - places_m.mean(axis=0) @ [[0, -1, 0], [0, 0, 1], [-1, 0, 0]]
     assert_allclose(np.linalg.norm(layout.positions_m - source_m, axis=1), distances_m, atol=1e-12)
-    assert "whose arrays face -z with x to the right and y up" in layout.notes[0]
+    assert "was turned from the axes of Acoular" in layout.notes[0]
     assert layout.is_flat == (depth_m == 0)
 
 
@@ -196,59 +196,59 @@ def test_array_that_lies_on_the_ground_has_a_note(tmp_path):
 
 TABLE = lines("{x},{y},{z}", 42)
 REFUSED = {
-    "empty": ("a.csv", b"", r"a\.csv: the file is empty; give a readable file or one of eRTIS_v2, "),
+    "empty": ("a.csv", b"", r"a\.csv: the file is empty; choose a readable file or one of eRTIS_v2, "),
     "large": ("a.csv", b"1,2\n" * 1_100_000, r"a\.csv: more than 4 MB, too large for a layout"),
     "picture": ("a.csv", b"\x89PNG\r\n\x1a\n\0\0\0\r1", r"a\.csv: the file is binary, not text"),
     "empty xml": ("a.xml", b" \n", r"a\.xml: the file is empty"),
-    "header alone": ("a.csv", b"x_m,y_m,z_m\n", r"a\.csv: no positions; use one row per channel"),
+    "header alone": ("a.csv", b"x_m,y_m,z_m\n", r"a\.csv: no positions; write one row per channel"),
     "axes": (
         "a.csv",
         b"x,y\n0,0\n42,0\n",
-        r"a\.csv: its header names only x and y, .* which way do the microphones face\?",
+        r"a\.csv: the header names only x and y, .* or add the missing column",
     ),
-    "one axis": ("a.csv", b"y_m\n0\n1\n", r"a\.csv: its header names only y, "),
+    "one axis": ("a.csv", b"y_m\n0\n1\n", r"a\.csv: the header names only y, "),
     "no axis": (
         "a.csv",
         b"a,b,c\n" + TABLE.encode(),
-        r"no column of its header \(a, b, c\) is named x, y or z; name them",
+        r"the header \(a, b, c\) names no column x, y or z; name the",
     ),
     "two axes": ("a.csv", b"x,y,y\n" + TABLE.encode(), r"two columns are named y; rename or remove one"),
     "unit": ("a.csv", b"x_ft,y_ft,z_ft\n" + TABLE.encode(), r"column 'x_ft' has the unit ft; use mm, cm, m, in"),
-    "two units": ("a.csv", b"x_m,y_mm,z_m\n" + TABLE.encode(), r"its columns have the units m, mm; use one unit"),
-    "short row": ("a.csv", b"x,y,z\n1,2,3\n1,2\n", r"a\.csv, line 3: number of cells 2, but line 2 has 3; use y, z or"),
-    "short rows": ("a.csv", b"x,y,z\n1,2\n1,2\n", r"a\.csv, line 2: number of cells 2, but the header has 3; use one"),
+    "two units": ("a.csv", b"x_m,y_mm,z_m\n" + TABLE.encode(), r"the columns have the units m, mm; use only one unit"),
+    "short row": ("a.csv", b"x,y,z\n1,2,3\n1,2\n", r"a\.csv, line 3 has 2 cells, but line 2 has 3; write the same"),
+    "short rows": ("a.csv", b"x,y,z\n1,2\n1,2\n", r"a\.csv, line 2 has 2 cells, but the header has 3; write one"),
     "missing": ("a.csv", b"x,y,z\n1,,3\n", r"a\.csv, line 2: y is ''; use a number"),
     "text": ("a.csv", b"x,y,z\n\n1,2,three\n", r"a\.csv, line 3: z is 'three'; use a number"),
     "underscore": ("a.csv", b"x,y,z\n1,2,1_0\n", r"a\.csv, line 2: z is '1_0'; use a number"),
     "NaN": ("a.csv", b"x,y,z\n1,2,3\n1,2,NaN\n", r"a\.csv, line 3: z is NaN; use a finite number"),
-    "five columns": ("a.csv", b"1,2,3,4,5\n", r"a\.csv, line 1: number of cells 5; use rows of y, z or x, y, z"),
-    "decimal commas": ("a.csv", b"0,021,0,063\n0,5,1,2\n", r"a\.csv, line 1: number of cells 4; use rows of"),
+    "five columns": ("a.csv", b"1,2,3,4,5\n", r"a\.csv, line 1 has 5 cells; write rows of y, z or x, y, z"),
+    "decimal commas": ("a.csv", b"0,021,0,063\n0,5,1,2\n", r"a\.csv, line 1 has 4 cells; write rows of"),
     "index": (
         "a.csv",
         b"0,0,0\n1,42,0\n2,0,42\n",
-        r"its first column counts the rows; does it contain numbers of channels",
+        r"the first column may be channel numbers or positions along x",
     ),
     "numbered": (
         "a.csv",
         b"0,1,2\n0.0,0.0,0.0\n0.0,42.0,0.0\n",
-        r"line 1: 0, 1, 2; are these numbers of columns, or a pos",
+        r"line 1: 0, 1, 2 may be column numbers or a pos",
     ),
-    "order": ("a.csv", b"mic,y,z\n1,0,0\n3,42,0\n2,0,42\n", r"a\.csv, line 3: mic 3 follows 1, but the rows must be"),
+    "order": ("a.csv", b"mic,y,z\n1,0,0\n3,42,0\n2,0,42\n", r"a\.csv, line 3: mic 3 follows 1; sort the rows by"),
     "gap": (
         "a.csv",
         b"mic,y,z\n1,0,0\n2,42,0\n4,0,42\n",
-        r"a\.csv, line 4: mic 4 follows 2, but the rows must be .* missing",
+        r"a\.csv, line 4: mic 4 follows 2; sort the rows .* missing",
     ),
-    "copy": ("a.csv", b"1,2\n30,4\n1,2\n", r"channels 0 and 2 have the same position; correct one"),
+    "copy": ("a.csv", b"1,2\n30,4\n1,2\n", r"channels 0 and 2 have the same position; correct one of them"),
     "small": (
         "a.csv",
         b"y_mm,z_mm\n0,0\n1.2,0\n",
-        r"its microphones span 1\.2 mm, less than 2 mm; are the numbers in anot",
+        r"the microphones span 1\.2 mm, less than 2 mm; if the numbers have anot",
     ),
     "wide": (
         "a.csv",
         b"y_m,z_m\n0,0\n42,0\n",
-        r"its microphones span 42 m, more than 25 m; .*state the unit in a header",
+        r"the microphones span 42 m, more than 25 m; .*state the unit in a header",
     ),
     "wide toml": (
         "a.toml",
@@ -258,12 +258,12 @@ REFUSED = {
     "wide xml": (
         "a.xml",
         acoular([[0, 0, 0], [42, 0, 0]]).encode(),
-        r"span 42 m, .*correct its positions, which are in met",
+        r"span 42 m, .*convert the positions in the file to met",
     ),
     "metres": (
         "a.toml",
         b"positions_mm = [[0, 0], [1.2, 0]]",
-        r"span 1\.2 mm, .*rename its positions to positions and set",
+        r"span 1\.2 mm, .*rename the key of the positions to positions",
     ),
     "no unit": (
         "a.toml",
@@ -281,29 +281,29 @@ REFUSED = {
         b"positions_mm = [[0, 0]]\npositions = [[0, 0]]",
         r"both positions and positions_mm; remove one",
     ),
-    "neither": ("a.toml", b"word_bits = 8", r"`positions_mm` is missing; give it, or `positions` and `unit`"),
+    "neither": ("a.toml", b"word_bits = 8", r"`positions_mm` is missing; add it, or `positions` and `unit`"),
     "grid": (
         "a.xml",
         b'<Grid><pos Name="1" x="0" y="0" z="0"/></Grid>',
-        r"contains <Grid>; use a file of Acoular with <MicA",
+        r"contains <Grid> instead of <MicArray>; use a file of Acou",
     ),
     "calibration": (
         "a.xml",
         b'<MicArray><pos Name="1" factor="2"/></MicArray>',
         r"<pos> 1: x is ''; use a finite number",
     ),
-    "no pos": ("a.xml", b"<MicArray></MicArray>", r"no <pos>; use one <pos Name= x= y= z=> per channel"),
-    "no xml": ("a.xml", b"1,2,3\n", r"a\.xml: not XML \(.*\); use a <MicArray> of Acoular, or a \.csv file"),
-    "pickled": ("a.npy", b"nothing", r"a\.npy cannot be read as an array of NumPy; save its numbers by numpy\.save"),
+    "no pos": ("a.xml", b"<MicArray></MicArray>", r"contains no <pos>; add one <pos Name= x= y= z=> per channel"),
+    "no xml": ("a.xml", b"1,2,3\n", r"a\.xml: not XML \(.*\); use a file of Acoular with <MicArray>, or a \.csv file"),
+    "pickled": ("a.npy", b"nothing", r"a\.npy is no array of NumPy; save the positions with numpy\.save"),
     "matlab": (
         "a.mat",
         b"MATLAB 5.0",
-        r"files with the ending \.mat are not read; save the positions as \.csv with a header",
+        r"files that end in \.mat cannot be read; save the positions as \.csv with a header",
     ),
     "json": (
         "a.json",
         b"[[1, 2, 3]]",
-        r"ending \.json are not read; .*choose another of \.toml, \.csv, \.tsv, \.txt, \.npy, \.xml",
+        r"end in \.json cannot be read; .*in another format: \.toml, \.csv, \.tsv, \.txt, \.npy, \.xml",
     ),
 }
 
@@ -316,13 +316,16 @@ def test_unusable_position_files_are_refused(tmp_path, name):
 
 
 def test_numpy_arrays_of_another_shape_are_refused(tmp_path):
-    for numbers, message in ((PLACES.T, r"contains float64 of shape \(3, 4\); use"), (PLACES > 0, r"contains bool of")):
+    for numbers, message in (
+        (PLACES.T, r"contains float64 of shape \(3, 4\); save"),
+        (PLACES > 0, r"contains bool of"),
+    ):
         content = io.BytesIO()
         np.save(content, numbers)
         with pytest.raises(ArgumentError, match=message):
             loaded(tmp_path, content.getvalue(), name="a.npy")
     np.savez(tmp_path / "a.npz", PLACES)
-    with pytest.raises(ArgumentError, match=r"contains several arrays; use numbers of shape"):
+    with pytest.raises(ArgumentError, match=r"contains several arrays; save numbers of shape"):
         loaded(tmp_path, (tmp_path / "a.npz").read_bytes(), name="a.npy")
     content = io.BytesIO()
     np.save(content, np.where(PLACES == 1, np.nan, PLACES))
@@ -332,7 +335,7 @@ def test_numpy_arrays_of_another_shape_are_refused(tmp_path):
 
 def test_folder_in_place_of_a_layout_is_refused(tmp_path):
     (tmp_path / "a.csv").mkdir()
-    with pytest.raises(ArgumentError, match=r"a\.csv: Is a directory; give a readable file or one of"):
+    with pytest.raises(ArgumentError, match=r"a\.csv: Is a directory; choose a readable file or one of"):
         load_layout(tmp_path / "a.csv")
 
 
@@ -401,7 +404,7 @@ def test_commands_name_an_own_array_by_its_file(tmp_path, monkeypatch):
     (tmp_path / "mics.csv").write_text(lines("{x},{y},{z}", 42))
     noted = run("import a.wav --layout mics.csv --passive -o c.h5")
     assert noted.exit_code == 0
-    assert "note: layout mics.csv states no unit; its numbers are taken for millimetres" in noted.stderr
+    assert "note: layout mics.csv states no unit; millimetres are assumed" in noted.stderr
     assert not run("import a.wav --layout mics.csv --passive -o c.h5 --force --quiet").stderr
 
 

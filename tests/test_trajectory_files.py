@@ -147,23 +147,27 @@ def test_damaged_mcap_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.tum", "", "there are no poses; give at least one"),
-        ("a.tum", "1 2 3\n", "line 1 has 3 fields; give 8: timestamp tx ty tz qx qy qz qw"),
+        ("a.tum", "", "the file contains no poses; choose a file with at least one"),
+        ("a.tum", "1 2 3\n", "line 1 has 3 fields; write 8: timestamp tx ty tz qx qy qz qw"),
         ("a.tum", "# first\nx 0 0 0 0 0 0 1\n", "line 2: time 'x' is not a number"),
         ("a.tum", "nan 0 0 0 0 0 0 1\n", "line 1: time 'nan' is not a number"),
         ("a.tum", "1 0 0 z 0 0 0 1\n", "line 1: could not convert string to float: 'z'"),
         ("a.tum", "1 0 0 inf 0 0 0 1\n", "position_m"),
-        ("a.tum", "1e30 0 0 0 0 0 0 1\n", "times such as 1e+30 lie between 1973 and 2116 in no unit"),
+        ("a.tum", "1e30 0 0 0 0 0 0 1\n", "times such as 1e+30 are no dates from 1973 to 2116 in any unit"),
         ("a.tum", "1e999999 0 0 0 0 0 0 1\n", "line 1: time '1e999999' is not a number"),
-        ("a.tum", "1 1e300 0 0 0 0 0 1\n", "line 1 has position_m 1e+300 0 0; give metres within"),
-        ("a.csv", "time_s,x_m,x_m,y_m,yaw_deg\n1,2,2,3,4\n", "give each once, and one time"),
-        ("a.csv", "time_s,time_ns,x_m,y_m,yaw_deg\n1,1,2,3,4\n", "give each once, and one time"),
+        ("a.tum", "1 1e300 0 0 0 0 0 1\n", "line 1 has position_m 1e+300 0 0; positions must be in metres, within"),
+        ("a.csv", "time_s,x_m,x_m,y_m,yaw_deg\n1,2,2,3,4\n", "each column must occur once, and only one may be a time"),
+        (
+            "a.csv",
+            "time_s,time_ns,x_m,y_m,yaw_deg\n1,1,2,3,4\n",
+            "each column must occur once, and only one may be a time",
+        ),
         ("a.tum", "2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "time_ns does not increase"),
         ("a.tum", "1 0 0 0 0 0 0 2\n", "rotation_xyzw has length 2"),
-        ("a.csv", "", "the first line names the columns none; give time_ns or time_s"),
-        ("a.csv", "time_s,x_m,yaw_deg\n", "the first line names the columns time_s, x_m, yaw_deg; give"),
-        ("a.csv", "time_s,x_m,y_m,yaw_deg\n1,2,3\n", "line 2 has 3 fields; give 4 as in the first line"),
-        ("a.csv", "time_s,x_m,y_m,yaw_deg\n", "there are no poses"),
+        ("a.csv", "", "the file contains no line that names its columns; the columns must be time_ns or time_s"),
+        ("a.csv", "time_s,x_m,yaw_deg\n", "the first line names the columns time_s, x_m, yaw_deg; they must be"),
+        ("a.csv", "time_s,x_m,y_m,yaw_deg\n1,2,3\n", "line 2 has 3 fields; write 4, as in the first line"),
+        ("a.csv", "time_s,x_m,y_m,yaw_deg\n", "the file contains no poses"),
         ("a.mcap", "no file of this kind", "the file is damaged"),
         ("a.mcap", "short", "the file is damaged or cut short; record it again"),
     ],
@@ -188,5 +192,5 @@ def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(DataError, match="is not a text file"):
         read_trajectory(tmp_path / "b.tum")
     (tmp_path / "c.tum").write_text("1 0 0 0 0 0 0 1\n")
-    with pytest.raises(ArgumentError, match="topic is '/pose', but"):
+    with pytest.raises(ArgumentError, match=r"topic \(--topic\) is for .mcap files, but"):
         read_trajectory(tmp_path / "c.tum", topic="/pose")

@@ -18,7 +18,7 @@ _UPRIGHT: Final = float(np.cos(np.radians(30.0)))
 _AXIS: Final = 0.6  # Mean vertical share of an axis that points up or down.
 _STEEP: Final = float(np.tan(np.radians(30.0)))
 _SHORT_M: Final = 0.5  # Path whose slope says nothing.
-_HOW: Final = "(--pose-axes of 'ertis map' and 'ertis import-poses', Trajectory.converted in Python)"
+_USE: Final = "use --pose-axes {0} of 'ertis import-poses' or 'ertis map' (in Python, Trajectory.converted('{0}'))"
 
 
 def tilt_note(rotation_xyzw: Floats, position_m: Floats) -> str | None:
@@ -49,8 +49,8 @@ def tilt_note(rotation_xyzw: Floats, position_m: Floats) -> str | None:
     spread_m = np.ptp(position_m, axis=0)
     if spread_m[2] > _SHORT_M and spread_m[2] > _STEEP * np.hypot(*spread_m[:2]):
         return (
-            f"the path extends over {spread_m[2]:.3g} m in height and {np.hypot(*spread_m[:2]):.3g} m along the "
-            f"ground; if the z axis of the world is not up, as for a camera, choose the axes camera-world {_HOW}"
+            f"the path is {spread_m[2]:.3g} m high and {np.hypot(*spread_m[:2]):.3g} m long on the ground; if the z "
+            f"axis of the world does not point up, as with many cameras, {_USE.format('camera-world')}"
         )
     return None
 
@@ -87,16 +87,16 @@ def _axis_up(up: Floats, along_y: float) -> str:
     """Return which axis points up, and the remedy."""
     wanted = "poses of the platform have x forward, y left and z up"
     if along_y > _AXIS:
-        return f", and its y axis is that of the world, as for a camera that turns; choose the axes camera-world {_HOW}"
+        return f", as of a camera that turns about the y axis of the world; {_USE.format('camera-world')}"
     axis = int(np.argmax(np.abs(up)))
     if abs(up[axis]) < _AXIS:
-        return f", and no axis points up throughout; {wanted}; for those of a camera, choose the axes camera {_HOW}"
+        return f", and no axis always points up; {wanted}; for poses of a camera, {_USE.format('camera')}"
     found = f", and its {'−' if up[axis] < 0 else ''}{'xyz'[axis]} axis points up"
     if axis == 1 and up[axis] < 0:
-        return f"{found}, as that of a camera (z forward, y down); choose the axes camera {_HOW}"
+        return f"{found}, as that of a camera does (z forward, y down); {_USE.format('camera')}"
     turned = "" if axis == len(up) - 1 and up[axis] > 0 else found
     order = ", and quaternions the order x, y, z, w" if axis == len(up) - 1 and turned else ""
-    return f"{turned}; {wanted}{order}, so correct them, or ignore this if the platform really moves so"
+    return f"{turned}; {wanted}{order}; correct the poses, or ignore this note if the platform really moves so"
 
 
 def _product(one: Floats, other: Floats) -> Floats:

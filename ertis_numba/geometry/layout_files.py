@@ -99,7 +99,7 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
                 )
             return self.positions_mm, _DEFAULT_UNIT
         if self.positions is None:
-            raise ArgumentError(f"{source}: `positions_mm` is missing; give it, or `positions` and `unit`")
+            raise ArgumentError(f"{source}: `positions_mm` is missing; add it, or `positions` and `unit`")
         if self.unit is None:
             raise ArgumentError(
                 f'{source}: positions have no unit; are they millimetres or metres? Add unit = "mm", or another of '
@@ -157,8 +157,8 @@ def read_layout(path: str | Path, names: str) -> ReadLayout:
     if not found.unit and len(positions_m) > 1:
         span = " × ".join(f"{1e3 * extent_m:.4g}" for extent_m in np.ptp(positions_m, axis=0))
         notes.append(
-            f"{source} states no unit; its numbers are taken for millimetres, so the array spans {span} mm "
-            f"(x × y × z); if they are not, {_remedy(source)}"
+            f"{source} states no unit; millimetres are assumed, so the array spans {span} mm (x × y × z); if this is "
+            f"wrong, {_remedy(source)}"
         )
     return ReadLayout(array, tuple(notes), unit_is_stated=bool(found.unit))
 
@@ -177,7 +177,7 @@ def parse_layout(path: str, text: str) -> ReadLayout:
     key = "positions_mm" if file.positions is None else "positions"
     if not rows or any(len(row) != len(rows[0]) or len(row) not in {2, 3} for row in rows):
         raise ArgumentError(
-            f"{source}: {key} does not consist of rows of 2 or 3 numbers; give y, z or x, y, z of each channel"
+            f"{source}: {key} does not consist of rows of 2 or 3 numbers; write y, z or x, y, z for each channel"
         )
     positions_m = np.zeros((len(rows), len(AXES)))
     positions_m[:, len(AXES) - len(rows[0]) :] = LENGTH_UNITS_M[unit] * np.asarray(rows, dtype=np.float64)
@@ -212,9 +212,9 @@ def _checked(source: str, positions_m: NDArray[np.float64], enabled: NDArray[np.
 def _remedy(source: str) -> str:
     """Return the way to state the unit of a file."""
     if source.lower().endswith(".toml"):
-        return 'rename its positions to positions and set their unit, as in unit = "m"'
+        return 'rename the key of the positions to positions, and set their unit, as in unit = "m"'
     if source.lower().endswith(".xml"):
-        return "correct its positions, which are in metres"
+        return "convert the positions in the file to metres"
     of_text = "" if source.lower().endswith((".csv", ".tsv", ".txt")) else "save a .csv file and "
     return f"{of_text}state the unit in a header, such as {HEADER_EXAMPLES}"
 
@@ -225,8 +225,8 @@ def _lying(source: str, positions_m: NDArray[np.float64]) -> tuple[str, ...]:
     if extent_m[2] > FLAT * extent_m.max() or extent_m[:2].min() <= FLAT * extent_m.max():
         return ()
     note = (
-        f"{source}: its microphones lie in a horizontal plane, because x is forward, y left and z up; if they face z "
-        "instead, with x to the right and y up for an observer behind them, use x = -z, y = -x and z = y"
+        f"{source}: the microphones lie in a horizontal plane, because x is forward, y left and z up; if x is to the "
+        "right and y up in the file, seen from behind the array, convert the axes: x = -z, y = -x, z = y"
     )
     return (note,)
 
@@ -239,7 +239,7 @@ def _require_span(source: str, positions_m: NDArray[np.float64]) -> None:
     if 0 < span_m < MIN_SPAN_M or span_m > MAX_SPAN_M:
         limit = f"less than {1e3 * MIN_SPAN_M:g} mm" if span_m < MIN_SPAN_M else f"more than {MAX_SPAN_M:g} m"
         raise ArgumentError(
-            f"{source}: its microphones span {_length(span_m)}, {limit}; are the numbers in another unit? If so, "
+            f"{source}: the microphones span {_length(span_m)}, {limit}; if the numbers have another unit, "
             f"{_remedy(source)}"
         )
 
@@ -294,6 +294,6 @@ def _require_apart(source: str, positions_m: NDArray[np.float64], channels: NDAr
         place = tuple(positions_m[channel].tolist())
         if first.setdefault(place, channel) != channel:
             raise ArgumentError(
-                f"{source}: channels {first[place]} and {channel} have the same position; correct one, or list it "
-                "under 'disabled' in a .toml file"
+                f"{source}: channels {first[place]} and {channel} have the same position; correct one of them, or "
+                "disable one with the key 'disabled' of a .toml file"
             )

@@ -209,8 +209,8 @@ def load_layout(name: str | Path) -> Layout:
         return replace(microphones(file.array), notes=file.notes, unit_is_stated=file.unit_is_stated)
     if suffix and Path(name).exists():
         raise ArgumentError(
-            f"layout {name}: files with the ending {suffix} are not read; save the positions as .csv with a header, "
-            f"such as x_m,y_m,z_m, or choose another of {', '.join(LAYOUT_SUFFIXES)}"
+            f"layout {name}: files that end in {suffix} cannot be read; save the positions as .csv with a header, "
+            f"such as x_m,y_m,z_m, or in another format: {', '.join(LAYOUT_SUFFIXES)}"
         )
     return microphones(_shipped_array(str(name)))
 
@@ -337,8 +337,8 @@ def require_plausible_size(settings: Settings) -> None:
     if span_m > max(_MIN_LARGE_M, reach_m):
         raise ArgumentError(
             f"array {layout.name!r} spans {span_m:.3g} m, but sound travels only {reach_m:.3g} m in a record of "
-            f"{1e3 * recording.duration_s:.3g} ms; are its positions in millimetres? Correct their unit, or use longer "
-            "records"
+            f"{1e3 * recording.duration_s:.3g} ms; if the positions are in millimetres, correct their unit, otherwise "
+            "use longer records"
         )
 
 

@@ -89,7 +89,7 @@ def observable_angles(array: Array, grid: Grid | None = None) -> ObservableAngle
     beside_m = positions_m - positions_m.mean(axis=0)  # An array may have lost microphones.
     _, sizes, axes = np.linalg.svd(np.concatenate([beside_m, np.zeros((3, 3))]), full_matrices=False)
     if sizes[0] < _POINT_M:
-        which = "one microphone" if count == 1 else f"{count} microphones in one place"
+        which = "one microphone" if count == 1 else f"{count} microphones at the same position"
         return ObservableAngles(
             azimuth=False, elevation=False, note=f"has {which}; its images show ranges but no directions"
         )
@@ -101,7 +101,7 @@ def observable_angles(array: Array, grid: Grid | None = None) -> ObservableAngle
             return ObservableAngles(
                 azimuth=True,
                 elevation=True,
-                note="has its microphones in a plane; directions on both sides of this plane sound alike",
+                note="has its microphones in a plane, so it cannot distinguish the two sides of this plane",
             )
     return ObservableAngles(azimuth=True, elevation=True)
 
@@ -109,8 +109,8 @@ def observable_angles(array: Array, grid: Grid | None = None) -> ObservableAngle
 def _of_line(axis: NDArray[np.float64]) -> ObservableAngles:
     """Return the angles that microphones along an axis observe."""
     if abs(axis[2]) < _UPRIGHT:
-        text = "the elevation is unknown, and the azimuth is that of echoes at elevation 0"
-        text += "; left and right sound alike" if abs(axis[1]) < _UPRIGHT else ""
+        text = "the elevation is unknown, and the azimuth is right for elevation 0 only"
+        text += "; left and right cannot be distinguished" if abs(axis[1]) < _UPRIGHT else ""
         return ObservableAngles(
             azimuth=True, elevation=False, note=f"has its microphones on a horizontal line; {text}", line=axis
         )

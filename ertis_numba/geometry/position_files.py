@@ -18,8 +18,8 @@ SENSOR_FRAME: Final = "x forward, y left, z up"
 """Value of the attribute ``axes`` of an XML file in the sensor frame, which is not turned."""
 _MAX_BYTES: Final = 4_000_000  # 1024 microphones with long names need 100,000 bytes.
 _TURNED: Final = (
-    "a file of Acoular, whose arrays face -z with x to the right and y up, seen from behind; here, they face x with "
-    "y to the left and z up"
+    "the array was turned from the axes of Acoular (seen from behind: x right, y up, facing -z) into the sensor frame "
+    "(x forward, y left, z up)"
 )
 FLAT: Final = 1e-3
 """Extent of an axis, relative to the largest, below which an array counts as flat."""
@@ -33,7 +33,7 @@ def layout_bytes(path: str | Path, names: str) -> bytes:
     ArgumentError
         The file cannot be read, is empty, or is too large for a layout.
     """
-    remedy = f"give a readable file or one of {names}"
+    remedy = f"choose a readable file or one of {names}"
     try:
         with Path(path).open("rb") as file:
             content = file.read(_MAX_BYTES + 1)
@@ -61,9 +61,9 @@ def layout_file_text(path: str | Path, content: bytes, names: str) -> str:
         text = content.decode("cp1252", "replace")
         if not any(character.isdigit() for character in text):
             reason = checks.reason_unreadable(error)
-            raise ArgumentError(f"layout {path}: {reason}; give a readable file or one of {names}") from error
+            raise ArgumentError(f"layout {path}: {reason}; choose a readable file or one of {names}") from error
     if "\0" in text or "\N{REPLACEMENT CHARACTER}" in text:
-        raise ArgumentError(f"layout {path}: the file is binary, not text; give a readable file or one of {names}")
+        raise ArgumentError(f"layout {path}: the file is binary, not text; choose a text file or one of {names}")
     return text
 
 
@@ -96,10 +96,10 @@ def _of_numpy(source: str, content: bytes) -> PositionTable:
     try:
         numbers = np.load(io.BytesIO(content), allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise ArgumentError(f"{source} cannot be read as an array of NumPy; save its numbers by numpy.save") from error
+        raise ArgumentError(f"{source} is no array of NumPy; save the positions with numpy.save") from error
     if getattr(numbers, "ndim", 0) != 2 or numbers.shape[1] not in {2, 3} or numbers.dtype.kind not in "iuf":
         found = f"{numbers.dtype} of shape {numbers.shape}" if isinstance(numbers, np.ndarray) else "several arrays"
-        raise ArgumentError(f"{source} contains {found}; use numbers of shape (channels, 2) or (channels, 3)")
+        raise ArgumentError(f"{source} contains {found}; save numbers of shape (channels, 2) or (channels, 3)")
     checks.finite_array(source, numbers.astype(np.float64))
     positions = np.zeros((len(numbers), len(AXES)))
     positions[:, len(AXES) - numbers.shape[1] :] = numbers
@@ -115,19 +115,22 @@ def _of_acoular(source: str, content: bytes) -> PositionTable:
     try:
         root = ET.fromstring(content)  # noqa: S314  Expat limits the expansion of entities.
     except ET.ParseError as error:
-        raise ArgumentError(f"{source}: not XML ({error}); use a <MicArray> of Acoular, or a .csv file") from error
+        raise ArgumentError(
+            f"{source}: not XML ({error}); use a file of Acoular with <MicArray>, or a .csv file"
+        ) from error
     if root.tag != "MicArray":
-        raise ArgumentError(f"{source} contains <{root.tag}>; use a file of Acoular with <MicArray>")
+        raise ArgumentError(f"{source} contains <{root.tag}> instead of <MicArray>; use a file of Acoular")
     rows = list(root.iter("pos"))
     if not rows:
-        raise ArgumentError(f"{source}: no <pos>; use one <pos Name= x= y= z=> per channel")
+        raise ArgumentError(f"{source} contains no <pos>; add one <pos Name= x= y= z=> per channel")
     positions = np.array([[_coordinate(source, row, place, axis) for axis in AXES] for place, row in enumerate(rows)])
     if root.get("axes") == SENSOR_FRAME:
         return PositionTable(positions, "m")
     extent = np.ptp(positions, axis=0)
     is_flat = extent < FLAT * extent.max()
     if is_flat[0] and not is_flat[2]:
-        return PositionTable(positions, "m", (f"a file of Acoular; its array lies in y and z, so it faces {AXES[0]}",))
+        note = f"the array of Acoular lies in y and z, so it faces {AXES[0]}, and was not turned"
+        return PositionTable(positions, "m", (note,))
     turned = np.column_stack([-positions[:, 2], -positions[:, 0], positions[:, 1]])
     return PositionTable(turned, "m", (_TURNED,))
 

@@ -72,7 +72,7 @@ def read_position_table(source: str, text: str) -> PositionTable:
             header = [f"{name} {unit}" for name, unit in zip(header, rows[0][1], strict=True)]
             rows = rows[1:]
     if not rows:
-        raise ArgumentError(f"{source}: no positions; use one row per channel, y, z or x, y, z")
+        raise ArgumentError(f"{source}: no positions; write one row per channel, y, z or x, y, z")
     _require_widths(source, rows)
     headings = _headings(source, header, comments, rows)
     places = _places(source, headings)
@@ -88,7 +88,7 @@ def read_position_table(source: str, text: str) -> PositionTable:
             elif not column.is_label:
                 unread.append(column.text)
     unit = next((headings[place].unit for place in places.values() if headings[place].unit), "")
-    notes = (f"columns that are not read: {', '.join(unread)}",) if unread else ()
+    notes = (f"these columns were ignored: {', '.join(unread)}",) if unread else ()
     return PositionTable(positions, unit or unit_in_comment("\n".join(comments)), notes)
 
 
@@ -170,8 +170,8 @@ def _require_widths(source: str, rows: _Rows) -> None:
     for line, cells in rows:
         if len(cells) != width:
             raise ArgumentError(
-                f"{source}, line {line}: number of cells {len(cells)}, but line {first} has {width}; use y, z or "
-                "x, y, z in every row"
+                f"{source}, line {line} has {len(cells)} cells, but line {first} has {width}; write the same cells in "
+                "every row"
             )
 
 
@@ -185,15 +185,15 @@ def _headings(source: str, header: list[str] | None, comments: Sequence[str], ro
     headings = [heading(name) for name in header]
     if not any(each.axis for each in headings):
         raise ArgumentError(
-            f"{source}: no column of its header ({', '.join(header):.60}) is named x, y or z; name them, as in "
+            f"{source}: the header ({', '.join(header):.60}) names no column x, y or z; name the columns, as in "
             f"{HEADER_EXAMPLES}"
         )
     if len(header) > width and not any(each.axis for each in headings[width:]):
         return headings[:width]
     if len(header) != width:
         raise ArgumentError(
-            f"{source}, line {rows[0][0]}: number of cells {width}, but the header has {len(header)}; use one cell for "
-            "each column"
+            f"{source}, line {rows[0][0]} has {width} cells, but the header has {len(header)}; write one cell for each "
+            "column"
         )
     return headings
 
@@ -215,20 +215,20 @@ def _usual(source: str, rows: _Rows, *, has_index: bool) -> list[ColumnHeading]:
     counts = first in (_counted(len(rows)), _counted(len(rows), 1))
     if width == len(AXES) and counts and len(rows) >= _MIN_COUNTED and not has_index:
         raise ArgumentError(
-            f"{source}: its first column counts the rows; does it contain numbers of channels, or positions along x? "
-            "Add a header: channel,y_mm,z_mm or x_mm,y_mm,z_mm"
+            f"{source}: the first column may be channel numbers or positions along x; add the header "
+            "channel,y_mm,z_mm or x_mm,y_mm,z_mm"
         )
     has_labels = has_index or not any(map(_is_number, first)) or (width == len(AXES) + 1 and counts)
     n_axes = width - has_labels
     if n_axes not in {2, 3}:
         raise ArgumentError(
-            f"{source}, line {rows[0][0]}: number of cells {width}; use rows of y, z or x, y, z, or add a header, such "
-            f"as {HEADER_EXAMPLES}"
+            f"{source}, line {rows[0][0]} has {width} cells; write rows of y, z or x, y, z, or add a header, such as "
+            f"{HEADER_EXAMPLES}"
         )
     if rows[0][1] == _counted(width) and all("." in cell for _, cells in rows[1:] for cell in cells) and rows[1:]:
         raise ArgumentError(
-            f"{source}, line {rows[0][0]}: {', '.join(rows[0][1])}; are these numbers of columns, or a position? "
-            f"Replace the line by a header, such as {HEADER_EXAMPLES}, or write decimal points"
+            f"{source}, line {rows[0][0]}: {', '.join(rows[0][1])} may be column numbers or a position; replace the "
+            f"line by a header, such as {HEADER_EXAMPLES}, or write the position with decimal points"
         )
     return [ColumnHeading()] * has_labels + [ColumnHeading(axis, axis) for axis in AXES[-n_axes:]]
 
@@ -238,19 +238,19 @@ def _places(source: str, headings: Sequence[ColumnHeading]) -> dict[str, int]:
     places: dict[str, int] = {}
     for place, column in enumerate(headings):
         if column.axis and places.setdefault(column.axis, place) != place:
-            raise ArgumentError(f"{source}: two columns are named {column.axis}; rename or remove one")
+            raise ArgumentError(f"{source}: two columns are named {column.axis}; rename or remove one of them")
         if column.unit and column.unit not in LENGTH_UNITS_M:
             raise ArgumentError(
                 f"{source}: column {column.text!r} has the unit {column.unit}; use {', '.join(LENGTH_UNITS_M)}"
             )
     if {*places} not in ({"y", "z"}, {"x", "y", "z"}):
         raise ArgumentError(
-            f"{source}: its header names only {' and '.join(sorted(places))}, but x is forward, y left and z up; "
-            "which way do the microphones face? Name the columns of a flat array y and z, or add the missing column"
+            f"{source}: the header names only {' and '.join(sorted(places))}, but x is forward, y left and z up; name "
+            "the columns of a flat array y and z, or add the missing column"
         )
     units = {headings[place].unit for place in places.values()} - {""}
     if len(units) > 1:
-        raise ArgumentError(f"{source}: its columns have the units {', '.join(sorted(units))}; use one unit")
+        raise ArgumentError(f"{source}: the columns have the units {', '.join(sorted(units))}; use only one unit")
     return places
 
 
@@ -259,8 +259,8 @@ def _require_order(source: str, column: ColumnHeading, labels: Sequence[tuple[in
     for (_, before), (line, number) in itertools.pairwise(labels):
         if number <= before or (column.numbers_channels and number != before + 1):
             raise ArgumentError(
-                f"{source}, line {line}: {column.text or 'row'} {number:g} follows {before:g}, but the rows must be "
-                "the channels in ascending order; sort them, and add missing ones"
+                f"{source}, line {line}: {column.text or 'row'} {number:g} follows {before:g}; sort the rows by "
+                "channel, and add missing channels"
             )
 
 

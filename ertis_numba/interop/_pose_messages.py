@@ -70,7 +70,9 @@ def _kinds(summary: Any) -> dict[str, str]:
     schemas = {number: schema.name for number, schema in summary.schemas.items()}
     found = {channel.topic: schemas.get(channel.schema_id, "") for channel in summary.channels.values()}
     if any(channel.message_encoding == "ros1" for channel in summary.channels.values()):
-        raise DataError("the messages are of ROS 1; convert the file with 'rosbags-convert' of the package rosbags")
+        raise DataError(
+            "the messages are those of ROS 1; convert the file with 'pip install rosbags' and 'rosbags-convert'"
+        )
     return {topic: kind for topic, kind in found.items() if kind in {*_POSES, _PATH, _TRANSFORMS}}
 
 
@@ -92,11 +94,15 @@ def _topic(kinds: dict[str, str], wanted: str | None, edge: str, edges: Callable
             )
         raise ArgumentError(f"topics with poses: {listed}; record a topic of type {', '.join(_POSES)}")
     if wanted not in kinds:
-        raise ArgumentError(f"topic {wanted!r} does not exist or has no poses; topics with poses: {listed}")
+        raise ArgumentError(
+            f"topic {wanted!r} does not exist or contains no poses; choose a topic with poses: {listed}"
+        )
     if edge and wanted in poses:
-        raise ArgumentError(f"topic {wanted!r} has poses and no transforms; leave out ':{edge}'")
+        raise ArgumentError(f"topic {wanted!r} contains poses instead of transforms; remove ':{edge}'")
     if edge and edge not in edges(wanted):
-        raise ArgumentError(f"topic {wanted!r} has no transform {edge!r}; choose one of {', '.join(edges(wanted))}")
+        raise ArgumentError(
+            f"topic {wanted!r} contains no transform {edge!r}; choose one of {', '.join(edges(wanted))}"
+        )
     return wanted
 
 
@@ -143,18 +149,20 @@ def _pose(log_ns: int, message: Any) -> _StampedPose:
 
 def _rows(poses: list[_StampedPose]) -> PoseRows:
     if not poses:
-        raise DataError("there are no poses; give at least one")
+        raise DataError("the topic contains no poses; choose another topic (topic, --topic)")
     frames = sorted({(pose.header.frame_id, pose.child) for pose in poses})
     if len(frames) > 1:
         named = ", ".join(f"{child or 'a platform'} in {frame!r}" for frame, child in frames)
         raise DataError(f"poses are in several frames ({named}); record poses in one frame")
     notes = []
     if frames[0][1] not in _PLATFORM_FRAMES:
-        notes.append(f"poses are those of the frame {frames[0][1]!r}; mountings of sensors must be relative to it")
+        notes.append(
+            f"poses are those of the frame {frames[0][1]!r}; the mountings of sensors must be relative to this frame"
+        )
     stamps_ns = np.array([pose.header.stamp.sec * _NS + pose.header.stamp.nanosec for pose in poses], np.int64)
     if not stamps_ns.any() and len({pose.log_ns for pose in poses}) == len(poses):
         stamps_ns = np.array([pose.log_ns for pose in poses], np.int64)
-        notes.append("messages state no time (0); the times at which they were recorded are used")
+        notes.append("the messages contain no times (0), so the times at which they were recorded are used")
     covariances = [pose.covariance for pose in poses if pose.covariance is not None]
     turns = [pose.rotation for pose in poses]
     return PoseRows(

@@ -91,7 +91,7 @@ def trajectory_of(rows: PoseRows, pose_axes: PoseAxes = "platform") -> Trajector
     """
     rows = _complete(rows)
     if not len(rows):
-        raise DataError("; ".join(("there are no poses", *rows.notes, "give at least one")))
+        raise DataError("; ".join(("the file contains no complete pose", *rows.notes, "choose a file with poses")))
     _require_places(rows)
     rows = _normalised(rows)
     rows = _one_per_time(rows)
@@ -114,8 +114,8 @@ def _gap_note(rows: PoseRows) -> str | None:
         return None
     worst = gaps[np.argmax(steps_s[gaps])]
     return (
-        f"{len(gaps)} interval{'s' * (len(gaps) != 1)} between poses longer than {_LONG_S:g} s, in which poses are "
-        f"interpolated; the longest is {steps_s[worst]:.3g} s after {rows.name(worst)}"
+        f"{len(gaps)} gap{'s' * (len(gaps) != 1)} of more than {_LONG_S:g} s between poses, bridged by interpolation; "
+        f"the longest lasts {steps_s[worst]:.3g} s after {rows.name(worst)}"
     )
 
 
@@ -127,7 +127,7 @@ def _complete(rows: PoseRows) -> PoseRows:
     first = rows.name(np.argmax(is_unknown))
     n_unknown = int(is_unknown.sum())
     return rows.kept(
-        ~is_unknown, f"{rows.count(n_unknown)} of {len(rows)} without numbers (NaN) left out, the first is {first}"
+        ~is_unknown, f"{n_unknown} of {rows.count(len(rows))} left out because numbers are missing, first {first}"
     )
 
 
@@ -136,8 +136,8 @@ def _require_places(rows: PoseRows) -> None:
     if beyond.size:
         place = " ".join(f"{each:g}" for each in rows.position_m[beyond[0]])
         raise DataError(
-            f"{rows.name(beyond[0])} has position_m {place}; give metres within ±{_MAX_POSITION_M:g} m of the "
-            "world's origin"
+            f"{rows.name(beyond[0])} has position_m {place}; positions must be in metres, within "
+            f"±{_MAX_POSITION_M:g} m of the world's origin"
         )
 
 
@@ -150,16 +150,16 @@ def _normalised(rows: PoseRows) -> PoseRows:
     if wrong.size:
         numbers = " ".join(f"{each:g}" for each in rows.rotation_xyzw[wrong[0]])
         raise DataError(
-            f"{rows.name(wrong[0])}: rotation_xyzw has length {lengths[wrong[0]]:g} ({numbers}); give unit quaternions "
-            f"x, y, z, w, or remove the {rows.count(len(wrong))} without one"
+            f"{rows.name(wrong[0])}: rotation_xyzw has length {lengths[wrong[0]]:g} ({numbers}), but must be a unit "
+            f"quaternion x, y, z, w; correct or remove {rows.count(len(wrong))}"
         )
     if errors.max() <= _ROUNDING:
         return rows
     count = int(np.count_nonzero(errors > _ROUNDING))
     worst = np.argmax(errors)
     note = (
-        f"quaternions of {rows.count(count)} scaled to length 1; the largest error is {100 * errors[worst]:.1f} % in "
-        f"{rows.name(worst)}"
+        f"quaternions of {rows.count(count)} were scaled to length 1; the largest deviation is "
+        f"{100 * errors[worst]:.1f} % in {rows.name(worst)}"
     )
     return replace(rows, rotation_xyzw=rows.rotation_xyzw / lengths[:, None], notes=(*rows.notes, note))
 
@@ -177,7 +177,7 @@ def _one_per_time(rows: PoseRows) -> PoseRows:
         late = int(np.argmax(steps_ns < 0)) + 1
         raise DataError(
             f"time_ns does not increase: {rows.name(late)} is {-steps_ns[late - 1] / 1e9:.9g} s before the "
-            f"{rows.kind} above it; sort the {rows.kind}s by time, or split a file of several runs"
+            f"{rows.kind} before; sort the {rows.kind}s by time, or split a file of several runs"
         )
     repeated = np.flatnonzero(steps_ns == 0) + 1
     if not repeated.size:
@@ -190,18 +190,18 @@ def _one_per_time(rows: PoseRows) -> PoseRows:
     between = f"{rows.name(kept[worst])} and {rows.name(repeated[worst])}"
     if away_m[worst] > _SAME_M or away_deg[worst] > _SAME_DEG:
         raise DataError(
-            f"{between} have the same time, but poses {away_m[worst]:.3g} m and {away_deg[worst]:.3g}° apart; give one "
-            "pose for each time, and times with all of their digits"
+            f"{between} have the same time, but poses {away_m[worst]:.3g} m and {away_deg[worst]:.3g}° apart; remove "
+            "one of them, or write the times with all digits"
         )
     if 2 * np.count_nonzero(away_m > 0) > len(rows):
         raise DataError(
-            f"{rows.count(len(repeated))} of {len(rows)} have the time of an earlier one, but other poses; give times "
-            "with all of their digits"
+            f"{len(repeated)} of {rows.count(len(rows))} repeat the time of an earlier {rows.kind} with another pose; "
+            "write the times with all digits"
         )
     differences = "the same pose"
     if away_m.any() or away_deg.any():
         differences = f"poses up to {away_m.max():.2g} m and {away_deg.max():.2g}° apart ({between})"
-    note = f"{rows.count(len(repeated))} left out, because an earlier one has the same time and {differences}"
+    note = f"{rows.count(len(repeated))} left out because an earlier {rows.kind} has the same time and {differences}"
     return rows.kept(is_first, note)
 
 

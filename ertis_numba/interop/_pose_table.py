@@ -72,23 +72,29 @@ def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: s
     """
     columns, rows = _header(text, needs_header=needs_header)
     if not rows:
-        raise DataError("there are no poses; give at least one")
+        raise DataError("the file contains no poses; choose a file with at least one")
     if columns is None and all(not cells[-1] for _, cells in rows):
         rows = [(number, cells[:-1]) for number, cells in rows]  # Each line ends with a separator.
     n_fields = len(rows[0][1])
     if columns is None and n_fields == _N_KITTI and not needs_header:
         return _kitti(rows, time_unit, times)
     if times is not None:
-        raise DataError(f"a file of times is for poses of KITTI, but the rows have {n_fields} fields; leave it out")
+        raise DataError(
+            f"times (--times) is for poses of KITTI, with {_N_KITTI} fields in a row, but the rows have {n_fields}; "
+            "remove the option"
+        )
     if columns is None:
         columns = _without_header(rows[0], text, needs_header=needs_header)
     for number, row in rows:
         if len(row) != columns.n_fields:
             is_tum = columns is _ORDER_OF_TUM
-            wanted = f"{len(TUM)}: {' '.join(TUM)}" if is_tum else f"{columns.n_fields} as in the first line"
-            raise DataError(f"line {number} has {len(row)} fields; give {wanted}")
+            wanted = f"{len(TUM)}: {' '.join(TUM)}" if is_tum else f"{columns.n_fields}, as in the first line"
+            raise DataError(f"line {number} has {len(row)} fields; write {wanted}")
     if time_unit is not None and columns.unit is not None and time_unit != columns.unit:
-        raise DataError(f"the file states times in {columns.unit}, but time_unit is {time_unit}; leave it out")
+        raise DataError(
+            f"the file states that its times are in {columns.unit}, but time_unit is {time_unit}; remove time_unit "
+            "(--time-unit)"
+        )
     time_ns, notes = times_of([(number, row[columns.time]) for number, row in rows], columns.unit or time_unit)
     position_m = np.zeros((len(rows), 3))
     for axis, place in columns.axes.items():
@@ -114,7 +120,7 @@ def _header(text: str, *, needs_header: bool) -> tuple[_Columns | None, list[Row
         if content and not content.startswith(("%", "//")):
             rows.append((number, _cells(content)))
     if needs_header and columns is None:
-        raise DataError(f"the first line names the columns none; give {_COLUMNS}")
+        raise DataError(f"the file contains no line that names its columns; the columns must be {_COLUMNS}")
     return columns, rows
 
 
@@ -150,7 +156,7 @@ def _columns(names: Sequence[str], *, is_stated: bool, in_metres: bool) -> _Colu
             if bracket != "m" and not in_metres and not _POSITION.fullmatch(name):
                 continue  # Its unit is unknown.
             if bracket not in {"", "m"}:
-                raise DataError(f"column {full!r} is not in metres; convert it, and name it {name[-1]}_m")
+                raise DataError(f"column {full!r} is not in metres; convert the column, and name it {name[-1]}_m")
             axis = next(filter(None, found.groups()))
             repeated += [full] * (axis in axes)
             axes[axis] = place
@@ -161,14 +167,17 @@ def _columns(names: Sequence[str], *, is_stated: bool, in_metres: bool) -> _Colu
             repeated += [full] * (yaw is not None)
             yaw = place
     if repeated and is_stated:
-        raise DataError(f"the first line names the columns {', '.join(names)}; give each once, and one time")
+        raise DataError(
+            f"the first line names {', '.join(names)}, but each column must occur once, and only one may be a time; "
+            "rename or remove columns"
+        )
     return _Columns(-1 if repeated else time, unit, axes, quaternion, yaw, len(names))
 
 
 def _checked(columns: _Columns, names: Sequence[str]) -> _Columns:
     """Refuse a header without poses."""
     if not columns.is_complete:
-        raise DataError(f"the first line names the columns {', '.join(names)}; give {_COLUMNS}")
+        raise DataError(f"the first line names the columns {', '.join(names)}; they must be {_COLUMNS}")
     return columns
 
 
@@ -176,8 +185,8 @@ def _require_rotations(number: int, columns: _Columns, names: Sequence[str]) -> 
     """Refuse a header with times and positions, but without rotations."""
     if columns.time >= 0 and {*"xy"} <= columns.axes.keys() and not columns.quaternion and columns.yaw_deg is None:
         raise DataError(
-            f"line {number} names the columns {', '.join(names)}, which include no rotation; give qx, qy, qz, qw or "
-            "yaw_deg as well"
+            f"line {number} names the columns {', '.join(names)}, but none contains a rotation; add qx, qy, qz, qw or "
+            "yaw_deg"
         )
 
 
@@ -187,8 +196,8 @@ def _require_no_sensor(names: Sequence[str]) -> None:
         sensor = _SENSORS.get(name.split("[")[0].strip().lower())
         if sensor is not None:
             raise DataError(
-                f"the file holds measurements of {sensor}, but no poses; give the poses of the same data set, such as "
-                "state_groundtruth_estimate0/data.csv of EuRoC"
+                f"the file contains measurements of {sensor} instead of poses; choose the poses of the data set, such "
+                "as state_groundtruth_estimate0/data.csv of EuRoC"
             )
 
 
@@ -202,16 +211,16 @@ def _without_header(first: Row, text: str, *, needs_header: bool) -> _Columns:
     """
     number, cells = first
     if needs_header:
-        raise DataError(f"the first line names the columns {', '.join(cells)}; give {_COLUMNS}")
+        raise DataError(f"the first line names the columns {', '.join(cells)}; they must be {_COLUMNS}")
     if len(cells) > len(TUM):
         raise DataError(
-            f"line {number} has {len(cells)} fields; give {len(TUM)}: {' '.join(TUM)}, or name all columns in a first "
-            "line, as in 'timestamp tx ty tz qx qy qz qw other'"
+            f"line {number} has {len(cells)} fields; write {len(TUM)}: {' '.join(TUM)}, or name all columns in the "
+            "first line, as in 'timestamp tx ty tz qx qy qz qw other'"
         )
     if "," in text.splitlines()[number - 1] and len(cells[0].split(".")[0]) > _DIGITS_OF_NS:
         raise DataError(
-            f"line {number} may have the order of TUM or that of EuRoC, w x y z; name the columns in a first line, as "
-            "in 'timestamp,tx,ty,tz,qx,qy,qz,qw'"
+            f"the order of the quaternion in line {number} is unclear: x y z w as in TUM, or w x y z as in EuRoC; name "
+            "the columns in the first line, as in 'timestamp,tx,ty,tz,qx,qy,qz,qw'"
         )
     return _ORDER_OF_TUM
 
@@ -222,22 +231,22 @@ def _kitti(rows: list[Row], time_unit: str | None, times: str | None) -> PoseRow
 
     if times is None:
         raise DataError(
-            "the rows have 12 fields, as poses of KITTI, and no times; give the file of their times, such as times.txt "
-            "(times, --times)"
+            "the rows have 12 fields, as poses of KITTI do, but no times; add the file of their times with --times "
+            "times.txt (times in Python)"
         )
     cells = [(number, cells[0]) for number, cells in _lines(times)]
     if len(cells) != len(rows):
-        raise DataError(f"there are {len(rows)} poses, but {len(cells)} times; give the times of the same drive")
+        raise DataError(f"there are {len(rows)} poses, but {len(cells)} times; choose the times of the same drive")
     time_ns, notes = times_of(cells, time_unit)
     for number, row in rows:
         if len(row) != _N_KITTI:
-            raise DataError(f"line {number} has {len(row)} fields; give {_N_KITTI} as in the first line")
+            raise DataError(f"line {number} has {len(row)} fields; write {_N_KITTI}, as in the first line")
     matrix = np.stack([_numbers(rows, place) for place in range(_N_KITTI)], axis=1).reshape(-1, 3, 4)
     turns = matrix[:, :, :3]
     wrong = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 0.05
     wrong |= np.linalg.det(turns) < 0
     if wrong.any():
-        raise DataError(f"line {rows[int(np.argmax(wrong))][0]}: the matrix of KITTI is no rotation; correct the pose")
+        raise DataError(f"line {rows[int(np.argmax(wrong))][0]}: the matrix is not a rotation; correct the pose")
     is_known = np.isfinite(turns).all(axis=(1, 2))
     rotation_xyzw = np.full((len(rows), 4), np.nan)
     rotation_xyzw[is_known] = Rotation.from_matrix(turns[is_known]).as_quat()
@@ -266,7 +275,7 @@ def _numbers(rows: list[Row], place: int) -> Floats:
         try:
             found.append(math.nan if cells[place].lower() in _UNKNOWN else float(cells[place]))
         except ValueError as error:
-            raise DataError(f"line {number}: {error}; give decimal numbers") from None
+            raise DataError(f"line {number}: {error}; use decimal numbers") from None
     return np.array(found, np.float64)
 
 

@@ -44,8 +44,8 @@ def times_of(cells: Sequence[tuple[int, str]], unit: str | None) -> tuple[NDArra
         time_ns = int((value * TIME_UNITS[unit]).to_integral_value()) if abs(value) < _MAX_NS else _MAX_NS + 1
         if abs(time_ns) > _MAX_NS:
             raise DataError(
-                f"line {line}: time {text} in {_NAMES[unit]} is beyond the year 2116; give seconds or nanoseconds "
-                "since 1970, or choose the unit (time_unit, --time-unit)"
+                f"line {line}: time {text} in {_NAMES[unit]} is beyond the year 2116; correct the time, or choose its "
+                "unit (time_unit, --time-unit)"
             )
         times_ns.append(time_ns)
     return np.array(times_ns, np.int64), notes
@@ -59,7 +59,7 @@ def _decimal(line: int, text: str) -> Decimal:
             return value
     except ArithmeticError:
         pass
-    raise DataError(f"line {line}: time {text!r} is not a number; give a decimal number, such as seconds since 1970")
+    raise DataError(f"line {line}: time {text!r} is not a number; use decimal numbers, such as seconds since 1970")
 
 
 def _unit_of(times: Sequence[Decimal]) -> tuple[str, tuple[str, ...]]:
@@ -73,10 +73,10 @@ def _unit_of(times: Sequence[Decimal]) -> tuple[str, tuple[str, ...]]:
             if unit == "s":
                 return unit, ()
             first = datetime.fromtimestamp(float(times[0] * ns_per_unit) / 1e9, UTC)
-            return unit, (f"times read as {_NAMES[unit]} since 1970; the first is {first:%Y-%m-%d %H:%M:%S} UTC",)
+            return unit, (f"times are read as {_NAMES[unit]} since 1970; the first is {first:%Y-%m-%d %H:%M:%S} UTC",)
     raise DataError(
-        f"times such as {usual:g} lie between 1973 and 2116 in no unit; correct them, or choose the unit (time_unit, "
-        f"--time-unit): {', '.join(TIME_UNITS)}"
+        f"times such as {usual:g} are no dates from 1973 to 2116 in any unit; correct them, or choose their unit "
+        f"(time_unit, --time-unit): {', '.join(TIME_UNITS)}"
     )
 
 
@@ -90,7 +90,7 @@ def _relative_notes(times: Sequence[Decimal]) -> tuple[str, ...]:
     if step_s <= _LONG_S and not (are_whole and step_s):
         return ()
     note = (
-        f"times from {times[0]:f} to {times[-1]:f} read as seconds, {step_s:f} s from row to row; if they have another "
-        "unit, choose it (time_unit, --time-unit)"
+        f"times from {times[0]:f} to {times[-1]:f} are read as seconds, {step_s:f} s from row to row; if this is "
+        "wrong, choose the unit (time_unit, --time-unit)"
     )
     return (note,)

@@ -19,14 +19,14 @@ __all__ = ["check_tum_target", "read_trajectory", "write_tum"]
 _OTHER_SUFFIXES: Final = (".csv", ".h5", ".mcap", ".mat", ".ply")
 _KINDS: Final = "a .tum, .txt, .csv or .mcap file"
 _CONVERT: Final = (
-    "convert it with 'pip install rosbags' and 'rosbags-convert --src {} --dst BAG --dst-storage mcap', and give the "
+    "convert it with 'pip install rosbags' and 'rosbags-convert --src {} --dst BAG --dst-storage mcap', and use the "
     ".mcap file in BAG"
 )
 _SIGNATURES: Final = {
     b"#ROSBAG": f"is a bag of ROS 1; {_CONVERT.format('{path}')}",
     b"SQLite format 3": f"is a bag of ROS 2 in SQLite; {_CONVERT.format('{path.parent}')}",
-    b"\x89HDF": "is HDF5; give it as a recording if it is one, or its poses as text (ertis export REC.h5 -o POSES.tum)",
-    b"PK\x03\x04": f"is an archive or a spreadsheet; unpack it, or save it as CSV, and give {_KINDS}",
+    b"\x89HDF": "is HDF5, not text; if it is a recording, write its poses with 'ertis export {path} -o POSES.tum'",
+    b"PK\x03\x04": f"is an archive or a spreadsheet; unpack it or save it as CSV, and use {_KINDS}",
 }
 """First bytes of files that are refused by name."""
 
@@ -88,10 +88,11 @@ def read_trajectory(
         checks.choice("time_unit", time_unit, TIME_UNITS)
     is_mcap = path.suffix.lower() == ".mcap"
     if topic is not None and not is_mcap:
-        raise ArgumentError(f"topic is {topic!r}, but {path} is not an .mcap file; leave out the topic")
+        raise ArgumentError(f"topic (--topic) is for .mcap files, but {path} is none; remove the topic")
     for name, value in (("time_unit", time_unit), ("times", times)):
         if value is not None and is_mcap:
-            raise ArgumentError(f"{name} is given, but messages in {path} have times; leave it out")
+            option = f"--{name.replace('_', '-')}"
+            raise ArgumentError(f"{name} ({option}) is for text, but messages in {path} contain times; remove {name}")
     _require_poses(path)
     stamps = None if times is None else _text(Path(times))
     try:
@@ -114,10 +115,10 @@ def _require_poses(path: Path) -> None:
         As described.
     """
     if path.is_dir() and (path / "metadata.yaml").is_file():
-        raise DataError(f"trajectory {path} is a folder of a bag of ROS 2; give the .mcap file in it")
+        raise DataError(f"trajectory {path} is the folder of a bag of ROS 2; use the .mcap file in this folder")
     if not path.is_file():
         fault = "is a folder" if path.is_dir() else "does not exist"
-        raise DataError(f"trajectory {path} {fault}; give {_KINDS}")
+        raise DataError(f"trajectory {path} {fault}; choose {_KINDS}")
     with path.open("rb") as file:
         start = file.read(16)
     for signature, fault in _SIGNATURES.items():
@@ -133,9 +134,9 @@ def _text(path: Path) -> str:
     except UnicodeDecodeError:
         text = "\0"
     except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error}); give an existing file") from error
+        raise DataError(f"{path} cannot be read ({error.strerror or error}); choose an existing file") from error
     if "\0" in text:
-        raise DataError(f"trajectory {path} is not a text file; give {_KINDS}")
+        raise DataError(f"trajectory {path} is not a text file; choose {_KINDS}")
     return text
 
 
