@@ -71,7 +71,13 @@ def _require_cache_folder() -> None:
         The temporary folder is not writable either.
     """
     numba = _imported()
-    if _is_cacheable(numba):
+    if numba.config.DISABLE_JIT:  # Nothing is stored.
+        return
+    wanted = numba.config.CACHE_DIR
+    folder = _cache_folder(numba)
+    if folder is not None:
+        if wanted and not Path(folder).is_relative_to(wanted):
+            _LOG.warning("NUMBA_CACHE_DIR, %s, is not writable; compiled kernels are stored in %s", wanted, folder)
         return
     try:
         folder = _private_folder()
@@ -82,13 +88,12 @@ def _require_cache_folder() -> None:
     _LOG.warning("compiled kernels are stored in %s, as no other folder is writable; to keep them, %s", folder, _REMEDY)
 
 
-def _is_cacheable(numba: Any) -> bool:
-    """Return True if Numba finds a folder for the kernels of this package."""
+def _cache_folder(numba: Any) -> str | None:
+    """Return the folder in which Numba stores the kernels of this package; None if no folder is writable."""
     try:
-        numba.njit(cache=True)(_private_folder)
+        return str(numba.njit(cache=True)(_private_folder).stats.cache_path)
     except RuntimeError:
-        return False
-    return True
+        return None
 
 
 def _private_folder() -> Path:

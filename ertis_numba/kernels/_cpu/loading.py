@@ -6,13 +6,16 @@ code needs neither, and every compilation prepares the compiler itself.
 """
 
 import functools
-from collections.abc import Iterable
-from typing import Any
+import logging
+from collections.abc import Callable, Iterable
+from typing import Any, Final
 
 from numba.core.caching import FunctionCache
 from numba.core.runtime import rtsys
 
 __all__ = ["load_without_compiler"]
+
+_LOG: Final = logging.getLogger("ertis_numba")
 
 
 def load_without_compiler(kernels: Iterable[Any]) -> None:
@@ -25,6 +28,26 @@ def load_without_compiler(kernels: Iterable[Any]) -> None:
         cache = getattr(kernel, "_cache", None)
         if isinstance(cache, FunctionCache) and hasattr(cache, "_load_overload"):
             cache.load_overload = functools.partial(_load, cache)
+            cache.save_overload = functools.partial(_save, cache.save_overload, cache)
+
+
+def _save(save: Callable[[Any, Any], None], cache: Any, signature: Any, compiled: Any) -> None:
+    """Store compiled code; if the disk is full, work without."""
+    try:
+        save(signature, compiled)
+    except OSError as error:
+        _warn_of_compilations(cache.cache_path, error.strerror)
+
+
+@functools.cache
+def _warn_of_compilations(folder: str, reason: str) -> None:
+    """Warn once for each folder."""
+    _LOG.warning(
+        "compiled kernels cannot be stored in %s (%s), so each process compiles them again; free space on that disk, "
+        "or set NUMBA_CACHE_DIR to a folder on another",
+        folder,
+        reason,
+    )
 
 
 def _load(cache: Any, signature: Any, context: Any) -> Any:
