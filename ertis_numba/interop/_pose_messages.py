@@ -1,5 +1,6 @@
 """Poses in messages of ROS 2 in MCAP."""
 
+import struct
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -20,6 +21,7 @@ _POSES: Final = (
 _PATH: Final = "nav_msgs/msg/Path"
 _TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 _NS: Final = 10**9
+_OF_DAMAGE: Final = (struct.error, EOFError, UnicodeDecodeError)
 _PLATFORM_FRAMES: Final = ("", "base_link", "base_footprint")
 
 
@@ -45,6 +47,7 @@ def read_messages(path: Path, topic: str | None) -> PoseRows:
         The file is damaged, or its poses are in several frames.
     """
     with extra("ros", "trajectories in .mcap files need mcap and mcap-ros2-support"):
+        from mcap.exceptions import DecoderNotFoundError, McapError, UnsupportedCompressionError  # noqa: PLC0415  an extra
         from mcap.reader import make_reader  # noqa: PLC0415  an extra
         from mcap_ros2.decoder import DecoderFactory  # noqa: PLC0415  an extra
     with path.open("rb") as file:
@@ -60,9 +63,18 @@ def read_messages(path: Path, topic: str | None) -> PoseRows:
         except (ErtisError, MemoryError, OSError):
             raise
         except Exception as error:  # The libraries raise errors of any type.
-            raise DataError(
-                "the file is damaged or cut short; record it again, or repair it with 'mcap recover'"
-            ) from error
+            is_foreign = isinstance(error, DecoderNotFoundError | UnsupportedCompressionError)
+            if (isinstance(error, (McapError, *_OF_DAMAGE)) and not is_foreign) or _is_of_compression(error):
+                fault = "the file is damaged or cut short; record it again, or repair it with 'mcap recover'"
+            else:
+                reason = " ".join(f"{type(error).__name__}: {error}".split())
+                fault = f"its messages cannot be read ({reason}); save the poses as .tum or .csv"
+            raise DataError(fault) from error
+
+
+def _is_of_compression(error: Exception) -> bool:
+    """Return True for an error of LZ4 or Zstandard, whose types depend on the package that is installed."""
+    return type(error) is RuntimeError or "zstd" in f"{type(error).__module__}.{type(error).__name__}".lower()
 
 
 def _kinds(summary: Any) -> dict[str, str]:

@@ -8,6 +8,7 @@ from typing import Final
 from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target
 from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.file_kinds import kind_of
 from ertis_numba.frames import PoseAxes, Trajectory
 from ertis_numba.interop._pose_messages import read_messages
 from ertis_numba.interop._pose_rows import trajectory_of
@@ -22,6 +23,7 @@ _CONVERT: Final = (
     "convert it with 'pip install rosbags' and 'rosbags-convert --src {} --dst BAG --dst-storage mcap', and use the "
     ".mcap file in BAG"
 )
+_MCAP = b"\x89MCAP0\r\n"
 _SIGNATURES: Final = {
     b"#ROSBAG": f"is a bag of ROS 1; {_CONVERT.format('{path}')}",
     b"SQLite format 3": f"is a bag of ROS 2 in SQLite; {_CONVERT.format('{path.parent}')}",
@@ -95,11 +97,12 @@ def read_trajectory(
             raise ArgumentError(f"{name} ({option}) is for text, but messages in {path} contain times; remove {name}")
     _require_poses(path)
     stamps = None if times is None else _text(Path(times))
+    text = "" if is_mcap else _text(path)
     try:
         rows = (
             read_messages(path, topic)
             if is_mcap
-            else read_table(_text(path), needs_header=path.suffix.lower() == ".csv", time_unit=time_unit, times=stamps)
+            else read_table(text, needs_header=path.suffix.lower() == ".csv", time_unit=time_unit, times=stamps)
         )
         return trajectory_of(rows, pose_axes)
     except (ArgumentError, DataError) as error:
@@ -124,6 +127,14 @@ def _require_poses(path: Path) -> None:
     for signature, fault in _SIGNATURES.items():
         if start.startswith(signature):
             raise DataError(f"trajectory {path} {fault.format(path=path)}")
+    kind, is_mcap = kind_of(path), path.suffix.lower() == ".mcap"
+    found = f"is {kind.name}" if kind else "has content of an unknown format" if start else "is empty"
+    if is_mcap and not start.startswith(_MCAP):
+        remedy = "rename it to end in .tum or .csv" if kind and kind.is_text else f"give {_KINDS}"
+        raise DataError(f"trajectory {path} {found}, not messages in MCAP; {remedy}")
+    if kind and not (is_mcap or kind.is_text):
+        remedy = "rename it to end in .mcap" if start.startswith(_MCAP) else f"give {_KINDS}"
+        raise DataError(f"trajectory {path} {found}; {remedy}")
 
 
 def _text(path: Path) -> str:
