@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import click
@@ -380,3 +381,35 @@ def test_commands_and_code_of_the_page_run(tmp_path):
     assert found[63] == pytest.approx(28, abs=0.5)  # the leak
     (code,) = python_in(text)
     assert run_code_here(tmp_path, code).count("\n") == len(sources)
+
+
+CALLS = {
+    "passive.h5": ("none (passive)", None),
+    "active.h5": (r"\d+\.\d, \d+\.\d kHz", [50.0, 25.0]),
+    "mixed.h5": (r"\d+\.\d, \d+\.\d kHz", [50.0, 25.0]),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_info_states_no_call_of_passive_measurements(name):
+    shown, khz = CALLS[name]
+    found = json.loads(run(f"info {name} --json").stdout)
+    lines = run(f"info {name}").stdout
+    assert re.search(rf"^call +{shown if khz else re.escape(shown)}$", lines, re.MULTILINE), lines
+    assert (found["call_khz"] is None) == (khz is None)
+    assert ("range_m" in found) == (khz is not None)
+
+
+def test_info_states_no_call_of_maps_of_passive_measurements():
+    run("process passive.h5 --device cpu -o maps.h5")
+    assert json.loads(run("info maps.h5 --json").stdout)["call_khz"] is None
+
+
+def test_images_of_measurements_without_a_call_are_warned_of(in_test_process):  # noqa: ARG001
+    done = run("process mixed.h5 -o images.h5 --mode active --device cpu")
+    assert "no call was emitted for 2 of 4 measurements, so their images show no echoes of one" in done.stderr
+    assert json.loads(run("info images.h5 --json").stdout)["call_khz"] is not None
+    picture = run("process passive.h5 -o silent_images.h5 --mode active --device cpu")
+    assert "no call was emitted for 3 of 3 measurements" in picture.stderr
+    assert json.loads(run("info silent_images.h5 --json").stdout)["call_khz"] is None
+    assert run("process active.h5 -o active_images.h5 --device cpu").stderr.count("no call") == 0

@@ -64,7 +64,8 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
             click.echo()
         for name, value in section.items():
             label, unit = _label(name)
-            click.echo(f"{label:{width}}  {_readable(value)}{unit}")
+            shown = "none (passive)" if name == "call_khz" and value is None else f"{_readable(value)}{unit}"
+            click.echo(f"{label:{width}}  {shown}")
 
 
 def _by_sensor(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -162,12 +163,24 @@ def _sensor(reader: "_Reader") -> dict[str, Any]:
         "layout": settings.array.layout,
         "microphones": int(microphones(settings.array).enabled.sum()),
         **({"disabled": list(settings.array.disabled)} if settings.array.disabled else {}),
-        "call_khz": [settings.call.start_frequency_hz / 1e3, settings.call.stop_frequency_hz / 1e3],
+        "call_khz": _call_khz(reader),
         "temperature_c": settings.air.temperature_c,
         "humidity_percent": settings.air.humidity_percent,
         "sound_speed_m_s": round(sound_speed_m_s(settings.air), 2),
         **({} if reader.attributes["ertis_format"] == "acoustic_map" else {"simulated": reader.truth is not None}),
     }
+
+
+def _call_khz(reader: "_Reader") -> list[float] | None:
+    """Return the frequencies of the emitted call; None if no measurement has one."""
+    call = reader.settings.call
+    return None if _is_passive(reader) else [call.start_frequency_hz / 1e3, call.stop_frequency_hz / 1e3]
+
+
+def _is_passive(reader: "_Reader") -> bool:
+    """Return True if no call was emitted for any measurement."""
+    stamps = reader.stamps()
+    return bool(stamps) and all(stamp.behaviour == "passive" for stamp in stamps)
 
 
 def _recording(reader: "RecordingReader") -> dict[str, Any]:
@@ -178,7 +191,7 @@ def _recording(reader: "RecordingReader") -> dict[str, Any]:
         "samples": recording.n_samples,
         "sample_rate_hz": recording.sample_rate_hz,
         "duration_ms": round(1000 * recording.duration_s, 3),
-        **({} if processing.mode == "passive" else {"range_m": list(processing.range_m)}),
+        **({} if processing.mode == "passive" or _is_passive(reader) else {"range_m": list(processing.range_m)}),
         "first": stamps[0].iso,
         "last": stamps[-1].iso,
         "behaviour": dict(Counter(stamp.behaviour for stamp in stamps)),

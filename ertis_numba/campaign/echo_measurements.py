@@ -36,7 +36,9 @@ class EchoMeasurements(Sequence[Measurement]):
         self.recording = recording
         self.path: Path = recording.path
         self.sensor, self.settings = recording.sensor, recording.settings
-        self._places = [place for place, stamp in enumerate(recording.stamps()) if not is_passive(settings, stamp)]
+        stamps = recording.stamps()
+        self._places = [place for place, stamp in enumerate(stamps) if not is_passive(settings, stamp)]
+        self._n_silent = sum(stamps[place].behaviour == "passive" for place in self._places)
 
     def __len__(self) -> int:
         return len(self._places)
@@ -64,6 +66,16 @@ class EchoMeasurements(Sequence[Measurement]):
         stamps = self.recording.stamps()
         _, rotation_xyzw = (mountings or {}).get(self.sensor, (None, None))
         return Attitudes(self.recording, [stamps[place] for place in self._places], rotation_xyzw)
+
+    @property
+    def warning(self) -> str:
+        """Warning of images of measurements without a call, which ``processing.mode`` requested; empty if none."""
+        if not self._n_silent:
+            return ""
+        return (
+            f"no call was emitted for {self._n_silent} of {len(self)} measurements, so their images show no echoes of "
+            "one; for maps of their sound, use --mode auto or passive (processing.mode)"
+        )
 
     @property
     def note(self) -> str:

@@ -247,6 +247,12 @@ def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
     return faults, "; ".join(shift or ()), first_call_match(heard)
 
 
+def _call_notes(run: SensorProcessing, recording: EchoMeasurements) -> Iterator[str]:
+    """Yield the ends of lines on another call than that of the settings, and on measurements without one."""
+    for text in filter(None, (run.call_warning, recording.warning)):
+        yield f": {text}"
+
+
 def _grid_notes(pipeline: Pipeline) -> Iterator[str]:
     """Yield the ends of lines on angles that the array does not observe, and on directions that are too far apart."""
     unknown = observable_angles(pipeline.settings.array, pipeline.grid).note
@@ -272,10 +278,9 @@ def _check_sensor(
         if options.strict:
             raise DataError(text)
         warn(text)
-    if match is not None and match.warning:
+    if match is not None:
         run.call_warning = match.warning
-        warn(f"{place}: {match.warning}")
-    for text in _grid_notes(run.pipeline):
+    for text in (*_call_notes(run, recording), *_grid_notes(run.pipeline)):
         warn(f"{place}{text}")
     heard = None
     if run.pipeline.settings.processing.method != "paper":

@@ -58,7 +58,7 @@ def of_image(image: Energyscape) -> Heading:
     return Heading(
         ("Energyscape", image.stamp.sensor, f"measurement {image.stamp.sequence}", *_if_faint(image.amplitude)),
         (
-            *_of_sensor(settings),
+            *_of_sensor(settings, image.stamp),
             directions,
             *((f"array {seen.note}",) if seen.note else ()),
             *level,
@@ -85,7 +85,7 @@ def of_measurement(title: str, settings: Settings, stamp: Stamp, *parts: str, va
     return Heading(
         (title, stamp.sensor, f"measurement {stamp.sequence}", *_if_faint(values)),
         (
-            *((settings.array.layout, "no call") if stamp.behaviour == "passive" else _of_sensor(settings)),
+            *_of_sensor(settings, stamp),
             *parts,
             f"{minus(f'{settings.air.temperature_c:g}')} °C",
             *filter(None, [stamp.utc]),
@@ -143,7 +143,9 @@ def _weights(settings: Settings) -> str:
     return given if isinstance(given, str) else "listed"
 
 
-def _of_sensor(settings: Settings) -> tuple[str, str]:
+def _of_sensor(settings: Settings, stamp: Stamp) -> tuple[str, str]:
+    if stamp.behaviour == "passive":
+        return settings.array.layout, "no call"
     call = settings.call
     return (
         settings.array.layout,
