@@ -2,6 +2,7 @@
 
 import codecs
 import encodings.aliases
+import errno
 import io
 import os
 import re
@@ -9,11 +10,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
+import numba
 import pytest
 from ertis_cli import _output
 
 from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import _numba_setup
+from ertis_numba.kernels._cpu import loading
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
 ENCODINGS = sorted(
@@ -154,7 +158,7 @@ def test_missing_library_of_a_threading_layer_is_named(monkeypatch):
 
 
 def test_kernels_are_cached_in_a_private_folder_without_a_writable_one(monkeypatch, tmp_path, caplog):
-    monkeypatch.setattr(_numba_setup, "_is_cacheable", lambda _: False)
+    monkeypatch.setattr(_numba_setup, "_cache_folder", lambda _: None)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
     monkeypatch.setattr("numba.config.reload_config", lambda: None)
@@ -167,8 +171,65 @@ def test_kernels_are_cached_in_a_private_folder_without_a_writable_one(monkeypat
     assert _numba_setup._private_folder() != folder  # noqa: SLF001
 
 
+def test_unwritable_cache_folder_of_the_user_is_named(monkeypatch, caplog, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "file" / "kernels"))
+    _numba_setup.prepare()
+    (logged,) = caplog.messages
+    assert re.search(
+        r"NUMBA_CACHE_DIR, .*file/kernels, is not writable; compiled kernels are stored in .*__pyc", logged
+    )
+
+
+def test_kernels_run_without_space_for_their_cache(monkeypatch, caplog):
+    def save(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    @numba.njit(cache=True)
+    def doubled(value):
+        return 2 * value
+
+    monkeypatch.setattr(doubled._cache, "_save_overload", save)  # noqa: SLF001
+    loading.load_without_compiler([doubled])
+    assert (doubled(2), doubled(2.5)) == (4, 5.0)
+    (logged,) = caplog.messages
+    assert re.search(r"cannot be stored in .* \(No space left on device\), .*set NUMBA_CACHE_DIR to a folder", logged)
+
+
+NAMES = {
+    "rec\n.h5": r"rec\n.h5: done rec\n.energy.h5",
+    "a\nb/rec.h5": r"a\nb/rec.h5: done rec.energy.h5",
+    "--output=a\x07\u2028b.h5": r"a\x07\u2028b.h5: done a\x07\u2028b.energy.h5",
+    "\n": "\n: done \n.energy.h5",
+}
+
+
+@pytest.mark.parametrize("argument", NAMES)
+def test_names_with_line_breaks_are_printed_in_one_line(argument, monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stdout", stream)
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    monkeypatch.setattr(_output, "_ESCAPED", {})
+    _output.escape_names(["process", argument, "--force"])
+    path = Path(argument.rpartition("=")[2])
+    click.echo(f"{path}: done {path.stem}.energy.h5\nnext")
+    assert stream.getvalue() == f"{NAMES[argument]}\nnext\n"
+
+
+def test_error_with_a_line_break_in_a_name_has_one_line(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "ertis_cli", "info", "a\n  b.h5"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith(r"ertis: error: a\n  b.h5: No such file")
+
+
 def test_missing_temporary_folder_is_refused(monkeypatch, tmp_path):
-    monkeypatch.setattr(_numba_setup, "_is_cacheable", lambda _: False)
+    monkeypatch.setattr(_numba_setup, "_cache_folder", lambda _: None)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
     with pytest.raises(DeviceError, match=r"no folder for compiled kernels is writable .*; set NUMBA_CACHE_DIR to a"):
         _numba_setup.prepare()

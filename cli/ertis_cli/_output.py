@@ -1,12 +1,22 @@
 """Output in any encoding, and figures without a window system."""
 
 import codecs
+import functools
 import os
 import sys
 import unicodedata
+from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Final
 
-__all__ = ["draw_without_display", "open_closed_streams", "replace_unencodable", "restore_display"]
+__all__ = [
+    "draw_without_display",
+    "escape_names",
+    "escaped",
+    "open_closed_streams",
+    "replace_unencodable",
+    "restore_display",
+]
 
 _BACKEND: Final = os.environ.get("MPLBACKEND")
 _REPLACEMENTS: Final = {
@@ -40,6 +50,8 @@ _REPLACEMENTS: Final = {
     "’": "'",
 }
 """Readable texts for characters that an encoding lacks."""
+_CONTROLS: Final = {"Cc", "Zl", "Zp"}  # Controls, and separators of lines and paragraphs.
+_ESCAPED: Final[dict[str, str]] = {}
 
 
 def open_closed_streams() -> None:
@@ -81,6 +93,35 @@ def _readable(char: str) -> str:
         return name.split()[-1].lower()
     parts = [part for part in unicodedata.normalize("NFKD", char) if not unicodedata.combining(part)]
     return "".join(part if part.isascii() else _REPLACEMENTS.get(part, "?") for part in parts)
+
+
+def escape_names(arguments: Iterable[str]) -> None:
+    """Let stdout and stderr print file names with control characters in one line, escaped as in Python.
+
+    Names come from the command line. Names of results contain the stem of a file, so stems are replaced.
+    """
+    parts = (part for argument in arguments for each in argument.split("=", 1) for part in Path(each).parts)
+    stems = {stem: _without_controls(stem) for stem in (Path(part).stem for part in parts) if stem.strip()}
+    _ESCAPED.update({stem: readable for stem, readable in stems.items() if stem != readable})
+    for stream in (sys.stdout, sys.stderr) if _ESCAPED else ():
+        stream.write = functools.partial(_write_escaped, stream.write)  # type: ignore[method-assign]
+
+
+def escaped(text: str) -> str:
+    """Return a text whose file names with control characters are escaped, see `escape_names`."""
+    for stem, readable in _ESCAPED.items():
+        text = text.replace(stem, readable)
+    return text
+
+
+def _write_escaped(write: Callable[[str], int], text: str) -> int:
+    return write(escaped(text))
+
+
+def _without_controls(text: str) -> str:
+    return "".join(
+        char.encode("unicode_escape").decode() if unicodedata.category(char) in _CONTROLS else char for char in text
+    )
 
 
 def draw_without_display() -> None:

@@ -11,7 +11,7 @@ from typing import Any, NoReturn, cast
 
 import click
 
-from ertis_cli import _config, _naming, _output, _supervisor
+from ertis_cli import _config, _naming, _output, _own_output, _supervisor
 from ertis_cli._stop_signals import interruption, obey_signals
 
 __all__ = ["COMMANDS", "cli", "main"]
@@ -79,6 +79,7 @@ class _Commands(click.Group):
         command: click.Command = getattr(importlib.import_module(module), attribute)
         _config.add_variables(command, (cmd_name,))
         _naming.name_options(command)
+        _own_output.protect_inputs(command)
         return command
 
     def resolve_command(
@@ -174,7 +175,8 @@ def _is_expected(error: Exception) -> bool:
 
 
 def _leave(code: int, message: str) -> NoReturn:
-    click.echo(f"ertis: error: {' '.join(message.split())}", err=True)
+    lines = filter(None, map(str.strip, _output.escaped(message).splitlines()))
+    click.echo(f"ertis: error: {' '.join(lines)}", err=True)
     sys.exit(code)
 
 
@@ -211,6 +213,7 @@ def main() -> None:
     """Run the command line."""
     _output.open_closed_streams()
     _output.replace_unencodable()
+    _output.escape_names(sys.argv[1:])
     _output.draw_without_display()
     obey_signals()
     _supervisor.allow()
