@@ -37,12 +37,15 @@ class FileKind:
         Instruction with ``{file}`` and ``{stem}``.
     is_wav, is_hdf5 : bool
         True for formats that `open_pcm` reads, if their content fits.
+    is_text : bool
+        True for lines of text.
     """
 
     name: str
     remedy: str
     is_wav: bool = False
     is_hdf5: bool = False
+    is_text: bool = False
 
     @property
     def is_sound(self) -> bool:
@@ -53,7 +56,7 @@ class FileKind:
 _WAV = FileKind("a WAV file", _IMPORT, is_wav=True)
 _MATLAB = FileKind("a MATLAB file", "save its signals with audiowrite('{stem}.wav', signals, rate_hz), and import that")
 _HDF5 = FileKind("an HDF5 file", _IMPORT, is_hdf5=True)
-_TEXT = FileKind("a text file", "choose a recording, or save the numbers as WAV (in Python: scipy.io.wavfile.write)")
+_TEXT = FileKind("a text file", f"choose a recording, or {_SAVE}", is_text=True)
 
 
 def _audio(name: str) -> FileKind:
@@ -176,11 +179,16 @@ def kind_of(path: str | Path) -> FileKind | None:
     return next((kind for fits, kind in checks if fits), None)
 
 
-def problem_of(path: str | Path) -> str:
-    """Return the format of a file and its remedy, as ``is a FLAC file; convert it with …``; empty if unknown."""
+def problem_of(path: str | Path, wanted: str = "a recording") -> str:
+    """Return the format of a file and its remedy, as ``is a FLAC file; convert it with …``; empty if unknown.
+
+    Signals can be converted into a recording. If no recording is wanted, the remedy names what is.
+    """
     kind, path = kind_of(path), Path(path)
     if kind is None:
         return ""
+    if "recording" not in wanted:
+        return f"is {kind.name}; give {wanted}"
     names = {
         "file": quoted(path),
         "path": str(path),

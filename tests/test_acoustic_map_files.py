@@ -246,9 +246,9 @@ def test_files_of_other_kinds_are_refused(path, tmp_path):
     ertis.write_recording(tmp_path / "rec.h5", noise(count=1))
     with pytest.raises(DataError, match=r"rec\.h5 is a recording, wanted a file of acoustic maps; process it first"):
         ertis.open_acoustic_maps(tmp_path / "rec.h5")
-    with pytest.raises(DataError, match=r"img\.h5 is an energyscape file, wanted a file of acoustic maps; give the"):
+    with pytest.raises(DataError, match=r"img\.h5 is an energyscape file, wanted a file of acoustic maps; proce"):
         ertis.open_acoustic_maps(tmp_path / "img.h5")
-    with pytest.raises(DataError, match=r"maps\.h5 is a file of acoustic maps, wanted an energyscape file; give the"):
+    with pytest.raises(DataError, match=r"maps\.h5 is a file of acoustic maps, wanted an energyscape file; proces"):
         ertis.open_energyscapes(path)
     with pytest.raises(DataError, match=r"maps\.h5 is a file of acoustic maps, wanted a recording; give the recording"):
         ertis.open_recording(path)

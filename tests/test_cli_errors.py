@@ -28,7 +28,7 @@ CASES = {
     "odd raw file": (RAW.format("odd.bin"), 1, "odd.bin has 262143 bytes, which is not a multiple of a word"),
     "truncated raw file": (RAW.format("cut.bin"), 1, "cut.bin has 262140 bytes, wanted a multiple of 262144"),
     "one good, one bad": (RAW.format("good.bin odd.bin"), 1, "odd.bin has 262143 bytes"),
-    "folder for raw file": (RAW.format("folder"), 1, "folder is a folder; give a file of raw words"),
+    "folder for raw file": (RAW.format("folder"), 2, "folder contains no files to import; choose a folder with .wav"),
     "unknown layout": (
         "import good.bin -o out.h5 --layout eRTIS_v3D --preset short_25_50",
         2,

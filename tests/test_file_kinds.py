@@ -6,10 +6,12 @@ import io
 import json
 import lzma
 import pickle
+import re
 import sqlite3
 import struct
 import tarfile
 import zipfile
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -23,6 +25,7 @@ import ertis_numba as ertis
 from ertis_numba.errors import DataError
 from ertis_numba.file_kinds import kind_of, problem_of
 
+RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
 N_WORDS = 65_536
 VALUES = np.random.default_rng(1).integers(-3_000, 3_000, (3_000, 2)).astype("<i2")
 SETTINGS = ertis.Settings().replace("recording.n_samples", N_WORDS)
@@ -230,10 +233,68 @@ def test_import_reads_raw_words_of_known_endings(tmp_path, raw_settings, name):
     assert f"--passive is for PCM (.wav, .h5), but {tmp_path / name} contains raw words; remove it" in passive.stderr
 
 
-@pytest.mark.parametrize("command", ["info", "process", "verify", "peaks", "check", "export"])
+@pytest.mark.parametrize("command", ["info", "process", "verify", "check", "export"])
 def test_commands_name_a_wav_file_and_its_import(tmp_path, command):
     wavfile.write(tmp_path / "take.wav", 96_000, VALUES)
     target = ["-o", tmp_path / "out.csv"] if command == "export" else []
     done = invoke(command, tmp_path / "take.wav", *target)
     assert done.exit_code == 1
     assert f"take.wav is a WAV file; import it with 'ertis import {tmp_path}/take.wav --settings FILE" in done.stderr
+
+
+IMAGES = "give an energyscape file"
+
+
+@pytest.mark.parametrize("ending", ["wav", "TOML", "tum", "npz"])
+def test_recordings_are_not_written_under_names_of_other_formats(tmp_path, ending):
+    measurement = ertis.Measurement(np.zeros(N_WORDS, np.uint32), SETTINGS, ertis.Stamp())
+    with pytest.raises(
+        ertis.ArgumentError, match=rf"take\.{ending} ends in \.{ending}, but the file is HDF5; give a n"
+    ):
+        ertis.write_recording(tmp_path / f"take.{ending}", [measurement])
+    assert not [*tmp_path.iterdir()]
+
+
+OVERWRITING = (
+    "import-poses rec.h5 poses.tum -o poses.tum",
+    "import-poses rec.h5 poses.tum --times times.txt -o times.txt",
+    "map rec.h5 --poses poses.tum -o poses.tum",
+    "odometry rec.h5 --mounting poses.tum -o poses.tum",
+    "calibrate rec.h5 --layout mine.toml -o mine.toml",
+    "process rec.h5 --settings mine.toml -o mine.toml",
+    "import times.txt --raw --settings mine.toml -o mine.toml",
+    "export rec.h5 --mounting mine.toml -o mine.toml",
+    "view rec.h5 --mounting mine.toml --save-html ./mine.toml",
+)
+
+
+@pytest.mark.parametrize("command", OVERWRITING)
+def test_no_command_overwrites_one_of_its_inputs(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    for name in ("rec.h5", "poses.tum", "times.txt", "mine.toml"):
+        (tmp_path / name).write_text("precious")
+    done = invoke(*command.split(), "--force")
+    assert done.exit_code == 1
+    assert re.search(r"^ertis: error: output \S+ is the input itself; give another name\n$", done.stderr)
+    assert all(path.read_text() == "precious" for path in tmp_path.iterdir())
+
+
+WANTED = {
+    "peaks": f"{IMAGES} or a file of acoustic maps ('ertis process' writes them)",
+    "compare": IMAGES,
+    "map -o map.h5": "choose a recording, or save its signals as WAV",
+    "odometry": "choose a recording, or save its signals as WAV",
+    "calibrate": "choose a recording, or save its signals as WAV",
+    "odometry REC --mounting": "give a scene or mounting file (.toml), or a file of ertis that contains mountings",
+    "map REC -o map.h5 --poses": "the first line names the columns some, words",
+}
+
+
+@pytest.mark.parametrize("command", WANTED)
+def test_remedy_for_a_text_file_is_what_the_command_takes(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notes.txt").write_text("some words\nand some more\n")
+    done = invoke(*command.replace("REC", str(RECORDING)).split(), "notes.txt")
+    assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith("ertis: error: notes.txt")
+    assert WANTED[command] in done.stderr

@@ -36,7 +36,7 @@ def path(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "No such file or directory; give a recording, an energyscape file or a file of acoustic maps"),
+        (None, "No such file or directory; give a recording$"),
         (b"", "is empty; give a recording"),
         (b"abc" * 1000, "is not an HDF5 file; give a recording"),
     ],

@@ -104,7 +104,7 @@ def _opened(
     from ertis_numba.errors import ArgumentError
     from ertis_numba.storage import open_recording, sensor_names
 
-    contained = [sensor_names(path) for path in paths]
+    contained = [sensor_names(path, "a recording") for path in paths]
     known = list(dict.fromkeys(name for names in contained for name in names))
     wanted = known if sensors is None else [*sensors]
     for name in wanted:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["Mounting", "mounting", "mountings", "note_unknown"]
 
 Mounting = tuple[Sequence[float], Sequence[float]]
+_WANTED: Final = "a scene or mounting file (.toml), or a file of ertis that contains mountings"
 
 mounting: "Decorator" = click.option(
     "--mounting",
@@ -67,7 +68,7 @@ def _of_scene(path: Path) -> dict[str, Mounting]:
 def _of_file(path: Path) -> dict[str, Mounting]:
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording, sensor_names
 
-    opened = open_energyscapes if file_kind(path) == "energyscape" else open_recording
+    opened = open_energyscapes if file_kind(path, _WANTED) == "energyscape" else open_recording
     found = {}
     for name in sensor_names(path):
         with opened(path, sensor=name) as reader:

@@ -58,9 +58,10 @@ def open_sensors(paths: "Sequence[Path]", stack: ExitStack, *, images: bool = Fa
 
     found: dict[str, Any] = {}
     for path in paths:
-        is_image = images and file_kind(path) == "energyscape"
+        wanted = "a recording or an energyscape file" if images else "a recording"
+        is_image = images and file_kind(path, wanted) == "energyscape"
         opened: Any = open_energyscapes if is_image else open_recording
-        for name in sensor_names(path):
+        for name in sensor_names(path, wanted):
             if is_image and name == PLATFORM:
                 raise click.UsageError(
                     f"{path} has fused images; give recordings, or images of each sensor", click.get_current_context()

@@ -69,7 +69,7 @@ def write_results(
     for name in _OF_IMAGES:
         if typed(name):
             raise click.UsageError(f"--{name} is for images; remove it with -o {target}", click.get_current_context())
-    names = options.sensors_of(path, sensor)
+    names = options.sensors_of(path, sensor, "a recording")
     if len(names) > 1:
         raise click.UsageError(
             f"{path} has sensors {', '.join(names)}, but an NPZ file holds one; choose one with --sensor",

@@ -211,7 +211,7 @@ def _opened(paths: tuple[Path, ...], sensor: str | None, stack: ExitStack) -> "t
 
     found = []
     for path in paths:
-        names = sensor_names(path)
+        names = sensor_names(path, "a recording")
         if sensor is None and len(names) > 1:
             raise ArgumentError(f"{path} contains sensors {', '.join(names)}; choose one with --sensor")
         found.append(stack.enter_context(closing(open_recording(path, sensor=sensor))))

@@ -287,11 +287,11 @@ def sensor(text: str) -> Decorator:
     return click.option("--sensor", metavar="NAME", help=text)
 
 
-def sensors_of(path: Path, sensor: str | None) -> tuple[str, ...]:
-    """Return the chosen sensor, or all sensors of a file."""
+def sensors_of(path: Path, sensor: str | None, wanted: str = "") -> tuple[str, ...]:
+    """Return the chosen sensor, or all sensors of a file; errors name the kinds of file that are wanted."""
     from ertis_numba.storage import sensor_names
 
-    return sensor_names(path) if sensor is None else (sensor,)
+    return (sensor_names(path, wanted) if wanted else sensor_names(path)) if sensor is None else (sensor,)
 
 
 def comparisons(

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["peaks"]
 
+_WANTED = "an energyscape file or a file of acoustic maps ('ertis process' writes them)"
 _TOP = 10
 _MIN_LEVEL_DB = -30.0
 _FALSE_ALARM = 1e-4  # per bin, with CFAR
@@ -133,8 +134,9 @@ def peaks(
         raise click.UsageError(
             "--false-alarm needs --detector cfar; add it, or remove --false-alarm", click.get_current_context()
         )
+    is_map = file_kind(path, _WANTED) == "acoustic_map"
     sensors = options.sensors_of(path, sensor)
-    if file_kind(path) == "acoustic_map":
+    if is_map:
         _list_sources(path, sensors, measurement, _TOP if top is None else top, min_level, as_json=as_json)
         return
     options.note_unlisted_directions(path, sensors)

@@ -267,7 +267,7 @@ def process(
             plan=plan,
         )
         return
-    sensors = options.sensors_of(path, sensor)
+    sensors = options.sensors_of(path, sensor, "a recording")
     if _acoustic_maps.are_wanted(path, sensors, changed):
         _acoustic_maps.write_maps(
             path,

@@ -183,6 +183,10 @@ def view(
 
         check_target(html, overwrite=force, sources=[] if live else [Path(location)])
         checks.choice("page format", html.suffix.lower(), _PAGES)
+    if not live:
+        from ertis_numba.storage import file_kind
+
+        file_kind(Path(location))  # The viewer loads kernels, so other files are refused before.
     from ertis_numba.viewer import Choices, Viewer
 
     choices = Choices(

@@ -33,19 +33,19 @@ _KIND_NAMES = {
 }
 
 
-def file_kind(path: str | Path) -> str:
-    """Return ``recording``, ``energyscape`` or ``acoustic_map``.
+def file_kind(path: str | Path, wanted: str = RESULT_OR_RECORDING) -> str:
+    """Return ``recording``, ``energyscape`` or ``acoustic_map``; errors name the kinds of file that are wanted.
 
     Raises
     ------
     DataError
         The file cannot be read, or is none of them.
     """
-    with open_file(Path(path)) as file:
-        return _kind(file, Path(path), RESULT_OR_RECORDING)
+    with open_file(Path(path), wanted) as file:
+        return _kind(file, Path(path), wanted)
 
 
-def sensor_names(path: str | Path) -> tuple[str, ...]:
+def sensor_names(path: str | Path, wanted: str = RESULT_OR_RECORDING) -> tuple[str, ...]:
     """Return the names of the sensors in a recording or a result of processing, in the order of the file.
 
     Raises
@@ -53,8 +53,8 @@ def sensor_names(path: str | Path) -> tuple[str, ...]:
     DataError
         The file cannot be read, or is of another kind.
     """
-    with open_file(Path(path)) as file, reading(file, Path(path)):
-        _kind(file, Path(path), RESULT_OR_RECORDING)
+    with open_file(Path(path), wanted) as file, reading(file, Path(path)):
+        _kind(file, Path(path), wanted)
         return sensors_of(file)
 
 
@@ -80,14 +80,13 @@ class FileReader(Sequence[Item]):
     """
 
     _kind: ClassVar[str]
-    _wanted: ClassVar[str] = RESULT_OR_RECORDING
     _row_name: ClassVar[str] = "measurement"
     _data: str
     _table: tuple[Variable, ...]
 
     def __init__(self, path: str | Path, *, sensor: str | None = None) -> None:
         self.path = Path(path)
-        self._file = open_file(self.path, self._wanted)
+        self._file = open_file(self.path, _KIND_NAMES[self._kind])
         try:
             with self._reading():
                 self._require_kind()
@@ -178,8 +177,18 @@ class FileReader(Sequence[Item]):
     def _require_kind(self) -> None:
         kind = _kind(self._file, self.path, _KIND_NAMES[self._kind])
         if kind != self._kind:
-            remedy = "process it first" if kind == "recording" else "give the recording it was made from"
-            raise DataError(f"{self.path} is {_KIND_NAMES[kind]}, wanted {_KIND_NAMES[self._kind]}; {remedy}")
+            raise DataError(
+                f"{self.path} is {_KIND_NAMES[kind]}, wanted {_KIND_NAMES[self._kind]}; {self._remedy(kind)}"
+            )
+
+    def _remedy(self, kind: str) -> str:
+        """Return the way from a file of another kind to one that can be read here."""
+        mode = "active" if self._kind == "energyscape" else "passive"
+        if self._kind == "recording":
+            return "give the recording it was made from"
+        if kind == "recording":
+            return f"process it first ('ertis process {quoted(self.path)} --mode {mode}')"
+        return f"process the recording it was made from with --mode {mode}"
 
     def _select_sensor(self, sensor: str | None) -> str:
         names = ", ".join(self.sensors[:_MAX_NAMES]) + ", …" * (len(self.sensors) > _MAX_NAMES)
@@ -239,9 +248,9 @@ def _problem(file: h5py.File, path: Path, wanted: str) -> str:
     """Return the kind of an HDF5 file of another program, and the remedy."""
     kind = kind_of(path)
     if kind is not None and not kind.is_hdf5:  # MATLAB puts its name before the HDF5.
-        return problem_of(path)
+        return problem_of(path, wanted)
     remedy = f"give {wanted}"
-    if "time_data" in file:
+    if "time_data" in file and "recording" in wanted:
         name = quoted(path)
         remedy = f"import its signals with 'ertis import {name} --settings FILE.toml --output FILE.h5'"
     return f"is HDF5, but not of this package; {remedy}"

@@ -33,6 +33,12 @@ __all__ = ["FileWriter"]
 
 Item = TypeVar("Item", Measurement, Energyscape, AcousticMap)
 
+_OTHER_SUFFIXES = (
+    *(".bin", ".raw", ".wav", ".flac"),
+    *(".csv", ".json", ".mat", ".npy", ".npz", ".toml", ".tum", ".txt"),
+    *(".html", ".jpg", ".mcap", ".pcd", ".pdf", ".ply", ".png", ".svg"),
+)
+
 
 class FileWriter(ABC, Generic[Item]):
     """Writer of rows; the file appears when the ``with`` block ends without an error.
@@ -62,6 +68,10 @@ class FileWriter(ABC, Generic[Item]):
         self._format_version = VERSION_WITHOUT_POSES
         self._file: h5py.File | None = None
         self._rows: dict[str, RowWriter] = {}
+        if self.path.suffix.lower() in _OTHER_SUFFIXES:
+            raise ArgumentError(
+                f"output {self.path} ends in {self.path.suffix}, but the file is HDF5; give a name in .h5"
+            )
         check_target(self.path, overwrite=overwrite)
 
     @abstractmethod

@@ -86,7 +86,6 @@ class AcousticMapReader(_AcousticMapFile, ResultReader[AcousticMap]):
         Pose of the platform at the last measurement of each map, by increasing time; None if the poses are unknown.
     """
 
-    _wanted: ClassVar[str] = "a file of acoustic maps"
     _row_name: ClassVar[str] = "acoustic map"
 
     band_hz: NDArray[np.float64]

@@ -77,10 +77,10 @@ def open_file(path: Path, wanted: str = RESULT_OR_RECORDING) -> h5py.File:
     if n_bytes == 0:
         raise DataError(f"{path} is empty; give {wanted}")
     if not h5py.is_hdf5(path):
-        found = problem_of(path)
+        found = problem_of(path, wanted)
         if found:
             raise DataError(f"{path} {found}")
-        remedy = f"give {wanted}, or import raw words first" if wanted == RESULT_OR_RECORDING else f"give {wanted}"
+        remedy = f"give {wanted}" + ", or import raw words first" * ("recording" in wanted)
         raise DataError(f"{path} is not an HDF5 file; {remedy}")
     try:
         return h5py.File(path, "r")

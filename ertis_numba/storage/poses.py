@@ -150,7 +150,7 @@ def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: 
         The recording cannot be read.
     """
     n_measurements = 0
-    for sensor in sensor_names(path):
+    for sensor in sensor_names(path, "a recording"):
         with open_recording(path, sensor=sensor) as recording:
             if recording.trajectory is not None and not replace:
                 origin = f" (source {recording.trajectory.source!r})" if recording.trajectory.source else ""
