@@ -169,9 +169,9 @@ def test_damaged_mcap_is_refused(tmp_path):
         ("a.csv", "time_s,x_m,y_m,yaw_deg\n1,2,3\n", "line 2 has 3 fields; write 4, as in the first line"),
         ("a.csv", "time_s,x_m,y_m,yaw_deg\n", "the file contains no poses"),
         ("a.mcap", "no file of this kind\n", "is a text file, not messages in MCAP; rename it to end in .tum or .csv"),
-        ("a.mcap", "short", "has content of an unknown format, not messages in MCAP; give a .tum"),
-        ("a.mcap", "", "is empty, not messages in MCAP; give a .tum"),
-        ("a.tum", "II*\0....", "is a TIFF image; give a .tum, .txt, .csv or .mcap file"),
+        ("a.mcap", "short", "has content of an unknown format, not messages in MCAP; choose a .tum"),
+        ("a.mcap", "", "is empty, not messages in MCAP; choose a .tum"),
+        ("a.tum", "II*\0....", "is a TIFF image; choose a .tum, .txt, .csv or .mcap file"),
     ],
 )
 def test_unusable_files_are_refused(tmp_path, name, text, message):

@@ -130,10 +130,10 @@ def _require_poses(path: Path) -> None:
     kind, is_mcap = kind_of(path), path.suffix.lower() == ".mcap"
     found = f"is {kind.name}" if kind else "has content of an unknown format" if start else "is empty"
     if is_mcap and not start.startswith(_MCAP):
-        remedy = "rename it to end in .tum or .csv" if kind and kind.is_text else f"give {_KINDS}"
+        remedy = "rename it to end in .tum or .csv" if kind and kind.is_text else f"choose {_KINDS}"
         raise DataError(f"trajectory {path} {found}, not messages in MCAP; {remedy}")
     if kind and not (is_mcap or kind.is_text):
-        remedy = "rename it to end in .mcap" if start.startswith(_MCAP) else f"give {_KINDS}"
+        remedy = "rename it to end in .mcap" if start.startswith(_MCAP) else f"choose {_KINDS}"
         raise DataError(f"trajectory {path} {found}; {remedy}")
 
 
