@@ -74,10 +74,10 @@ def _require_cache_folder() -> None:
     if numba.config.DISABLE_JIT:  # Nothing is stored.
         return
     wanted = numba.config.CACHE_DIR
-    folder = _cache_folder(numba)
-    if folder is not None:
-        if wanted and not Path(folder).is_relative_to(wanted):
-            _LOG.warning("NUMBA_CACHE_DIR, %s, is not writable; compiled kernels are stored in %s", wanted, folder)
+    found = _cache_folder(numba)
+    if found is not None:
+        if wanted and not Path(found).is_relative_to(wanted):
+            _LOG.warning("NUMBA_CACHE_DIR, %s, is not writable; compiled kernels are stored in %s", wanted, found)
         return
     try:
         folder = _private_folder()
