@@ -404,6 +404,32 @@ def opened_folder(path):
     return ertis.open_pcm(path, ONE, passive=True)
 
 
+def test_files_of_other_rates_name_the_expansion(tmp_path):
+    paths = [write(tmp_path / "a.wav", guano("TE: 10"), rate_hz=25_000), write(tmp_path / "b.wav", rate_hz=25_000)]
+    with pytest.raises(
+        DataError, match=r"import each file separately, or use --time-expansion \(time_expansion\) if all"
+    ):
+        opened(*paths)
+    assert opened(*paths, time_expansion=10).settings.recording.sample_rate_hz == 250_000
+    with pytest.raises(DataError, match=r"b.wav has 48000 Hz, but a.wav has 250000; import each file separately$"):
+        opened(paths[0], write(tmp_path / "b.wav", rate_hz=48_000))
+
+
+def test_import_asks_for_the_call(tmp_path):
+    (tmp_path / "one.csv").write_text("0, 0\n")
+    arguments = ("import", write(tmp_path / "a.wav"), "--layout", tmp_path / "one.csv")
+    done = command(*arguments)
+    assert done.exit_code == 2
+    assert "a.wav is unknown; use --passive if none was emitted, otherwise --settings with the call or" in done.stderr
+    assert command(*arguments, "--passive").exit_code == 0
+
+
+def test_folders_with_the_ending_of_wav_are_no_files(tmp_path):
+    (tmp_path / "a.wav").mkdir()
+    write(tmp_path / "b.wav")
+    assert len(opened_folder(tmp_path)) == 1
+
+
 def test_folder_without_times_has_the_order_of_numbers(tmp_path):
     for number in (2, 10, 1):
         write(tmp_path / f"R_{number}.wav", seconds=0.01 * number)

@@ -270,8 +270,14 @@ def _opened_pcm(
 
     settings = whole_range = None
     if any(part is not None for part in (layout, preset, settings_file)):
-        if settings_file is None and (layout is None or (preset is None and not given["passive"])):
-            _require("--layout" if layout is None else "--preset")
+        if settings_file is None and layout is None:
+            _require("--layout")
+        if settings_file is None and preset is None and not given["passive"]:
+            raise click.UsageError(
+                f"the call in {raw[0]} is unknown; use --passive if none was emitted, otherwise --settings with the "
+                "call or --preset",
+                click.get_current_context(),
+            )
         settings = _settings(layout, preset, settings_file, {"processing.range_m": _UNSTATED_M})
         whole_range = settings.processing.range_m == _UNSTATED_M
     elif raw[0].is_dir() or raw[0].suffix.lower() not in _PCM - {".wav"}:

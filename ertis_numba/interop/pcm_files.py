@@ -225,10 +225,17 @@ def require_alike(files: Sequence[PcmFile], *, joined: bool = False) -> None:
             ("numbers", file.encoding, first.encoding),
         ):
             if came != wanted:
+                if name == "Hz" and _is_multiple(file.rate_hz, first.rate_hz) and not joined:
+                    remedy += ", or use --time-expansion (time_expansion) if all play slower by one factor"
                 raise DataError(
                     f"{file.path} has {_format_value(came)} {name}, but {first.path.name} has "
                     f"{_format_value(wanted)}; {remedy}"
                 )
+
+
+def _is_multiple(one_hz: float, other_hz: float) -> bool:
+    ratio = max(one_hz, other_hz) / min(one_hz, other_hz)
+    return ratio == round(ratio)
 
 
 def per_file(notes: Iterable[tuple[Path, str]]) -> list[str]:

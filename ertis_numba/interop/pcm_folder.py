@@ -38,7 +38,11 @@ def wav_files(folder: Path, *, by_time: bool) -> list[Path]:
     DataError
         A file cannot be read.
     """
-    visible = [each for each in folder.iterdir() if not each.name.startswith(".") and each.suffix.lower() in _WAV]
+    visible = [
+        each
+        for each in folder.iterdir()
+        if not each.name.startswith(".") and each.suffix.lower() in _WAV and not each.is_dir()
+    ]
     paths = sorted(visible, key=lambda path: natural_order(path.name))
     if not by_time:
         return paths
