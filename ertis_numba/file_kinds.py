@@ -188,7 +188,7 @@ def problem_of(path: str | Path, wanted: str = "a recording") -> str:
     if kind is None:
         return ""
     if "recording" not in wanted:
-        return f"is {kind.name}; give {wanted}"
+        return f"is {kind.name}; choose {wanted}"
     names = {
         "file": quoted(path),
         "path": str(path),

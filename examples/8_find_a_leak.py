@@ -21,7 +21,7 @@ USAGE = "give a recording and, optionally, the distance of the leak in metres"
 def require_sound(recording: RecordingReader) -> None:
     """End the program if the recording contains echoes, or no sound because all microphones are faulty."""
     if any(stamp.behaviour == "active" for stamp in recording.stamps()):
-        sys.exit(f"{recording.path} has measurements with a call; give a recording of 'ertis capture --passive'")
+        sys.exit(f"{recording.path} has measurements with a call; choose a recording of 'ertis capture --passive'")
     health = ertis.health(recording[0])
     if all(channel.faults for channel in health.channels):
         sys.exit(f"{recording.path}: {health.verdict()}; find the cause with 'ertis check' and record again")

@@ -216,7 +216,7 @@ def test_map_outside_the_file_is_refused(path):
 
 
 def test_missing_map_file_is_reported(tmp_path):
-    with pytest.raises(DataError, match="No such file or directory; give a file of acoustic maps"):
+    with pytest.raises(DataError, match="No such file or directory; choose a file of acoustic maps"):
         ertis.open_acoustic_maps(tmp_path / "maps.h5")
 
 

@@ -62,10 +62,14 @@ CASES = {
         "sensor name 'a/b' cannot name a group in a file; give",
     ),
     # recordings
-    "missing recording": ("process none.h5 -o out.h5", 1, "none.h5: No such file or directory; give a recording"),
-    "empty recording": ("process empty.h5 -o out.h5", 1, "empty.h5 is empty; give a recording"),
-    "not HDF5": ("process good.bin -o out.h5", 1, "good.bin is not an HDF5 file; give a recording"),
-    "HDF5 of others": ("process other.h5 -o out.h5", 1, "other.h5 is HDF5, but not of this package; give a recording"),
+    "missing recording": ("process none.h5 -o out.h5", 1, "none.h5: No such file or directory; choose a recording"),
+    "empty recording": ("process empty.h5 -o out.h5", 1, "empty.h5 is empty; choose a recording"),
+    "not HDF5": ("process good.bin -o out.h5", 1, "good.bin is not an HDF5 file; choose a recording"),
+    "HDF5 of others": (
+        "process other.h5 -o out.h5",
+        1,
+        "other.h5 is HDF5, but not of this package; choose a recording",
+    ),
     "energyscapes instead": ("process img.h5 -o out.h5", 1, "img.h5 is an energyscape file, wanted a recording; give"),
     "recording instead": ("peaks rec.h5", 1, "rec.h5 is a recording, wanted an energyscape file; process it first"),
     "cut short": ("process cut.h5 -o out.h5", 1, "cut.h5 is cut short or damaged: it has"),
@@ -79,7 +83,7 @@ CASES = {
     "info of nothing": (
         "info folder",
         1,
-        "folder is a folder; give a recording, an energyscape file or a file of acoustic maps",
+        "folder is a folder; choose a recording, an energyscape file or a file of acoustic maps",
     ),
     # processing
     "no directions": ("process rec.h5 -o out.h5 --directions 2d:0", 2, "count of directions '2d:0' is 0; give a whole"),
@@ -159,16 +163,16 @@ CASES = {
     "no peaks": ("peaks img.h5 --top 0", 2, "--top is 0; give a whole number of at least 1"),
     "peaks above": ("peaks img.h5 --min-level 3", 2, "--min-level is 3; give a number from -1000 to 0"),
     "nothing at that level": ("compare truth.h5 --min-level 3", 2, "--min-level is 3; give a number from -1000 to 0"),
-    "this folder": ("plot .", 1, ". is a folder; give a recording, an energyscape file or a file of acoustic maps"),
+    "this folder": ("plot .", 1, ". is a folder; choose a recording, an energyscape file or a file of acoustic maps"),
     "root": (
         "plot / --kind array",
         1,
-        "/ is a folder; give a recording, an energyscape file or a file of acoustic maps",
+        "/ is a folder; choose a recording, an energyscape file or a file of acoustic maps",
     ),
     "a folder": (
         "plot folder",
         1,
-        "folder is a folder; give a recording, an energyscape file or a file of acoustic maps",
+        "folder is a folder; choose a recording, an energyscape file or a file of acoustic maps",
     ),
     "picture format": ("plot img.h5 -o out.bmp", 1, "picture format '.bmp' is unknown; known are .pdf, .png, .svg"),
     "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 2, "--dynamic-range is -5; give a number above 0"),

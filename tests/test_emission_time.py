@@ -96,12 +96,15 @@ def test_emission_of_few_measurements_is_not_used():
 
 
 SHIFTS = {
-    "late": ([1.37e-3] * 3, r"arrives 1\.37 ms later than the emitter's place allows; the ranges are 23\.6 cm too far"),
+    "late": (
+        [1.37e-3] * 3,
+        r"arrives 1\.37 ms later than the distance of the emitter allows; all ranges are 23\.6 cm too large",
+    ),
     "early": (
         [-0.5e-3] * 3,
-        r"arrives 0\.5 ms earlier than the emitter's place allows; the ranges are 8\.\d+ cm too near",
+        r"arrives 0\.5 ms earlier than the distance of the emitter allows; all ranges are 8\.\d+ cm too small",
     ),
-    "drifting": ([1e-4, 3e-4, 5e-4], r"drifts from 0\.1 ms later to 0\.5 ms later .* up to 8\.\d+ cm wrong"),
+    "drifting": ([1e-4, 3e-4, 5e-4], r"drifts from 0\.1 ms later to 0\.5 ms later .* wrong by up to 8\.\d+ cm"),
     "drifting around 0": ([-8e-5, 0.0, 8e-5], r"drifts from 0\.08 ms earlier to 0\.08 ms later"),
 }
 

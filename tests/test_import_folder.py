@@ -228,7 +228,7 @@ def test_file_of_many_measurements_is_imported(tmp_path):
     [
         (
             {"names": ()},
-            r"run.1 is a folder; give a file of raw words, or a folder with .wav files or .bin files of RTIS Dev",
+            r"run.1 is a folder; choose a file of raw words, or a folder with .wav files or .bin files of RTIS Dev",
         ),
         (
             {"names": ("a_1.bin", "b_2.bin")},

@@ -158,7 +158,7 @@ def test_recording_without_a_call_needs_no_fitting_call(tmp_path):
     command = ["import", str(path), "--settings", str(tmp_path / "ring.toml"), "--length", "0.1"]
     refused = CliRunner().invoke(cli, [*command, "-o", str(tmp_path / "refused.h5")])
     assert refused.exit_code == 1
-    assert "or give --passive (passive=True) if no call was emitted" in refused.stderr
+    assert "or --passive (passive=True) if no call was emitted" in refused.stderr
     done = CliRunner().invoke(cli, [*command, "--passive", "-o", str(tmp_path / "rec.h5")])
     assert done.exit_code == 0, done.stderr
     assert "cannot be processed" not in done.stderr
@@ -179,7 +179,11 @@ def test_recording_without_a_call_needs_no_fitting_call(tmp_path):
 
 REFUSED = {
     "no file": (lambda folder: folder / "none.wav", {}, "No such file"),
-    "other kind": (lambda folder: _text(folder / "a.wav"), {}, r"is not a WAV file: it begins with b'noth'; give WAV"),
+    "other kind": (
+        lambda folder: _text(folder / "a.wav"),
+        {},
+        r"is not a WAV file: it begins with b'noth'; choose a WAV",
+    ),
     "cut short": (
         lambda folder: _cut(folder / "a.wav"),
         {},
@@ -188,15 +192,15 @@ REFUSED = {
     "channels": (
         lambda folder: write_wav(folder / "a.wav", numbers(n_channels=7)),
         {},
-        r"has 7 channels, but array '\w+' has 8; (use a layout with|correct array.positions_m, )one row for each",
+        r"has 7 channels, but array '\w+' has 8; (use a layout with|write )one row for each",
     ),
     "slow": (
         lambda folder: write_wav(folder / "a.wav", numbers(), 44_100),
         {},
-        r"sample rate of 44100 Hz, too low for a call up to 50000 Hz; give the emitted call",
+        r"sample rate of 44100 Hz, too low for a call up to 50000 Hz; set the emitted call",
     ),
     "skip": (lambda folder: write_wav(folder / "a.wav", numbers()), {"skip_s": 1.0}, r"skip less \(--skip\)"),
-    "length": (lambda folder: write_wav(folder / "a.wav", numbers()), {"length_s": 1.0}, r"give a shorter --length"),
+    "length": (lambda folder: write_wav(folder / "a.wav", numbers()), {"length_s": 1.0}, r"use a shorter --length"),
     "length of less than a sample": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
         {"length_s": 1e-7},
@@ -210,7 +214,7 @@ REFUSED = {
     "beyond float32": (
         lambda folder: write_wav(folder / "a.wav", np.where(np.arange(8) == 3, 1e300, numbers())),
         {},
-        r"contains 1e\+300 at sample 0 of channel 3; give numbers up to 3\.403e\+38",
+        r"contains 1e\+300 at sample 0 of channel 3; scale the samples to at most 3\.403e\+38",
     ),
     "skip for ever": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
@@ -232,7 +236,7 @@ REFUSED = {
         {},
         r"b.wav has 96000 Hz, but a.wav has 192000; import each file separately",
     ),
-    "none": (lambda _: [], {}, "no PCM file is given"),
+    "none": (lambda _: [], {}, "the list of PCM files is empty"),
     "half of it": (
         lambda folder: _changed(folder / "a.wav", lambda content: content[: len(content) // 2]),
         {},
@@ -246,7 +250,7 @@ REFUSED = {
     "half a frame": (
         lambda folder: _changed(folder / "a.wav", lambda content: _with_data_size(content, 191_996)),
         {},
-        r"has 191996 bytes of samples, not a multiple of its frame size, 64 bytes; copy it again",
+        r"has 191996 bytes of samples, not a multiple of its frame size, 64 bytes; copy the file again",
     ),
     "no channels": (
         lambda folder: _changed(folder / "a.wav", lambda content: content[:22] + b"\0\0" + content[24:]),
@@ -256,7 +260,7 @@ REFUSED = {
     "shorter than the call": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
         {"length_s": 1e-3},
-        r"has 1 ms, but the call alone lasts 2.5 ms; give a longer --length",
+        r"has 1 ms, but the call alone lasts 2.5 ms; use a longer --length",
     ),
 }
 
@@ -313,7 +317,7 @@ def test_acoular_files_are_read_in_slices(tmp_path):
 
 
 def test_wav_without_settings_is_refused(tmp_path):
-    with pytest.raises(ArgumentError, match=r"contains no array and call; give settings"):
+    with pytest.raises(ArgumentError, match=r"contains no array and no call; pass settings"):
         ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers()))
 
 
@@ -347,7 +351,7 @@ def test_acoular_file_without_settings_is_refused(tmp_path):
         file["time_data"].attrs["sample_freq"] = float(RATE_HZ)
     (measurement,) = ertis.open_pcm(tmp_path / "a.h5", PCM)
     assert np.array_equal(measurement.data, given)
-    with pytest.raises(ArgumentError, match="give settings"):
+    with pytest.raises(ArgumentError, match="pass settings"):
         ertis.open_pcm(tmp_path / "a.h5")
 
 
@@ -385,9 +389,9 @@ def test_acoular_sample_rate_may_be_an_array_of_one(tmp_path, rate_hz):
         (np.inf, r"a\.h5: recording\.sample_rate_hz is inf; give a finite number"),
         (0.0, r"a\.h5: recording\.sample_rate_hz is 0; give a number from 1000 to 1e\+09"),
         (1e308, r"a\.h5: recording\.sample_rate_hz is 1e\+308; give a number"),
-        (np.array([1.0, 2.0]), r"a\.h5: sample_freq is \[1\.0, 2\.0\]; give one number, the rate in Hz"),
-        ("fast", r"sample_freq is not a number; give one number, the rate in Hz"),
-        (h5py.Empty("f8"), r"sample_freq is not a number; give one"),
+        (np.array([1.0, 2.0]), r"a\.h5: sample_freq is \[1\.0, 2\.0\]; store one number, the sample rate in Hz"),
+        ("fast", r"sample_freq is not a number; store one number, the sample rate in Hz"),
+        (h5py.Empty("f8"), r"sample_freq is not a number; store one"),
     ],
     ids=["nan", "inf", "zero", "huge", "two", "text", "empty"],
 )
@@ -426,7 +430,7 @@ STRANGE = {
     "complex": (lambda file: _rated(file, numbers().astype(complex)), r"time_data is complex128 of shape \(3000, 8\)"),
     "text": (
         lambda file: _rated(file, [b"a", b"b"]),
-        r"time_data is object of shape \(2, 1\); give floating or signed",
+        r"time_data is object of shape \(2, 1\); store floating-point or signed",
     ),
 }
 
@@ -445,7 +449,7 @@ def test_hdf5_without_signals_is_refused_by_its_content(tmp_path, name):
 
 def test_recordings_need_no_import(tmp_path, measurement):
     path = write_recording(tmp_path / "rec.h5", [measurement])
-    with pytest.raises(DataError, match=r"is a file of this package, and needs no import; use 'ertis process'"):
+    with pytest.raises(DataError, match=r"is a file of this package, which needs no import; use 'ertis process'"):
         ertis.open_pcm(path, PCM)
 
 

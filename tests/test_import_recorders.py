@@ -47,7 +47,10 @@ def test_joined_files_are_the_channels(tmp_path):
     reader = ertis.open_pcm(paths, LINE, passive=True, join=True)
     (measurement,) = reader
     assert np.array_equal(measurement.data, samples)
-    assert "mic0.wav: the files are joined, channel 0 first: mic0.wav, mic1.wav, mic2.wav, mic3.wav" in reader.notes
+    assert (
+        "mic0.wav: the files were joined as channels, channel 0 first: mic0.wav, mic1.wav, mic2.wav, mic3.wav"
+        in reader.notes
+    )
 
 
 def test_joined_stereo_files_are_the_channels(tmp_path):
@@ -71,30 +74,32 @@ def test_joined_files_are_cut_to_the_shortest(tmp_path):
     reader = ertis.open_pcm(paths, LINE, passive=True, join=True)
     (measurement,) = reader
     assert measurement.data.shape == (5_997, 4)
-    assert any("the files differ in length; 1.563e-05 s at the end are left out" in note for note in reader.notes)
+    assert any(
+        "the files differ in length; up to 1.563e-05 s at the end were left out" in note for note in reader.notes
+    )
 
 
 NOT_JOINED = {
     "one file per microphone": (
         {"count": 4},
         {},
-        r"as all 4 files have together; use --join \(join=True\) if they are",
+        r"the total of all 4 files; use --join \(join=True\) if the files are",
     ),
-    "too few files": ({"count": 3}, {"join": True}, r"has 3 channels, but array 'line' has 4; correct array"),
+    "too few files": ({"count": 3}, {"join": True}, r"has 3 channels, but array 'line' has 4; write one row"),
     "rates": (
         {"count": 4, "rates_hz": (RATE_HZ, 96_000)},
         {"join": True},
-        r"1.wav has 96000 Hz, but 0.wav has 192000; join files of one recorder only",
+        r"1.wav has 96000 Hz, but 0.wav has 192000; join only files of one recorder",
     ),
     "alphabet": (
         {"count": 4, "names": ("mic1", "mic10", "mic2", "mic3")},
         {"join": True},
-        r"the files are in the order of the alphabet: mic1.wav, mic10.wav, mic2.wav, mic3.wav; list them in the order",
+        r"the files are in alphabetical order: mic1.wav, mic10.wav, mic2.wav, mic3.wav; list them in the order",
     ),
     "takes": (
         {"count": 4, "names": ("20240518_042537", "20240518_042637", "20240518_042737", "20240518_042837")},
         {"join": True},
-        r"042637.wav begins 60 s after 20240518_042537.wav; join files of the same time only",
+        r"042637.wav begins 60 s after 20240518_042537.wav; join only files that begin at the same time",
     ),
 }
 
@@ -265,7 +270,7 @@ def test_default_window_is_what_the_record_holds(tmp_path, range_m):
     first_m, last_m = reader.settings.processing.range_m
     assert first_m == pytest.approx(speed_m_s * 2.5e-3 / 2, abs=0.01)
     assert last_m == pytest.approx(speed_m_s * (3_740 / RATE_HZ - 2.5e-3) / 2, abs=0.01)
-    assert f"range {first_m:g}–{last_m:g} m, all that the record holds" in reader.notes
+    assert f"range {first_m:g}–{last_m:g} m, the full window of the record" in reader.notes
     (peak,) = ertis.find_peaks(Pipeline(reader.settings, predict=False).process(next(iter(reader))), top=1)
     assert peak.range_m == pytest.approx(range_m, abs=2e-3)
 
@@ -279,7 +284,7 @@ def test_stated_window_is_kept(tmp_path):
         )
         with ertis.open_recording(target) as recording:
             assert recording.settings.processing.range_m == stated
-        assert f"range {stated[0]:g}–{stated[1]:g} m as in the settings; the record holds 0.43–2.91 m" in said
+        assert f"range {stated[0]:g}–{stated[1]:g} m, as in the settings; the record contains 0.43–2.91 m" in said
 
 
 @pytest.mark.parametrize("preset", ["short_25_50", "default_25_50", None])
@@ -287,7 +292,7 @@ def test_window_of_a_preset_is_replaced(tmp_path, preset):
     path = write(tmp_path / "a.wav", echo_at(1.0))
     options = () if preset is None else ("--preset", preset)
     said = imported(path, "--settings", ring_file(tmp_path), *options)
-    assert "note: range 0.43–2.91 m, all that the record holds" in said
+    assert "note: range 0.43–2.91 m, the full window of the record" in said
     shown = CliRunner().invoke(cli, ["info", str(tmp_path / "a.h5")]).stdout
     assert re.search(r"^range +0.43, 2.91 m$", shown, re.MULTILINE)
 
@@ -295,7 +300,7 @@ def test_window_of_a_preset_is_replaced(tmp_path, preset):
 def test_window_follows_the_air(tmp_path):
     path = write(tmp_path / "a.wav", echo_at(1.0))
     said = imported(path, "--settings", ring_file(tmp_path), "--temperature", -20)
-    assert "note: range 0.4–2.7 m, all that the record holds" in said
+    assert "note: range 0.4–2.7 m, the full window of the record" in said
 
 
 def test_record_range_is_empty_inwards():

@@ -79,9 +79,9 @@ def test_suggested_presets_depend_on_the_array(tmp_path, settings, n_bytes, mess
 
 
 def test_unreadable_raw_paths_are_refused(tmp_path):
-    with pytest.raises(DataError, match=r"none.bin: No such file or directory; give a file of raw words"):
+    with pytest.raises(DataError, match=r"none.bin: No such file or directory; choose a file of raw words"):
         open_raw(tmp_path / "none.bin", SHORT)
-    with pytest.raises(DataError, match="is a folder; give a file of raw words"):
+    with pytest.raises(DataError, match="is a folder; choose a file of raw words"):
         open_raw(tmp_path, SHORT)
     with pytest.raises(ArgumentError, match="no raw file is given; give at least one"):
         open_raw([], SHORT)

@@ -192,7 +192,7 @@ def test_plot_draws_a_map(folder):
         assert "map of" in done.stderr
     assert (folder / "drawn.png").read_bytes() == (folder / "again.png").read_bytes()
     done = CliRunner().invoke(cli, ["plot", str(folder / "drawn.h5"), "--kind", "slices", "--force"])
-    assert "is an occupancy map; give a recording, an energyscape file or a file of acoustic maps" in done.stderr
+    assert "is an occupancy map; choose a recording, an energyscape file or a file of acoustic maps" in done.stderr
     done = CliRunner().invoke(cli, ["plot", str(folder / "both.h5"), "--kind", "map", "--force"])
     assert "is HDF5, but not an occupancy map" in done.stderr
 

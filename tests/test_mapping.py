@@ -607,7 +607,7 @@ def test_damaged_map_file_is_refused(tmp_path):
 
 def test_map_and_recording_are_told_apart(tmp_path):
     ertis.write_map(tmp_path / "m.h5", small())
-    with pytest.raises(DataError, match=r"m.h5 is an occupancy map; give a recording"):
+    with pytest.raises(DataError, match=r"m.h5 is an occupancy map; choose a recording"):
         ertis.open_recording(tmp_path / "m.h5")
     with pytest.raises(DataError, match="not an occupancy map; give one, as from 'ertis map'"):
         ertis.read_map(REFLECTORS)

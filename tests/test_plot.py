@@ -112,7 +112,7 @@ def test_plot_accepts_the_name_of_a_layout(tmp_path):
         (
             "plot none.h5 --kind array",
             1,
-            "none.h5: No such file or directory; give a recording, an energyscape file or a file of acoustic maps",
+            "none.h5: No such file or directory; choose a recording, an energyscape file or a file of acoustic maps",
         ),
         ("plot rec.h5 --kind signals --microphone 40", 1, "microphone 40 is none of the 32 enabled ones"),
         ("plot img.h5 --kind slices --left 1", 1, "--left is 1, but a planar image has no upright plane; leave it out"),

@@ -104,7 +104,7 @@ def test_hexadecimal_name_without_a_letter_counts_beside_others():
 METADATA = {
     "GUANO with offset": (guano("Timestamp: 2024-05-18T04:25:37.5+02:00"), "2024-05-18T02:25:37.5", "UTC+02:00"),
     "GUANO in UTC": (guano("Timestamp:2024-05-18T04:25:37Z"), "2024-05-18T04:25:37", "UTC"),
-    "GUANO, local": (guano("  Timestamp :  2024-05-18 04:25:37"), "2024-05-18T04:25:37", "taken as UTC"),
+    "GUANO, local": (guano("  Timestamp :  2024-05-18 04:25:37"), "2024-05-18T04:25:37", "UTC is assumed"),
     "GUANO, name": (guano("Original Filename: A_20240518_042537.wav"), "2024-05-18T04:25:37", "Original Filename"),
     "AudioMoth": (
         comment("Recorded at 19:17:30 02/03/2023 (UTC) by AudioMoth 24E144085F256C7B at medium gain"),
@@ -173,22 +173,22 @@ UNUSED = {
 def test_unknown_time_is_noted(tmp_path, name):
     reader = opened(write(tmp_path / "M00123.WAV", *UNUSED[name]))
     assert times_s(reader) == [0]
-    assert reader.notes == ("M00123.WAV states no time, so its time is unknown; use --start for the first file",)
+    assert reader.notes == ("M00123.WAV contains no time, so its time is unknown; use --start for the first file",)
 
 
 @pytest.mark.parametrize("time", ["9999-12-31T23:59:59+00:00", "0001-01-01T00:00:00+14:00", "2262-05-01T00:00:00"])
 def test_years_of_no_recorder_are_not_used(tmp_path, time):
     reader = opened(write(tmp_path / "20240518_042537.wav", guano(f"Timestamp: {time}")))
     assert times_s(reader) == [seconds("2024-05-18T04:25:37")]
-    assert f"20240518_042537.wav: GUANO Timestamp '{time}' is no time and is not used" in reader.notes
+    assert f"20240518_042537.wav: GUANO Timestamp '{time}' was ignored, because it is no time" in reader.notes
 
 
 def test_invalid_guano_fields_are_noted(tmp_path):
     lines = ("Timestamp: yesterday", "TE: none", "Samplerate: -1")
     notes = " ".join(opened(write(tmp_path / "a.wav", guano(*lines))).notes)
-    assert "GUANO Timestamp 'yesterday' is no time and is not used" in notes
-    assert "GUANO TE 'none' is no positive number and is not used" in notes
-    assert "GUANO Samplerate '-1' is no positive number and is not used" in notes
+    assert "GUANO Timestamp 'yesterday' was ignored, because it is no time" in notes
+    assert "GUANO TE 'none' was ignored, because it is no positive number" in notes
+    assert "GUANO Samplerate '-1' was ignored, because it is no positive number" in notes
 
 
 # ---- several files --------------------------------------------------------------------------------
@@ -201,14 +201,14 @@ def test_triggered_files_keep_their_times(tmp_path):
     assert times_s(reader) == [first, first + 60, first + 900]
     (note,) = reader.notes
     assert "times are from file names (2024-05-18 04:25:37 UTC to 2024-05-18 04:40:37 UTC)" in note
-    assert "no offset is stated, so they are taken as UTC" in note
+    assert "they state no offset, so UTC is assumed" in note
 
 
 def test_start_of_the_first_file_shifts_all(tmp_path):
     paths = [write(tmp_path / f"20240518_04{minute}37.WAV") for minute in (25, 26)]
     reader = opened(*paths, start_ns=10**18)
     assert times_s(reader) == [1e9, 1e9 + 60]
-    assert reader.notes == ("the times between files are from file names; that of the first file is --start",)
+    assert reader.notes == ("the first file begins at --start; the times between files are from file names",)
 
 
 def test_start_of_each_file_overrides_names(tmp_path):
@@ -222,7 +222,7 @@ def test_files_without_times_follow_each_other(tmp_path):
     paths = [write(tmp_path / f"M0012{number}.WAV", seconds=length) for number, length in ((3, 0.5), (4, 0.25))]
     reader = opened(*paths)
     assert times_s(reader) == [0, 0.5]
-    assert "no times are known from metadata or names; the files are stamped back to back" in reader.notes[0]
+    assert "neither metadata nor names contain times, so the files are assumed to follow each other" in reader.notes[0]
     assert times_s(opened(*paths, start_ns=10**18)) == [1e9, 1e9 + 0.5]
 
 
@@ -240,8 +240,8 @@ def test_names_of_whole_seconds_never_overlap(tmp_path):
     first = seconds("2024-05-18T04:25:37")
     assert times_s(reader) == pytest.approx([first, first + 0.25], abs=1e-6)
     assert any(
-        "files begin up to 0.25 s before the end of the previous one, as their times are accurate to 1 s; they are "
-        "stamped at its end; use --join (join=True) if files of one time are the microphones" in note
+        "times in whole steps of 1 s overlap the previous file by up to 0.25 s; such files begin at the end of the "
+        "previous one; use --join (join=True) if files with the same time are the microphones" in note
         for note in reader.notes
     )
 
@@ -268,8 +268,8 @@ def test_contradicting_times_are_noted(tmp_path):
     reader = opened(*paths)
     assert times_s(reader)[0] == seconds("2024-05-18T03:25:37")
     assert (
-        "20240518_042537.WAV (and 1 more): GUANO and file names differ (2024-05-18 05:25:37 UTC+02:00 and "
-        "2024-05-18 04:25:37); GUANO is used"
+        "20240518_042537.WAV (and 1 more): GUANO (2024-05-18 05:25:37 UTC+02:00) and file names (2024-05-18 04:25:37) "
+        "differ; GUANO is used"
     ) in reader.notes
 
 
@@ -298,7 +298,7 @@ REFUSED = {
         ["20240518_042637.WAV", "b.wav"],
         {},
         DataError,
-        r"b.wav states no time in its metadata or name, but 20240518_042637.WAV does; use --start once for each file",
+        r"b.wav contains no time in its metadata or name, but 20240518_042637.WAV does; use --start once for each file",
     ),
     "too many starts": (
         ["a.wav", "b.wav"],
@@ -395,7 +395,7 @@ def test_recordings_that_a_folder_leaves_out_are_noted(tmp_path):
     (tmp_path / "d.flac").write_bytes(b"fLaC\0\0\0\x22" + bytes(99))
     (tmp_path / "notes.txt").write_text("wind")
     assert opened_folder(tmp_path).notes[0] == (
-        f"{tmp_path.name} contains more recordings, which were left out: d.flac, Data/; import them separately"
+        f"{tmp_path.name} also contains recordings that were not imported: d.flac, Data/; import them separately"
     )
     assert not any("left out" in note for note in opened_folder(tmp_path / "Data").notes)
 

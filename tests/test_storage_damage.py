@@ -36,9 +36,9 @@ def path(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "No such file or directory; give a recording$"),
-        (b"", "is empty; give a recording"),
-        (b"abc" * 1000, "is not an HDF5 file; give a recording"),
+        (None, "No such file or directory; choose a recording$"),
+        (b"", "is empty; choose a recording"),
+        (b"abc" * 1000, "is not an HDF5 file; choose a recording"),
     ],
 )
 def test_text_file_is_not_a_recording(tmp_path, content, message):
@@ -60,7 +60,7 @@ def test_impossible_gap_is_damage(path):
 
 
 def test_folder_is_not_a_recording(tmp_path):
-    with pytest.raises(DataError, match="is a folder; give"):
+    with pytest.raises(DataError, match="is a folder; choose"):
         open_recording(tmp_path)
 
 
@@ -68,7 +68,7 @@ def test_foreign_hdf5_file_is_refused(tmp_path):
     with h5py.File(tmp_path / "other.h5", "w") as file:
         file["x"] = 1
     for read in (open_recording, open_energyscapes, file_kind):
-        with pytest.raises(DataError, match="is HDF5, but not of this package; give a"):
+        with pytest.raises(DataError, match="is HDF5, but not of this package; choose a"):
             read(tmp_path / "other.h5")
 
 

@@ -203,7 +203,7 @@ def test_several_and_unreadable_files_are_reported(tmp_path, recording):
     images = write_energyscapes(tmp_path / "img.h5", [image()])
     with create(tmp_path, name="used.h5") as journal:
         done = run("verify", tmp_path / "none", images, journal.path, recording, code=1)
-    assert "none: No such file or directory; give a recording or a journal" in done.stderr
+    assert "none: No such file or directory; choose a recording or a journal" in done.stderr
     assert "is an energyscape file, wanted a recording" in done.stderr
     assert "used.h5.journal is in use by another process" in done.stderr
     assert done.stdout.startswith(f"{recording}  left: 6 measurements")

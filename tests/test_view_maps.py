@@ -307,10 +307,10 @@ def test_file_of_acoustic_maps_is_played(tmp_path):
 
 def test_other_content_than_that_of_the_file_is_refused(tmp_path):
     images = write_energyscapes(tmp_path / "img.h5", stamped(1))
-    with pytest.raises(ArgumentError, match=r"img\.h5 holds images only; give a recording for others"):
+    with pytest.raises(ArgumentError, match=r"img\.h5 holds images only; choose a recording for others"):
         Playback(images, acoustic_maps=True)
     maps = write_acoustic_maps(tmp_path / "maps.h5", [sounds()])
-    with pytest.raises(ArgumentError, match=r"maps\.h5 holds acoustic maps only; give a recording for others"):
+    with pytest.raises(ArgumentError, match=r"maps\.h5 holds acoustic maps only; choose a recording for others"):
         Playback(maps, acoustic_maps=False)
 
 
@@ -342,7 +342,7 @@ def measured(camera, original):
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
-        (("IMG", "--acoustic-maps"), "holds images only; give a recording for others"),
+        (("IMG", "--acoustic-maps"), "holds images only; choose a recording for others"),
         (("REC", "--range", "1:2"), "--range is for images; remove it with acoustic maps"),
         (("REC", "--threshold", "-3"), "--threshold is for images; remove it with acoustic maps"),
         (("REC", "--images", "--band", "30000"), "--band is for acoustic maps; remove it with images"),

@@ -84,19 +84,28 @@ def test_read_wav_returns_metadata(tmp_path):
 
 WRONG = {
     # content with another length than stated, and a part of the note
-    "power cut": (riff(form(), chunk(b"data", DATA, 0), size=0), "at byte 36 states 0 bytes, an unknown length"),
-    "ffmpeg": (riff(form(), chunk(b"data", DATA, 2**32 - 1), size=2**32 - 1), "states 4294967295 bytes, an unknown"),
-    "ffmpeg's difference": (riff(form(), chunk(b"data", DATA, 2**32 - 37), size=2**32 - 1), "unknown length"),
-    "sox": (riff(form(), chunk(b"data", DATA, 0x7FFFF000), size=0x7FFFF024), "states 2147479552 bytes, an unknown"),
-    "arecord": (riff(form(), chunk(b"data", DATA, 2**31), size=2**31 + 36), "states 2147483648 bytes, an unknown"),
-    "GStreamer": (riff(form(), chunk(b"data", DATA, 0x7FFF0000)), "states 2147418112 bytes, an unknown"),
+    "power cut": (riff(form(), chunk(b"data", DATA, 0), size=0), "at byte 36 states 0 bytes, which means unknown"),
+    "ffmpeg": (
+        riff(form(), chunk(b"data", DATA, 2**32 - 1), size=2**32 - 1),
+        "states 4294967295 bytes, which means unknown",
+    ),
+    "ffmpeg's difference": (riff(form(), chunk(b"data", DATA, 2**32 - 37), size=2**32 - 1), "which means unknown"),
+    "sox": (
+        riff(form(), chunk(b"data", DATA, 0x7FFFF000), size=0x7FFFF024),
+        "states 2147479552 bytes, which means unknown",
+    ),
+    "arecord": (
+        riff(form(), chunk(b"data", DATA, 2**31), size=2**31 + 36),
+        "states 2147483648 bytes, which means unknown",
+    ),
+    "GStreamer": (riff(form(), chunk(b"data", DATA, 0x7FFF0000)), "states 2147418112 bytes, which means unknown"),
     "unknown, and chunks behind": (riff(form(), chunk(b"data", DATA, 0), INFO, ODD, size=0), "read to the end, 3840"),
     "within a frame": (riff(form(), chunk(b"data", DATA + b"\1\2\3", 0), size=0), "read to the end, 3840 bytes"),
     "RF64 without its lengths": (riff(ds64(0), form(), chunk(b"data", DATA, 2**32 - 1), kind=b"RF64"), "unknown"),
     "RF64 with the lower length": (riff(ds64(7), form(), DATA_CHUNK, kind=b"RF64", size=2**32 - 1), ""),
     "RF64 with a wrong length": (
         riff(ds64(3840), form(), chunk(b"data", DATA, 16), kind=b"RF64"),
-        "states 16 bytes, but 3840 fit the file",
+        "states 16 bytes, but the file contains 3840",
     ),
     "only RIFF is right": (riff(form(), chunk(b"data", DATA, len(DATA) + 44)), "as the RIFF chunk states"),
     "rest": (riff(form(), DATA_CHUNK) + b"\x01\xff\x80?" * 9, "36 bytes from byte 3884 on belong to no chunk"),
@@ -106,7 +115,7 @@ WRONG = {
     "bytes per second": (riff(form(byte_rate=12_345), DATA_CHUNK), "states 12345 bytes per second, but 96000 Hz need"),
     "frame": (
         riff(chunk(b"fmt ", struct.pack("<HHIIHH", 1, 4, RATE_HZ, 8 * RATE_HZ, 7, 16)), DATA_CHUNK),
-        "states frames of 7 bytes, but all else needs 8",
+        "states frames of 7 bytes, but its other values need 8",
     ),
 }
 
@@ -166,7 +175,7 @@ REFUSED = {
     "unknown GUID": (riff(extensible(16, 16, b"\1" * 16), DATA_CHUNK), r"contains samples of an unknown format"),
     "other form": (b"RIFF\x00\x10\0\0AVI LIST", r"is an AVI video; convert it with"),
     "only a start": (b"RIF", r"is not a WAV file: it begins with b'RIF'"),
-    "nothing": (b"", r"is empty, with 0 bytes; copy it again, or leave it out"),
+    "nothing": (b"", r"is empty; copy the file again, or leave it out"),
     "16 bits in 4 bytes": (
         riff(chunk(b"fmt ", struct.pack("<HHIIHH", 1, 1, RATE_HZ, 2 * RATE_HZ, 4, 16)), DATA_CHUNK),
         r"states frames of 4 bytes, but 1 channels of 16 bits and 192000 bytes per second need 2; save the file again",
@@ -182,7 +191,7 @@ def test_read_wav_refuses_by_chunk_and_byte(tmp_path, name):
 
 
 def test_read_wav_refuses_missing_files(tmp_path):
-    with pytest.raises(DataError, match=r"none\.wav: No such file or directory; give a WAV file"):
+    with pytest.raises(DataError, match=r"none\.wav: No such file or directory; choose a WAV file"):
         read_wav(tmp_path / "none.wav")
 
 
@@ -258,7 +267,7 @@ def test_read_wav_unwraps_lengths_above_4_gib(tmp_path, n_bytes, trailer):
     assert wav.samples.shape == (n_bytes // 16, 8)
     assert last.tolist() == [[1, 2, 3, 4, 5, 6, 7, 8]]
     assert wav.notes[0] == (
-        f"the data chunk at byte 36 states {n_bytes % 2**32} bytes, but {n_bytes} fit the file; these were read"
+        f"the data chunk at byte 36 states {n_bytes % 2**32} bytes, but the file contains {n_bytes}, which were read"
     )
     assert most < 100e6
 

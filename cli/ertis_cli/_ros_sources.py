@@ -239,7 +239,7 @@ def _with_call(
         if not is_passive(readers[name].settings, stamps[name][index])
     ]
     if not kept:
-        raise DataError(f"{path}: all measurements are passive and have no echoes; give a recording of emitted calls")
+        raise DataError(f"{path}: all measurements are passive and have no echoes; choose a recording of emitted calls")
     if len(kept) < len(order):
         on_passive(len(order) - len(kept))
     return kept

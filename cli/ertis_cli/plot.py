@@ -174,7 +174,7 @@ def plot(
     if kind != "array":
         _require_no_array(path)
     if not path.name:  # "." and "/" give no name for the picture
-        raise DataError(f"{path} is a folder; give a recording, an energyscape file or a file of acoustic maps")
+        raise DataError(f"{path} is a folder; choose a recording, an energyscape file or a file of acoustic maps")
     target = target or path.with_suffix(".png")
     checks.choice("picture format", target.suffix.lower(), _FORMATS)
     check_target(target, overwrite=force)

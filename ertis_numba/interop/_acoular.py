@@ -71,13 +71,13 @@ def read_acoular(path: Path) -> tuple[float, Samples, Settings | None]:
         reported = _settings(file)
     if rates_hz is None or rates_hz.size != 1:
         raise DataError(
-            f"{path}: sample_freq is {'not a number' if rates_hz is None else rates_hz.tolist()}; give one number, the "
-            "rate in Hz"
+            f"{path}: sample_freq is {'not a number' if rates_hz is None else rates_hz.tolist()}; store one "
+            "number, the sample rate in Hz"
         )
     rate_hz = float(rates_hz.item())
     if len(shape) != 2 or not all(shape) or samples.dtype.kind not in "fi":
         raise DataError(
-            f"{path}: time_data is {samples.dtype} of shape {shape}; give floating or signed numbers of shape "
+            f"{path}: time_data is {samples.dtype} of shape {shape}; store floating-point or signed numbers of shape "
             "(sample, channel)"
         )
     return rate_hz, samples, _of_signals(received_settings(reported, str(path)), rate_hz) if reported else None
@@ -100,7 +100,7 @@ class _Stored:
 def _time_data(file: h5py.File, path: Path) -> h5py.Dataset:
     """Return the signals; refuse a file without them, or without their rate."""
     if "ertis_format" in file.attrs:
-        raise DataError(f"{path} is a file of this package, and needs no import; use 'ertis process' or 'ertis info'")
+        raise DataError(f"{path} is a file of this package, which needs no import; use 'ertis process' or 'ertis info'")
     if "time_data" not in file:
         names = ", ".join(sorted(file)[:_MAX_NAMES]) or "nothing"
         raise DataError(f"{path} contains no time_data with a sample_freq, but {names}; {_SAVE}")

@@ -107,7 +107,7 @@ class _EchoRows(NamedTuple):
             if not isinstance(measurement, Measurement):
                 raise ArgumentError(
                     f"{type(measurement).__name__} is given, but format 'batslam' holds the signals of measurements; "
-                    "give a recording"
+                    "choose a recording"
                 )
             if ears is None:
                 ears, sensor = VirtualEars(measurement.settings, beam_azimuth_deg), measurement.stamp.sensor

@@ -109,7 +109,7 @@ def open_pcm(
         others = left_out(several[0])
         several = wav_files(several[0], by_time=not join)
     if not several:
-        raise ArgumentError("no PCM file is given; give at least one")
+        raise ArgumentError("the list of PCM files is empty; pass at least one file")
     _require_different(several)
     if time_expansion is not None:
         checks.between("time_expansion", time_expansion, 1 / _MAX_EXPANSION, _MAX_EXPANSION)
@@ -166,7 +166,7 @@ def _require_emissions(skip_s: float, *, passive: bool) -> None:
 def _require_settings(settings: Settings | None, first: PcmFile) -> Settings:
     known = settings or first.settings
     if known is None:
-        raise ArgumentError(f"{first.path} contains no array and call; give settings")
+        raise ArgumentError(f"{first.path} contains no array and no call; pass settings (--settings)")
     return known
 
 
@@ -177,8 +177,8 @@ def _require_channels(files: Sequence[PcmFile], settings: Settings, sync_channel
         checks.integer("sync_channel", sync_channel, 0, first.n_channels - 1)
         if first.n_channels != wanted + 1:
             raise DataError(
-                f"{first.path} has {first.n_channels} channels, but {wanted} of array {layout.name!r} and the one of "
-                "--sync-channel are needed; give a layout with one row for each other channel (--layout)"
+                f"{first.path} has {first.n_channels} channels, but array {layout.name!r} and --sync-channel need "
+                f"{wanted} + 1; use a layout (--layout) with one row for each channel except that of --sync-channel"
             )
         return
     if first.n_channels == wanted:
@@ -188,11 +188,11 @@ def _require_channels(files: Sequence[PcmFile], settings: Settings, sync_channel
     text = f"{first.path} has {first.n_channels} channels, but array {layout.name!r} has {wanted}"
     if len(files) > 1 and sum(file.n_channels for file in files) == wanted:
         raise DataError(
-            f"{text}, as all {len(files)} files have together; use --join (join=True) if they are the microphones of "
+            f"{text}, the total of all {len(files)} files; use --join (join=True) if the files are the microphones of "
             "one measurement"
         )
     if settings.array.positions_m is not None:
-        raise DataError(f"{text}; correct array.positions_m, one row for each of {first.n_channels} channels")
+        raise DataError(f"{text}; write one row for each of {first.n_channels} channels in array.positions_m")
     raise DataError(f"{text}; use a layout with one row for each channel (--layout, or array.layout in the settings)")
 
 
@@ -206,14 +206,14 @@ def _fitted(
     if recording.sample_rate_hz <= 2 * call.high_frequency_hz:
         raise DataError(
             f"{first.path} has a sample rate of {recording.sample_rate_hz:g} Hz, too low for a call up to "
-            f"{call.high_frequency_hz:g} Hz; give the emitted call, record at more than twice its frequency, use "
-            "--time-expansion (time_expansion) if the file plays slower than the sound, or give --passive "
-            "(passive=True) if no call was emitted"
+            f"{call.high_frequency_hz:g} Hz; set the emitted call as [call], record at a higher rate, use "
+            "--time-expansion (time_expansion) if the file plays slower than the sound, or --passive (passive=True) "
+            "if no call was emitted"
         )
     if recording.duration_s <= call.end_s:
         raise DataError(
             f"a measurement of {first.path} has {1e3 * recording.duration_s:.4g} ms, but the call alone lasts "
-            f"{1e3 * call.end_s:.4g} ms; give a longer --length, or skip less (--skip)"
+            f"{1e3 * call.end_s:.4g} ms; use a longer --length, or skip less (--skip)"
         )
     held_m = record_range_m(recording, call, sound_speed_m_s(settings.air))
     stated_m = settings.processing.range_m
@@ -222,7 +222,7 @@ def _fitted(
     processing = processing.replace(range_m=held_m if is_whole else stated_m)
     holds = f"{held_m[0]:g}–{held_m[1]:g} m"
     if is_whole:
-        note = f"range {holds}, all that the record holds"
+        note = f"range {holds}, the full window of the record"
     else:
-        note = f"range {stated_m[0]:g}–{stated_m[1]:g} m as in the settings; the record holds {holds}"
+        note = f"range {stated_m[0]:g}–{stated_m[1]:g} m, as in the settings; the record contains {holds}"
     return settings.replace(recording=recording, processing=processing), [note]

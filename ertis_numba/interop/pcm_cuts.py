@@ -78,7 +78,7 @@ def cut_regularly(files: Sequence[PcmFile], *, skip_s: float, length_s: float | 
             raise DataError(
                 f"{file.path} lasts {file.duration_s:.4g} s, but {skipped / rate_hz:.4g} s to skip and a measurement "
                 f"of {max(n_samples, 1) / rate_hz:.4g} s are needed; skip less (--skip)"
-                + (" or give a shorter --length" if length_s is not None else "")
+                + (" or use a shorter --length" if length_s is not None else "")
             )
     several = [period * np.arange(count, dtype=np.float64) for count in counts]
     return Cuts(
@@ -119,8 +119,8 @@ def cut_at_emissions(
         wanted = math.floor(_checked_length_s(length_s) * rate_hz * (1 + 1e-12))
         if wanted > n_samples:
             raise DataError(
-                f"{files[0].path}: {n_samples / rate_hz:.6g} s follow an emission until the next one or the end, but "
-                f"--length is {length_s:g} s; use a shorter --length (length_s)"
+                f"{files[0].path}: an emission is followed by the next one or by the end after "
+                f"{n_samples / rate_hz:.6g} s, but --length is {length_s:g} s; use a shorter --length (length_s)"
             )
         n_samples = wanted
     kept = [starts[starts + n_samples <= file.n_samples] for file, starts in zip(files, several, strict=True)]
@@ -128,7 +128,7 @@ def cut_at_emissions(
     rounding = max(float(np.abs(exact - starts).max()) for exact, starts in zip(times, kept, strict=True))
     cuts = Cuts(n_samples, kept, [exact / rate_hz for exact in times], ())
     summary = (
-        f"{len(cuts)} emission{'s' * (len(cuts) > 1)} found in channel {channel}, which is left out"
+        f"{len(cuts)} emission{'s' * (len(cuts) > 1)} found in channel {channel}, which is not imported"
         f"{_intervals(cuts.times_s)}; rounding to samples changes ranges by up to "
         f"{1e3 * rounding / rate_hz * sound_speed_m_s / 2:.2g} mm"
     )
@@ -159,12 +159,12 @@ def _count(n_samples: int, period: float, length: int) -> int:
 
 def _assumption(skip_s: float, length_s: float | None) -> str:
     """Return the note on the assumed times of the emissions."""
-    text = f"the sample at {skip_s:g} s of each file" if skip_s else "the first sample of each file"
+    text = f"{skip_s:g} s after the start of each file" if skip_s else "at the first sample of each file"
     if length_s is not None:
-        text += f", and one every {length_s:g} s after it,"
+        text += f", and then every {length_s:g} s"
     return (
-        f"{text} is taken as the start of the emission, where range is 0; use --skip or --sync-channel (skip_s, "
-        "sync_channel) if the emission is later"
+        f"the emission (range 0) is assumed {text}; use --skip or --sync-channel (skip_s, sync_channel) if this is "
+        "wrong"
     )
 
 

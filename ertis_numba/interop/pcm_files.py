@@ -115,7 +115,7 @@ class PcmSamples:
         """
         numbers = self.channel_or_nan(channel, samples)
         if not np.isfinite(numbers).all():
-            raise DataError(f"{self._file.path} contains numbers that are not finite in channel {channel}; remove them")
+            raise DataError(f"channel {channel} of {self._file.path} contains NaN or infinity; replace these numbers")
         return numbers
 
     def channel_or_nan(self, channel: int, samples: slice) -> NDArray[np.float64]:
@@ -169,11 +169,11 @@ def joined(files: Sequence[PcmFile]) -> PcmFile:
     _require_one_measurement(files)
     first = files[0]
     n_samples = min(file.n_samples for file in files)
-    notes = [f"the files are joined, {_channels(files)}"]
+    notes = [f"the files were joined as channels, {_channels(files)}"]
     longest = max(file.n_samples for file in files)
     if longest > n_samples:
         notes.append(
-            f"the files differ in length; {(longest - n_samples) / first.rate_hz:.4g} s at the end are left out"
+            f"the files differ in length; up to {(longest - n_samples) / first.rate_hz:.4g} s at the end were left out"
         )
     return replace(
         first,
@@ -190,8 +190,8 @@ def _require_one_measurement(files: Sequence[PcmFile]) -> None:
     if names == sorted(names) != sorted(names, key=natural_order):
         listed = ", ".join(names[:8]) + ", …" * (len(names) > 8)
         raise DataError(
-            f"the files are in the order of the alphabet: {listed}; list them in the order of the channels, or import "
-            "their folder, in which numbers count"
+            f"the files are in alphabetical order: {listed}; list them in the order of the channels, or import their "
+            "folder, which sorts them by number"
         )
     times_ns = [time and time.since_1970_ns for time in first_stated_times(files)]
     for file, time_ns in zip(files, times_ns, strict=True):
@@ -199,7 +199,7 @@ def _require_one_measurement(files: Sequence[PcmFile]) -> None:
         if abs(late_s) > MAX_DIFFERENCE_S:
             raise DataError(
                 f"{file.path} begins {abs(late_s):.6g} s {'after' if late_s > 0 else 'before'} {first.path.name}; join "
-                "files of the same time only"
+                "only files that begin at the same time"
             )
 
 
@@ -217,7 +217,7 @@ def first_stated_times(files: Sequence[PcmFile]) -> list[StatedTime | None]:
 def require_alike(files: Sequence[PcmFile], *, joined: bool = False) -> None:
     """Refuse files that differ in rate, channels or type of numbers."""
     first = files[0]
-    remedy = "join files of one recorder only" if joined else "import each file separately"
+    remedy = "join only files of one recorder" if joined else "import each file separately"
     for file in files[1:]:
         for name, came, wanted in (
             ("Hz", file.rate_hz, first.rate_hz),
@@ -275,7 +275,7 @@ def _read(path: Path) -> _Read:
     except PermissionError as error:
         raise DataError(f"{path}: {error.strerror}; ask its owner for permission to read it") from error
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; give a PCM file") from error
+        raise DataError(f"{path}: {error.strerror}; choose a PCM file") from error
     kind = kind_of(path)
     if kind is None:
         is_acoular = path.suffix.lower() in _ACOULAR
@@ -311,7 +311,7 @@ def _converted(
         came = numbers[sample, channel]
         raise DataError(
             f"{file.path} contains {came:g} at sample {first_sample + sample} of channel {channel}; "
-            + (f"give numbers up to {_MAX_FLOAT32:.4g}" if np.isfinite(came) else "give finite numbers")
+            + (f"scale the samples to at most {_MAX_FLOAT32:.4g}" if np.isfinite(came) else "give finite numbers")
         )
     return words
 

@@ -24,7 +24,7 @@ def is_wav_folder(path: str | Path) -> bool:
     try:
         suffixes = {each.suffix.lower() for each in Path(path).iterdir()} if Path(path).is_dir() else set()
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; give a folder that can be read") from error
+        raise DataError(f"{path}: {error.strerror}; choose a readable folder") from error
     return bool(suffixes & _WAV) and ".bin" not in suffixes
 
 
@@ -66,4 +66,4 @@ def left_out(folder: Path) -> list[str]:
     if not names:
         return []
     listed = ", ".join(names[:4]) + ", …" * (len(names) > 4)
-    return [f"{folder.name} contains more recordings, which were left out: {listed}; import them separately"]
+    return [f"{folder.name} also contains recordings that were not imported: {listed}; import them separately"]

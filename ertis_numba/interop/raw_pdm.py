@@ -88,12 +88,12 @@ class RawReader:
     def _count(self, path: Path) -> int:
         """Return the number of measurements in a file; refuse incomplete ones."""
         if path.is_dir():
-            raise DataError(f"{path} is a folder; give a file of raw words")
+            raise DataError(f"{path} is a folder; choose a file of raw words")
         try:
             with path.open("rb") as file:  # stat does not show whether the file is readable.
                 n_bytes = file.seek(0, 2)
         except OSError as error:
-            raise DataError(f"{path}: {error.strerror}; give a file of raw words") from error
+            raise DataError(f"{path}: {error.strerror}; choose a file of raw words") from error
         found = problem_of(path) if self._check_kind else ""
         if found:
             raise DataError(f"{path} {found}; if it contains raw words all the same, use --raw (check_kind=False)")

@@ -74,7 +74,7 @@ def _read_guano(content: bytes, found: RecorderMetadata) -> None:
         try:
             found.stated_times.append(_stated_time(time, "GUANO"))
         except ValueError:
-            found.notes.append(f"GUANO Timestamp {time!r} is no time and is not used")
+            found.notes.append(f"GUANO Timestamp {time!r} was ignored, because it is no time")
     elif name := fields.get("Original Filename"):
         found.stated_times += [
             time._replace(source="GUANO's Original Filename") for time in times_in_names([name]) if time
@@ -91,7 +91,7 @@ def _positive(name: str, fields: dict[str, str], found: RecorderMetadata) -> flo
         number = float(text)
         if 0 < number < math.inf:
             return number
-    found.notes.append(f"GUANO {name} {text!r} is no positive number and is not used")
+    found.notes.append(f"GUANO {name} {text!r} was ignored, because it is no positive number")
     return None
 
 

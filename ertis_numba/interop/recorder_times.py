@@ -66,8 +66,8 @@ def file_times(
         without = files[best.index(None)].path
         with_time = next(file.path for file, time in zip(files, best, strict=True) if time)
         raise DataError(
-            f"{without} states no time in its metadata or name, but {with_time.name} does; use --start once for each "
-            "file (start_ns), or import such files separately"
+            f"{without} contains no time in its metadata or name, but {with_time.name} does; use --start once for each "
+            "file (start_ns), or import the files without times separately"
         )
     times_ns = [time.since_1970_ns for time in known]
     if min(times_ns) < 0:
@@ -88,10 +88,13 @@ def _back_to_back_ns(files: Sequence[TimedFile], start_ns: int) -> list[int]:
 def _unknown(files: Sequence[TimedFile], starts_ns: Sequence[int]) -> list[str]:
     """Return the note on files without any time."""
     if len(files) == 1:
-        return [f"{files[0].path.name} states no time, so its time is unknown; {_UNKNOWN.partition(',')[0]}"]
-    relative = "from --start on, without pauses" if starts_ns else "without pauses"
+        return [f"{files[0].path.name} contains no time, so its time is unknown; {_UNKNOWN.partition(',')[0]}"]
+    relative = ", beginning at --start" if starts_ns else ""
     remedy = "use --start once for each file" if starts_ns else _UNKNOWN
-    return [f"no times are known from metadata or names; the files are stamped back to back, {relative}; {remedy}"]
+    assumption = (
+        "neither metadata nor names contain times, so the files are assumed to follow each other without pauses"
+    )
+    return [f"{assumption}{relative}; {remedy}"]
 
 
 def _require_order(files: Sequence[TimedFile], times_ns: Sequence[int]) -> None:
@@ -127,10 +130,10 @@ def _moved(moved_s: Sequence[float], resolution_s: float, times_ns: Sequence[int
     """Return the note on files that were stamped at the end of the previous one."""
     if max(moved_s) < _NEGLIGIBLE_S:
         return []
-    same = "; use --join (join=True) if files of one time are the microphones of one measurement"
+    same = "; use --join (join=True) if files with the same time are the microphones of one measurement"
     note = (
-        f"files begin up to {max(moved_s):.3g} s before the end of the previous one, as their times are accurate to "
-        f"{resolution_s:g} s; they are stamped at its end{same if len(set(times_ns)) < len(times_ns) else ''}"
+        f"times in whole steps of {resolution_s:g} s overlap the previous file by up to {max(moved_s):.3g} s; such "
+        f"files begin at the end of the previous one{same if len(set(times_ns)) < len(times_ns) else ''}"
     )
     return [note]
 
@@ -142,7 +145,7 @@ def _overlapping(files: Sequence[TimedFile], overlaps: Sequence[tuple[int, float
     more = f" (and {len(overlaps) - 1} more)" if len(overlaps) > 1 else ""
     note = (
         f"{files[number].path.name} begins {overlap_s:.3g} s before the end of {files[number - 1].path.name}{more}; "
-        "check the times, and import each recorder separately"
+        "check the times, or import each recorder separately"
     )
     return [note]
 
@@ -161,7 +164,7 @@ def _contradictions(files: Sequence[TimedFile], named: Sequence[StatedTime | Non
     used = file.stated_times[0]
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     note = (
-        f"{file.path.name}{more}: {used.source} and {other.source} differ ({_stated(used)} and {_stated(other)}); "
+        f"{file.path.name}{more}: {used.source} ({_stated(used)}) and {other.source} ({_stated(other)}) differ; "
         f"{used.source} is used"
     )
     return [note]
@@ -179,12 +182,12 @@ def _source(known: Sequence[StatedTime], *, is_relative: bool) -> str:
     """Return the note on the source and the zone of the times."""
     sources = " and ".join(dict.fromkeys(time.source for time in known))
     if is_relative:
-        return f"the times between files are from {sources}; that of the first file is --start"
+        return f"the first file begins at --start; the times between files are from {sources}"
     span = _text(known[0].since_1970_ns)
     if len(known) > 1:
         span += f" to {_text(known[-1].since_1970_ns)}"
     if all(time.offset is None for time in known):
-        return f"times are from {sources} ({span}); no offset is stated, so they are taken as UTC; else use --start"
+        return f"times are from {sources} ({span}); they state no offset, so UTC is assumed; otherwise use --start"
     offsets = dict.fromkeys("UTC" if time.offset is None else _zone(time.offset) for time in known)
     return f"times are from {sources} ({span}), with the offset {' and '.join(offsets)}"
 

@@ -123,7 +123,7 @@ def _measurements(folder: Path) -> tuple[list[Path], list[int]]:
         raise DataError(f"{folder}: {error.strerror}; give a folder of raw files") from error
     if not paths:
         raise DataError(
-            f"{folder} is a folder; give a file of raw words, or a folder with .wav files or .bin files of RTIS Dev"
+            f"{folder} is a folder; choose a file of raw words, or a folder with .wav files or .bin files of RTIS Dev"
         )
     split = [re.fullmatch(r"(.*?)(\d*)", path.stem) for path in paths]
     names = {match[1] for match in split if match}

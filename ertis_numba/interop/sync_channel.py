@@ -75,24 +75,24 @@ def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, 
     notes = []
     if len(times) and match < _GOOD_MATCH:
         notes.append(
-            f"the call in channel {channel} resembles that of the settings by only {match:.2f} of 1; the emissions are "
-            "shifted if another call was emitted"
+            f"the call in channel {channel} matches that of the settings poorly (correlation {match:.2f}); if another "
+            "call was emitted, set it as [call], because all ranges may be shifted"
         )
     if not len(times):
         times, rise = _onsets(read, n_samples, rate_hz)
         if not len(times):
             raise DataError(
-                f"{path}: channel {channel} contains no emission: at most {max(match, 0.0):.2f} of 1 matches the call, "
-                "and no pulse exceeds the noise; choose the channel of the loopback (--sync-channel), and set the "
-                "emitted call as [call]"
+                f"{path}: channel {channel} contains no emission: neither the call (correlation "
+                f"{max(match, 0.0):.2f}) nor a pulse above the noise; choose the channel of the loopback "
+                "(--sync-channel), and set the emitted call as [call]"
             )
         notes.append(
-            f"channel {channel} does not contain the call (correlation {match:.2f}); the onsets of its pulses, which "
-            f"rise in {1e6 * rise / rate_hz:.2g} µs, are taken as the emissions"
+            f"channel {channel} does not contain the call (correlation {match:.2f}); emissions are assumed at the "
+            f"onsets of its pulses, which rise in {1e6 * rise / rate_hz:.2g} µs"
         )
     complete = times[times >= -0.5]
     if len(complete) < len(times):
-        notes.append("an emission began before the first sample; it was left out")
+        notes.append("an emission that began before the first sample was left out")
     if not len(complete):
         raise DataError(
             f"{path}: the only emission in channel {channel} began before the first sample; start the recorder before "

@@ -36,7 +36,7 @@ def true_rate_hz(
         differs = any(each is not None and not _equal(each, expansion) for each in (stated, ratio))
         text = _expanded(expansion, header_hz, "--time-expansion")
         if differs:
-            text += f", although its metadata state {_statement(metadata)}"
+            text += f", although the metadata state {_statement(metadata)}"
         return header_hz * expansion, [text] if differs or expansion != 1 else []
     if ratio is None:
         factor = stated or 1.0
@@ -52,14 +52,14 @@ def true_rate_hz(
         else f"--time-expansion {stated:g} if the file plays slower by this factor"
     )
     raise DataError(
-        f"{path}: its header states {header_hz:g} Hz, but its metadata state {_statement(metadata)}; use "
+        f"{path}: the header states {header_hz:g} Hz, but the metadata state {_statement(metadata)}; use "
         f"--time-expansion 1 (time_expansion=1) if the header is right, or {other}"
     )
 
 
 def _expanded(factor: float, header_hz: float, source: str) -> str:
     if factor == 1:
-        return f"the sample rate is the header's {header_hz:g} Hz ({source})"
+        return f"the sample rate is {header_hz:g} Hz, as in the header ({source})"
     return f"time-expanded by {factor:g} ({source}): the sample rate is {header_hz * factor:g} Hz, not {header_hz:g} Hz"
 
 

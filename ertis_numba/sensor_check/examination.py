@@ -124,8 +124,8 @@ def uncheckable_recording(path: str | Path, error: Exception) -> RecordingCheck:
     --------
     >>> from ertis_numba.errors import DataError
     >>> from ertis_numba.sensor_check import uncheckable_recording
-    >>> uncheckable_recording("a.h5", DataError("a.h5 is empty; give a recording")).verdict
-    'a.h5: 1 fault: the file is empty. Remedy: give a recording'
+    >>> uncheckable_recording("a.h5", DataError("a.h5 is empty; choose a recording")).verdict
+    'a.h5: 1 fault: the file is empty. Remedy: choose a recording'
     """
     return RecordingCheck(path=Path(path), sensors=(), unreadable=(_unreadable(Path(path), _reason(error)),))
 

@@ -185,10 +185,10 @@ class FileReader(Sequence[Item]):
         """Return the way from a file of another kind to one that can be read here."""
         mode = "active" if self._kind == "energyscape" else "passive"
         if self._kind == "recording":
-            return "give the recording it was made from"
+            return "use the recording from which it was made"
         if kind == "recording":
             return f"process it first ('ertis process {quoted(self.path)} --mode {mode}')"
-        return f"process the recording it was made from with --mode {mode}"
+        return f"process the recording from which it was made with --mode {mode}"
 
     def _select_sensor(self, sensor: str | None) -> str:
         names = ", ".join(self.sensors[:_MAX_NAMES]) + ", …" * (len(self.sensors) > _MAX_NAMES)
@@ -234,7 +234,7 @@ def _kind(file: h5py.File, path: Path, wanted: str) -> str:
     kind = to_python(file.attrs.get("ertis_format", ""))
     version = to_python(file.attrs.get("ertis_format_version", 0))
     if isinstance(kind, str) and kind == "occupancy_map":
-        raise DataError(f"{path} is an occupancy map; give {wanted}")
+        raise DataError(f"{path} is an occupancy map; choose {wanted}")
     if not isinstance(kind, str) or kind not in _KIND_NAMES or not isinstance(version, int):
         raise DataError(f"{path} {_problem(file, path, wanted)}")
     if version > FORMAT_VERSION:
@@ -249,7 +249,7 @@ def _problem(file: h5py.File, path: Path, wanted: str) -> str:
     kind = kind_of(path)
     if kind is not None and not kind.is_hdf5:  # MATLAB puts its name before the HDF5.
         return problem_of(path, wanted)
-    remedy = f"give {wanted}"
+    remedy = f"choose {wanted}"
     if "time_data" in file and "recording" in wanted:
         name = quoted(path)
         remedy = f"import its signals with 'ertis import {name} --settings FILE.toml --output FILE.h5'"

@@ -66,21 +66,21 @@ def _n_bytes(path: Path, wanted: str) -> int:
     except PermissionError as error:
         raise DataError(f"{path}: {error.strerror}; ask its owner for permission to read it") from error
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; give {wanted}") from error
+        raise DataError(f"{path}: {error.strerror}; choose {wanted}") from error
 
 
 def open_file(path: Path, wanted: str = RESULT_OR_RECORDING) -> h5py.File:
     """Open an HDF5 file for reading; errors name the kind of file that is wanted."""
     if path.is_dir():
-        raise DataError(f"{path} is a folder; give {wanted}")
+        raise DataError(f"{path} is a folder; choose {wanted}")
     n_bytes = _n_bytes(path, wanted)
     if n_bytes == 0:
-        raise DataError(f"{path} is empty; give {wanted}")
+        raise DataError(f"{path} is empty; choose {wanted}")
     if not h5py.is_hdf5(path):
         found = problem_of(path, wanted)
         if found:
             raise DataError(f"{path} {found}")
-        remedy = f"give {wanted}" + ", or import raw words first" * ("recording" in wanted)
+        remedy = f"choose {wanted}" + ", or import raw words first" * ("recording" in wanted)
         raise DataError(f"{path} is not an HDF5 file; {remedy}")
     try:
         return h5py.File(path, "r")

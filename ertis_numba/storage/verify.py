@@ -100,7 +100,7 @@ def _is_journal(path: Path) -> bool:
         with path.open("rb") as file:
             return file.read(len(_SQLITE)) == _SQLITE
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; give a recording or a journal") from error
+        raise DataError(f"{path}: {error.strerror}; choose a recording or a journal") from error
 
 
 def _of_recording(path: Path, sensor: str, structure: str) -> SensorReport:

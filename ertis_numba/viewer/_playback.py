@@ -124,7 +124,7 @@ class Playback:
             else:
                 self.shows_maps = kind == "acoustic_map"
                 if acoustic_maps is not None and acoustic_maps != self.shows_maps:
-                    raise ArgumentError(f"{path} holds {_CONTENTS[kind]} only; give a recording for others")
+                    raise ArgumentError(f"{path} holds {_CONTENTS[kind]} only; choose a recording for others")
             if self.shows_maps:
                 self._notes += [
                     masked_note(name) for name, each in stamps.items() if any(one.behaviour == "active" for one in each)

@@ -106,12 +106,14 @@ def _opened(path: Path) -> Content:
         with path.open("rb") as file:
             start = file.read(12)
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; give a WAV file") from error
+        raise DataError(f"{path}: {error.strerror}; choose a WAV file") from error
     if not start:
-        raise DataError(f"{path} is empty, with 0 bytes; copy it again, or leave it out")
+        raise DataError(f"{path} is empty; copy the file again, or leave it out")
     if start[:4] not in _ORDERS or start[8:] != b"WAVE":
         found = problem_of(path)
         if found:
             raise DataError(f"{path} {found}")
-        raise DataError(f"{path} is not a WAV file: it begins with {start[:4]!r}; give WAV, or HDF5 of Acoular (.h5)")
+        raise DataError(
+            f"{path} is not a WAV file: it begins with {start[:4]!r}; choose a WAV file, or HDF5 of Acoular (.h5)"
+        )
     return Content(path, np.asarray(np.memmap(path, np.uint8, "r")), _ORDERS[start[:4]])

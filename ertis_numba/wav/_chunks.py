@@ -80,7 +80,7 @@ def _require_complete(content: Content, chunks: Chunks, last: bytes, place: int)
     if chunks.n_bytes % form.frame_bytes:
         raise DataError(
             f"{path} has {chunks.n_bytes} bytes of samples, not a multiple of its frame size, {form.frame_bytes} "
-            "bytes; copy it again or save it again as WAV"
+            "bytes; copy the file again, or save it again as WAV"
         )
     return form
 

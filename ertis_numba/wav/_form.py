@@ -109,7 +109,10 @@ def read_form(content: bytes, order: str, place: int, path: Path) -> Form:
     notes = []
     wanted = -(-bits // 8) * n_channels
     if frame_bytes % n_channels and byte_rate == rate_hz * wanted:
-        notes.append(f"the fmt chunk at byte {place} states frames of {frame_bytes} bytes, but all else needs {wanted}")
+        notes.append(
+            f"the fmt chunk at byte {place} states frames of {frame_bytes} bytes, but its other values need "
+            f"{wanted}, which was used"
+        )
         frame_bytes = wanted
     sample_bytes, rest = divmod(frame_bytes, n_channels)
     if frame_bytes != wanted and byte_rate == rate_hz * wanted:

@@ -160,11 +160,11 @@ def sample_bytes(content: Content, place: int, wide: int | None, frame_bytes: in
     if stated in fits and (stated or not room or len(fits) == 1):
         return Length(stated)
     if len(fits) == 1:
-        return Length(fits[0], f"{where}, but {fits[0]} fit the file; these were read")
+        return Length(fits[0], f"{where}, but the file contains {fits[0]}, which were read")
     if is_mark(stated):
         length = _end_of_samples(content, start) - start
         length -= length % frame_bytes
-        return Length(length, f"{where}, an unknown length; it was read to the end, {length} bytes")
+        return Length(length, f"{where}, which means unknown; the samples were read to the end, {length} bytes")
     return _of_misfit(content, start, stated, room, where)
 
 
@@ -174,7 +174,9 @@ def _of_misfit(content: Content, start: int, stated: int, room: int, where: str)
     if stated > room:
         riff = content.header(0)[1]
         if riff + HEADER_BYTES == n_bytes:
-            return Length(room, f"{where}, but the file ends after {room}, as the RIFF chunk states; these were read")
+            return Length(
+                room, f"{where}, but the file ends after {room}, as the RIFF chunk states; these bytes were read"
+            )
         raise DataError(
             f"{content.path} is truncated: {where}, but the file ends after {room}; copy it again, or read what is "
             f"left of it with {_read_on(content.path)}"
@@ -185,7 +187,7 @@ def _of_misfit(content: Content, start: int, stated: int, room: int, where: str)
             f"{content.path}: {where}, but {room} follow, and no chunk begins at byte {start + stated}; "
             f"read all of them with {_read_on(content.path)}"
         )
-    return Length(stated, f"{left} bytes from byte {start + stated} on belong to no chunk; they were left out")
+    return Length(stated, f"{left} bytes from byte {start + stated} on belong to no chunk and were left out")
 
 
 def _read_on(path: Path) -> str:

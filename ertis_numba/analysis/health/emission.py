@@ -69,20 +69,20 @@ def describe_shift(late_s: Sequence[float], speed_m_s: float) -> tuple[str, str]
     first_s, last_s = min(late_s), max(late_s)
     if last_s - first_s > _DRIFT_S:
         text = (
-            f"the direct sound drifts from {_side(first_s)} to {_side(last_s)} than the emitter's place allows; the "
-            f"ranges are up to {_centimetres(max(abs(first_s), abs(last_s)), speed_m_s)} wrong"
+            f"the direct sound drifts from {_side(first_s)} to {_side(last_s)} than the distance of the emitter "
+            f"allows; ranges are wrong by up to {_centimetres(max(abs(first_s), abs(last_s)), speed_m_s)}"
         )
-        return text, "import with --sync-channel, or with the exact time between emissions (--length)"
+        return text, "import again with --sync-channel, or with the exact time between emissions (--length)"
     middle_s = float(np.median(late_s))
     if abs(middle_s) <= MAX_SHIFT_S:
         return None
     text = (
-        f"the direct sound arrives {_side(middle_s)} than the emitter's place allows; the ranges are "
-        f"{_centimetres(abs(middle_s), speed_m_s)} too {'far' if middle_s > 0 else 'near'}"
+        f"the direct sound arrives {_side(middle_s)} than the distance of the emitter allows; all ranges are "
+        f"{_centimetres(abs(middle_s), speed_m_s)} too {'large' if middle_s > 0 else 'small'}"
     )
     if middle_s > 0:
-        return text, f"use --skip {round(middle_s, 6):g} when importing (in addition to a --skip used before)"
-    return text, f"start the record {-1e3 * middle_s:.3g} ms earlier, or use a smaller --skip when importing"
+        return text, f"import again with --skip {round(middle_s, 6):g}, plus the value of an earlier --skip"
+    return text, f"start recording {-1e3 * middle_s:.3g} ms earlier, or import again with a smaller --skip"
 
 
 def _side(late_s: float) -> str:
