@@ -250,5 +250,5 @@ def test_files_of_other_kinds_are_refused(path, tmp_path):
         ertis.open_acoustic_maps(tmp_path / "img.h5")
     with pytest.raises(DataError, match=r"maps\.h5 is a file of acoustic maps, wanted an energyscape file; proces"):
         ertis.open_energyscapes(path)
-    with pytest.raises(DataError, match=r"maps\.h5 is a file of acoustic maps, wanted a recording; give the recording"):
+    with pytest.raises(DataError, match=r"maps\.h5 is a file of acoustic maps, wanted a recording; use the recording"):
         ertis.open_recording(path)

@@ -260,7 +260,7 @@ def test_files_that_cannot_be_read_are_errors(tmp_path):
     errors = done.stderr.splitlines()
     assert [line.split(": ", 2)[:2] for line in errors] == [["ertis", "error"]] * 3
     assert "cut short or damaged" in errors[0]
-    assert f"{image} is an energyscape file, wanted a recording; give the recording it was made from" in errors[1]
+    assert f"{image} is an energyscape file, wanted a recording; use the recording from which it was made" in errors[1]
     assert f"{absent}: No such file or directory" in errors[2]
     assert done.stdout == ""
     objects = [json.loads(line) for line in run(cut, whole, "--json", code=1).stdout.splitlines()]

@@ -70,7 +70,7 @@ CASES = {
         1,
         "other.h5 is HDF5, but not of this package; choose a recording",
     ),
-    "energyscapes instead": ("process img.h5 -o out.h5", 1, "img.h5 is an energyscape file, wanted a recording; give"),
+    "energyscapes instead": ("process img.h5 -o out.h5", 1, "img.h5 is an energyscape file, wanted a recording; use"),
     "recording instead": ("peaks rec.h5", 1, "rec.h5 is a recording, wanted an energyscape file; process it first"),
     "cut short": ("process cut.h5 -o out.h5", 1, "cut.h5 is cut short or damaged: it has"),
     "newer": ("process newer.h5 -o out.h5", 1, "newer.h5 has format version 9, but this package reads up to 4; update"),

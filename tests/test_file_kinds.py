@@ -242,7 +242,7 @@ def test_commands_name_a_wav_file_and_its_import(tmp_path, command):
     assert f"take.wav is a WAV file; import it with 'ertis import {tmp_path}/take.wav --settings FILE" in done.stderr
 
 
-IMAGES = "give an energyscape file"
+IMAGES = "choose an energyscape file"
 
 
 @pytest.mark.parametrize("ending", ["wav", "TOML", "tum", "npz"])
@@ -285,7 +285,7 @@ WANTED = {
     "map -o map.h5": "choose a recording, or save its signals as WAV",
     "odometry": "choose a recording, or save its signals as WAV",
     "calibrate": "choose a recording, or save its signals as WAV",
-    "odometry REC --mounting": "give a scene or mounting file (.toml), or a file of ertis that contains mountings",
+    "odometry REC --mounting": "choose a scene or mounting file (.toml), or a file of ertis that contains mountings",
     "map REC -o map.h5 --poses": "the first line names the columns some, words",
 }
 

@@ -53,7 +53,7 @@ def test_info_reports_the_health(sick, tmp_path):
     image = write_energyscapes(tmp_path / "img.h5", [files.image()])
     done = run("info", image, "--health", code=1)
     assert done.stderr == (
-        f"ertis: error: {image} is an energyscape file, wanted a recording; give the recording it was made from\n"
+        f"ertis: error: {image} is an energyscape file, wanted a recording; use the recording from which it was made\n"
     )
     assert done.stdout == ""
 

@@ -76,7 +76,7 @@ def test_energyscape_file_is_not_a_recording(path, tmp_path):
     write_energyscapes(tmp_path / "img.h5", [image()])
     with pytest.raises(DataError, match=r"rec.h5 is a recording, wanted an energyscape file; process it first"):
         open_energyscapes(path)
-    with pytest.raises(DataError, match=r"img.h5 is an energyscape file, wanted a recording; give the recording"):
+    with pytest.raises(DataError, match=r"img.h5 is an energyscape file, wanted a recording; use the recording"):
         open_recording(tmp_path / "img.h5")
 
 

@@ -88,7 +88,7 @@ def check_recording(
     kind = file_kind(path)
     if kind != "recording":
         name = "an energyscape file" if kind == "energyscape" else "a file of acoustic maps"
-        raise DataError(f"{path} is {name}, wanted a recording; give the recording it was made from")
+        raise DataError(f"{path} is {name}, wanted a recording; use the recording from which it was made")
     names = sensor_names(path)
     try:
         stored = {report.sensor: report for report in verify(path)}
