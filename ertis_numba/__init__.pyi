@@ -22,6 +22,8 @@ from .errors import (
     ForeignDataError as ForeignDataError,
     FormatVersionError as FormatVersionError,
     JournalInUseError as JournalInUseError,
+    LayoutMismatchWarning as LayoutMismatchWarning,
+    LayoutUnitWarning as LayoutUnitWarning,
     NetworkError as NetworkError,
     PoseWarning as PoseWarning,
     RefusedError as RefusedError,

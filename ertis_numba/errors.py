@@ -17,9 +17,10 @@
     └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
         └── RefusedError                 it denies access or rejects a request
 
-Each class also inherits the built-in exception in brackets. Five warnings, all ``UserWarning``, complete them:
+Each class also inherits the built-in exception in brackets. Seven warnings, all ``UserWarning``, complete them:
 ``ErrorBudgetWarning`` for images that may exceed their error budget, ``CallMismatchWarning`` for echoes that do not
-match the call, ``CoarseGridWarning`` for directions that miss sources between them,
+match the call, ``LayoutMismatchWarning`` for echoes that do not match the layout, ``LayoutUnitWarning`` for files of
+positions that state no unit, ``CoarseGridWarning`` for directions that miss sources between them,
 ``OutsideBandsWarning`` for sound that the bands of acoustic maps leave out, and ``PoseWarning`` for poses that
 tilt a platform by more than 30°.
 """
@@ -37,6 +38,8 @@ __all__ = [
     "ForeignDataError",
     "FormatVersionError",
     "JournalInUseError",
+    "LayoutMismatchWarning",
+    "LayoutUnitWarning",
     "NetworkError",
     "OutsideBandsWarning",
     "PoseWarning",
@@ -109,6 +112,14 @@ class ErrorBudgetWarning(UserWarning):
 
 class CallMismatchWarning(UserWarning):
     """Echoes do not match the call in the settings, so that ranges in images are wrong."""
+
+
+class LayoutMismatchWarning(UserWarning):
+    """Echoes do not match the layout in the settings, so that directions in images are wrong."""
+
+
+class LayoutUnitWarning(UserWarning):
+    """A file of microphone positions states no unit, and its numbers may be millimetres or metres."""
 
 
 class CoarseGridWarning(UserWarning):

@@ -1,11 +1,12 @@
-"""Checks of the images of a pipeline: echoes that do not match the call, and errors beyond the budget."""
+"""Checks of the images of a pipeline: echoes that match neither call nor layout, and errors beyond the budget."""
 
 import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ertis_numba.analysis.call_match import call_match
-from ertis_numba.errors import CallMismatchWarning, DeviceError, ErrorBudgetWarning
+from ertis_numba.analysis.layout_match import layout_match
+from ertis_numba.errors import CallMismatchWarning, DeviceError, ErrorBudgetWarning, LayoutMismatchWarning
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.kernels import KernelSet
 from ertis_numba.prediction import BudgetMonitor
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
 
 __all__ = ["ImageChecks"]
 
-_CALL_CHECKS: Final = 8
+_MATCHES: Final = ((call_match, CallMismatchWarning), (layout_match, LayoutMismatchWarning))
+_MAX_CHECKS: Final = 8  # Measurements that are compared with the settings, if they contain no sound.
 _CALLER: Final = 5  # Frames from a warning to the caller of `Pipeline.process`.
 
 
@@ -39,7 +41,7 @@ class ImageChecks:
         has_budget = settings.processing.method == "fast" and not kernel_set.simulated
         self._monitor = BudgetMonitor(kernel_set, threads) if has_budget else None
         self._warned = False
-        self._remaining_call_checks = 0 if kernel_set.simulated else _CALL_CHECKS
+        self._remaining = {} if kernel_set.simulated else dict.fromkeys(_MATCHES, _MAX_CHECKS)
 
     @property
     def prediction(self) -> "Prediction | None":
@@ -48,19 +50,19 @@ class ImageChecks:
 
     def check(self, image: Energyscape, measurement: Measurement) -> None:
         """Check an image, before it is cleaned, and its measurement."""
-        self._check_call(measurement)
+        self._check_sound(measurement)
         self._check_budget(image, measurement)
 
-    def _check_call(self, measurement: Measurement) -> None:
-        """Compare echoes with the call in the first measurements, until one has sound above the noise."""
-        if self._remaining_call_checks <= 0:
-            return
-        self._remaining_call_checks -= 1
-        match = call_match(replace(measurement, settings=self._settings))
-        if match is not None:
-            self._remaining_call_checks = 0
-            if match.warning:
-                warnings.warn(match.warning, CallMismatchWarning, stacklevel=_CALLER)
+    def _check_sound(self, measurement: Measurement) -> None:
+        """Compare echoes with call and layout in the first measurements, until one has sound above the noise."""
+        for check in [*self._remaining]:
+            compare, category = check
+            match = compare(replace(measurement, settings=self._settings))
+            self._remaining[check] -= 1
+            if match is not None or not self._remaining[check]:
+                del self._remaining[check]
+            if match is not None and match.warning:
+                warnings.warn(match.warning, category, stacklevel=_CALLER)
 
     def _check_budget(self, image: Energyscape, measurement: Measurement) -> None:
         """Predict the error of an image if it needs a prediction, and issue the warning once."""

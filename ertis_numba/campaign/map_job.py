@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from ertis_numba.analysis.health import health
+from ertis_numba.analysis.layout_match import LayoutMatch
 from ertis_numba.campaign.sensor_processing import describe_faults, require_same_air
 from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.errors import DataError
@@ -222,8 +224,9 @@ def check_maps(
 def _check_sensor(recording: RecordingReader, settings: Settings, options: CampaignOptions, warn: _Warn) -> None:
     """Report faulty microphones, or refuse them."""
     name = f"{recording.path}: sensor {recording.sensor}"
-    faults = describe_faults(name, replace(recording[0], settings=settings))
-    if faults and options.strict:
-        raise DataError(faults)
-    if faults:
-        warn(faults)
+    report = health(replace(recording[0], settings=settings))
+    layout = LayoutMatch.of(report.findings).warning
+    for text in filter(None, (describe_faults(name, report), layout and f"{name}: {layout}")):
+        if options.strict:
+            raise DataError(text)
+        warn(text)

@@ -14,12 +14,15 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
 from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.analysis.emission_time import emission_times_s
+from ertis_numba.analysis.health import health
 from ertis_numba.analysis.health.emission import describe_shift
+from ertis_numba.analysis.layout_match import LayoutMatch, first_layout_match
 from ertis_numba.campaign.attitudes import unlevelled_image
 from ertis_numba.campaign.echo_measurements import EchoMeasurements, require_images
 from ertis_numba.campaign.sensor_processing import SensorProcessing, describe_faults
 from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.errors import DataError
+from ertis_numba.frames import Measurement
 from ertis_numba.geometry import observable_angles
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
@@ -32,7 +35,7 @@ __all__ = ["Pipelines", "RecordingJob", "check_recording", "prepare_recording"]
 
 Pipelines = Callable[[Sequence[Settings]], AbstractContextManager[Sequence[Pipeline]]]
 _Show = Callable[[str, dict[str, Any]], None]
-_Checks = tuple[str, str, CallMatch | None]
+_Checks = tuple[str, str, CallMatch | None, LayoutMatch | None]
 
 
 class RecordingJob:
@@ -101,9 +104,9 @@ def prepare_recording(
     max_bytes : float, optional
         Limit on images that wait to be written, in bytes. See `SensorProcessing`.
     warn : callable
-        Called with a line for each sensor that has faulty microphones, whose echoes do not match the call, or whose
-        images may exceed the error budget, and for each sensor with passive measurements, which are left out, or with
-        level directions from poses that tilt the platform by more than 30°.
+        Called with a line for each sensor that has faulty microphones, whose echoes do not match the call or the
+        layout, or whose images may exceed the error budget, and for each sensor with passive measurements, which are
+        left out, or with level directions from poses that tilt the platform by more than 30°.
     show : callable
         Called with the name of a sensor and each result about its plan.
 
@@ -155,6 +158,7 @@ def prepare_recording(
             if run.prediction is not None:
                 writer.note_error(recording.sensor, **run.prediction.as_dict())
             writer.note_call(recording.sensor, run.call_warning)
+            writer.note_layout(recording.sensor, run.layout_warning)
             writer.note_wavefront(recording.sensor, run.reported.get("wavefront_error_db"))
         yield RecordingJob(recordings, runs, writer)
 
@@ -237,14 +241,23 @@ def _begin_checks(
 
 
 def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
-    """Return the faults of a sensor's microphones, the shift of its records, and the match of its call."""
+    """Return the faults of a sensor's microphones, the shift of its records, and the match of its call and layout."""
     first = recording[0]
     some = (replace(recording[index], settings=settings) for index in {0, len(recording) // 2, len(recording) - 1})
     shift = describe_shift(emission_times_s(some), sound_speed_m_s(settings.air))
-    faults = describe_faults(f"{recording.path}: sensor {recording.sensor}", replace(first, settings=settings))
-    others = (recording[index] for index in range(1, len(recording)))
-    heard = (replace(each, settings=settings) for each in itertools.chain([first], others))
-    return faults, "; ".join(shift or ()), first_call_match(heard)
+    report = health(replace(first, settings=settings))
+    faults = describe_faults(f"{recording.path}: sensor {recording.sensor}", report)
+
+    def heard() -> Iterator[Measurement]:
+        others = (recording[index] for index in range(1, len(recording)))
+        return (replace(each, settings=settings) for each in itertools.chain([first], others))
+
+    call, layout = first_call_match(heard()), LayoutMatch.of(report.findings)
+    if call is not None and call.warning:
+        layout = None  # The filter of another call does not find the times of arrival.
+    elif not layout.warning:
+        layout = first_layout_match(heard())
+    return faults, "; ".join(shift or ()), call, layout
 
 
 def _call_notes(run: SensorProcessing, recording: EchoMeasurements) -> Iterator[str]:
@@ -271,10 +284,12 @@ def _check_sensor(
     show: _Show,
 ) -> None:
     first = run.with_pipeline_settings(recording[0])
-    faults, shift, match = checks
+    faults, shift, match, layout = checks
     place = f"{recording.path}: sensor {recording.sensor}"
     shift = shift and f"{place}: {shift}"
-    for text in filter(None, (faults, shift)):
+    run.layout_warning = layout.warning if layout is not None else ""
+    other_layout = run.layout_warning and f"{place}: {run.layout_warning}"
+    for text in filter(None, (faults, shift, other_layout)):
         if options.strict:
             raise DataError(text)
         warn(text)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ertis_numba.analysis.health import health
+from ertis_numba.analysis.health import ARRAY_FAULTS, Health
 from ertis_numba.analysis.health.kinds import DISABLE
 from ertis_numba.campaign.attitudes import Attitudes
 from ertis_numba.campaign.echo_measurements import EchoMeasurements
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 __all__ = ["SensorProcessing", "describe_faults", "require_same_air"]
 
 
-def describe_faults(name: str, measurement: Measurement) -> str:
+def describe_faults(name: str, report: Health) -> str:
     """Return the faults of the microphones with the remedy, in one line; empty if there are none.
 
-    `describe_shift` describes a shift of the record, from several measurements.
+    `describe_shift` describes a shift of the record from several measurements, and `LayoutMatch` a wrong layout.
     """
-    report = health(measurement)
-    report = replace(report, findings=tuple(item for item in report.findings if item.fault != "shifted record"))
+    elsewhere = {"shifted record", *ARRAY_FAULTS}
+    report = replace(report, findings=tuple(item for item in report.findings if item.fault not in elsewhere))
     if not report.faults:
         return ""
     if report.record_faults:
@@ -70,8 +70,8 @@ class SensorProcessing:
         Results about the plan.
     prediction : Prediction or None
         Predicted error of the first measurement's image; None before it is computed, and for the paper's method.
-    call_warning : str
-        Warning that echoes do not match the call; empty if they do.
+    call_warning, layout_warning : str
+        Warnings that echoes do not match the call or the layout; empty if they do.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class SensorProcessing:
         self.times_ms: list[float] = []
         self.reported: dict[str, Any] = {}
         self.prediction: Prediction | None = None
-        self.call_warning = ""
+        self.call_warning = self.layout_warning = ""
         image_bytes = 4 * len(pipeline.grid) * len(pipeline.range_m)
         self._size = max(1, min(batch, int((max_bytes or MAX_WAITING_BYTES) / image_bytes)))
 
@@ -141,6 +141,7 @@ class SensorProcessing:
             "median_ms": round(statistics.median(self.times_ms), 3),
             **(self.prediction.as_dict() if self.prediction else {}),
             **({"call_warning": self.call_warning} if self.call_warning else {}),
+            **({"layout_warning": self.layout_warning} if self.layout_warning else {}),
             **self.reported,
         }
 

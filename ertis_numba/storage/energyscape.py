@@ -23,7 +23,7 @@ from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]
 
 _ERRORS_DB: Final = ("predicted_error_db", "max_error_db", "wavefront_error_db")
-_TEXTS: Final = ("budget_applies_to", "error_warning", "call_warning")
+_TEXTS: Final = ("budget_applies_to", "error_warning", "call_warning", "layout_warning")
 
 
 class _EnergyscapeFile(ResultFile):
@@ -112,6 +112,13 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         """
         self._state(sensor, call_warning=call_warning)
 
+    def note_layout(self, sensor: str, layout_warning: str) -> None:
+        """Store a warning that a sensor's echoes do not match the layout of its settings; empty if they do.
+
+        Call this before the sensor's first energyscape is written.
+        """
+        self._state(sensor, layout_warning=layout_warning)
+
     def note_wavefront(self, sensor: str, wavefront_error_db: float | None) -> None:
         """Store the error of plane wavefronts at the first range of a sensor; None stores nothing.
 
@@ -185,6 +192,8 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
     call_warning : str
         Warning that echoes of the recording do not match the call of its settings; empty if they do, or if it was not
         examined.
+    layout_warning : str
+        Warning that echoes do not match the layout; empty if they may, or if it was not examined.
     """
 
     range_m: NDArray[np.float64]
@@ -193,6 +202,7 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
     budget_applies_to: str
     error_warning: str
     call_warning: str
+    layout_warning: str
     wavefront_error_db: float | None
 
     def _load(self) -> None:

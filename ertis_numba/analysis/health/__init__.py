@@ -1,6 +1,7 @@
 """Health of the microphones and of the record, measured on the recorded samples alone."""
 
+from ertis_numba.analysis.health.array_match import ARRAY_FAULTS
 from ertis_numba.analysis.health.examination import health
 from ertis_numba.analysis.health.report import ChannelHealth, Finding, Health, merge
 
-__all__ = ["ChannelHealth", "Finding", "Health", "health", "merge"]
+__all__ = ["ARRAY_FAULTS", "ChannelHealth", "Finding", "Health", "health", "merge"]

@@ -16,9 +16,13 @@ from ertis_numba.analysis.health.arrival import Compressed, strongest
 from ertis_numba.analysis.health.report import Finding
 from ertis_numba.geometry import Layout, layout_names, load_layout
 
-__all__ = ["SIZE", "find_other_array"]
+__all__ = ["ARRAY_FAULTS", "SIZE", "find_other_array"]
 
+_ORDER: Final = "order of channels"
+_HALF: Final = "half late"
 SIZE: Final = "size of the array"
+ARRAY_FAULTS: Final = frozenset({_ORDER, _HALF, SIZE})
+"""Faults that `find_other_array` finds."""
 
 _MIN_CHANNELS: Final = 12  # Fewer channels fit another order by chance.
 _MIN_CURVED: Final = 3.0  # Residuals with the curvature of an echo relative to those with the best curvature.
@@ -65,6 +69,8 @@ def find_other_array(
     layout: Layout,
     path_m: float,
     speed_m_s: float,
+    *,
+    is_near: bool = False,
 ) -> Finding | None:
     """Return the finding of an array that fits the strongest arrival much better than the layout; None without one.
 
@@ -80,6 +86,8 @@ def find_other_array(
     path_m : float
         Way of the sound since the emission.
     speed_m_s : float
+    is_near : bool
+        True for sound so soon after the emission that its curvature is unknown; False by default.
     """
     picked = list(channels)
     if len(picked) < _MIN_CHANNELS:
@@ -91,7 +99,7 @@ def find_other_array(
         across_s = float(2 * np.linalg.norm(layout.positions_m[picked], axis=1).max()) / speed_m_s
         wide = (strongest(found, width_s) for width_s in (_WIDE_S, _WIDER * across_s))
         every += [arrived[0] - layout.delay_s[picked] for arrived in wide if arrived is not None]
-    for check in (_other_order, _other_size):
+    for check in (_other_order, _other_size_of_direct_sound if is_near else _other_size):
         for times in every[::-1]:
             finding = check(times, picked, layout, path_m, speed_m_s)
             if finding is not None:
@@ -107,17 +115,17 @@ def _other_order(
     own = _best(times_s, positions_m, path_m, speed_m_s)
     if own is None or own.spread_s < _MIN_SPREAD_S:
         return None
-    within = f"within {1e6 * own.spread_s:.2g} µs"
     found: list[tuple[_Match, str, float, str]] = []
     for name, other_m in _orders(layout):
         match = _best(times_s, other_m[channels], path_m, speed_m_s)
         if match is not None:
-            detail = f"{name} fits far better than the given one, {within}"
-            found.append((match, "order of channels", own.spread_s, detail))
+            residuals = f"{1e6 * match.spread_s:.2g} instead of {1e6 * own.spread_s:.2g} µs"
+            detail = f"{name} fits far better than the given one, with residuals of {residuals}"
+            found.append((match, _ORDER, own.spread_s, detail))
     for name, late in _halves(len(layout.enabled)):
         match = _best(times_s, positions_m, path_m, speed_m_s, late=late[channels])
         if match is not None:
-            found.append((match, "half late", match.delay_s, f"{name} by {1e6 * match.delay_s:.1f} µs"))
+            found.append((match, _HALF, match.delay_s, f"{name} by {1e6 * match.delay_s:.1f} µs"))
     limit_s = own.spread_s / _MIN_RATIO
     better = [each for each in found if each[0].slowness <= _MAX_SLOWNESS and each[0].spread_s < limit_s]
     if not better:
@@ -141,13 +149,33 @@ def _other_size(
     low = max(low, own.slowness)
     if is_possible and low <= _MAX_GROWTH and high >= _MIN_SHRINKAGE:
         return None
-    factor, about = (low, "at least") if low > 1 else (high, "at most")
+    factor, about = (low, "at least ") if low > 1 else (high, "at most ")
+    return _of_size(channels, factor, about)
+
+
+def _other_size_of_direct_sound(
+    times_s: NDArray[np.float64], channels: list[int], layout: Layout, path_m: float, speed_m_s: float
+) -> Finding | None:
+    """Return the finding of positions in another unit, if the sound of an emitter at the centre fits another size."""
+    own = _best(times_s, layout.positions_m[channels], path_m, speed_m_s)
+    travel_s = np.linalg.norm(layout.positions_m[channels], axis=1) / speed_m_s
+    if own is None or own.spread_s < _MIN_SPREAD_S or np.ptp(travel_s) < _MIN_SPREAD_S:
+        return None
+    solution, spread_s = _solve(times_s, np.column_stack([np.ones(len(travel_s)), travel_s]))
+    factor = float(solution[1])
+    is_clear = spread_s < min(own.spread_s / _MIN_RATIO, _CLEAR * float(np.ptp(times_s)))
+    if not is_clear or _MIN_SHRINKAGE < factor < 1 / _MIN_SHRINKAGE or factor <= 0:
+        return None
+    return _of_size(channels, factor, "")
+
+
+def _of_size(channels: list[int], factor: float, about: str) -> Finding:
     return Finding(
         fault=SIZE,
         channels=tuple(channels),
         measured=factor,
         limit=_MAX_SLOWNESS if factor > 1 else _MIN_SHRINKAGE,
-        detail=f"the wavefront suits an array {about} {factor:.2g} times as large",
+        detail=f"the wavefront suits an array {about}{factor:.2g} times as large",
     )
 
 

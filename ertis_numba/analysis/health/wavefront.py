@@ -1,7 +1,7 @@
 """Checks on the wavefront of the strongest arrival: polarity, order and delay of channels, and time of the emission."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from ertis_numba.analysis.health.report import Finding
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.settings import Settings
 
-__all__ = ["DESCRIPTIONS", "by_wavefront"]
+__all__ = ["DESCRIPTIONS", "by_array", "by_wavefront"]
 
 DESCRIPTIONS = "polarity, order and delay of channels, and a shift of the record"
 _COMPACT_SHARE = 0.75  # Minimum share of the microphones that a wavefront must fit.
@@ -30,6 +30,7 @@ _MAX_SPREAD_S = 3e-6  # Spread of the wavefront, beyond which the phase of the c
 _HALF_PERIOD_S = 12e-6  # Half a period of the highest usual carrier.
 _AGREEMENT_S = 8e-6  # Tolerance between the delays of a swapped pair, or of the two halves of the band.
 _LAG_S = 60e-6
+_SMALL = 0.12  # Size of an array whose positions in millimetres are read as centimetres, and a margin.
 _PRESENT = 0.85  # Minimum correlation relative to the usual value for an arrival at its expected time.
 _DEVIATIONS = 7.5  # Median absolute residuals of the wavefront; five deviations of a normal distribution.
 _COHERENT = 0.85
@@ -38,6 +39,72 @@ _SAME = 0.95  # Minimum coherence of a channel whose delay or level is compared.
 _INVERTED = 0.97
 _OPPOSITE = 1.08  # Minimum ratio of negative to positive correlation; half a period of an octave band has 0.83.
 _MAX_SUSPECTS = 0.25  # Maximum share of microphones; if more disagree, the arrival is the cause.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Arrival:
+    """Strongest arrival of a record.
+
+    Attributes
+    ----------
+    found : Compressed
+        Signals after the matched filter.
+    times_s : (mic,) float64
+        Times of arrival without the calibrated delays, in seconds.
+    path_m : float
+        Way of the sound since the emission.
+    is_near : bool
+        True if the way is too short for an echo.
+    shifts : list of Finding
+        Finding if the record does not begin with the emission.
+    other : Finding, optional
+        Finding of an array that fits far better.
+    """
+
+    found: Compressed
+    times_s: NDArray[np.float64]
+    path_m: float
+    is_near: bool
+    shifts: list[Finding]
+    other: Finding | None
+
+
+def by_array(
+    signals: Callable[[int], NDArray[np.float32]], channels: Sequence[int], settings: Settings, *, n_samples: int
+) -> list[Finding] | None:
+    """Return the faults of the array as a whole, in half the time of `by_wavefront`; None without an arrival."""
+    arrival = _arrival(signals, channels, settings, n_samples)
+    if arrival is None:
+        return None
+    return [] if arrival.other is None else [arrival.other]
+
+
+def _arrival(
+    signals: Callable[[int], NDArray[np.float32]], channels: Sequence[int], settings: Settings, n_samples: int
+) -> _Arrival | None:
+    """Return the strongest arrival, compared with other arrays; None if no arrival exceeds the background."""
+    layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
+    positions_m = layout.positions_m[list(channels)]
+    rate_hz = settings.recording.sample_rate_hz
+    first, last = _loudest(signals, channels, settings, n_samples)
+    found = compress(signals, channels, settings.call, rate_hz=rate_hz, first=first, last=last)
+    width_s = float(2 * np.linalg.norm(positions_m, axis=1).max(initial=0.0)) / speed_m_s
+    arrived = strongest(found, width_s)
+    is_small = arrived is None  # Positions in a larger unit would spread an arrival over most of the record.
+    arrived = strongest(found, _SMALL * width_s) if arrived is None else arrived
+    if arrived is None:
+        return None
+    times_s, middle_s = arrived
+    times_s = times_s - layout.delay_s[list(channels)]
+    emission_s = fit_emission(times_s, positions_m, speed_m_s)
+    shifts = [] if emission_s is None else _shifts(emission_s, channels, speed_m_s)
+    path_m, is_near = max(middle_s * speed_m_s, _MIN_PATH_M), middle_s * speed_m_s < _MIN_PATH_M
+    other = find_other_array(found, times_s, channels, layout, path_m, speed_m_s, is_near=is_near)
+    if other is not None and shifts and other.fault == SIZE:  # A shift changes the expected curvature.
+        other = None
+    if is_small and other is None:
+        return None
+    return _Arrival(found, times_s, path_m, is_near, shifts, other)
 
 
 def by_wavefront(
@@ -61,19 +128,13 @@ def by_wavefront(
     """
     layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
     positions_m = layout.positions_m[list(channels)]
-    rate_hz = settings.recording.sample_rate_hz
-    first, last = _loudest(signals, channels, settings, n_samples)
-    found = compress(signals, channels, settings.call, rate_hz=rate_hz, first=first, last=last)
-    width_s = float(2 * np.linalg.norm(positions_m, axis=1).max(initial=0.0)) / speed_m_s
-    arrived = strongest(found, width_s)
-    if arrived is None:
+    arrival = _arrival(signals, channels, settings, n_samples)
+    if arrival is None:
         return [], (f"{DESCRIPTIONS}: no arrival exceeds the background",)
-    times_s, middle_s = arrived
-    times_s = times_s - layout.delay_s[list(channels)]
-    emission_s = fit_emission(times_s, positions_m, speed_m_s)
-    shifts = [] if emission_s is None else _shifts(emission_s, channels, speed_m_s)
-    path_m = max(middle_s * speed_m_s, _MIN_PATH_M)
-    curvatures = (0.0, 1 / path_m, 2 / path_m)
+    if arrival.other is not None:
+        return [arrival.other], ()
+    times_s, shifts = arrival.times_s, arrival.shifts
+    curvatures = (0.0, 1 / arrival.path_m, 2 / arrival.path_m)
     echo = fit_delays(times_s, positions_m, curvatures, speed_m_s)
     if echo is None:
         return shifts, (f"{DESCRIPTIONS}: {len(channels)} microphones are too few to fit a wavefront",)
@@ -84,15 +145,12 @@ def by_wavefront(
         and direct.spread_s < _DIRECT_SPREAD * echo.spread_s
         and float(np.ptp(from_centre_m)) > _MIN_DEPTH_M
     )
-    if not is_direct and middle_s * speed_m_s < _MIN_PATH_M:
+    if not is_direct and arrival.is_near:
         return shifts, (f"{DESCRIPTIONS}: the strongest arrival is too near to fit a wavefront",)
-    other = find_other_array(found, times_s, channels, layout, path_m, speed_m_s)
-    if other is not None and not (shifts and other.fault == SIZE):  # A shift changes the expected curvature.
-        return [other], ()
     fit = direct if is_direct else echo
     if fit.share < _COMPACT_SHARE:
         return shifts, (f"{DESCRIPTIONS}: no single wavefront fits the strongest arrival",)
-    findings = [*shifts, *_of_channels(found, times_s, fit, channels, layout)]
+    findings = [*shifts, *_of_channels(arrival.found, times_s, fit, channels, layout)]
     return findings, () if is_direct else ("a shift of the record: the strongest arrival is not the direct sound",)
 
 

@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 from ertis_numba.network.processing.pipe_messages import Predicted
 
@@ -48,21 +48,24 @@ class Predictions:
             found.append(self._found.popleft())
         return found
 
-    def _report_call(self, sensor: str, measurement: "Measurement") -> None:
-        """Report echoes that do not match the call."""
+    def _report_matches(self, sensor: str, measurement: "Measurement") -> None:
+        """Report echoes that do not match the call or the layout."""
         from ertis_numba.analysis.call_match import call_match  # noqa: PLC0415
+        from ertis_numba.analysis.layout_match import layout_match  # noqa: PLC0415
 
-        try:
-            match = call_match(measurement)
-        except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images
-            text = f"echoes were not compared with the call: {type(error).__name__}: {error}"
-        else:
-            text = match.warning if match else ""
-        if text:
-            self._found.append(Predicted(sensor=sensor, event="call_mismatch", warning=text))
+        compared: tuple[tuple[Literal["call", "layout"], Any], ...] = (("call", call_match), ("layout", layout_match))
+        for name, compare in compared:
+            try:
+                match = compare(measurement)
+            except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images
+                text = f"echoes were not compared with the {name}: {type(error).__name__}: {error}"
+            else:
+                text = match.warning if match else ""
+            if text:
+                self._found.append(Predicted(sensor=sensor, event=f"{name}_mismatch", warning=text))
 
     def _predict(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
-        self._report_call(sensor, measurement)
+        self._report_matches(sensor, measurement)
         if image.settings.processing.method == "paper" or not image.amplitude.any():
             return  # The paper's method has no plan, and silence no relative error.
         from ertis_numba import kernels  # noqa: PLC0415  in a process that has loaded them

@@ -1,0 +1,97 @@
+"""Comparison of echoes with the layout of the settings, which determines the directions in images."""
+
+import functools
+import itertools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ertis_numba.analysis import _bits
+from ertis_numba.analysis.health import ARRAY_FAULTS, Finding
+from ertis_numba.analysis.health.limits import MAX_SAMPLES, MIN_SAMPLES
+from ertis_numba.analysis.health.pcm_samples import scaled
+from ertis_numba.analysis.health.wavefront import by_array
+from ertis_numba.frames import Measurement
+from ertis_numba.geometry import microphones
+from ertis_numba.sample_format import sample_format
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+__all__ = ["LayoutMatch", "first_layout_match", "layout_match"]
+
+_MAX_MEASUREMENTS: Final = 8
+_MAX_MICS: Final = 48
+
+
+@dataclass(frozen=True, slots=True)
+class LayoutMatch:
+    """Comparison of the strongest sound of a measurement with the layout of the settings.
+
+    Attributes
+    ----------
+    finding : Finding, optional
+        Another order, size or timing of the channels, which fits far better; None if the layout may be right.
+    """
+
+    finding: Finding | None
+
+    @classmethod
+    def of(cls, findings: Iterable[Finding]) -> "LayoutMatch":
+        """Return the match that findings of a health report describe."""
+        return cls(next((each for each in findings if each.fault in ARRAY_FAULTS), None))
+
+    @property
+    def warning(self) -> str:
+        """One-line warning; empty if the layout may be right."""
+        if self.finding is None:
+            return ""
+        return (
+            f"echoes do not match the layout of the settings ({self.finding.fault}: {self.finding.detail}). Directions "
+            f"are wrong; {self.finding.remedy}"
+        )
+
+
+def first_layout_match(measurements: Iterable[Measurement]) -> LayoutMatch | None:
+    """Return the match of the first measurement with an arrival; None if the first 8 contain none."""
+    for measurement in itertools.islice(measurements, _MAX_MEASUREMENTS):
+        found = layout_match(measurement)
+        if found is not None:
+            return found
+    return None
+
+
+def layout_match(measurement: Measurement) -> LayoutMatch | None:
+    """Compare the strongest arrival with the layout, and with other orders, sizes and timings of its channels.
+
+    Parameters
+    ----------
+    measurement : Measurement
+
+    Returns
+    -------
+    LayoutMatch or None
+        None if no arrival exceeds the background.
+
+    Raises
+    ------
+    DataError
+        The samples do not match the settings.
+    """
+    settings = measurement.settings
+    channels = np.flatnonzero(microphones(settings.array).enabled)
+    if len(channels) > _MAX_MICS:  # At random, because every second one could hide an order.
+        channels = np.sort(np.random.default_rng(0).choice(channels, _MAX_MICS, replace=False))
+    words = sample_format(settings).validated(measurement.data)[:MAX_SAMPLES]
+    if len(words) < MIN_SAMPLES:
+        return None
+    signals: Callable[[int], NDArray[np.float32]]
+    if settings.recording.is_pdm:
+        signals = functools.partial(_bits.signal_of, _bits.octets_of(words))
+    else:
+        full = max(settings.recording.full_scale, float(np.abs(words[:, channels].astype(np.float64)).max()))
+        signals = functools.partial(scaled, words, full)
+    findings = by_array(signals, channels.tolist(), settings, n_samples=len(words))
+    return None if findings is None else LayoutMatch.of(findings)

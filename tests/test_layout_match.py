@@ -1,0 +1,161 @@
+"""Layout match: recordings read with the layout of another array are reported, right ones are not."""
+
+import dataclasses
+import json
+import shutil
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
+
+from ertis_numba.analysis.layout_match import first_layout_match, layout_match
+from ertis_numba.errors import LayoutMismatchWarning
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.geometry import layout_names, load_layout
+from ertis_numba.network.processing._predictions import Predictions
+from ertis_numba.pipeline import Pipeline
+from ertis_numba.settings import Array, Processing, Recording, Settings
+from ertis_numba.storage import open_energyscapes, open_recording, write_recording
+from ertis_numba.waveform import call_at
+
+DATA = Path(__file__).parents[1] / "data" / "synthetic"
+SETTINGS = Settings(
+    recording=Recording(sample_rate_hz=300e3, n_samples=4096, encoding="int16"),
+    processing=Processing(directions="2d:9", range_m=(0.5, 1.0), range_decimation=6),
+)
+SPEED_M_S = 343.2
+
+
+def heard(positions_m, *, source_m=(0.9, 0.5, 0.1), level=3000, array=None, seed=0):
+    """Echo of a point, with spherical wavefronts and noise; ``array`` is that of the settings."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(SETTINGS.recording.n_samples)[:, None] / SETTINGS.recording.sample_rate_hz
+    source_m = np.asarray(source_m)
+    way_m = np.linalg.norm(source_m) + np.linalg.norm(positions_m - source_m, axis=1)
+    words = level * call_at(SETTINGS.call, time_s - way_m / SPEED_M_S) + rng.normal(0, 20, (len(time_s), len(way_m)))
+    given = Array(positions_m=positions_m) if array is None else array
+    return Measurement(words.astype(np.int16), SETTINGS.replace(array=given), Stamp(sensor="sensor", sequence=seed))
+
+
+def disc(size_m, count=16):
+    turn, radius_m = 2.4 * np.arange(count), size_m / 2 * np.sqrt((np.arange(count) + 1) / count)
+    places_m = np.stack([0 * turn, radius_m * np.cos(turn), radius_m * np.sin(turn)], axis=1)
+    return places_m - places_m.mean(axis=0)
+
+
+def read_as(measurement, **array):
+    settings = measurement.settings
+    return dataclasses.replace(measurement, settings=settings.replace(array=settings.array.replace(**array)))
+
+
+@pytest.mark.parametrize("recording", ["reflectors.h5", "reflectors_3d.h5"])
+@pytest.mark.parametrize("layout", layout_names())
+def test_layout_match_finds_the_layout_of_recordings(recording, layout):
+    """The loudest sound of the first recording is the direct sound of the emitter, that of the other an echo."""
+    with open_recording(DATA / recording) as reader:
+        measurement = reader[0]
+    settings = measurement.settings.replace(array=Array(layout=layout))
+    found = layout_match(dataclasses.replace(measurement, settings=settings)).warning
+    assert not found if layout == "eRTIS_v3D1" else "layout eRTIS_v3D1 fits far better" in found
+
+
+@pytest.mark.parametrize("size_m", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("source_m", [(0.9, 0.5, 0.1), (1.2, -0.3, 0.4), (0.6, 0.0, 0.0), (1.0, 0.9, 0.0)])
+def test_right_positions_match(size_m, source_m):
+    assert not layout_match(heard(disc(size_m), source_m=source_m)).warning
+
+
+@pytest.mark.parametrize(
+    ("array", "named"),
+    [
+        ({"positions_m": disc(0.1)[::-1]}, "the reversed order fits far better"),
+        ({"positions_m": disc(0.1)[np.arange(16) ^ 1]}, "the order of swapped neighbours fits far better"),
+        ({"positions_m": np.roll(disc(0.1), 8, axis=0)}, "the order of reversed bytes fits far better"),
+        ({"positions_m": 10 * disc(0.1)}, "size of the array"),
+        ({"positions_m": 0.1 * disc(0.1)}, "size of the array"),
+        ({"positions_m": disc(0.1) / 2.54}, "size of the array"),
+        ({"delay_s": np.repeat([0.0, 3e-6], 8)}, "channels 8 to 15 are late by -3.0 µs"),
+    ],
+)
+def test_wrong_arrays_are_named(array, named):
+    assert named in layout_match(read_as(heard(disc(0.1)), **array)).warning
+
+
+def test_size_of_direct_sound_is_named():
+    """The emitter is at the centre of the array."""
+    given = heard(disc(0.1), source_m=(0.0, 0.0, 1e-6))
+    assert not layout_match(given).warning
+    found = layout_match(read_as(given, positions_m=10 * disc(0.1))).warning
+    assert "suits an array 0.1 times as large" in found
+
+
+def test_silence_and_few_microphones_are_not_judged():
+    silent = heard(disc(0.1), level=0)
+    assert layout_match(silent) is None
+    assert first_layout_match([silent, silent, heard(disc(0.1))]).finding is None
+    assert first_layout_match([silent]) is None
+    few = disc(0.1, 8)
+    assert layout_match(heard(few, array=Array(positions_m=few[::-1]))).finding is None
+
+
+def test_large_arrays_are_judged_by_some_microphones():
+    many = disc(0.3, 120)
+    assert layout_match(heard(many)).finding is None
+    assert "reversed order" in layout_match(heard(many, array=Array(positions_m=many[::-1]))).warning
+
+
+def wrong():
+    """Two measurements, of which the first is silent, with another layout of the same number of microphones."""
+    array, other = load_layout("eRTIS_v3D1"), Array(layout="eRTIS_v2")
+    return [heard(array.positions_m, level=level, array=other, seed=seed) for seed, level in enumerate((0, 3000))]
+
+
+def test_pipelines_warn_once_of_another_layout():
+    silent, loud = wrong()
+    with Pipeline(loud.settings, "cpu", 1) as pipeline:
+        pipeline.process(silent)
+        with pytest.warns(LayoutMismatchWarning, match="layout eRTIS_v3D1 fits far better") as caught:
+            pipeline.process(loud)
+        pipeline.process(loud)
+        assert [each.filename for each in caught] == [__file__]
+    with Pipeline(loud.settings, "cpu", 1, predict=False) as pipeline, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pipeline.process(loud)
+
+
+def test_process_warns_of_another_layout_on_stderr_and_in_the_file(tmp_path):
+    recording, images = write_recording(tmp_path / "rec.h5", wrong()), tmp_path / "rec.energy.h5"
+    done = CliRunner().invoke(cli, ["process", str(recording), "--json"])
+    assert done.exit_code == 0, done.stderr
+    with open_energyscapes(images) as opened:
+        assert "layout eRTIS_v3D1 fits far better" in opened.layout_warning
+        assert f"ertis: warning: {recording}: sensor sensor: {opened.layout_warning}" in done.stderr.splitlines()
+        assert opened.layout_warning == json.loads(done.stdout)["sensors"][0]["layout_warning"]
+    assert "layout eRTIS_v3D1 fits far better" in CliRunner().invoke(cli, ["info", str(images)]).stdout
+    strict = CliRunner().invoke(cli, ["process", str(recording), "--strict", "--force"])
+    assert strict.exit_code == 1
+    assert "layout eRTIS_v3D1 fits far better" in strict.stderr
+
+
+@pytest.mark.parametrize("more", [(), ("--mode", "passive")])
+def test_process_with_the_settings_of_another_array_warns(tmp_path, more):
+    shutil.copy(DATA / "reflectors_3d.h5", tmp_path / "rec.h5")
+    (tmp_path / "other.toml").write_text('array.layout = "eRTIS_v2"\nprocessing.directions = "2d:9"\n')
+    files = [str(tmp_path / "rec.h5"), "--settings", str(tmp_path / "other.toml")]
+    done = CliRunner().invoke(cli, ["process", *files, *more])
+    assert done.exit_code == 0, done.stderr
+    assert "layout eRTIS_v3D1 fits far better" in done.stderr
+
+
+def test_workers_report_another_layout():
+    _, loud = wrong()
+    predictions = Predictions("cpu")
+    predictions._report_matches(  # noqa: SLF001  the thread needs an image
+        "left", loud
+    )
+    (found,) = predictions.drain()
+    assert (found.sensor, found.event) == ("left", "layout_mismatch")
+    assert "layout eRTIS_v3D1 fits far better" in found.warning
