@@ -4,9 +4,13 @@ import shutil
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+import scipy
 from click.testing import CliRunner
 from ertis_cli.main import cli
+
+from tests.remedies import strange_options
 
 DATA = Path(__file__).parents[1] / "data" / "synthetic"
 TIMEOUT_S = 10.0
@@ -114,7 +118,31 @@ export nope.h5 -o a.ply
 export img.h5 -o img.h5
 export img.h5 -o a.ply --mounting nope.toml
 export img.h5
-layout nope
+layouts nope
+layouts nope.csv
+layouts text.toml
+import odd.bin -o o.h5 --layout m.csv --preset default_25_50
+import odd.bin -o o.h5 --layout other.toml --preset default_25_50
+import text.txt -o o.h5 --layout eRTIS_v3D1
+import dir -o o.h5 --layout eRTIS_v3D1
+import rec.wav -o o.h5
+import rec.wav -o o.h5 --passive
+import rec.wav -o o.h5 --layout m.csv --preset default_25_50 --passive
+check nope.h5
+check text.h5
+calibrate rec.h5
+calibrate rec.h5 -o l.toml --layout m.csv
+calibrate rec.h5 -o l.toml --layout eRTIS_v4
+calibrate img.h5 -o l.toml
+map rec.h5 -o m.h5
+map img.h5 -o m.h5 --poses nope.csv
+odometry rec.h5 -o p.csv
+process rec.h5 -o y.h5 --settings wide.toml
+process rec.h5 -o y.h5 --mode passive --range 1:2
+process rec.h5 -o y.h5 --level
+process rec.h5 -o y.h5 --fuse
+process rec.h5 -o y.h5 --bands 0:1
+process rec.h5 -o y.h5 --layout eRTIS_v2
 settings nope
 example nope
 capture
@@ -183,6 +211,10 @@ def folder(tmp_path_factory):
     (folder / "text.h5").write_text("hello")
     (folder / "text.toml").write_text("a = [")
     (folder / "other.toml").write_text("pionts = 3\n")
+    (folder / "m.csv").write_text("0,0\n1.2,0\n0,1.2\n")
+    (folder / "wide.toml").write_text('[array]\nlayout = "m.csv"\n')
+    (folder / "text.txt").write_text("hello")
+    scipy.io.wavfile.write(folder / "rec.wav", 192000, np.zeros((9000, 2), np.int16))
     (folder / "odd.bin").write_bytes(b"123")
     (folder / "torn.h5").write_bytes((folder / "rec.h5").read_bytes()[:50_000])
     (folder / "ünï.h5").write_bytes(b"x")
@@ -203,4 +235,6 @@ def test_common_command_mistakes_are_refused_in_one_line(line, folder, monkeypat
     (reported,) = done.stderr.strip().splitlines()
     assert reported.startswith("ertis: error: ")
     assert len(reported) < MAX_LENGTH
+    typed = {word.partition("=")[0] for word in line.split()}
+    assert not strange_options(reported, line.split()[0]) - typed
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before

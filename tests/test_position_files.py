@@ -1,6 +1,9 @@
 """Files of microphone positions as other people and programs write them: read right, questioned or refused."""
 
 import io
+import tomllib
+import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +14,7 @@ from scipy.io import wavfile
 
 from ertis_numba import Settings
 from ertis_numba.accepted_words import AcceptedWords
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.errors import ArgumentError, LayoutUnitWarning, SettingsError
 from ertis_numba.geometry import load_layout, microphones, require_plausible_size, self_contained, written_out
 from ertis_numba.settings import Array
 
@@ -339,6 +342,67 @@ def test_folder_in_place_of_a_layout_is_refused(tmp_path):
         load_layout(tmp_path / "a.csv")
 
 
+@pytest.mark.parametrize(("size", "may_be_metres"), [(16, True), (25, True), (26, False), (300, False)])
+def test_numbers_that_may_be_metres_cause_a_warning(tmp_path, size, may_be_metres):
+    (tmp_path / "a.csv").write_text(f"0,0\n0,{size}\n{size},0\n")
+    if may_be_metres:
+        with pytest.warns(LayoutUnitWarning, match=r"millimetres, not metres, are assumed, so the array spans 0 × "):
+            load_layout(tmp_path / "a.csv")
+    assert len([note for note in noted(tmp_path / "a.csv") if "states no unit" in note]) == 1
+    for unit in ("mm", "m"):
+        if unit == "mm" or may_be_metres:
+            (tmp_path / "a.csv").write_text(f"y_{unit},z_{unit}\n0,0\n0,{size}\n{size},0\n")
+            assert not load_layout(tmp_path / "a.csv").notes
+
+
+def noted(path):
+    with warnings.catch_warnings(category=LayoutUnitWarning, action="ignore"):
+        return load_layout(path).notes
+
+
+@pytest.mark.parametrize("size", [5, 12, 14.9])
+def test_numbers_of_small_and_of_large_arrays_are_questioned(tmp_path, size):
+    (tmp_path / "a.csv").write_text(f"0,0\n0,{size}\n{size},0\n{size},{size}\n")
+    with pytest.raises(ArgumentError, match=rf"would span only {size} mm\. Are the numbers cm .* or m \({size} m\)"):
+        load_layout(tmp_path / "a.csv")
+
+
+def test_layouts_prints_files_in_millimetres(tmp_path):
+    (tmp_path / "a.csv").write_text("x_m,y_m,z_m\n0,0,0\n0,6,0\n0,0,-3\n")
+    (tmp_path / "small.csv").write_text("0,0\n0,20\n20,0\n")
+    done = CliRunner().invoke(cli, ["layouts", str(tmp_path / "a.csv")])
+    assert (done.exit_code, done.stderr) == (0, "")
+    (tmp_path / "a.toml").write_text(done.stdout)
+    assert tomllib.loads(done.stdout)["positions_mm"][1] == [0.0, 4000.0, 1000.0]
+    assert np.array_equal(load_layout(tmp_path / "a.toml").positions_m, load_layout(tmp_path / "a.csv").positions_m)
+    done = CliRunner().invoke(cli, ["layouts", str(tmp_path / "small.csv")])
+    assert done.stderr.startswith("note: layout ")
+    assert done.stderr.count("states no unit") == 1
+    assert tomllib.loads(done.stdout)["name"] == "small"
+
+
+def test_notes_of_a_layout_appear_when_a_recording_is_made(tmp_path, monkeypatch):
+    """Later commands with the same settings file repeat none of them."""
+    monkeypatch.chdir(tmp_path)
+    Path("a.csv").write_text("0,0\n0,20\n20,0\n")
+    Path("b.csv").write_text("0,0\n0,20\n30,0\n")
+    for name in "ab":
+        Path(f"{name}.toml").write_text(
+            f'array.layout = "{name}.csv"\nrecording.encoding = "int16"\nrecording.sample_rate_hz = 192000.0\n'
+            'recording.n_samples = 3000\nprocessing.directions = "2d:9"\nprocessing.range_m = [0.3, 1.0]\n'
+            "processing.range_decimation = 4\n"
+        )
+    wavfile.write("a.wav", 192000, np.random.default_rng(0).integers(-99, 99, (3000, 3)).astype(np.int16))
+    for line, count in {
+        "import a.wav -o a.h5 --settings a.toml": 1,
+        "process a.h5 --settings a.toml --force": 0,
+        "process a.h5 --settings b.toml --force": 1,
+    }.items():
+        done = CliRunner().invoke(cli, line.split())
+        assert done.exit_code == 0, done.stderr
+        assert done.stderr.count("states no unit") == count, done.stderr
+
+
 # ---- size relative to the sound ---------------------------------------------------------------------
 
 
@@ -347,15 +411,15 @@ def of_file(path, **changes):
 
 
 def test_array_below_a_third_of_the_wavelength_is_questioned(tmp_path):
-    (tmp_path / "a.csv").write_text("0, 0\n6, 0\n0, 6\n")
-    low = {"processing.mode": "passive", "passive.bands_hz": [[1000.0, 8000.0]]}
-    require_plausible_size(of_file(tmp_path / "a.csv"))  # 6 mm are 0.9 wavelengths at 50 kHz …
-    for use in (require_plausible_size, self_contained, AcceptedWords):  # … and 0.14 at 8 kHz.
+    (tmp_path / "a.csv").write_text("0, 0\n30, 0\n0, 30\n")
+    low = {"processing.mode": "passive", "passive.bands_hz": [[1000.0, 2000.0]]}
+    require_plausible_size(of_file(tmp_path / "a.csv"))  # 30 mm are 4.4 wavelengths at 50 kHz …
+    for use in (require_plausible_size, self_contained, AcceptedWords):  # … and 0.17 at 2 kHz.
         with pytest.raises(
-            ArgumentError, match=r"span only 6 mm, less than a third of the wavelength at 8 kHz\. Are the"
+            ArgumentError, match=r"span only 30 mm, less than a third of the wavelength at 2 kHz\. Are the"
         ):
             use(of_file(tmp_path / "a.csv", **low))
-    (tmp_path / "a.csv").write_text("y_mm, z_mm\n0, 0\n6, 0\n0, 6\n")
+    (tmp_path / "a.csv").write_text("y_mm, z_mm\n0, 0\n30, 0\n0, 30\n")
     require_plausible_size(of_file(tmp_path / "a.csv", **low))
 
 

@@ -222,6 +222,7 @@ def _renderer(
     changes = {"count": count, "seed": seed}
     scene = load_scene(path).replace(**{name: value for name, value in changes.items() if value is not None})
     for name in names:
+        options.note_layout(scene.sensor(name).array)
         shot = snapshot(scene, scene.sensor(name), 0.0)
         target_validity.require_clear(shot)
         for note in target_validity.notes(shot):

@@ -5,6 +5,7 @@ import gc
 import importlib
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn, cast
@@ -207,6 +208,8 @@ def cli(ctx: click.Context) -> None:
         click.echo(f"ertis: warning: {fault}", err=True)
     for line in _config.unknown_variables(cast("click.Group", ctx.command), ctx):
         click.echo(f"ertis: warning: {line}", err=True)
+    ctx.with_resource(warnings.catch_warnings())
+    warnings.filterwarnings("ignore", "layout .* states no unit")  # A note says the same.
 
 
 def main() -> None:

@@ -343,7 +343,7 @@ def settings_with(
     from ertis_numba.settings import preset_tables
 
     settings = recorded if settings_file is None else recorded.updated_from_file(settings_file)
-    note_layout(settings.array)
+    note_layout(settings.array, recorded=recorded.array)
     if preset is not None:
         keys = preset_tables(preset, "processing")["processing"]
         settings = settings.replace(processing=settings.processing.replace(**keys))
@@ -418,16 +418,25 @@ def complete_layouts(ctx: click.Context, param: click.Parameter, incomplete: str
     return names or [CompletionItem(incomplete, type="file")]
 
 
-def note_layout(array: "Array") -> None:
-    """Print the notes about the layout file of an array, once per command and unless it is quiet."""
+def note_layout(array: "Array", *, recorded: "Array | None" = None) -> None:
+    """Print the notes about the layout file of an array, once per command and unless it is quiet.
+
+    There are none if the positions are those of the recording, because its import printed them.
+    """
+    import numpy as np
+
     from ertis_numba.geometry import microphones
 
     context = click.get_current_context()
     noted: set[str] = context.meta.setdefault("ertis_cli.noted_layouts", set())
-    if array.is_file and array.layout not in noted:
-        noted.add(array.layout)
-        for note in microphones(array).notes:
-            say(f"note: {note}", quiet=bool(context.params.get("quiet")))
+    if not array.is_file or array.layout in noted:
+        return
+    noted.add(array.layout)
+    layout = microphones(array)
+    if recorded is not None and np.array_equal(layout.positions_m, microphones(recorded).positions_m):
+        return
+    for note in layout.notes:
+        say(f"note: {note}", quiet=bool(context.params.get("quiet")))
 
 
 def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:

@@ -77,6 +77,8 @@ def simulate(
     target = target or path.with_suffix(".h5")
     check_target(target, overwrite=force, sources=[path])
     names = [scene.sensor(sensor).name] if sensor else [each.name for each in scene.sensors]
+    for name in names:
+        options.note_layout(scene.sensor(name).array)
     _require_room(target, scene, names)
     with options.note_when_slow(options.PREPARING, quiet=quiet):
         from ertis_numba.simulation.effect_plan import make_plan

@@ -1,6 +1,7 @@
 """Layout files: microphone positions in TOML, text tables, NumPy arrays or XML, checked for their size and unit."""
 
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.constants import MAX_MICROPHONES
 from ertis_numba.documents import TomlDocument
-from ertis_numba.errors import ArgumentError
+from ertis_numba.errors import ArgumentError, LayoutUnitWarning
 from ertis_numba.geometry.position_files import FLAT, layout_bytes, layout_file_text, read_position_file
 from ertis_numba.geometry.position_headings import AXES
 from ertis_numba.geometry.position_tables import HEADER_EXAMPLES
@@ -20,8 +21,7 @@ from ertis_numba.settings import LENGTH_UNITS_M, MAX_SPAN_M, MIN_SPAN_M, Array
 __all__ = ["LayoutFile", "ReadLayout", "parse_layout", "read_layout", "unclear_unit"]
 
 _DEFAULT_UNIT: Final = "mm"
-_MIN_UNSTATED_M: Final = 5e-3  # Extent in millimetres below which an array whose file states no unit is questioned.
-_LIKELY_SPAN_M: Final = 15e-3  # Smaller arrays are rare.
+_LIKELY_SPAN_M: Final = 15e-3  # Smaller arrays are rare, so that they are questioned if their file states no unit.
 _MIN_SPACING_M: Final = 2e-3  # Microphones are larger; the packages of MEMS microphones have 2.7 mm.
 _SPLIT_ROW = re.compile(r"\[\s+((?:[-\d.e]+,\s+)+)\]")  # numbers of a list on lines of their own
 
@@ -140,6 +140,11 @@ def read_layout(path: str | Path, names: str) -> ReadLayout:
     ------
     ArgumentError
         The file cannot be read or used, or its unit or axes are unclear.
+
+    Warns
+    -----
+    LayoutUnitWarning
+        The file states no unit, and its numbers may be metres as well as millimetres.
     """
     content = layout_bytes(path, names)
     if Path(path).suffix.lower() == ".toml":
@@ -155,11 +160,15 @@ def read_layout(path: str | Path, names: str) -> ReadLayout:
     if Path(path).suffix.lower() != ".xml":
         notes += _lying(source, positions_m)
     if not found.unit and len(positions_m) > 1:
+        may_be_m = float(np.ptp(found.positions, axis=0).max()) <= MAX_SPAN_M
         span = " × ".join(f"{1e3 * extent_m:.4g}" for extent_m in np.ptp(positions_m, axis=0))
+        unit = "millimetres, not metres," if may_be_m else "millimetres"
         notes.append(
-            f"{source} states no unit; millimetres are assumed, so the array spans {span} mm (x × y × z); if this is "
-            f"wrong, {_remedy(source)}"
+            f"{source} states no unit; {unit} are assumed, so the array spans {span} mm (x × y × z); if this is wrong, "
+            f"{_remedy(source)}"
         )
+        if may_be_m:
+            warnings.warn(notes[-1], LayoutUnitWarning, stacklevel=2)
     return ReadLayout(array, tuple(notes), unit_is_stated=bool(found.unit))
 
 
@@ -252,7 +261,7 @@ def _require_clear_unit(source: str, positions: NDArray[np.float64]) -> None:
     apart = np.linalg.norm(positions[:, None] - positions, axis=2)
     spacing_m = LENGTH_UNITS_M[_DEFAULT_UNIT] * float(apart[apart > 0].min(initial=np.inf))
     span_m = LENGTH_UNITS_M[_DEFAULT_UNIT] * span
-    if 0 < span_m < _MIN_UNSTATED_M or (spacing_m < _MIN_SPACING_M and span <= MAX_SPAN_M):
+    if 0 < span_m < _LIKELY_SPAN_M or (spacing_m < _MIN_SPACING_M and span <= MAX_SPAN_M):
         raise ArgumentError(unclear_unit(source, span))
 
 

@@ -159,7 +159,7 @@ def layout_file(layout: Layout, *, name: str, source: str = "") -> LayoutFile:
         name=name,
         source=source,
         word_bits=layout.word_bits,
-        positions_mm=np.round(1e3 * layout.positions_m, 4).tolist(),
+        positions_mm=(np.round(1e3 * layout.positions_m, 4) + 0.0).tolist(),  # without -0.0
         disabled=tuple(np.flatnonzero(~layout.enabled).tolist()),
         gain=tuple(np.round(layout.gain, 6).tolist()),
         delay_s=tuple(np.round(layout.delay_s, 12).tolist()),
@@ -191,6 +191,11 @@ def load_layout(name: str | Path) -> Layout:
     ------
     ArgumentError
         The name is unknown, the file cannot be read or used, or its unit or axes are unclear.
+
+    Warns
+    -----
+    LayoutUnitWarning
+        The file states no unit, and its numbers may be metres as well as millimetres.
 
     Examples
     --------
