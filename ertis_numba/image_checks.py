@@ -63,6 +63,8 @@ class ImageChecks:
                 del self._remaining[check]
             if match is not None and match.warning:
                 warnings.warn(match.warning, category, stacklevel=_CALLER)
+                self._remaining.clear()  # The filter of another call does not find the times of arrival.
+                return
 
     def _check_budget(self, image: Energyscape, measurement: Measurement) -> None:
         """Predict the error of an image if it needs a prediction, and issue the warning once."""

@@ -252,11 +252,10 @@ def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
         others = (recording[index] for index in range(1, len(recording)))
         return (replace(each, settings=settings) for each in itertools.chain([first], others))
 
-    call, layout = first_call_match(heard()), LayoutMatch.of(report.findings)
-    if call is not None and call.warning:
-        layout = None  # The filter of another call does not find the times of arrival.
-    elif not layout.warning:
-        layout = first_layout_match(heard())
+    call, layout = first_call_match(heard()), None
+    if call is None or not call.warning:  # The filter of another call does not find the times of arrival.
+        of_report = LayoutMatch.of(report.findings)
+        layout = of_report if of_report.warning else first_layout_match(heard())
     return faults, "; ".join(shift or ()), call, layout
 
 

@@ -42,7 +42,7 @@ _MAX_SUSPECTS = 0.25  # Maximum share of microphones; if more disagree, the arri
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Arrival:
+class _StrongestSound:
     """Strongest arrival of a record.
 
     Attributes
@@ -81,7 +81,7 @@ def by_array(
 
 def _arrival(
     signals: Callable[[int], NDArray[np.float32]], channels: Sequence[int], settings: Settings, n_samples: int
-) -> _Arrival | None:
+) -> _StrongestSound | None:
     """Return the strongest arrival, compared with other arrays; None if no arrival exceeds the background."""
     layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
     positions_m = layout.positions_m[list(channels)]
@@ -104,7 +104,7 @@ def _arrival(
         other = None
     if is_small and other is None:
         return None
-    return _Arrival(found, times_s, path_m, is_near, shifts, other)
+    return _StrongestSound(found, times_s, path_m, is_near, shifts, other)
 
 
 def by_wavefront(

@@ -2,11 +2,13 @@
 
 import threading
 from collections import deque
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ertis_numba.network.processing.pipe_messages import Predicted
 
 if TYPE_CHECKING:
+    from ertis_numba.analysis.call_match import CallMatch
+    from ertis_numba.analysis.layout_match import LayoutMatch
     from ertis_numba.frames import Energyscape, Measurement
 
 __all__ = ["Predictions"]
@@ -53,16 +55,18 @@ class Predictions:
         from ertis_numba.analysis.call_match import call_match  # noqa: PLC0415
         from ertis_numba.analysis.layout_match import layout_match  # noqa: PLC0415
 
-        compared: tuple[tuple[Literal["call", "layout"], Any], ...] = (("call", call_match), ("layout", layout_match))
-        for name, compare in compared:
+        event: Literal["call_mismatch", "layout_mismatch"]
+        for event, compare in (("call_mismatch", call_match), ("layout_mismatch", layout_match)):
             try:
-                match = compare(measurement)
+                match: CallMatch | LayoutMatch | None = compare(measurement)
             except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images
+                name = event.removesuffix("_mismatch")
                 text = f"echoes were not compared with the {name}: {type(error).__name__}: {error}"
             else:
                 text = match.warning if match else ""
             if text:
-                self._found.append(Predicted(sensor=sensor, event=f"{name}_mismatch", warning=text))
+                self._found.append(Predicted(sensor=sensor, event=event, warning=text))
+                return  # The filter of another call does not find the times of arrival.
 
     def _predict(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
         self._report_matches(sensor, measurement)
