@@ -371,7 +371,7 @@ def test_named_pipe_is_refused_instead_of_waiting_for_a_writer(words, folder, mo
     os.mkfifo(pipe)
     done = CliRunner().invoke(cli, words.replace("PIPE", str(pipe)).split())
     assert done.exit_code == 1
-    assert done.stderr == f"ertis: error: {pipe} is a named pipe; write its content to a file, and use that file\n"
+    assert done.stderr == f"ertis: error: {pipe} is a named pipe; write its content to a file, and use the file\n"
 
 
 def test_unreadable_file_and_pipe_of_a_shell_get_their_own_remedies(folder, monkeypatch):

@@ -124,7 +124,9 @@ def test_kind_of_names_common_formats(tmp_path, ending):
     path = tmp_path / f"take.{ending}"
     path.write_bytes(content)
     assert name.replace("\\", "") in kind_of(path).name
-    with pytest.raises(DataError, match=rf"take\.{ending} is {name}.*; if it contains raw words .*, use --raw \(check"):
+    with pytest.raises(
+        DataError, match=rf"take\.{ending} is {name}.*; if the file contains raw words .*, use --raw \(check"
+    ):
         ertis.open_raw(path, SETTINGS)
     if not kind_of(path).is_hdf5:
         with pytest.raises(DataError, match=rf"take\.{ending} is {name}"):
@@ -219,7 +221,8 @@ def test_import_of_unknown_endings_needs_raw(tmp_path, raw_settings, name):
     done = invoke("import", tmp_path / name, *raw_settings)
     assert done.exit_code == 2
     assert (
-        f"{name} has no known content, and an unknown ending; use --raw if it contains raw eRTIS words" in done.stderr
+        f"{name} has unknown content and an unknown ending; use --raw if the file contains raw eRTIS words"
+        in done.stderr
     )
     assert invoke("import", tmp_path / name, *raw_settings, "--raw").exit_code == 0
 
@@ -230,7 +233,10 @@ def test_import_reads_raw_words_of_known_endings(tmp_path, raw_settings, name):
     done = invoke("import", tmp_path / name, *raw_settings)
     assert done.exit_code == 0, done.stderr
     passive = invoke("import", tmp_path / name, *raw_settings, "--force", "--passive")
-    assert f"--passive is for PCM (.wav, .h5), but {tmp_path / name} contains raw words; remove it" in passive.stderr
+    assert (
+        f"--passive is for PCM (.wav, .h5), but {tmp_path / name} contains raw words; remove --passive"
+        in passive.stderr
+    )
 
 
 @pytest.mark.parametrize("command", ["info", "process", "verify", "check", "export"])

@@ -540,14 +540,14 @@ def test_unstorable_start_times_are_refused(tmp_path, start):
     done = CliRunner().invoke(cli, arguments)
     assert done.exit_code == 2
     assert f"'--start': {start[:16]}" in done.stderr
-    assert "is outside the range of a recording; give a time from 1970 to 2262" in done.stderr
+    assert "is outside the range of a recording; use a time from 1970 to 2262" in done.stderr
 
 
 def test_recording_needs_another_name_than_its_source(tmp_path):
     path = write_acoular(tmp_path / "ac.h5", numbers().astype(np.float32), RATE_HZ)
     done = CliRunner().invoke(cli, ["import", str(path)])
     assert done.exit_code == 2
-    assert f"{path} cannot become a recording of the same name; give another name (--output)" in done.stderr
+    assert f"{path} cannot become a recording of the same name; choose another name with --output" in done.stderr
 
 
 def test_pcm_options_are_refused_for_pdm(tmp_path):

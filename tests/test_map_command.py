@@ -320,7 +320,7 @@ def test_map_refuses_poses_at_other_times(folder):
 @pytest.mark.parametrize(
     ("line", "code", "message"),
     [
-        ("both.h5", 2, "contains no poses of the platform; give --poses FILE"),
+        ("both.h5", 2, "contains no poses of the platform; add --poses FILE"),
         ("both.h5 left.h5 --poses poses.tum", 2, "have the same sensor 'left'"),
         (
             "both.h5 --poses poses.tum -o place.tif",

@@ -69,7 +69,8 @@ def test_benchmark_that_the_wheel_lacks_names_the_source_folder(monkeypatch, nam
     assert done.exit_code == 1
     assert (
         done.stderr
-        == f"ertis: error: 'ertis bench {name}' is in the source folder only; run pip install --editable . there\n"
+        == f"ertis: error: 'ertis bench {name}' exists only in the source folder; run 'pip install --editable .' in "
+        "that folder\n"
     )
 
 

@@ -18,7 +18,7 @@ def require_no_pipes(options: Mapping[str, Any]) -> None:
         if is_pipe and path.parts[:2] not in {("/", "dev"), ("/", "proc")}:
             from ertis_numba.errors import ArgumentError
 
-            raise ArgumentError(f"{path} is a named pipe; write its content to a file, and use that file")
+            raise ArgumentError(f"{path} is a named pipe; write its content to a file, and use the file")
 
 
 def _paths(value: Any) -> Iterator[Path]:

@@ -23,17 +23,21 @@ def reading(command: "Callable[..., Any]") -> "Callable[..., Any]":
             type=click.Choice(("platform", "camera", "camera-world")),
             default="platform",
             show_default=True,
-            help="Axes of the poses in a file: platform has x forward and z up. camera has z forward and y down, in a "
-            "world with z up. In camera-world, the world has the axes of a camera as well.",
+            help="Axes of the poses. platform: x forward, z up. camera: z forward and y down, in a world with z up. "
+            "camera-world: as camera, and the world has the axes of the first camera.",
         ),
-        click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Times of poses of KITTI."),
+        click.option(
+            "--times", type=click.Path(path_type=Path), metavar="FILE", help="Text file with the times of KITTI poses."
+        ),
         click.option(
             "--time-unit",
             type=click.Choice(("s", "ms", "us", "ns")),
-            help="Unit of times in a file of poses that states none; found from their magnitude by default.",
+            help="Unit of the times, if the file of poses states none; chosen by their magnitude by default.",
         ),
         click.option(
-            "--topic", metavar="NAME", help="Topic of an MCAP file of poses; the only one with poses by default."
+            "--topic",
+            metavar="NAME",
+            help="Topic of an MCAP file, or transform as TOPIC:PARENT.CHILD; by default, the only topic with poses.",
         ),
     ):
         command = option(command)

@@ -599,7 +599,7 @@ def _in_source_folder(name: str, package: str | None = None) -> ModuleType:
         from ertis_numba.errors import ArgumentError
 
         raise ArgumentError(
-            f"'ertis bench {name}' is in the source folder only; run pip install --editable . there"
+            f"'ertis bench {name}' exists only in the source folder; run 'pip install --editable .' in that folder"
         ) from None
 
 

@@ -56,9 +56,9 @@ def import_poses(
 
     TRAJ is a text file of TUM (.tum, .txt), a table (.csv) such as those of EuRoC, poses of KITTI with --times, or
     messages of ROS 2 (.mcap). The trajectory is interpolated at the times of the measurements of all sensors, and must
-    cover them. Notes state rows that were left out, and the number of poses that were interpolated between poses more
-    than a second apart. A folder stands for its recordings (*.h5). A recording is replaced only when the new one is
-    complete.
+    cover all of them. Notes report rows that were left out, and the number of measurements whose pose is interpolated
+    across more than a second. A folder stands for its recordings (*.h5). A recording is replaced only when the new one
+    is complete.
     """
     from ertis_numba import checks
     from ertis_numba.atomic_files import make_folder

@@ -69,24 +69,27 @@ _UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
     metavar="TIME",
     multiple=True,
     type=click.DateTime([f"%Y-%m-%dT%H:%M{rest}{zone}" for rest in ("", ":%S", ":%S.%f") for zone in ("", "%z")]),
-    help="PCM: time of the first emission, as 2026-05-04T12:30 or 12:30:00.5, in UTC unless it has an offset; once for "
-    "the first file, or once for each file. By default, from metadata or names of the files.",
+    help="PCM: time of the first emission, such as 2026-05-04T12:30 or 2026-05-04T12:30:00.5+02:00; UTC unless it has "
+    "an offset. Use it once for the first file, or once per file. By default, from the metadata or names of the files.",
 )
 @click.option("--passive", is_flag=True, help="PCM: no call was emitted, so the settings need no call.")
-@click.option("--join", is_flag=True, help="PCM: each file holds one microphone or some, in the order of the channels.")
+@click.option(
+    "--join", is_flag=True, help="PCM: join files of single microphones, listed in the order of the channels."
+)
 @click.option(
     "--time-expansion",
     type=click.FloatRange(min=0, min_open=True),
     metavar="FACTOR",
-    help="PCM: factor by which files play slower than the sound, such as 10; by default, as in their metadata.",
+    help="PCM: factor by which the files play slower than the sound, such as 10; from their metadata by default.",
 )
 @click.option(
     "--sync-channel",
     type=click.IntRange(min=0),
     metavar="N",
-    help="PCM: channel with the emitted call or its trigger, which is left out; measurements begin at its emissions.",
+    help="PCM: channel, counted from 0, that recorded the emitted call or its trigger. Measurements begin at these "
+    "emissions; the channel itself is not imported.",
 )
-@click.option("--raw", "is_raw", is_flag=True, help="Read files of any content and ending as raw eRTIS words.")
+@click.option("--raw", "is_raw", is_flag=True, help="Read files as raw eRTIS words, whatever their content and ending.")
 @click.option("--sensor", metavar="NAME", default="sensor", show_default=True, help="Name of the sensor.")
 @click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default.")
 @click.option("--humidity", type=float, metavar="PCT", help="Relative humidity in percent; 50 by default.")
@@ -121,15 +124,16 @@ def import_raw(
     supply the missing information; a preset names the length of a measurement and the band of the call in kHz. A
     settings file can supply all of it instead. The recording then contains these settings.
 
-    Instead of files, give a folder to which a program based on RTIS Dev has saved. It contains NAME<number>.bin
+    Instead of files, a folder of a program based on RTIS Dev can be imported. It contains NAME<number>.bin
     for each measurement, and the settings of recording and processing as JSON.
 
-    Files of raw data end in .bin, .raw, .dat or .pdm; others need --raw. The content decides about other formats.
+    Names of raw files end in .bin, .raw, .dat or .pdm; other endings need --raw. All other formats are recognized by
+    their content.
 
     WAV files contain multichannel PCM, as do .h5 files with the time_data of Acoular. Their channels are
     the rows of the layout, and their sample rate becomes that of the recording. With --passive, the files
-    contain sound without a call, for acoustic maps. A folder of .wav files is imported in the order of their times.
-    Notes state the source of the times, and what was assumed or left out.
+    contain sound without a call, for acoustic maps. A folder of .wav files is imported in the order of the recording
+    times. Notes report the source of the times, and everything that was assumed or left out.
     """
     from ertis_numba.interop import is_wav_folder
     from ertis_numba.storage import check_target, write_recording
@@ -143,7 +147,8 @@ def import_raw(
     for name, parameter in _OF_PCM.items():
         if typed(parameter) and not is_pcm:
             raise click.UsageError(
-                f"{name} is for PCM (.wav, .h5), but {raw[0]} contains raw words; remove it, or choose another file",
+                f"{name} is for PCM (.wav, .h5), but {raw[0]} contains raw words; remove {name}, or choose another "
+                "file",
                 click.get_current_context(),
             )
     if not is_pcm and any(are_pcm):
@@ -213,13 +218,13 @@ def _is_pcm(path: Path, *, is_raw: bool) -> bool:
 
     kind, suffix = None if is_raw else kind_of(path), path.suffix.lower()
     if kind is not None and not (kind.is_wav or kind.is_hdf5):
-        raise DataError(f"{path} {problem_of(path)}; if it contains raw words all the same, use --raw")
+        raise DataError(f"{path} {problem_of(path)}; if the file contains raw words nevertheless, use --raw")
     if is_raw or kind is not None or suffix in _PCM:
         return not is_raw
     if suffix not in _RAW and path.is_file():
         raise click.UsageError(
-            f"{path} has no known content, and an unknown ending; use --raw if it contains raw eRTIS words without a "
-            f"header, as in {', '.join(sorted(_RAW))}",
+            f"{path} has unknown content and an unknown ending; use --raw if the file contains raw eRTIS words without "
+            f"a header, like {', '.join(sorted(_RAW))}",
             click.get_current_context(),
         )
     return False
@@ -229,7 +234,7 @@ def _beside(first: Path) -> Path:
     """Return the default name of the recording."""
     if first.suffix.lower() == ".h5":
         raise click.UsageError(
-            f"{first} cannot become a recording of the same name; give another name (--output)",
+            f"{first} cannot become a recording of the same name; choose another name with --output",
             click.get_current_context(),
         )
     return first.with_suffix(".h5")
@@ -250,7 +255,7 @@ def _opened_raw(
     if folder is not None:
         if typed("settings_file"):
             raise click.UsageError(
-                "--settings is for files, and a folder contains its own settings; remove it",
+                "--settings is for files, but a folder contains its own settings; remove --settings",
                 click.get_current_context(),
             )
         return open_rtis_folder(folder, layout=layout, preset=preset, sensor=sensor)
@@ -290,7 +295,7 @@ def _since_1970_ns(start: datetime) -> int:
     since_1970_ns = (given - datetime.fromtimestamp(0, UTC)) // timedelta(microseconds=1) * 1000
     if not 0 <= since_1970_ns < _END_NS:
         raise click.BadParameter(
-            f"{given.isoformat()} is outside the range of a recording; give a time from 1970 to 2262",
+            f"{given.isoformat()} is outside the range of a recording; use a time from 1970 to 2262",
             param_hint="'--start'",
         )
     return since_1970_ns

@@ -283,5 +283,9 @@ def spacing_warning(settings: Settings, grid: DegreesFromRadians) -> str | None:
     return (
         f"directions are {math.degrees(check.spacing_rad):.1f}° apart, so a reflector between them appears up to "
         f"{check.loss_db(lobe)} dB too weak{narrower}; "
-        + (remedy or f"no grid of up to {LARGEST_GRID} directions suffices, so use narrower limits, or delay_and_sum")
+        + (
+            remedy
+            or f"no grid of up to {LARGEST_GRID} directions suffices, so use narrower limits (--azimuth, --elevation), "
+            "or delay_and_sum"
+        )
     )

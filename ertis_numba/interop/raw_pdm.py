@@ -96,7 +96,9 @@ class RawReader:
             raise DataError(f"{path}: {error.strerror}; choose a file of raw words") from error
         found = problem_of(path) if self._check_kind else ""
         if found:
-            raise DataError(f"{path} {found}; if it contains raw words all the same, use --raw (check_kind=False)")
+            raise DataError(
+                f"{path} {found}; if the file contains raw words nevertheless, use --raw (check_kind=False)"
+            )
         count, rest = divmod(n_bytes, self._format.n_bytes)
         if count and not rest:
             return count

@@ -59,7 +59,9 @@ def _imported() -> Any:
     except (ValueError, RuntimeWarning) as error:
         given = ", ".join(f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("NUMBA_"))
         reason = str(error).split("\n")[0].strip()
-        raise DeviceError(f"Numba refuses one of its environment variables {given} ({reason}); unset it") from error
+        raise DeviceError(
+            f"Numba refuses one of its environment variables, {given} ({reason}); correct or unset this variable"
+        ) from error
 
 
 def _require_cache_folder() -> None:

@@ -28,6 +28,6 @@ class Owner:
         """Raise NetworkError in a fork."""
         if not self.is_this_process:
             raise NetworkError(
-                f"this {self._name} was opened before the process forked, and works only in the process that opened "
-                f"it; open a {self._name} in each worker"
+                f"this {self._name} was opened before the process forked, and works only in the parent process; open "
+                f"a {self._name} in each worker"
             )

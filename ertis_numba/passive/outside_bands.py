@@ -84,14 +84,14 @@ class OutsideBands:
         frequency_hz = float(self._frequency_hz[place])
         low_hz, high_hz = self._edges_hz
         return (
-            f"{100 * float(outside.sum()) / total:.3g} % of the power lies outside of the bands, {low_hz / 1e3:.4g} to "
-            f"{high_hz / 1e3:.4g} kHz, with its maximum of {10 * math.log10(max(beside, 1e-30)):.1f} dBFS at "
-            f"{frequency_hz / 1e3:.4g} kHz; {self._remedy(frequency_hz)}"
+            f"{100 * float(outside.sum()) / total:.3g} % of the sound power is outside of the bands "
+            f"({low_hz / 1e3:.4g} to {high_hz / 1e3:.4g} kHz), strongest at {frequency_hz / 1e3:.4g} kHz with "
+            f"{10 * math.log10(max(beside, 1e-30)):.1f} dBFS; {self._remedy(frequency_hz)}"
         )
 
     def _remedy(self, frequency_hz: float) -> str:
         highest_hz = HIGHEST_SHARE * self._rate_hz / 2
         low_hz, high_hz = 0.8 * frequency_hz, min(1.2 * frequency_hz, highest_hz)
         if frequency_hz >= 0.98 * highest_hz:
-            return f"bands end at {highest_hz / 1e3:.4g} kHz, so record at a higher rate to locate it"
-        return f"use bands_hz {low_hz:.4g}:{high_hz:.4g} to locate it"
+            return f"to locate this sound, record at a higher rate: bands end at {highest_hz / 1e3:.4g} kHz"
+        return f"to locate this sound, use --bands {low_hz:.4g}:{high_hz:.4g} (passive.bands_hz)"

@@ -114,8 +114,8 @@ class Array(TomlTable, frozen=True, kw_only=True):
             span_m = float(np.ptp(np.asarray(positions_m)[enabled], axis=0).max())
             if span_m > MAX_SPAN_M:
                 raise ArgumentError(
-                    f"array.positions_m spans {span_m:.4g} m, more than {MAX_SPAN_M:g} m; are the numbers millimetres? "
-                    "Divide them by 1000"
+                    f"array.positions_m spans {span_m:.4g} m, more than {MAX_SPAN_M:g} m; if the numbers are "
+                    "millimetres, divide them by 1000"
                 )
 
     def _check_per_channel(self, name: str, low: float, high: float) -> None:

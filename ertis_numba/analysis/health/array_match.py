@@ -120,7 +120,7 @@ def _other_order(
         match = _best(times_s, other_m[channels], path_m, speed_m_s)
         if match is not None:
             residuals = f"{1e6 * match.spread_s:.2g} instead of {1e6 * own.spread_s:.2g} µs"
-            detail = f"{name} fits far better than the given one, with residuals of {residuals}"
+            detail = f"{name} fits far better than that of the settings, with residuals of {residuals}"
             found.append((match, _ORDER, own.spread_s, detail))
     for name, late in _halves(len(layout.enabled)):
         match = _best(times_s, positions_m, path_m, speed_m_s, late=late[channels])
@@ -175,7 +175,7 @@ def _of_size(channels: list[int], factor: float, about: str) -> Finding:
         channels=tuple(channels),
         measured=factor,
         limit=_MAX_SLOWNESS if factor > 1 else _MIN_SHRINKAGE,
-        detail=f"the wavefront suits an array {about}{factor:.2g} times as large",
+        detail=f"the wavefront fits an array {about}{factor:.2g} times as large",
     )
 
 
