@@ -16,7 +16,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
 
-__all__ = ["find_peaks", "neighbours_of", "peaks_of_grid", "spacing_of"]
+__all__ = ["find_peaks", "neighbours_of", "peaks_of_grid"]
 
 _NEIGHBOURS = 8  # Number of directions around each direction of a dense grid.
 
@@ -81,16 +81,11 @@ def find_peaks(
 
 def _observed(peak: Peak, seen: ObservableAngles, *, is_planar: bool) -> Peak:
     """Return a peak without the angles that the array cannot observe."""
-    azimuth_deg = peak.azimuth_deg
-    if seen.line is not None and not is_planar:
-        azimuth_deg = math.degrees(
-            seen.in_plane_rad(unit_vectors(np.array([peak.azimuth_rad]), np.array([peak.elevation_rad]))[0])
-        )
-    return replace(
-        peak,
-        azimuth_deg=azimuth_deg if seen.azimuth else math.nan,
-        elevation_deg=peak.elevation_deg if seen.elevation else math.nan,
-    )
+    if seen.azimuth and seen.elevation:
+        return peak
+    angles_rad = seen.observed_rad(peak.azimuth_rad, peak.elevation_rad, is_planar=is_planar)
+    azimuth_deg, elevation_deg = map(math.degrees, angles_rad)
+    return replace(peak, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
 
 
 def peaks_of_grid(
@@ -168,23 +163,6 @@ def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
     count = 2 if np.ptp(directions[:, 2]) == 0 else _NEIGHBOURS
     _, nearest = scipy.spatial.KDTree(directions).query(directions, k=min(count + 1, len(directions)))
     return np.asarray(nearest, dtype=np.int64).reshape(len(directions), -1)
-
-
-def spacing_of(directions: NDArray[np.float64], neighbours: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the distance from each direction to its nearest neighbour, in radians: (direction,) float64.
-
-    The distance is infinite for a single direction.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
-    neighbours : (direction, neighbour) int64
-        Result of `neighbours_of`.
-    """
-    if neighbours.shape[1] < 2:
-        return np.full(len(directions), np.inf)
-    return np.asarray(np.linalg.norm(directions[neighbours[:, 1]] - directions, axis=1))
 
 
 def _local_maxima(

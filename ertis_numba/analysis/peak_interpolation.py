@@ -110,7 +110,7 @@ class PeakInterpolator:
         measured = np.log(np.maximum(image.amplitude[rows, columns].astype(np.float64), np.finfo(np.float32).tiny))
         found = self._tops(directions, measured)
         if self._is_predicted and not image.settings.processing.is_adaptive:
-            found = self._corrected(self._spread, found, directions, measured, (rows, columns), step_m, image)
+            found = self._corrected(found, directions, measured, (rows, columns), step_m, image)
         shift_m, offset = found[:, 0].clip(-0.5, 0.5) * step_m, found[:, 1:4]
         offset, width_rad = self._fits.within_cells(self._row[directions], offset, n_axes=self._n_axes)
         top = self._directions[directions] + offset
@@ -137,7 +137,6 @@ class PeakInterpolator:
 
     def _corrected(
         self,
-        spread: PointSpread,
         found: NDArray[np.float64],
         directions: NDArray[np.int64],
         measured: NDArray[np.float64],
@@ -153,9 +152,7 @@ class PeakInterpolator:
         last = np.full(len(found), np.inf)
         for _ in range(_MAX_CORRECTIONS):
             here = found[active]
-            predicted = self._predicted(
-                spread, here, directions[active], rows[active], offsets[active], steps_m[active], step_m, image
-            )
+            predicted = self._predicted(here, rows[active], offsets[active], steps_m[active], step_m, image)
             difference = measured[active] - predicted
             is_alike = np.abs(difference - difference[:, 1:2]).max(axis=1) < _MAX_DIFFERENCE
             correction = first[active] - self._tops(directions[active], predicted)
@@ -177,12 +174,6 @@ class PeakInterpolator:
         The columns are the shift along the range in bins, the three components of the direction offset, and the
         logarithm of the amplitude. Bins without amplitude, such as those that cleaning removes, count as
         half of the maximum. Results therefore change by about half a bin and 1 dB at most.
-
-        Parameters
-        ----------
-        directions : (place,) int64
-        logs : (place, sample) float64
-            Logarithms of the amplitude at the bins that `_bins` returns.
         """
         logs = np.where(logs > _ABSENT, logs, logs[:, 1:2] - math.log(2))
         before, level, after = logs[:, 0], logs[:, 1], logs[:, 2]
@@ -193,9 +184,7 @@ class PeakInterpolator:
 
     def _predicted(
         self,
-        spread: PointSpread,
         found: NDArray[np.float64],
-        directions: NDArray[np.int64],
         rows: NDArray[np.int64],
         offsets: NDArray[np.float64],
         steps_m: NDArray[np.float64],
@@ -203,16 +192,14 @@ class PeakInterpolator:
         image: Energyscape,
     ) -> NDArray[np.float64]:
         """Return predicted log amplitudes of reflectors at the found positions: (place, sample) float64."""
-        middles = self._directions[directions]
+        middles = self._directions[rows[:, 0]]
         tops = middles + found[:, 1:4]
         tops = tops / np.linalg.norm(tops, axis=1)[:, None]
         away = offsets + (middles - tops)[:, None]
         away_m = steps_m - step_m * found[:, :1]
         deviation = None if self._deviation is None else self._deviation.of(rows.ravel())
-        amplitude = spread(away.reshape(-1, 3), away_m.ravel(), image.settings.air, deviation=deviation).reshape(
-            away_m.shape
-        )
-        return np.asarray(np.log(np.maximum(amplitude, _DARK)) + found[:, 4:])
+        amplitude = self._spread(away.reshape(-1, 3), away_m.ravel(), image.settings.air, deviation=deviation)
+        return np.asarray(np.log(np.maximum(amplitude.reshape(away_m.shape), _DARK)) + found[:, 4:])
 
 
 def _bins(

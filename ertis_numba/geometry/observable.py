@@ -1,5 +1,6 @@
 """Angles that an array can observe."""
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -40,22 +41,25 @@ class ObservableAngles(NamedTuple):
         is_upright = self.elevation and not self.azimuth
         return self.azimuth or (self.line is not None and not (is_planar and is_upright))
 
-    def in_plane_rad(self, direction: NDArray[np.float64]) -> float:
-        """Return the azimuth of the direction in the horizontal plane that sounds like a given one.
+    def observed_rad(self, azimuth_rad: float, elevation_rad: float, *, is_planar: bool) -> tuple[float, float]:
+        """Return the azimuth and the elevation of a direction; NaN for angles that the array cannot observe.
+
+        For arrays on a horizontal line, the azimuth is that of the direction in the horizontal plane that sounds alike.
 
         Parameters
         ----------
-        direction : (axis,) float64
-            Unit vector.
+        azimuth_rad, elevation_rad : float
+        is_planar : bool
+            True if all compared directions lie at one elevation; the azimuth then remains.
         """
-        x, y, _ = direction
-        if self.line is None or not self.azimuth:
-            return float(np.arctan2(y, x))
-        along = float(np.arctan2(self.line[1], self.line[0]))
-        angle = float(np.arccos(np.clip(direction @ self.line, -1.0, 1.0)))
-        both = np.array([along + angle, along - angle])
-        nearest = int(np.argmax(np.cos(both) * x + np.sin(both) * y))
-        return float(np.angle(np.exp(1j * both[nearest])))
+        if self.line is not None and self.azimuth and not is_planar:
+            (direction,) = unit_vectors(np.array([azimuth_rad]), np.array([elevation_rad]))
+            along = float(np.arctan2(self.line[1], self.line[0]))
+            angle = float(np.arccos(np.clip(direction @ self.line, -1.0, 1.0)))
+            both = np.array([along + angle, along - angle])
+            nearest = int(np.argmax(np.cos(both) * direction[0] + np.sin(both) * direction[1]))
+            azimuth_rad = float(np.angle(np.exp(1j * both[nearest])))
+        return azimuth_rad if self.azimuth else math.nan, elevation_rad if self.elevation else math.nan
 
 
 def observable_angles(array: Array, grid: Grid | None = None) -> ObservableAngles:

@@ -118,13 +118,8 @@ def find_sound_sources(
 
 def _observed(source: SoundDirection, seen: ObservableAngles, *, is_planar: bool) -> SoundDirection:
     """Return a source without the angles that the array cannot observe."""
-    azimuth_rad = source.azimuth_rad
-    if seen.line is not None and not is_planar:
-        azimuth_rad = seen.in_plane_rad(unit_vectors(np.array([azimuth_rad]), np.array([source.elevation_rad]))[0])
-    return source._replace(
-        azimuth_rad=azimuth_rad if seen.azimuth else math.nan,
-        elevation_rad=source.elevation_rad if seen.elevation else math.nan,
-    )
+    azimuth_rad, elevation_rad = seen.observed_rad(source.azimuth_rad, source.elevation_rad, is_planar=is_planar)
+    return source._replace(azimuth_rad=azimuth_rad, elevation_rad=elevation_rad)
 
 
 def sources_of_grid(

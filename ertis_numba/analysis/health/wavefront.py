@@ -24,7 +24,6 @@ _COMPACT_SHARE = 0.75  # Minimum share of the microphones that a wavefront must 
 _MIN_PATH_M = 0.2  # Minimum path of an echo; shorter paths are indistinguishable from the direct sound.
 _MIN_DEPTH_M = 0.01  # Minimum spread of distances from the emitter. On a ring, its sound equals an echo from ahead.
 _DIRECT_SPREAD = 0.75  # Maximum spread relative to that of an echo, which has two more unknowns.
-_MIN_RECORD_CHANNELS = 12  # Fewer channels fit another order or the emitter by chance.
 _PILOTS = 4  # Number of microphones in which the strongest arrival is searched.
 _MAX_SPREAD_S = 3e-6  # Spread of the wavefront, beyond which the phase of the carrier is not conclusive.
 _HALF_PERIOD_S = 12e-6  # Half a period of the highest usual carrier.
