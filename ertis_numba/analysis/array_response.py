@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.point_spread import PointSpread
-from ertis_numba.geometry import microphones
+from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.settings import Settings
 
 __all__ = ["ArrayAxes", "CallResponse", "Response", "ToneResponse"]
@@ -24,6 +24,9 @@ _N_TARGETS: Final = 3072
 
 class Response(Protocol):
     """Response of an array to a kind of sound."""
+
+    axes: "ArrayAxes"
+    """Axes of the array, with the weights of its microphones."""
 
     def __call__(self, sources: Floats, directions: Floats) -> Floats:
         """Return amplitudes relative to that of a source in the direction: (n,) float64.
@@ -77,7 +80,7 @@ class ToneResponse:
 
     def __init__(self, settings: Settings, frequency_hz: float, delays: Callable[[Floats], Floats]) -> None:
         n_mics = len(microphones(settings.array).enabled_positions_m)
-        self._axes, self._delays = ArrayAxes(settings, np.ones(n_mics)), delays
+        self.axes, self._delays = ArrayAxes(settings, np.ones(n_mics)), delays
         self._omega_rad_s = 2 * math.pi * frequency_hz
         self._wave_1_m = self._omega_rad_s / sound_speed_m_s(settings.air)
 
@@ -91,7 +94,7 @@ class ToneResponse:
         targets = np.random.default_rng(0).permutation(places)[:_N_TARGETS]
         waves = np.exp(1j * self._omega_rad_s * self._delays(targets)).astype(np.complex64)
         amplitude = np.abs(waves[:_N_SOURCES].conj() @ waves.T) / waves.shape[1]
-        scaled = self._wave_1_m * self._axes.scaled_m(targets)
+        scaled = self._wave_1_m * self.axes.scaled_m(targets)
         squares = (scaled**2).sum(axis=1)
         far = squares[:_N_SOURCES, None] + squares - 2 * scaled[:_N_SOURCES] @ scaled.T > _FAR**2
         return float(amplitude.max(initial=0.0, where=far))
@@ -107,6 +110,7 @@ class CallResponse:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
+        self.axes = ArrayAxes(settings, array_weights(settings))
 
     @functools.cached_property
     def _point_spread(self) -> PointSpread:

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.geometry import PAPER_GRIDS, grid_count, unit_vectors
+from ertis_numba.geometry import grid_count, named_grid, unit_vectors
 from ertis_numba.settings import Processing
 
 __all__ = ["Between", "farthest_places"]
@@ -102,14 +102,10 @@ def farthest_places(between: Between, distance: Callable[[Floats], Floats], spac
 
 def _limits_rad(processing: Processing, count: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """Return the limits of the azimuth and the elevation of a spatial grid with a name; None for other grids."""
-    name = processing.directions
-    if not isinstance(name, str) or grid_count(name) != count or count < 2:
+    named = named_grid(processing)
+    if named is None or named[0] == "2d" or grid_count(processing.directions) != count or count < 2:
         return None
-    own = processing.azimuth_limits_deg, processing.elevation_limits_deg
-    kind, *limits = PAPER_GRIDS.get(name, (name, *own))
-    if kind.startswith("2d:"):
-        return None
-    (west, east), (low, high) = np.radians(limits).tolist()
+    (west, east), (low, high) = np.radians(named[1:]).tolist()
     return (west, east), (low, high)
 
 

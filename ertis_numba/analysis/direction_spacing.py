@@ -9,19 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ertis_numba.analysis.array_response import ArrayAxes, CallResponse, Response
+from ertis_numba.analysis.array_response import CallResponse, Response
 from ertis_numba.analysis.between_directions import Between, farthest_places
 from ertis_numba.angles import DegreesFromRadians
-from ertis_numba.geometry import (
-    PAPER_GRIDS,
-    Grid,
-    array_weights,
-    direction_grid,
-    grid_count,
-    microphones,
-    spacing_rad,
-    unit_vectors,
-)
+from ertis_numba.geometry import Grid, direction_grid, microphones, named_grid, spacing_rad, unit_vectors
 from ertis_numba.settings import Processing, Settings
 
 __all__ = ["LARGEST_GRID", "MAX_LOSS_DB", "GridCheck", "Lobe", "Peak", "image_peak", "rounded_down", "spacing_warning"]
@@ -51,7 +42,6 @@ class Lobe(NamedTuple):
     ----------
     response : Response
         Response of delay-and-sum.
-    axes : ArrayAxes
     peak : callable
         Returns the amplitudes of the method from those of delay-and-sum.
     max_loss_db : float
@@ -59,7 +49,6 @@ class Lobe(NamedTuple):
     """
 
     response: Response
-    axes: ArrayAxes
     peak: Peak
     max_loss_db: float = MAX_LOSS_DB
 
@@ -83,7 +72,7 @@ class Lobe(NamedTuple):
     def largest_rad(self, side_lobe: float) -> float:
         """Return the angle, along the longest axis of the array, at which a source is as weak as it may be."""
         away_rad = np.linspace(0.0, math.pi / 2, 8001)[1:, None]
-        along = self.axes.longest
+        along = self.response.axes.longest
         ahead = np.eye(3)[int(np.abs(along).argmin())]
         ahead = ahead - (ahead @ along) * along
         ahead /= np.linalg.norm(ahead)
@@ -128,11 +117,10 @@ class GridCheck:
     def weakest(self, lobe: Lobe) -> float:
         """Return the amplitude of delay-and-sum in the direction nearest to the weakest source."""
         if self._farthest is None:
-            tree, count = KDTree(lobe.axes.scaled_m(self._directions)), min(_NEAREST, len(self._directions))
-            sources = farthest_places(
-                self._between, lambda places: tree.query(lobe.axes.scaled_m(places))[0], self.spacing_rad
-            )
-            near = tree.query(lobe.axes.scaled_m(sources), k=count)[1].reshape(len(sources), count)
+            scaled_m, count = lobe.response.axes.scaled_m, min(_NEAREST, len(self._directions))
+            tree = KDTree(scaled_m(self._directions))
+            sources = farthest_places(self._between, lambda places: tree.query(scaled_m(places))[0], self.spacing_rad)
+            near = tree.query(scaled_m(sources), k=count)[1].reshape(len(sources), count)
             self._farthest = sources, near
         sources, near = self._farthest
         directions = self._directions[near].reshape(-1, 3)
@@ -185,19 +173,12 @@ class GridCheck:
 
     def _kind_and_limits(self) -> tuple[str, Processing]:
         """Return the kind of the grid, and settings with its limits."""
-        name = self._processing.directions
-        if not self._is_named:
+        named = named_grid(self._processing)
+        if named is None:
             return "2d" if self._between.is_planar else "3d", self._processing
-        text, azimuth_deg, elevation_deg = PAPER_GRIDS.get(
-            str(name), (str(name), self._processing.azimuth_limits_deg, self._processing.elevation_limits_deg)
-        )
+        kind, azimuth_deg, elevation_deg = named
         limits = {"azimuth_limits_deg": azimuth_deg, "elevation_limits_deg": elevation_deg}
-        return text[:2], self._processing.replace(**limits if text[:2] == "3d" else {"azimuth_limits_deg": azimuth_deg})
-
-    @property
-    def _is_named(self) -> bool:
-        name = self._processing.directions
-        return isinstance(name, str) and grid_count(name) is not None
+        return kind, self._processing.replace(**limits if kind == "3d" else {"azimuth_limits_deg": azimuth_deg})
 
     def _worded(self, named: Processing, largest_rad: float, verb: str) -> str:
         """Return the name of a grid, with its limits unless they are those of the settings, or a spacing."""
@@ -205,7 +186,7 @@ class GridCheck:
         (west, east), (low, high) = named.azimuth_limits_deg, named.elevation_limits_deg
         if (west, east) != ours.azimuth_limits_deg or (low, high) != ours.elevation_limits_deg:
             words += f" within azimuths {west:g}:{east:g} and elevations {low:g}:{high:g}"
-        if self._is_named:
+        if named_grid(ours) is not None:
             return words
         factor = 2.0 if self._between.is_planar else math.sqrt(2)
         closer = f"list directions at most {rounded_down(math.degrees(factor * largest_rad)):g}° apart"
@@ -272,7 +253,7 @@ def spacing_warning(settings: Settings, grid: DegreesFromRadians) -> str | None:
     ...     spacing_warning(recording.settings, ertis.Pipeline(recording.settings).grid) is None
     True
     """
-    lobe = Lobe(CallResponse(settings), ArrayAxes(settings, array_weights(settings)), image_peak(settings))
+    lobe = Lobe(CallResponse(settings), image_peak(settings))
     check = GridCheck(Grid(grid.azimuth_rad, grid.elevation_rad), settings.processing)
     if check.suffices(lobe):
         return None

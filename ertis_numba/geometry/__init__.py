@@ -7,12 +7,10 @@ to the centroid of the enabled microphones.
 from ertis_numba.geometry.azimuths import ALONE_RAD, FAR, is_closed, reach_rad, unrolled_rad
 from ertis_numba.geometry.delay_matrix import delay_matrix, plane_delays
 from ertis_numba.geometry.delays import far_field_delays, spherical_delays, unit_vectors
-from ertis_numba.geometry.grids import MAX_DIRECTIONS, PAPER_GRIDS, Grid, direction_grid, grid_count
+from ertis_numba.geometry.grids import MAX_DIRECTIONS, PAPER_GRIDS, Grid, direction_grid, grid_count, named_grid
 from ertis_numba.geometry.layouts import (
     Layout,
     layout_file,
-    layout_names,
-    layout_text,
     load_layout,
     microphones,
     require_plausible_size,
@@ -26,6 +24,7 @@ from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
 from ertis_numba.geometry.observable import ObservableAngles, observable_angles
 from ertis_numba.geometry.position_files import SENSOR_FRAME
 from ertis_numba.geometry.sector import Fan, plan_m, round_step
+from ertis_numba.geometry.shipped_layouts import layout_names, layout_text
 from ertis_numba.geometry.untrusted_settings import received_settings
 from ertis_numba.geometry.weights import array_weights, effective_count
 
@@ -54,6 +53,7 @@ __all__ = [
     "load_layout",
     "microphones",
     "mounting",
+    "named_grid",
     "observable_angles",
     "plan_m",
     "plane_delays",

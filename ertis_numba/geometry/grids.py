@@ -14,7 +14,7 @@ from ertis_numba.csv_numbers import csv_rows
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Processing
 
-__all__ = ["MAX_DIRECTIONS", "PAPER_GRIDS", "Grid", "direction_grid", "grid_count"]
+__all__ = ["MAX_DIRECTIONS", "PAPER_GRIDS", "Grid", "direction_grid", "grid_count", "named_grid"]
 
 MAX_DIRECTIONS = 1_000_000
 """Maximum number of directions of a grid."""
@@ -75,6 +75,21 @@ def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
     return checks.integer(f"count of directions {name!r}", int(count), 1, MAX_DIRECTIONS)
 
 
+def named_grid(processing: Processing) -> tuple[str, tuple[float, float], tuple[float, float]] | None:
+    """Return the kind of a grid, 2d or 3d, with its azimuth and elevation limits in degrees; None for other directions.
+
+    Parameters
+    ----------
+    processing : Processing
+    """
+    name = processing.directions
+    if not isinstance(name, str) or grid_count(name) is None:
+        return None
+    own = name, processing.azimuth_limits_deg, processing.elevation_limits_deg
+    kind, azimuth_deg, elevation_deg = PAPER_GRIDS.get(name, own)
+    return kind[:2], azimuth_deg, elevation_deg
+
+
 def direction_grid(processing: Processing) -> Grid:
     """Return the directions that ``processing.directions`` names or lists.
 
@@ -106,13 +121,11 @@ def direction_grid(processing: Processing) -> Grid:
     if not isinstance(name, str):
         angles_rad = np.radians(np.asarray(name, dtype=np.float64))
         return Grid(angles_rad[:, 0].copy(), angles_rad[:, 1].copy())
-    kind, azimuth_deg, elevation_deg = PAPER_GRIDS.get(
-        name, (name, processing.azimuth_limits_deg, processing.elevation_limits_deg)
-    )
-    n_directions = grid_count(name)
-    if n_directions is None:
+    n_directions, named = grid_count(name), named_grid(processing)
+    if n_directions is None or named is None:
         return _csv_grid(name)
-    if kind.startswith("2d:"):
+    kind, azimuth_deg, elevation_deg = named
+    if kind == "2d":
         return _level_grid(n_directions, azimuth_deg, 0.0 if name in PAPER_GRIDS else processing.elevation_deg)
     return _equal_area_grid(n_directions, azimuth_deg, elevation_deg)
 

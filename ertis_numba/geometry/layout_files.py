@@ -126,15 +126,13 @@ class ReadLayout:
     unit_is_stated: bool = True
 
 
-def read_layout(path: str | Path, names: str) -> ReadLayout:
+def read_layout(path: str | Path) -> ReadLayout:
     """Read a layout file.
 
     Parameters
     ----------
     path : str or Path
         File with one of the endings in `ertis_numba.settings.LAYOUT_SUFFIXES`.
-    names : str
-        Names of the shipped layouts, for errors.
 
     Raises
     ------
@@ -146,10 +144,10 @@ def read_layout(path: str | Path, names: str) -> ReadLayout:
     LayoutUnitWarning
         The file states no unit, and its numbers may be metres as well as millimetres.
     """
-    content = layout_bytes(path, names)
+    content = layout_bytes(path)
     if Path(path).suffix.lower() == ".toml":
-        return parse_layout(str(path), layout_file_text(path, content, names))
-    found = read_position_file(path, content, names)
+        return parse_layout(str(path), layout_file_text(path, content))
+    found = read_position_file(path, content)
     source, factor_m = f"layout {path}", LENGTH_UNITS_M[found.unit or _DEFAULT_UNIT]
     positions_m = factor_m * found.positions
     every = np.ones(len(positions_m), dtype=np.bool_)

@@ -2,8 +2,6 @@
 
 import functools
 from dataclasses import dataclass, replace
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +13,12 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry.grids import grid_count
 from ertis_numba.geometry.layout_files import LayoutFile, parse_layout, read_layout, unclear_unit
+from ertis_numba.geometry.shipped_layouts import layout_text
 from ertis_numba.settings import LAYOUT_SUFFIXES, Array, Settings
 
 __all__ = [
     "Layout",
     "layout_file",
-    "layout_names",
-    "layout_text",
     "load_layout",
     "microphones",
     "require_plausible_size",
@@ -103,40 +100,6 @@ class Layout:
         )
 
 
-@functools.cache
-def layout_names() -> tuple[str, ...]:
-    """Return the names of the shipped layouts in alphabetical order.
-
-    Examples
-    --------
-    >>> import ertis_numba as ertis
-    >>> ertis.layout_names()[:3]
-    ('eRTIS_v2', 'eRTIS_v2REC', 'eRTIS_v3D1')
-    """
-    return tuple(sorted(item.name.removesuffix(".toml") for item in _shipped() if item.name.endswith(".toml")))
-
-
-def _shipped() -> list[Traversable]:
-    return list(resources.files("ertis_numba").joinpath("layouts").iterdir())
-
-
-def layout_text(name: str) -> str:
-    """Return the TOML text of a shipped layout.
-
-    Parameters
-    ----------
-    name : str
-        One of `layout_names`.
-
-    Raises
-    ------
-    ArgumentError
-        The name is unknown.
-    """
-    checks.choice("layout", name, layout_names())
-    return resources.files("ertis_numba").joinpath("layouts", f"{name}.toml").read_text("utf-8")
-
-
 def layout_file(layout: Layout, *, name: str, source: str = "") -> LayoutFile:
     """Return the content of a layout file with the microphones of a layout, to 0.1 µm, 1 ps and six digits of gain.
 
@@ -210,7 +173,7 @@ def load_layout(name: str | Path) -> Layout:
     """
     suffix = Path(name).suffix.lower()
     if suffix in LAYOUT_SUFFIXES:
-        file = read_layout(name, ", ".join(layout_names()))
+        file = read_layout(name)
         return replace(microphones(file.array), notes=file.notes, unit_is_stated=file.unit_is_stated)
     if suffix and Path(name).exists():
         raise ArgumentError(

@@ -11,6 +11,7 @@ from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry.position_headings import AXES
 from ertis_numba.geometry.position_tables import PositionTable, read_position_table
+from ertis_numba.geometry.shipped_layouts import layout_names
 
 __all__ = ["FLAT", "SENSOR_FRAME", "layout_bytes", "layout_file_text", "read_position_file"]
 
@@ -25,28 +26,27 @@ FLAT: Final = 1e-3
 """Extent of an axis, relative to the largest, below which an array counts as flat."""
 
 
-def layout_bytes(path: str | Path, names: str) -> bytes:
-    """Return the content of a layout file; ``names`` are the shipped layouts, for errors.
+def layout_bytes(path: str | Path) -> bytes:
+    """Return the content of a layout file.
 
     Raises
     ------
     ArgumentError
         The file cannot be read, is empty, or is too large for a layout.
     """
-    remedy = f"choose a readable file or one of {names}"
     try:
         with Path(path).open("rb") as file:
             content = file.read(_MAX_BYTES + 1)
     except OSError as error:
-        raise ArgumentError(f"layout {path}: {checks.reason_unreadable(error)}; {remedy}") from error
+        raise ArgumentError(f"layout {path}: {checks.reason_unreadable(error)}; {_remedy()}") from error
     if not content.strip():
-        raise ArgumentError(f"layout {path}: the file is empty; {remedy}")
+        raise ArgumentError(f"layout {path}: the file is empty; {_remedy()}")
     if len(content) > _MAX_BYTES:
-        raise ArgumentError(f"layout {path}: more than {_MAX_BYTES / 1e6:g} MB, too large for a layout; {remedy}")
+        raise ArgumentError(f"layout {path}: more than {_MAX_BYTES / 1e6:g} MB, too large for a layout; {_remedy()}")
     return content
 
 
-def layout_file_text(path: str | Path, content: bytes, names: str) -> str:
+def layout_file_text(path: str | Path, content: bytes) -> str:
     """Return the text of a layout file in UTF-8, UTF-16 with a byte order mark, or Windows-1252.
 
     Raises
@@ -60,14 +60,17 @@ def layout_file_text(path: str | Path, content: bytes, names: str) -> str:
     except UnicodeDecodeError as error:
         text = content.decode("cp1252", "replace")
         if not any(character.isdigit() for character in text):
-            reason = checks.reason_unreadable(error)
-            raise ArgumentError(f"layout {path}: {reason}; choose a readable file or one of {names}") from error
+            raise ArgumentError(f"layout {path}: {checks.reason_unreadable(error)}; {_remedy()}") from error
     if "\0" in text or "\N{REPLACEMENT CHARACTER}" in text:
-        raise ArgumentError(f"layout {path}: the file is binary, not text; choose a text file or one of {names}")
+        raise ArgumentError(f"layout {path}: the file is binary, not text; {_remedy("text")}")
     return text
 
 
-def read_position_file(path: str | Path, content: bytes, names: str) -> PositionTable:
+def _remedy(wanted: str = "readable") -> str:
+    return f"choose a {wanted} file or one of {', '.join(layout_names())}"
+
+
+def read_position_file(path: str | Path, content: bytes) -> PositionTable:
     """Return the positions in a file other than TOML, by its ending.
 
     Parameters
@@ -76,8 +79,6 @@ def read_position_file(path: str | Path, content: bytes, names: str) -> Position
         File with one of the endings in `ertis_numba.settings.LAYOUT_SUFFIXES`.
     content : bytes
         Its content.
-    names : str
-        Names of the shipped layouts, for errors.
 
     Raises
     ------
@@ -89,7 +90,7 @@ def read_position_file(path: str | Path, content: bytes, names: str) -> Position
         return _of_acoular(source, content)
     if suffix == ".npy":
         return _of_numpy(source, content)
-    return read_position_table(source, layout_file_text(path, content, names))
+    return read_position_table(source, layout_file_text(path, content))
 
 
 def _of_numpy(source: str, content: bytes) -> PositionTable:

@@ -2,7 +2,7 @@
 
 from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry.grids import grid_count
-from ertis_numba.geometry.layouts import layout_names
+from ertis_numba.geometry.shipped_layouts import layout_names
 from ertis_numba.settings import Settings
 
 __all__ = ["received_settings"]

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.array_response import ArrayAxes, ToneResponse
+from ertis_numba.analysis.array_response import ToneResponse
 from ertis_numba.analysis.direction_spacing import LARGEST_GRID, MAX_LOSS_DB, GridCheck, Lobe, Peak, rounded_down
 from ertis_numba.angles import DegreesFromRadians
 from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
@@ -236,14 +236,8 @@ def _highest_hz(is_fine: Callable[[float], bool], highest_hz: float) -> float:
 
 def _lobes(settings: Settings, peak: Peak, max_loss_db: float = MAX_LOSS_DB) -> Callable[[float], Lobe]:
     """Return a function that returns the main lobe at a frequency in hertz."""
-    axes, delays = ArrayAxes(settings, np.ones(_n_mics(settings))), WaveDelays(settings)
-    return functools.cache(
-        lambda frequency_hz: Lobe(ToneResponse(settings, frequency_hz, delays), axes, peak, max_loss_db)
-    )
-
-
-def _n_mics(settings: Settings) -> int:
-    return len(microphones(settings.array).enabled_positions_m)
+    delays = WaveDelays(settings)
+    return functools.cache(lambda frequency_hz: Lobe(ToneResponse(settings, frequency_hz, delays), peak, max_loss_db))
 
 
 def _map_peak(settings: Settings) -> Peak:
@@ -252,7 +246,7 @@ def _map_peak(settings: Settings) -> Peak:
     ``ρ²`` becomes ``(M ρ² − 1) / (M − 1)`` without the diagonal, ``ρ^(2ν)`` for ``functional`` of the order ν, and
     ``ε / (ε + M (1 − ρ²))`` for ``capon`` with the loading ε and M microphones. Maps of ``music`` have no level.
     """
-    passive, n_mics = settings.passive, _n_mics(settings)
+    passive, n_mics = settings.passive, len(microphones(settings.array).enabled_positions_m)
 
     def peak(rho: NDArray[np.float64]) -> NDArray[np.float64]:
         power = np.clip(rho, 0.0, 1.0) ** 2
