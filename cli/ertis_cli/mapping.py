@@ -169,13 +169,7 @@ def _report_heights(occupancy: "OccupancyMap", height_m: tuple[float, float], *,
 def _trajectory(
     poses_file: Path | None, paths: "Sequence[Path]", *, quiet: bool, pose_axes: Any, **reading: Any
 ) -> "Trajectory":
-    """Return the poses of a file, or else those of the recordings, and print notes on them.
-
-    Raises
-    ------
-    UsageError
-        There are none, or an option is for files only.
-    """
+    """Return the poses of a file, or else those of the recordings, and print notes on them."""
     from ertis_numba.frames.platform_tilt import tilt_note
     from ertis_numba.storage import platform_trajectory
 
@@ -201,13 +195,7 @@ def _trajectory(
 
 
 def _located(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajectory") -> "list[dict[str, StampedIndex]]":
-    """Return the groups within the time of a trajectory.
-
-    Raises
-    ------
-    DataError
-        There is none, or all have the same time.
-    """
+    """Return the groups within the time of a trajectory."""
     from ertis_numba.errors import DataError
 
     times_ns = _times_ns(groups)

@@ -18,7 +18,6 @@ from ertis_numba.constants import MAX_MICROPHONES
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
     from ertis_numba.angles import DegreesFromRadians
-    from ertis_numba.geometry import Grid
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Array, Settings
     from ertis_numba.stages.costs import PlanCosts
@@ -441,15 +440,14 @@ def note_layout(array: "Array", *, recorded: "Array | None" = None) -> None:
 
 def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
     """Print a note for each sensor whose array cannot observe some angles, which are not listed."""
-    from ertis_numba.geometry import Grid
     from ertis_numba.storage import open_energyscapes
 
     for name in sensors:
         with open_energyscapes(path, sensor=name) as images:
-            note_unknown_angles(name, images.settings, Grid(images.azimuth_rad, images.elevation_rad))
+            note_unknown_angles(name, images.settings, images)
 
 
-def note_unknown_angles(sensor: str, settings: "Settings", grid: "Grid") -> None:
+def note_unknown_angles(sensor: str, settings: "Settings", grid: "DegreesFromRadians") -> None:
     """Print a note if the array of a sensor cannot observe some angles."""
     from ertis_numba.geometry import observable_angles
 

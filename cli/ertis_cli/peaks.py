@@ -180,7 +180,6 @@ def _list_sources(
     as_json: bool,
 ) -> None:
     """Print the sources in each band of acoustic maps."""
-    from ertis_numba.geometry import Grid
     from ertis_numba.passive import find_sound_sources
     from ertis_numba.passive.search_grid import coarse_map_warning
     from ertis_numba.storage import open_acoustic_maps
@@ -194,7 +193,7 @@ def _list_sources(
     rows: list[dict[str, Any]] = []
     for name in sensors:
         with open_acoustic_maps(path, sensor=name) as maps:
-            options.note_unknown_angles(name, maps.settings, Grid(maps.azimuth_rad, maps.elevation_rad))
+            options.note_unknown_angles(name, maps.settings, maps)
             options.warn_of(name, coarse_map_warning(maps.settings, maps))
             for index in options.places(measurement, len(maps)):
                 found = find_sound_sources(maps[index], top=top, min_level_db=min_level_db)

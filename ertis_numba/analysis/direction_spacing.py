@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from ertis_numba.analysis.array_response import CallResponse, Response
 from ertis_numba.analysis.between_directions import Between, farthest_places
 from ertis_numba.angles import DegreesFromRadians
-from ertis_numba.geometry import Grid, direction_grid, microphones, named_grid, spacing_rad, unit_vectors
+from ertis_numba.geometry import direction_grid, microphones, named_grid, spacing_rad, unit_vectors
 from ertis_numba.settings import Processing, Settings
 
 __all__ = ["LARGEST_GRID", "MAX_LOSS_DB", "GridCheck", "Lobe", "Peak", "image_peak", "rounded_down", "spacing_warning"]
@@ -90,14 +90,16 @@ class GridCheck:
 
     Parameters
     ----------
-    grid : Grid
+    grid : Grid, or a result with directions
     processing : Processing
         Source of the grid's name and limits.
     side_lobes : dict of Response to float, optional
         Results of `side_lobe` in the same limits.
     """
 
-    def __init__(self, grid: Grid, processing: Processing, *, side_lobes: dict[Response, float] | None = None) -> None:
+    def __init__(
+        self, grid: DegreesFromRadians, processing: Processing, *, side_lobes: dict[Response, float] | None = None
+    ) -> None:
         self._directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         self._processing, self._between = processing, Between(self._directions, processing)
         self._farthest: tuple[Floats, NDArray[np.intp]] | None = None
@@ -254,7 +256,7 @@ def spacing_warning(settings: Settings, grid: DegreesFromRadians) -> str | None:
     True
     """
     lobe = Lobe(CallResponse(settings), image_peak(settings))
-    check = GridCheck(Grid(grid.azimuth_rad, grid.elevation_rad), settings.processing)
+    check = GridCheck(grid, settings.processing)
     if check.suffices(lobe):
         return None
     processing = settings.processing

@@ -19,7 +19,7 @@ from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures._sampling import PIXELS, centres, look_raster
 from ertis_numba.figures.style import angle, minus
 from ertis_numba.frames import AcousticMap, LevelReference, SoundDirection
-from ertis_numba.geometry import Grid, observable_angles, unit_vectors
+from ertis_numba.geometry import observable_angles, unit_vectors
 
 __all__ = ["draw", "draw_bands", "draw_on_photo"]
 
@@ -178,7 +178,7 @@ def _heading(canvas: Canvas, found: AcousticMap, loudest: SoundDirection, *parts
     low_khz, high_khz = (_captions.number(edge_hz / 1e3) for edge_hz in loudest.band_hz)
     towards = f"azimuth {angle(math.degrees(loudest.azimuth_rad))}, elevation "
     towards += angle(math.degrees(loudest.elevation_rad))
-    note = observable_angles(found.settings.array, Grid(found.azimuth_rad, found.elevation_rad)).note
+    note = observable_angles(found.settings.array, found).note
     parts = (*parts, f"array {note}") if note else parts
     return _captions.of_acoustic_map(
         "Acoustic map",

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.figures.style import angle, minus
 from ertis_numba.frames import AcousticMap, Energyscape, Stamp
-from ertis_numba.geometry import Grid, microphones, observable_angles
+from ertis_numba.geometry import microphones, observable_angles
 from ertis_numba.method_titles import METHOD_TITLES
 from ertis_numba.settings import Settings
 
@@ -43,7 +43,7 @@ def of_image(image: Energyscape) -> Heading:
     """Return the words above an energyscape."""
     settings = image.settings
     processing = settings.processing
-    seen = observable_angles(settings.array, Grid(image.azimuth_rad, image.elevation_rad))
+    seen = observable_angles(settings.array, image)
     if not seen.has_direction(is_planar=image.is_planar):
         directions = "no direction"
     elif len(image.azimuth_rad) == 1:

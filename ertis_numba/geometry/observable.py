@@ -6,8 +6,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.angles import DegreesFromRadians
 from ertis_numba.geometry.delays import unit_vectors
-from ertis_numba.geometry.grids import Grid
 from ertis_numba.geometry.layouts import microphones
 from ertis_numba.settings import Array
 
@@ -62,7 +62,7 @@ class ObservableAngles(NamedTuple):
         return azimuth_rad if self.azimuth else math.nan, elevation_rad if self.elevation else math.nan
 
 
-def observable_angles(array: Array, grid: Grid | None = None) -> ObservableAngles:
+def observable_angles(array: Array, grid: DegreesFromRadians | None = None) -> ObservableAngles:
     """Return the angles that the enabled microphones of an array can observe.
 
     Microphones in one place observe no angle. Those on a line observe the angle to this line only: the azimuth of
@@ -72,7 +72,7 @@ def observable_angles(array: Array, grid: Grid | None = None) -> ObservableAngle
     Parameters
     ----------
     array : Array
-    grid : Grid, optional
+    grid : Grid, or a result with directions, optional
         Directions to compare; without them, the sides of a plane are not noted.
 
     Returns

@@ -62,7 +62,7 @@ def layout_file_text(path: str | Path, content: bytes) -> str:
         if not any(character.isdigit() for character in text):
             raise ArgumentError(f"layout {path}: {checks.reason_unreadable(error)}; {_remedy()}") from error
     if "\0" in text or "\N{REPLACEMENT CHARACTER}" in text:
-        raise ArgumentError(f"layout {path}: the file is binary, not text; {_remedy("text")}")
+        raise ArgumentError(f"layout {path}: the file is binary, not text; {_remedy('text')}")
     return text
 
 

@@ -165,13 +165,7 @@ def _normalised(rows: PoseRows) -> PoseRows:
 
 
 def _one_per_time(rows: PoseRows) -> PoseRows:
-    """Return one row for each time: the first one.
-
-    Raises
-    ------
-    DataError
-        Times decrease, or rows for one time differ by too much.
-    """
+    """Return one row for each time: the first one."""
     steps_ns = np.diff(rows.time_ns)
     if (steps_ns < 0).any():
         late = int(np.argmax(steps_ns < 0)) + 1

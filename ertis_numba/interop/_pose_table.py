@@ -76,7 +76,7 @@ def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: s
     if columns is None and all(not cells[-1] for _, cells in rows):
         rows = [(number, cells[:-1]) for number, cells in rows]  # Each line ends with a separator.
     n_fields = len(rows[0][1])
-    if columns is None and n_fields == _N_KITTI and not needs_header:
+    if columns is None and n_fields == _N_KITTI:
         return _kitti(rows, time_unit, times)
     if times is not None:
         raise DataError(
@@ -84,7 +84,7 @@ def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: s
             "remove the option"
         )
     if columns is None:
-        columns = _without_header(rows[0], text, needs_header=needs_header)
+        columns = _without_header(rows[0], text)
     for number, row in rows:
         if len(row) != columns.n_fields:
             is_tum = columns is _ORDER_OF_TUM
@@ -114,8 +114,10 @@ def _header(text: str, *, needs_header: bool) -> tuple[_Columns | None, list[Row
             _require_no_sensor(names)
             found = _columns(names, is_stated=is_stated, in_metres=not needs_header)
             _require_rotations(number, found, names)
-            if found.is_complete or is_stated:
-                columns = _checked(found, names)
+            if is_stated and not found.is_complete:
+                raise DataError(f"the first line names the columns {', '.join(names)}; they must be {_COLUMNS}")
+            if found.is_complete:
+                columns = found
                 continue
         if content and not content.startswith(("%", "//")):
             rows.append((number, _cells(content)))
@@ -174,13 +176,6 @@ def _columns(names: Sequence[str], *, is_stated: bool, in_metres: bool) -> _Colu
     return _Columns(-1 if repeated else time, unit, axes, quaternion, yaw, len(names))
 
 
-def _checked(columns: _Columns, names: Sequence[str]) -> _Columns:
-    """Refuse a header without poses."""
-    if not columns.is_complete:
-        raise DataError(f"the first line names the columns {', '.join(names)}; they must be {_COLUMNS}")
-    return columns
-
-
 def _require_rotations(number: int, columns: _Columns, names: Sequence[str]) -> None:
     """Refuse a header with times and positions, but without rotations."""
     if columns.time >= 0 and {*"xy"} <= columns.axes.keys() and not columns.quaternion and columns.yaw_deg is None:
@@ -201,17 +196,9 @@ def _require_no_sensor(names: Sequence[str]) -> None:
             )
 
 
-def _without_header(first: Row, text: str, *, needs_header: bool) -> _Columns:
-    """Return the columns of rows without a header: those of TUM.
-
-    Raises
-    ------
-    DataError
-        The order of the columns is unknown.
-    """
+def _without_header(first: Row, text: str) -> _Columns:
+    """Return the columns of TUM for rows without a header, unless the order of these may be another."""
     number, cells = first
-    if needs_header:
-        raise DataError(f"the first line names the columns {', '.join(cells)}; they must be {_COLUMNS}")
     if len(cells) > len(TUM):
         raise DataError(
             f"line {number} has {len(cells)} fields; write {len(TUM)}: {' '.join(TUM)}, or name all columns in the "

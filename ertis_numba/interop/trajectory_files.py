@@ -110,13 +110,7 @@ def read_trajectory(
 
 
 def _require_poses(path: Path) -> None:
-    """Refuse folders, missing files, and files of other formats by name.
-
-    Raises
-    ------
-    DataError
-        As described.
-    """
+    """Refuse folders, missing files, and files of other formats by name."""
     if path.is_dir() and (path / "metadata.yaml").is_file():
         raise DataError(f"trajectory {path} is the folder of a bag of ROS 2; use the .mcap file in this folder")
     if not path.is_file():

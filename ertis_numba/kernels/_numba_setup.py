@@ -65,13 +65,7 @@ def _imported() -> Any:
 
 
 def _require_cache_folder() -> None:
-    """Let Numba store compiled kernels in a private temporary folder if neither the package nor the home is writable.
-
-    Raises
-    ------
-    DeviceError
-        The temporary folder is not writable either.
-    """
+    """Let Numba store compiled kernels in a private temporary folder if no other folder is writable."""
     numba = _imported()
     if numba.config.DISABLE_JIT:  # Nothing is stored.
         return

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.array_response import ToneResponse
 from ertis_numba.analysis.direction_spacing import LARGEST_GRID, MAX_LOSS_DB, GridCheck, Lobe, Peak, rounded_down
 from ertis_numba.angles import DegreesFromRadians
-from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
+from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.passive.heard_signals import heard_bands
 from ertis_numba.passive.scan_extent import is_level
 from ertis_numba.passive.wave_delays import WaveDelays
@@ -60,8 +60,7 @@ def coarse_map_warning(settings: Settings, grid: DegreesFromRadians | None = Non
     >>> coarse_map_warning(settings.replace("processing.directions", "3d:1300")) is None
     True
     """
-    grid = direction_grid(settings.processing) if grid is None else Grid(grid.azimuth_rad, grid.elevation_rad)
-    check = GridCheck(grid, settings.processing)
+    check = GridCheck(direction_grid(settings.processing) if grid is None else grid, settings.processing)
     if check.is_single:
         return None
     bands_hz, lobe_at = _bands_hz(settings), _lobes(settings, _map_peak(settings))

@@ -35,29 +35,9 @@ _MARKS: Final = (  # lengths that programs write before they are known, each wit
     range(0x7FFF0000, 0x80000100),  # sox, arecord and GStreamer
     range(0xFFFF0000, WRAP),  # ffmpeg
 )
-_TRAILERS: Final = (
-    b"LIST",
-    b"bext",
-    b"iXML",
-    b"guan",
-    b"id3 ",
-    b"ID3 ",
-    b"cue ",
-    b"junk",
-    b"JUNK",
-    b"PAD ",
-    b"_PMX",
-    b"afsp",
-    b"smpl",
-    b"inst",
-    b"axml",
-    b"chna",
-    b"PEAK",
-    b"wamd",
-    b"umid",
-    b"levl",
-    b"plst",
-)
+_KNOWN: Final = b"LISTbextiXMLguanid3 ID3 cue junkJUNKPAD _PMXafspsmplinstaxmlchnaPEAKwamdumidlevlplst"
+_TRAILERS: Final = tuple(_KNOWN[place : place + 4] for place in range(0, len(_KNOWN), 4))
+"""Chunks that follow samples."""
 _TAIL_BYTES = 2**24
 _MAX_CHUNKS = 4096
 _MAX_LEFT_BYTES = 2**16  # between the last chunk and the end of the file
