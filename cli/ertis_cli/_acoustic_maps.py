@@ -176,7 +176,7 @@ def write_maps(
         with options.note_when_slow(options.PREPARING, quiet=quiet):
             from ertis_numba.campaign import prepare_maps
 
-            work = stack.enter_context(prepare_maps(path, target, wanted, sensors=sensors, warn=_warn))
+            work = stack.enter_context(prepare_maps(path, target, wanted, sensors=sensors, warn=options.warn))
         steps = stack.enter_context(closing(work.run()))
         shown = stack.enter_context(options.progress(steps, length=work.measurements, label="processing", quiet=quiet))
         for _ in shown:
@@ -186,10 +186,6 @@ def write_maps(
         options.say(line, quiet=quiet)
     if as_json:
         options.print_json({"output": str(target), **report})
-
-
-def _warn(text: str) -> None:
-    click.echo(f"ertis: warning: {text}", err=True)
 
 
 def summary(target: Path, rows: "Sequence[dict[str, Any]]", device: str) -> Iterator[str]:

@@ -191,6 +191,6 @@ def _print(made: "PoseCalibration", paths: Sequence[Path], *, quiet: bool) -> No
     )
     if made.unused:
         pulses = ", ".join(_pulse(number, paths) for number in made.unused)
-        options.say(f"note: no new reflector at SYNC pulse {pulses}", quiet=quiet)
+        options.note(f"no new reflector at SYNC pulse {pulses}", quiet=quiet)
     for line in made.not_observable:
         options.say(f"not observable: {line}", quiet=quiet)

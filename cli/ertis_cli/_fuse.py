@@ -69,7 +69,7 @@ def write_fused(
         by_name = {reader.sensor: reader for reader in readers}
         clocks = _clock_check(mountings, groups, by_name)
         for text in clocks.warnings():
-            click.echo(f"ertis: warning: {text}", err=True)
+            options.warn(text)
         incomplete = 0
         writer = stack.enter_context(
             EnergyscapeWriter(target, overwrite=force, mounting={PLATFORM: ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})
@@ -79,7 +79,7 @@ def write_fused(
                 fused = fuser(pipelines.image(by_name[name][place.index]) for name, place in group.items())
                 incomplete += bool(fused.missing)
                 if fused.missing:
-                    options.say(f"note: pulse {number} has no image of {', '.join(fused.missing)}", quiet=quiet)
+                    options.note(f"pulse {number} has no image of {', '.join(fused.missing)}", quiet=quiet)
                 writer.write(_numbered(fused, number))
     pulses = options.counted(len(groups), "pulse")
     options.say(f"{target}: {pulses} of {', '.join(by_name)}, fused", quiet=quiet)

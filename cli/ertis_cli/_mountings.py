@@ -53,7 +53,7 @@ def note_unknown(sensors: Sequence[str], remedy: str, *, quiet: bool) -> None:
     """Print a line if the mounting of sensors is unknown."""
     if sensors:
         noun = "sensor" if len(sensors) == 1 else "sensors"
-        options.say(f"note: the mounting of {noun} {', '.join(sensors)} is unknown; {remedy}", quiet=quiet)
+        options.note(f"the mounting of {noun} {', '.join(sensors)} is unknown; {remedy}", quiet=quiet)
 
 
 def _of_scene(path: Path) -> dict[str, Mounting]:

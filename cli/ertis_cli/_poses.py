@@ -56,4 +56,4 @@ def trajectory_of(path: Path, *, quiet: bool, **chosen: Any) -> "Trajectory":
 def print_notes(path: Path, notes: tuple[str, ...], *, quiet: bool) -> None:
     """Print the notes of a trajectory."""
     for note in notes:
-        options.say(f"note: {path}: {note}", quiet=quiet)
+        options.note(f"{path}: {note}", quiet=quiet)

@@ -193,7 +193,7 @@ def active_groups(
         )
     if len(active) < len(groups):
         left_out = f"{len(groups) - len(active)} of {options.counted(len(groups), 'pulse')}"
-        options.say(f"note: {left_out} left out, because no sensor emitted its call", quiet=quiet)
+        options.note(f"{left_out} left out, because no sensor emitted its call", quiet=quiet)
     return ActiveGroups(active, len(groups) - len(active))
 
 
@@ -245,7 +245,7 @@ class PipelinesBySensor:
             text = spacing_warning(image.settings, image)
             if text is not None:
                 self.warnings.append(text)
-                click.echo(f"ertis: warning: {text}", err=True)
+                options.warn(text)
         return image
 
     def _image(self, measurement: "Measurement | Energyscape") -> "Energyscape":

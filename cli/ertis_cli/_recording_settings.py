@@ -81,4 +81,4 @@ def warn_without_images(settings: "Settings") -> None:
     try:
         require_images(settings)
     except ArgumentError as error:
-        click.echo(f"ertis: warning: images of these measurements need other settings: {error}", err=True)
+        options.warn(f"images of these measurements need other settings: {error}")

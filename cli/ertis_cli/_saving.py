@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
+from ertis_cli import options
+
 if TYPE_CHECKING:
     from ertis_numba.frames import Energyscape, Measurement
     from ertis_numba.network.products import Arrival
@@ -105,7 +107,7 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
     known: set[str] = set()
     with Journal.create(path, target=target.name, source="received from a central node") as journal:
         if journal.remark:
-            click.echo(f"ertis: warning: {journal.remark}", err=True)
+            options.warn(journal.remark)
 
         def write(arrival: "Arrival") -> None:
             measurement = cast("Measurement", arrival.item)

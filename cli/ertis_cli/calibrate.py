@@ -277,4 +277,4 @@ def _print(made: "Calibration", places: list[str], *, quiet: bool) -> None:
     for line in made.not_observable:
         options.say(f"not observable: {line}", quiet=quiet)
     for number, reason in made.rejected.items():
-        click.echo(f"ertis: warning: {places[number]} is left out: {reason}", err=True)
+        options.warn(f"{places[number]} is left out: {reason}")

@@ -247,7 +247,7 @@ def _record(
         Journal.create(path, target=target.name, source=f"capture of {', '.join(session.counts)}")
     )
     if journal.remark:
-        click.echo(f"ertis: warning: {journal.remark}", err=True)
+        options.warn(journal.remark)
     where = f"the measurements so far are safe in {path}; recover them with 'ertis recover {path}'"
     failure = watch.run(session, journal, checks, where=where)
     if signals.came and not len(journal):

@@ -226,7 +226,7 @@ def _renderer(
         shot = snapshot(scene, scene.sensor(name), 0.0)
         target_validity.require_clear(shot)
         for note in target_validity.notes(shot):
-            options.say(f"note: {note}", quiet=quiet)
+            options.note(note, quiet=quiet)
     with options.note_when_slow(options.PREPARING, quiet=quiet):
         from ertis_numba.simulation.render import compile_kernels
 
@@ -301,14 +301,14 @@ def _accepts(refusal: "Refusal", name: str, config: "DeviceConfig") -> bool:
     """Return False, and print the reason, if no measurements exist for a configuration."""
     reason = refusal(name, config)
     if reason:
-        click.echo(f"ertis: warning: {reason}", err=True)
+        options.warn(reason)
     return not reason
 
 
 def _report_difference(replayed: "Replayed", index: int, active: bool) -> None:  # noqa: FBT001 - a callback
     """Print a warning if the recording has another behaviour than the host has requested."""
     if message := replayed.difference(index, active):
-        click.echo(f"ertis: warning: {message}", err=True)
+        options.warn(message)
 
 
 def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> None:

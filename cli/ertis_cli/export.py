@@ -245,8 +245,8 @@ class _Items:
         n_passive = sum(map(len, chosen)) - len(self)
         if n_passive:
             left_out = options.counted(n_passive, "measurement")
-            options.say(
-                f"note: {left_out} without a call left out; 'ertis process --mode passive' makes acoustic maps",
+            options.note(
+                f"{left_out} without a call left out; 'ertis process --mode passive' makes acoustic maps",
                 quiet=quiet,
             )
 

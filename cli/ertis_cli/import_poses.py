@@ -87,7 +87,7 @@ def import_poses(
         n_in_gaps = count_in_gaps(shifted, poses.time_ns)
         if n_in_gaps:
             between = f"poses of {trajectory_file} more than a second apart"
-            options.say(f"note: {n_in_gaps} of {count} interpolated between {between}", quiet=quiet)
+            options.note(f"{n_in_gaps} of {count} interpolated between {between}", quiet=quiet)
         reports.append(
             {
                 "output": str(written),

@@ -182,7 +182,7 @@ def import_raw(
     options.say(f"{target}: {options.counted(len(measurements), 'measurement')}", quiet=quiet)
     notes = getattr(measurements, "notes", ())
     for note in notes:
-        options.say(f"note: {note}", quiet=quiet)
+        options.note(note, quiet=quiet)
     _report_obstacle(measurements.settings, quiet=quiet)
     if as_json:
         options.print_json({"output": str(target), "measurements": len(measurements), "notes": list(notes)})
@@ -315,7 +315,7 @@ def _report_obstacle(settings: "Settings", *, quiet: bool) -> None:
         else:
             time_window(settings, largest_delay_s=0.0, n_taps=1)
     except ArgumentError as error:
-        options.say(f"note: this recording cannot be processed with its own settings: {error}", quiet=quiet)
+        options.note(f"this recording cannot be processed with its own settings: {error}", quiet=quiet)
 
 
 def _require(option: str) -> None:

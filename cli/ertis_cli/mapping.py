@@ -137,7 +137,7 @@ def mapping(
     written = write_map(target, occupancy, overwrite=force, probabilities=probabilities)
     if len(located) < len(groups):
         left_out = options.counted(len(groups) - len(located), "pulse")
-        options.say(f"note: {left_out} of {len(groups)} outside of the time of the poses left out", quiet=quiet)
+        options.note(f"{left_out} of {len(groups)} outside of the time of the poses left out", quiet=quiet)
     report = _report(written, readers, occupancy) | {
         "left_out": active.n_passive + len(groups) - len(located),
         "notes": list(trajectory.notes),
@@ -163,7 +163,7 @@ def _report_heights(occupancy: "OccupancyMap", height_m: tuple[float, float], *,
     )
     if not occupancy.log_odds.any():
         raise DataError(reason)
-    options.say(f"note: {reason}", quiet=quiet)
+    options.note(reason, quiet=quiet)
 
 
 def _trajectory(
@@ -226,7 +226,7 @@ def _note_gaps(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Traject
     n_in_gaps = count_in_gaps(trajectory, _times_ns(groups))
     if n_in_gaps:
         pulses = f"{n_in_gaps} of {options.counted(len(groups), 'pulse')}"
-        options.say(f"note: {pulses} between poses more than a second apart, which are interpolated", quiet=quiet)
+        options.note(f"{pulses} between poses more than a second apart, which are interpolated", quiet=quiet)
 
 
 def _report(

@@ -135,7 +135,7 @@ def odometry_of(
         )
     if unmeasured:
         steps = options.counted(len(groups) - 1, "step")
-        options.say(f"note: {unmeasured} of {steps} assume that the last velocity continued", quiet=quiet)
+        options.note(f"{unmeasured} of {steps} assume that the last velocity continued", quiet=quiet)
     return found
 
 

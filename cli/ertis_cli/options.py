@@ -44,6 +44,7 @@ __all__ = [
     "input_file",
     "measurement",
     "min_level",
+    "note",
     "note_layout",
     "note_unknown_angles",
     "note_unlisted_directions",
@@ -62,6 +63,9 @@ __all__ = [
     "settings_file",
     "settings_with",
     "threads",
+    "warn",
+    "warn_of",
+    "warn_of_spacing",
 ]
 
 _MAX_DEG = 90.0  # limit of azimuth and elevation in front of an array
@@ -434,8 +438,8 @@ def note_layout(array: "Array", *, recorded: "Array | None" = None) -> None:
     layout = microphones(array)
     if recorded is not None and np.array_equal(layout.positions_m, microphones(recorded).positions_m):
         return
-    for note in layout.notes:
-        say(f"note: {note}", quiet=bool(context.params.get("quiet")))
+    for text in layout.notes:
+        note(text, quiet=bool(context.params.get("quiet")))
 
 
 def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
@@ -451,9 +455,9 @@ def note_unknown_angles(sensor: str, settings: "Settings", grid: "DegreesFromRad
     """Print a note if the array of a sensor cannot observe some angles."""
     from ertis_numba.geometry import observable_angles
 
-    note = observable_angles(settings.array, grid).note
-    if note is not None:
-        click.echo(f"note: sensor {sensor} {note}", err=True)
+    text = observable_angles(settings.array, grid).note
+    if text is not None:
+        note(f"sensor {sensor} {text}")
 
 
 def say(text: str, *, quiet: bool) -> None:
@@ -462,10 +466,20 @@ def say(text: str, *, quiet: bool) -> None:
         click.echo(text, err=True)
 
 
+def note(text: str, *, quiet: bool = False) -> None:
+    """Print a note on stderr, unless ``quiet``: results are right, and this may matter."""
+    say(f"note: {text}", quiet=quiet)
+
+
+def warn(text: str) -> None:
+    """Print a warning on stderr: results may be wrong or incomplete."""
+    click.echo(f"ertis: warning: {text}", err=True)
+
+
 def warn_of(sensor: str, text: str | None) -> None:
     """Print a warning about the results of a sensor, if there is any."""
     if text:
-        click.echo(f"ertis: warning: sensor {sensor}: {text}", err=True)
+        warn(f"sensor {sensor}: {text}")
 
 
 def warn_of_spacing(sensor: str, settings: "Settings", grid: "DegreesFromRadians") -> None:

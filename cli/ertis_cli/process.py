@@ -351,7 +351,7 @@ def _process_one(path: Path, target: Path, wanted: "CampaignOptions", *, quiet: 
         wanted,
         sensors=options.sensors_of(path, wanted.sensor),
         pipelines=pipelines,
-        warn=lambda faults: click.echo(f"ertis: warning: {faults}", err=True),
+        warn=options.warn,
         show=show,
     ) as work:
         with (

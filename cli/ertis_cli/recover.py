@@ -44,7 +44,7 @@ def recover(ctx: click.Context, *, places: tuple[Path, ...], force: bool, quiet:
         if "error" in report and _failed(report):
             continue
         if report.get("lost") or report.get("damage"):
-            click.echo(f"ertis: warning: {_reported(report)}", err=True)
+            options.warn(_reported(report))
         else:
             options.say(_reported(report), quiet=quiet)
     if as_json:

@@ -43,10 +43,9 @@ def reset(*, port: str, pin: int | None, hook: str | None, within_s: float, quie
     with reset_sensor(port, pulse, within_s=within_s) as (sonar, is_certain):
         options.say(f"{sonar.port} answers again: firmware {sonar.firmware}", quiet=quiet)
     if not is_certain:
-        click.echo(
-            f"ertis: warning: {sonar.port} still has its call, so the reset has probably not reached it; check the pin "
-            "(--pin) or the program (--hook)",
-            err=True,
+        options.warn(
+            f"{sonar.port} still has its call, so the reset has probably not reached it; check the pin "
+            "(--pin) or the program (--hook)"
         )
 
 

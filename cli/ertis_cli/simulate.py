@@ -123,13 +123,13 @@ def simulate(
     for simulator in simulators:
         followed, by = (_FOLLOWED, "modulators") if simulator.sensor.recording.is_pdm else (1.0, "converters")
         if simulator.loudest > followed:
-            options.say(
-                f"note: signals of {simulator.sensor.name} reach {simulator.loudest:.2g} of full scale, but {by} "
+            options.note(
+                f"signals of {simulator.sensor.name} reach {simulator.loudest:.2g} of full scale, but {by} "
                 f"follow only up to {followed:g}; lower emitter.level_db or increase distances",
                 quiet=quiet,
             )
     for note in plan.notes:
-        options.say(f"note: {note}", quiet=quiet)
+        options.note(note, quiet=quiet)
     effects = _effects(plan, simulators)
     if as_json:
         options.print_json(_report(target, scene, plan, firsts) | ({"effects": effects} if explain else {}))
