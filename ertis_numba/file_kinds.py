@@ -10,6 +10,7 @@ __all__ = ["FileKind", "kind_of", "problem_of", "quoted"]
 
 _HEAD_BYTES = 4096
 _HDF5_PLACES: Final = (0, 512, 1024, 2048)  # behind a block of the user, such as that of MATLAB
+_PICKLES: Final = {b"\x80\2", b"\x80\3", b"\x80\4", b"\x80\5"}
 _KILOBITS: Final = (  # per second, of layer III in MPEG 1 and MPEG 2
     (0, 32, 40, 48, 56, 64, 80, 96, 112, 128, 160, 192, 224, 256, 320),
     (0, 8, 16, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128, 144, 160),
@@ -59,54 +60,42 @@ _HDF5 = FileKind("an HDF5 file", _IMPORT, is_hdf5=True)
 _TEXT = FileKind("a text file", f"choose a recording, or {_SAVE}", is_text=True)
 
 
-def _audio(name: str) -> FileKind:
-    return FileKind(name, _FFMPEG)
-
-
-def _data(name: str) -> FileKind:
-    return FileKind(name, _SAVE)
-
-
 def _packed(name: str, command: str) -> FileKind:
     return FileKind(name, _UNPACK.format(command + " {file}"))
-
-
-def _other(name: str) -> FileKind:
-    return FileKind(name, _NO_SIGNALS)
 
 
 # Each row: first bytes, as place and content, all of which must match.
 _MAGICS: Final[tuple[tuple[FileKind, tuple[tuple[int, bytes], ...]], ...]] = (
     *((_WAV, ((0, name), (8, b"WAVE"))) for name in (b"RIFF", b"RIFX", b"RF64", b"BW64")),
-    (_audio("an AVI video"), ((0, b"RIFF"), (8, b"AVI "))),
-    (_other("a RIFF file of another form than WAVE"), ((0, b"RIFF"),)),
-    (_audio("a Sony Wave64 file"), ((0, bytes.fromhex("726966662e91cf11a5d628db04c10000")),)),
-    (_audio("a FLAC file"), ((0, b"fLaC"),)),
-    (_audio("an Ogg file"), ((0, b"OggS"),)),
-    (_audio("an MP3 file"), ((0, b"ID3"),)),
-    (_audio("an AIFF file"), ((0, b"FORM"), (8, b"AIFF"))),
-    (_audio("an AIFF-C file"), ((0, b"FORM"), (8, b"AIFC"))),
-    (_audio("an IFF 8SVX file"), ((0, b"FORM"), (8, b"8SVX"))),
-    (_audio("a CAF file"), ((0, b"caff"),)),
-    (_audio("a Sun AU file"), ((0, b".snd"),)),
-    (_audio("a Sun AU file"), ((0, b"dns."),)),
-    (_audio("a WavPack file"), ((0, b"wvpk"),)),
-    (_audio("a Monkey's Audio file"), ((0, b"MAC "),)),
-    (_audio("a TTA file"), ((0, b"TTA1"),)),
-    (_audio("a Creative Voice file"), ((0, b"Creative Voice File"),)),
-    (_audio("a NIST SPHERE file"), ((0, b"NIST_1A"),)),
-    (_audio("a DSF file"), ((0, b"DSD "),)),
-    (_audio("a DSDIFF file"), ((0, b"FRM8"),)),
+    (FileKind("an AVI video", _FFMPEG), ((0, b"RIFF"), (8, b"AVI "))),
+    (FileKind("a RIFF file of another form than WAVE", _NO_SIGNALS), ((0, b"RIFF"),)),
+    (FileKind("a Sony Wave64 file", _FFMPEG), ((0, bytes.fromhex("726966662e91cf11a5d628db04c10000")),)),
+    (FileKind("a FLAC file", _FFMPEG), ((0, b"fLaC"),)),
+    (FileKind("an Ogg file", _FFMPEG), ((0, b"OggS"),)),
+    (FileKind("an MP3 file", _FFMPEG), ((0, b"ID3"),)),
+    (FileKind("an AIFF file", _FFMPEG), ((0, b"FORM"), (8, b"AIFF"))),
+    (FileKind("an AIFF-C file", _FFMPEG), ((0, b"FORM"), (8, b"AIFC"))),
+    (FileKind("an IFF 8SVX file", _FFMPEG), ((0, b"FORM"), (8, b"8SVX"))),
+    (FileKind("a CAF file", _FFMPEG), ((0, b"caff"),)),
+    (FileKind("a Sun AU file", _FFMPEG), ((0, b".snd"),)),
+    (FileKind("a Sun AU file", _FFMPEG), ((0, b"dns."),)),
+    (FileKind("a WavPack file", _FFMPEG), ((0, b"wvpk"),)),
+    (FileKind("a Monkey's Audio file", _FFMPEG), ((0, b"MAC "),)),
+    (FileKind("a TTA file", _FFMPEG), ((0, b"TTA1"),)),
+    (FileKind("a Creative Voice file", _FFMPEG), ((0, b"Creative Voice File"),)),
+    (FileKind("a NIST SPHERE file", _FFMPEG), ((0, b"NIST_1A"),)),
+    (FileKind("a DSF file", _FFMPEG), ((0, b"DSD "),)),
+    (FileKind("a DSDIFF file", _FFMPEG), ((0, b"FRM8"),)),
     *(
-        (_audio("an IRCAM file"), ((0, bytes.fromhex(mark)),))
+        (FileKind("an IRCAM file", _FFMPEG), ((0, bytes.fromhex(mark)),))
         for mark in ("64a30100", "64a30200", "64a30300", "64a30400")
     ),
-    (_audio("a PVF file"), ((0, b"PVF1\n"),)),
-    (_audio("an AVR file"), ((0, b"2BIT"),)),
-    (_audio("a FastTracker instrument"), ((0, b"Extended Instrument: "),)),
-    (_audio("an MP4 file"), ((4, b"ftyp"),)),
-    (_audio("a Matroska or WebM file"), ((0, bytes.fromhex("1a45dfa3")),)),
-    (_audio("an ASF or WMA file"), ((0, bytes.fromhex("3026b2758e66cf11")),)),
+    (FileKind("a PVF file", _FFMPEG), ((0, b"PVF1\n"),)),
+    (FileKind("an AVR file", _FFMPEG), ((0, b"2BIT"),)),
+    (FileKind("a FastTracker instrument", _FFMPEG), ((0, b"Extended Instrument: "),)),
+    (FileKind("an MP4 file", _FFMPEG), ((4, b"ftyp"),)),
+    (FileKind("a Matroska or WebM file", _FFMPEG), ((0, bytes.fromhex("1a45dfa3")),)),
+    (FileKind("an ASF or WMA file", _FFMPEG), ((0, bytes.fromhex("3026b2758e66cf11")),)),
     (
         FileKind("a Wildlife Acoustics WAC file", "convert it to WAV with Kaleidoscope, and import that"),
         ((0, b"WAac"),),
@@ -114,10 +103,10 @@ _MAGICS: Final[tuple[tuple[FileKind, tuple[tuple[int, bytes], ...]], ...]] = (
     (_MATLAB, ((0, b"MATLAB 5.0 MAT-file"),)),
     (_MATLAB, ((0, b"MATLAB 7.3 MAT-file"),)),
     *((_HDF5, ((place, b"\x89HDF\r\n\x1a\n"),)) for place in _HDF5_PLACES),
-    (_data("an HDF4 file"), ((0, bytes.fromhex("0e031301")),)),
-    *((_data("a NetCDF file"), ((0, b"CDF" + bytes([version])),)) for version in (1, 2, 5)),
+    (FileKind("an HDF4 file", _SAVE), ((0, bytes.fromhex("0e031301")),)),
+    *((FileKind("a NetCDF file", _SAVE), ((0, b"CDF" + bytes([version])),)) for version in (1, 2, 5)),
     (FileKind("a NumPy file", _NUMPY), ((0, b"\x93NUMPY"),)),
-    (_data("a NumPy archive"), ((0, b"PK\3\4"), (-1, b".npy"))),
+    (FileKind("a NumPy archive", _SAVE), ((0, b"PK\3\4"), (-1, b".npy"))),
     (_packed("a ZIP archive", "unzip"), ((0, b"PK\3\4"),)),
     (_packed("an empty ZIP archive", "unzip"), ((0, b"PK\5\6"),)),
     (_packed("a gzip file", "gunzip --keep"), ((0, b"\x1f\x8b\x08"),)),
@@ -128,33 +117,33 @@ _MAGICS: Final[tuple[tuple[FileKind, tuple[tuple[int, bytes], ...]], ...]] = (
     (_packed("a 7-Zip archive", "7z x"), ((0, bytes.fromhex("377abcaf271c")),)),
     (_packed("a RAR archive", "unrar x"), ((0, b"Rar!\x1a\x07"),)),
     (_packed("a tar archive", "tar xf"), ((257, b"ustar"),)),
-    (_data("a Parquet file"), ((0, b"PAR1"),)),
-    (_data("an Arrow file"), ((0, b"ARROW1"),)),
-    (_data("a Feather file"), ((0, b"FEA1"),)),
-    (_data("a TDMS file of LabVIEW"), ((0, b"TDSm"),)),
-    (_data("a ROOT file"), ((0, b"root"),)),
-    (_data("a FITS file"), ((0, b"SIMPLE  ="),)),
-    (_data("an EDF file"), ((0, b"0       "),)),
-    (_data("a ROS 1 bag"), ((0, b"#ROSBAG"),)),
-    (_data("an MCAP file"), ((0, b"\x89MCAP0\r\n"),)),
+    (FileKind("a Parquet file", _SAVE), ((0, b"PAR1"),)),
+    (FileKind("an Arrow file", _SAVE), ((0, b"ARROW1"),)),
+    (FileKind("a Feather file", _SAVE), ((0, b"FEA1"),)),
+    (FileKind("a TDMS file of LabVIEW", _SAVE), ((0, b"TDSm"),)),
+    (FileKind("a ROOT file", _SAVE), ((0, b"root"),)),
+    (FileKind("a FITS file", _SAVE), ((0, b"SIMPLE  ="),)),
+    (FileKind("an EDF file", _SAVE), ((0, b"0       "),)),
+    (FileKind("a ROS 1 bag", _SAVE), ((0, b"#ROSBAG"),)),
+    (FileKind("an MCAP file", _SAVE), ((0, b"\x89MCAP0\r\n"),)),
     (
         FileKind("an SQLite database", "if it is a journal, seal it with 'ertis recover {file}'"),
         ((0, b"SQLite format 3\0"),),
     ),
-    (_other("a PNG image"), ((0, b"\x89PNG\r\n\x1a\n"),)),
-    (_other("a JPEG image"), ((0, b"\xff\xd8\xff"),)),
-    (_other("a GIF image"), ((0, b"GIF8"),)),
-    (_other("a TIFF image"), ((0, b"II*\0"),)),
-    (_other("a TIFF image"), ((0, b"MM\0*"),)),
-    (_other("a PDF document"), ((0, b"%PDF"),)),
-    (_other("a PostScript document"), ((0, b"%!PS"),)),
-    (_other("a PLY file"), ((0, b"ply\n"),)),
-    (_other("a PCD file"), ((0, b"# .PCD"),)),
-    (_other("a LAS file"), ((0, b"LASF"),)),
-    (_other("a MIDI file"), ((0, b"MThd"),)),
-    (_other("a program (ELF)"), ((0, b"\x7fELF"),)),
-    (_other("a DICOM file"), ((128, b"DICM"),)),
-    (_other("a program (Mach-O)"), ((0, bytes.fromhex("cffaedfe")),)),
+    (FileKind("a PNG image", _NO_SIGNALS), ((0, b"\x89PNG\r\n\x1a\n"),)),
+    (FileKind("a JPEG image", _NO_SIGNALS), ((0, b"\xff\xd8\xff"),)),
+    (FileKind("a GIF image", _NO_SIGNALS), ((0, b"GIF8"),)),
+    (FileKind("a TIFF image", _NO_SIGNALS), ((0, b"II*\0"),)),
+    (FileKind("a TIFF image", _NO_SIGNALS), ((0, b"MM\0*"),)),
+    (FileKind("a PDF document", _NO_SIGNALS), ((0, b"%PDF"),)),
+    (FileKind("a PostScript document", _NO_SIGNALS), ((0, b"%!PS"),)),
+    (FileKind("a PLY file", _NO_SIGNALS), ((0, b"ply\n"),)),
+    (FileKind("a PCD file", _NO_SIGNALS), ((0, b"# .PCD"),)),
+    (FileKind("a LAS file", _NO_SIGNALS), ((0, b"LASF"),)),
+    (FileKind("a MIDI file", _NO_SIGNALS), ((0, b"MThd"),)),
+    (FileKind("a program (ELF)", _NO_SIGNALS), ((0, b"\x7fELF"),)),
+    (FileKind("a DICOM file", _NO_SIGNALS), ((128, b"DICM"),)),
+    (FileKind("a program (Mach-O)", _NO_SIGNALS), ((0, bytes.fromhex("cffaedfe")),)),
 )
 
 
@@ -171,9 +160,9 @@ def kind_of(path: str | Path) -> FileKind | None:
             return kind
     checks = (
         (_is_matlab_4(head), _MATLAB),
-        (_is_mpeg(head), _audio("an MP3 or AAC file")),
-        (head[:1] == b"\x80" and head[1:2] in {b"\2", b"\3", b"\4", b"\5"} and last == b".", _data("a Python pickle")),
-        (head[:2] == b"MZ" and b"This program" in head, _other("a program (Windows)")),
+        (_is_mpeg(head), FileKind("an MP3 or AAC file", _FFMPEG)),
+        (head[:2] in _PICKLES and last == b".", FileKind("a Python pickle", _SAVE)),
+        (head[:2] == b"MZ" and b"This program" in head, FileKind("a program (Windows)", _NO_SIGNALS)),
         (_is_text(head), _TEXT),
     )
     return next((kind for fits, kind in checks if fits), None)

@@ -19,16 +19,6 @@ _END_NS = 2**63  # in the year 2262
 _PCM = {".wav", ".h5", ".hdf5", ".hdf"}
 _RAW = {".bin", ".dat", ".pdm", ".raw"}
 _WAV = {".wav", ".wave"}
-_OF_PCM = {
-    "--skip": "skip_s",
-    "--length": "length_s",
-    "--start": "start",
-    "--passive": "passive",
-    "--join": "join",
-    "--time-expansion": "time_expansion",
-    "--sync-channel": "sync_channel",
-}
-"""Options for PCM by their names on the command line."""
 _UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
 
 
@@ -103,13 +93,6 @@ def import_raw(
     layout: str | None,
     preset: str | None,
     settings_file: Path | None,
-    skip_s: float | None,
-    length_s: float | None,
-    start: tuple[datetime, ...],
-    passive: bool,
-    join: bool,
-    time_expansion: float | None,
-    sync_channel: int | None,
     is_raw: bool,
     sensor: str,
     temperature: float | None,
@@ -117,6 +100,7 @@ def import_raw(
     force: bool,
     quiet: bool,
     as_json: bool,
+    **of_pcm: Any,
 ) -> None:
     """Import raw eRTIS data or PCM into a recording.
 
@@ -144,10 +128,11 @@ def import_raw(
     check_target(target, overwrite=force, sources=raw)
     are_pcm = [_is_pcm(path, is_raw=is_raw) for path in raw] if folder is None else [is_wav_folder(folder)]
     is_pcm = all(are_pcm)
-    for name, parameter in _OF_PCM.items():
-        if typed(parameter) and not is_pcm:
+    for name in of_pcm:
+        if typed(name) and not is_pcm:
+            option = f"--{name.removesuffix('_s').replace('_', '-')}"
             raise click.UsageError(
-                f"{name} is for PCM (.wav, .h5), but {raw[0]} contains raw words; remove {name}, or choose another "
+                f"{option} is for PCM (.wav, .h5), but {raw[0]} contains raw words; remove {option}, or choose another "
                 "file",
                 click.get_current_context(),
             )
@@ -160,18 +145,9 @@ def import_raw(
     air = {name: value for name, value in given.items() if value is not None}
     measurements: PcmReader | RawReader
     if is_pcm:
-        options_of_reader = {
-            "sensor": sensor,
-            "skip_s": skip_s or 0.0,
-            "length_s": length_s,
-            "start_ns": [_since_1970_ns(each) for each in start],
-            "passive": passive,
-            "join": join,
-            "time_expansion": time_expansion,
-            "sync_channel": sync_channel,
-            "air": air,
-        }
-        measurements = _opened_pcm(raw, layout, preset, settings_file, options_of_reader)
+        of_pcm["start_ns"] = [_since_1970_ns(each) for each in of_pcm.pop("start")]
+        of_pcm |= {"sensor": sensor, "air": air, "skip_s": of_pcm["skip_s"] or 0.0}
+        measurements = _opened_pcm(raw, layout, preset, settings_file, of_pcm)
     else:
         measurements = _opened_raw(raw, folder, layout, preset, settings_file, sensor, check_kind=not is_raw)
         settings = measurements.settings

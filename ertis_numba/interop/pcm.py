@@ -12,7 +12,7 @@ from ertis_numba.interop.pcm_cuts import cut_at_emissions, cut_regularly
 from ertis_numba.interop.pcm_files import PcmFile, inspect, joined, per_file, require_alike
 from ertis_numba.interop.pcm_folder import is_wav_folder, left_out, wav_files
 from ertis_numba.interop.pcm_reader import PcmReader
-from ertis_numba.interop.recorder_times import TimedFile, file_times
+from ertis_numba.interop.recorder_times import file_times
 from ertis_numba.settings import Processing, Recording, Settings, fit_ranges, record_range_m
 
 __all__ = ["open_pcm"]
@@ -132,7 +132,7 @@ def open_pcm(
     fitted, ranges = _fitted(known, recording, files[0], whole_range=whole_range)
     starts_ns = [start_ns] if isinstance(start_ns, int) else list(start_ns)
     firsts_ns, times = file_times(
-        [TimedFile(file.path, file.duration_s, file.metadata.stated_times) for file in files],
+        files,
         [checks.integer("start_ns", each, 0, 2**63 - 1) for each in starts_ns],
         first_s=[float(times_s[0]) for times_s in cuts.times_s],
     )

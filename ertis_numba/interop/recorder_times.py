@@ -3,36 +3,28 @@
 import itertools
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.interop.pcm_files import PcmFile, first_stated_times
 from ertis_numba.interop.recorder_names import MAX_DIFFERENCE_S, StatedTime, times_in_names
 
-__all__ = ["TimedFile", "file_times"]
+__all__ = ["file_times"]
 
 _NEGLIGIBLE_S: Final = 1e-3
 _UNKNOWN: Final = "use --start for the first file, or once for each file (start_ns)"
 
 
-class TimedFile(NamedTuple):
-    """File, its duration in seconds, and its time according to its metadata, the most reliable source first."""
-
-    path: Path
-    duration_s: float
-    stated_times: Sequence[StatedTime]
-
-
 def file_times(
-    files: Sequence[TimedFile], starts_ns: Sequence[int], *, first_s: Sequence[float]
+    files: Sequence[PcmFile], starts_ns: Sequence[int], *, first_s: Sequence[float]
 ) -> tuple[list[int], list[str]]:
     """Return the time of the first measurement of each file, in nanoseconds since 1970, and notes about the times.
 
     Parameters
     ----------
-    files : sequence of TimedFile
+    files : sequence of PcmFile
         Files in the order of their times.
     starts_ns : sequence of int
         Times of the first measurements as given by the user: none, that of the first file, or one for each file.
@@ -54,8 +46,7 @@ def file_times(
     if len(starts_ns) == len(files) and files:
         _require_order(files, starts_ns)
         return _without_overlaps(files, list(starts_ns), 0.0)
-    named = times_in_names([file.path.name for file in files])
-    best = [file.stated_times[0] if file.stated_times else name for file, name in zip(files, named, strict=True)]
+    best = first_stated_times(files)
     known = [time for time in best if time is not None]
     firsts_ns = [round(1e9 * each) for each in first_s]
     if not known:
@@ -74,18 +65,18 @@ def file_times(
         earliest = times_ns.index(min(times_ns))
         raise DataError(f"{files[earliest].path} states a time before 1970 ({_stated(known[earliest])}); {_UNKNOWN}")
     _require_order(files, times_ns)
-    notes = [*_contradictions(files, named), _source(known, is_relative=bool(starts_ns))]
+    notes = [*_contradictions(files), _source(known, is_relative=bool(starts_ns))]
     times_ns, overlaps = _without_overlaps(files, times_ns, max(time.resolution_s for time in known))
     shift_ns = starts_ns[0] - firsts_ns[0] - times_ns[0] if starts_ns else 0
     return [sum(pair) + shift_ns for pair in zip(times_ns, firsts_ns, strict=True)], notes + overlaps
 
 
-def _back_to_back_ns(files: Sequence[TimedFile], start_ns: int) -> list[int]:
+def _back_to_back_ns(files: Sequence[PcmFile], start_ns: int) -> list[int]:
     ends_s = np.cumsum([file.duration_s for file in files])
     return [start_ns, *(start_ns + np.rint(1e9 * ends_s[:-1]).astype(np.int64)).tolist()]
 
 
-def _unknown(files: Sequence[TimedFile], starts_ns: Sequence[int]) -> list[str]:
+def _unknown(files: Sequence[PcmFile], starts_ns: Sequence[int]) -> list[str]:
     """Return the note on files without any time."""
     if len(files) == 1:
         return [f"{files[0].path.name} contains no time, so its time is unknown; {_UNKNOWN.partition(',')[0]}"]
@@ -97,7 +88,7 @@ def _unknown(files: Sequence[TimedFile], starts_ns: Sequence[int]) -> list[str]:
     return [f"{assumption}{relative}; {remedy}"]
 
 
-def _require_order(files: Sequence[TimedFile], times_ns: Sequence[int]) -> None:
+def _require_order(files: Sequence[PcmFile], times_ns: Sequence[int]) -> None:
     for number, (before_ns, after_ns) in enumerate(itertools.pairwise(times_ns)):
         if after_ns < before_ns:
             raise DataError(
@@ -108,7 +99,7 @@ def _require_order(files: Sequence[TimedFile], times_ns: Sequence[int]) -> None:
 
 
 def _without_overlaps(
-    files: Sequence[TimedFile], times_ns: list[int], resolution_s: float
+    files: Sequence[PcmFile], times_ns: list[int], resolution_s: float
 ) -> tuple[list[int], list[str]]:
     """Return times in which files begin after the end of the previous one, and notes on overlaps.
 
@@ -150,18 +141,18 @@ def _overlapping(files: Sequence[TimedFile], overlaps: Sequence[tuple[int, float
     return [note]
 
 
-def _contradictions(files: Sequence[TimedFile], named: Sequence[StatedTime | None]) -> list[str]:
+def _contradictions(files: Sequence[PcmFile]) -> list[str]:
     """Return a note on the first file whose sources contradict each other."""
     found = []
-    for file, name in zip(files, named, strict=True):
-        for other in (*file.stated_times[1:], *([name] if name and file.stated_times else [])):
-            if not _agree(file.stated_times[0], other):
-                found.append((file, other))
-                break
+    for file, name in zip(files, times_in_names([file.path.name for file in files]), strict=True):
+        times = [*file.metadata.stated_times, *([name] if name else [])]
+        other = next((each for each in times[1:] if not _agree(times[0], each)), None)
+        if other is not None:
+            found.append((file, other))
     if not found:
         return []
     file, other = found[0]
-    used = file.stated_times[0]
+    used = file.metadata.stated_times[0]
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     note = (
         f"{file.path.name}{more}: {used.source} ({_stated(used)}) and {other.source} ({_stated(other)}) differ; "
