@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-__all__ = ["FileKind", "kind_of", "problem_of", "quoted"]
+__all__ = ["HDF5_PLACES", "HDF5_SIGNATURE", "FileKind", "kind_of", "problem_of", "quoted"]
 
 _HEAD_BYTES = 4096
-_HDF5_PLACES: Final = (0, 512, 1024, 2048)  # behind a block of the user, such as that of MATLAB
+HDF5_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
+HDF5_PLACES: Final = (0, 512, 1024, 2048)
+"""Places of the signature of HDF5: behind a block of the user, such as that of MATLAB."""
 _PICKLES: Final = {b"\x80\2", b"\x80\3", b"\x80\4", b"\x80\5"}
 _KILOBITS: Final = (  # per second, of layer III in MPEG 1 and MPEG 2
     (0, 32, 40, 48, 56, 64, 80, 96, 112, 128, 160, 192, 224, 256, 320),
@@ -102,7 +104,7 @@ _MAGICS: Final[tuple[tuple[FileKind, tuple[tuple[int, bytes], ...]], ...]] = (
     ),
     (_MATLAB, ((0, b"MATLAB 5.0 MAT-file"),)),
     (_MATLAB, ((0, b"MATLAB 7.3 MAT-file"),)),
-    *((_HDF5, ((place, b"\x89HDF\r\n\x1a\n"),)) for place in _HDF5_PLACES),
+    *((_HDF5, ((place, HDF5_SIGNATURE),)) for place in HDF5_PLACES),
     (FileKind("an HDF4 file", _SAVE), ((0, bytes.fromhex("0e031301")),)),
     *((FileKind("a NetCDF file", _SAVE), ((0, b"CDF" + bytes([version])),)) for version in (1, 2, 5)),
     (FileKind("a NumPy file", _NUMPY), ((0, b"\x93NUMPY"),)),

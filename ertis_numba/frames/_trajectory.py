@@ -1,7 +1,7 @@
 """Trajectories: poses of a platform at increasing times."""
 
 from dataclasses import dataclass
-from typing import Any, Final, Literal, TypeAlias
+from typing import Any, Final, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames._replacing import replaced
-from ertis_numba.frames.platform_tilt import POSE_AXES, turned_axes
+from ertis_numba.frames.platform_tilt import turned_axes
 
 __all__ = ["PoseAxes", "Trajectory"]
 
@@ -174,7 +174,7 @@ class Trajectory:
         >>> ahead.converted("camera-world").position_m.tolist()
         [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
         """
-        checks.choice("pose_axes", pose_axes, POSE_AXES)
+        checks.choice("pose_axes", pose_axes, get_args(PoseAxes))
         rotation_xyzw, world = turned_axes(self.rotation_xyzw, pose_axes)
         covariance = self.covariance
         if covariance is not None:

@@ -5,15 +5,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["POSE_AXES", "tilt_note", "turned_axes"]
+__all__ = ["tilt_note", "turned_axes"]
 
 Floats = NDArray[np.float64]
 
-POSE_AXES: Final = ("platform", "camera", "camera-world")
-"""Axes of poses: x forward, y left, z up; z forward, x right, y down in a world with z up; the latter in both."""
-_CAMERA_TO_PLATFORM: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 _FROM_PLATFORM_XYZW: Final = (0.5, -0.5, 0.5, 0.5)
-"""Rotation from the axes of a platform to those of a camera: the transposed matrix above."""
+"""Rotation from the axes of a platform, x forward and z up, to those of a camera, z forward and y down."""
 _UPRIGHT: Final = float(np.cos(np.radians(30.0)))
 _AXIS: Final = 0.6  # Mean vertical share of an axis that points up or down.
 _STEEP: Final = float(np.tan(np.radians(30.0)))
@@ -68,13 +65,16 @@ def turned_axes(rotation_xyzw: Floats, axes: str) -> tuple[Floats, Floats]:
     rotation_xyzw : (pose, 4) float64
     world : (3, 3) float64
     """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  importing it takes longer than this package
+
     if axes == "platform":
         return rotation_xyzw, np.eye(3)
-    turned = _product(rotation_xyzw, np.array(_FROM_PLATFORM_XYZW))
+    from_platform = Rotation.from_quat(_FROM_PLATFORM_XYZW)
+    turned = Rotation.from_quat(rotation_xyzw) * from_platform
     if axes == "camera":
-        return turned, np.eye(3)
-    to_platform = np.array(_FROM_PLATFORM_XYZW) * [-1.0, -1.0, -1.0, 1.0]
-    return _product(to_platform, turned), _CAMERA_TO_PLATFORM
+        return turned.as_quat(), np.eye(3)
+    to_platform = from_platform.inv()
+    return (to_platform * turned).as_quat(), to_platform.as_matrix()
 
 
 def _vertical_shares(rotation_xyzw: Floats) -> Floats:
@@ -97,11 +97,3 @@ def _axis_up(up: Floats, along_y: float) -> str:
     turned = "" if axis == len(up) - 1 and up[axis] > 0 else found
     order = ", and quaternions the order x, y, z, w" if axis == len(up) - 1 and turned else ""
     return f"{turned}; {wanted}{order}; correct the poses, or ignore this note if the platform really moves so"
-
-
-def _product(one: Floats, other: Floats) -> Floats:
-    """Return the quaternion of the rotation `one` after the rotation `other`: (…, 4) float64."""
-    one, other = np.broadcast_arrays(one, other)
-    v, w = one[..., :3], one[..., 3:]
-    u, s = other[..., :3], other[..., 3:]
-    return np.concatenate([w * u + s * v + np.cross(v, u), w * s - np.sum(v * u, axis=-1, keepdims=True)], axis=-1)

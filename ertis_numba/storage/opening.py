@@ -11,7 +11,7 @@ from typing import Final
 import h5py
 
 from ertis_numba.errors import ArgumentError, DamagedError, DataError, SettingsError
-from ertis_numba.file_kinds import problem_of, quoted
+from ertis_numba.file_kinds import HDF5_PLACES, HDF5_SIGNATURE, problem_of, quoted
 
 __all__ = ["RESULT_OR_RECORDING", "open_file", "reading"]
 
@@ -23,8 +23,6 @@ _SYSTEM_ERROR = re.compile(r"errno = (\d+), error message = '(.*?)'")  # Part of
 # Other errors may result from damaged addresses.
 _TRANSIENT_ERRNOS = (errno.EIO, errno.ENXIO, errno.ENODEV, errno.ENOMEM, errno.ETIMEDOUT)
 _STORED_END = re.compile(r"stored_eof = (\d+)")
-_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_USER_BLOCKS = (0, 512, 1024, 2048)  # bytes before the signature
 _FLAGS, _IS_OPEN = 11, 1  # byte of the superblock, and its bit for a file that is open for writing
 
 
@@ -101,11 +99,11 @@ def open_file(path: Path, wanted: str = RESULT_OR_RECORDING) -> h5py.File:
 def _is_left_open(path: Path) -> bool:
     """Return True if the superblock of a file marks it as open for writing."""
     with path.open("rb") as file:
-        for start in _USER_BLOCKS:
+        for start in HDF5_PLACES:
             file.seek(start)
             block = file.read(_FLAGS + 1)
-            if block.startswith(_SIGNATURE) and len(block) > _FLAGS:
-                return block[len(_SIGNATURE)] >= 3 and bool(block[_FLAGS] & _IS_OPEN)
+            if block.startswith(HDF5_SIGNATURE) and len(block) > _FLAGS:
+                return block[len(HDF5_SIGNATURE)] >= 3 and bool(block[_FLAGS] & _IS_OPEN)
     return False
 
 
