@@ -119,7 +119,7 @@ def import_raw(
     contain sound without a call, for acoustic maps. A folder of .wav files is imported in the order of the recording
     times. Notes report the source of the times, and everything that was assumed or left out.
     """
-    from ertis_numba.interop import is_wav_folder
+    from ertis_numba.interop.pcm_folder import is_wav_folder
     from ertis_numba.storage import check_target, write_recording
 
     folder = _folder(raw)

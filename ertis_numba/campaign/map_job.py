@@ -16,8 +16,9 @@ from ertis_numba.campaign.sensor_processing import describe_faults, require_same
 from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.errors import DataError
 from ertis_numba.frames import AcousticMap
-from ertis_numba.passive import AcousticCamera, find_sound_sources, gathered
+from ertis_numba.passive import AcousticCamera, find_sound_sources
 from ertis_numba.passive.bands import shaped_noise_warning
+from ertis_numba.passive.components import gathered
 from ertis_numba.settings import Settings
 from ertis_numba.storage import AcousticMapWriter, RecordingReader, open_recording
 

@@ -134,7 +134,7 @@ def _levels(
     canvas: Canvas, found: AcousticMap, band_hz: tuple[float, float] | None
 ) -> tuple[Canvas, NDArray[np.float32], SoundDirection]:
     """Return the levels of a band in all directions, a canvas with their scale, and the loudest source in them."""
-    from ertis_numba.passive import gathered  # noqa: PLC0415  few plots need it, and it imports kernels
+    from ertis_numba.passive.components import gathered  # noqa: PLC0415  few plots need it, and it imports kernels
     from ertis_numba.passive.sound_sources import sources_of_grid  # noqa: PLC0415
 
     if band_hz is not None:

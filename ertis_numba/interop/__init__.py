@@ -4,7 +4,6 @@ from ertis_numba.interop._drive import Drive
 from ertis_numba.interop._export import FORMATS, TOPICS, choose_format, export, output_files
 from ertis_numba.interop._map_files import MAP_SUFFIXES, map_files, write_map
 from ertis_numba.interop.pcm import open_pcm
-from ertis_numba.interop.pcm_folder import is_wav_folder
 from ertis_numba.interop.pcm_reader import PcmReader
 from ertis_numba.interop.raw_pdm import RawReader, open_raw
 from ertis_numba.interop.rtis_folder import open_rtis_folder
@@ -20,7 +19,6 @@ __all__ = [
     "check_tum_target",
     "choose_format",
     "export",
-    "is_wav_folder",
     "map_files",
     "open_pcm",
     "open_raw",

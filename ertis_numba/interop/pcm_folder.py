@@ -13,14 +13,7 @@ _WAV: Final = {".wav", ".wave"}
 
 
 def is_wav_folder(path: str | Path) -> bool:
-    """Return True for a folder with WAV files, unless it contains .bin files of RTIS Dev.
-
-    Examples
-    --------
-    >>> from ertis_numba.interop import is_wav_folder
-    >>> is_wav_folder(".")
-    False
-    """
+    """Return True for a folder with WAV files, unless it contains .bin files of RTIS Dev."""
     try:
         suffixes = {each.suffix.lower() for each in Path(path).iterdir()} if Path(path).is_dir() else set()
     except OSError as error:

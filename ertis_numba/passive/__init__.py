@@ -5,7 +5,6 @@ from ertis_numba.passive.beam_sound import BeamSound, heterodyned, listen_to, ti
 from ertis_numba.passive.bearing_tracker import BearingTracker
 from ertis_numba.passive.bearings import BearingFinder, find_bearings
 from ertis_numba.passive.camera import AcousticCamera
-from ertis_numba.passive.components import gathered
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.heard_signals import HeardSignals
 from ertis_numba.passive.sound_sources import find_sound_sources
@@ -22,7 +21,6 @@ __all__ = [
     "band_edges",
     "find_bearings",
     "find_sound_sources",
-    "gathered",
     "heterodyned",
     "listen_to",
     "octave_bands",
