@@ -12,12 +12,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks, kernels
 from ertis_numba.errors import ArgumentError, CoarseGridWarning, DataError, OutsideBandsWarning
 from ertis_numba.frames import AcousticMap, Measurement, Stamp
-from ertis_numba.geometry import (
-    Grid,
-    direction_grid,
-    microphones,
-    unit_vectors,
-)
+from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.block_spectra import BlockSpectra
 from ertis_numba.passive.components import gathered

@@ -35,16 +35,12 @@ class OutsideBands:
     """
 
     def __init__(self, settings: Settings, bands_hz: NDArray[np.float64]) -> None:
-        recording, enabled = settings.recording, np.flatnonzero(microphones(settings.array).enabled)
-        self._is_pdm, self._rate_hz, self._full_scale = (
-            recording.is_pdm,
-            recording.sample_rate_hz,
-            recording.full_scale,
-        )
+        self._recording = recording = settings.recording
+        enabled = np.flatnonzero(microphones(settings.array).enabled)
         self._channels = enabled[np.linspace(0, len(enabled) - 1, min(_CHANNELS, len(enabled))).astype(int)]
         self._size = max(8, 2 * (min(_BLOCK, recording.n_samples // _LEAST_BLOCKS) // 2))
         self._window = scipy.signal.get_window("hann", self._size)
-        self._frequency_hz = np.arange(self._size // 2 + 1) * self._rate_hz / self._size
+        self._frequency_hz = np.arange(self._size // 2 + 1) * recording.sample_rate_hz / self._size
         inside = (self._frequency_hz >= bands_hz[:, :1]) & (self._frequency_hz <= bands_hz[:, 1:])
         self._inside = inside.any(axis=0)
         self._edges_hz = float(bands_hz.min()), float(bands_hz.max())
@@ -58,10 +54,10 @@ class OutsideBands:
         ----------
         measurement : Measurement
         """
-        if self._is_pdm or len(measurement.data) < self._size:
+        if self._recording.is_pdm or len(measurement.data) < self._size:
             return
         hop = self._size // 2
-        scale = 2 / (self._size * float((self._window**2).sum()) * self._full_scale**2)
+        scale = 2 / (self._size * float((self._window**2).sum()) * self._recording.full_scale**2)
         for channel in self._channels.tolist():
             samples = measurement.data[:, channel].astype(np.float64)
             pieces = np.lib.stride_tricks.sliding_window_view(samples - samples.mean(), self._size)[::hop]
@@ -90,7 +86,7 @@ class OutsideBands:
         )
 
     def _remedy(self, frequency_hz: float) -> str:
-        highest_hz = HIGHEST_SHARE * self._rate_hz / 2
+        highest_hz = HIGHEST_SHARE * self._recording.sample_rate_hz / 2
         low_hz, high_hz = 0.8 * frequency_hz, min(1.2 * frequency_hz, highest_hz)
         if frequency_hz >= 0.98 * highest_hz:
             return f"to locate this sound, record at a higher rate: bands end at {highest_hz / 1e3:.4g} kHz"
