@@ -129,7 +129,7 @@ def _moved(moved_s: Sequence[float], resolution_s: float, times_ns: Sequence[int
     return [note]
 
 
-def _overlapping(files: Sequence[TimedFile], overlaps: Sequence[tuple[int, float]]) -> list[str]:
+def _overlapping(files: Sequence[PcmFile], overlaps: Sequence[tuple[int, float]]) -> list[str]:
     if not overlaps:
         return []
     number, overlap_s = overlaps[0]
