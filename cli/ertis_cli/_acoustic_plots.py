@@ -122,8 +122,8 @@ def draw(
     if kind == "acoustic_map":
         _require_pair(photo, photo_fov_deg)
         found = _map(path, sensor, index, quiet=quiet)
-        options.warn_of(found.stamp.sensor, coarse_map_warning(found.settings, found))
         figure = figures.acoustic_map(found, band_hz=band_hz, photo=photo, photo_fov_deg=photo_fov_deg, **look)
+        options.warn_of(found.stamp.sensor, coarse_map_warning(found.settings, found))
         return figure, found.stamp.sensor
     if kind == "spectrum":
         source = (
