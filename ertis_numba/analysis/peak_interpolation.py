@@ -91,7 +91,6 @@ class PeakInterpolator:
         self._row = np.zeros(len(directions), dtype=np.int64)
         self._row[wanted] = np.arange(len(wanted))
         self._fits = QuadricFits.of(directions, neighbours, wanted)
-        self._n_axes = 1 if np.ptp(directions[:, 2]) == 0 else 2
         self._spread = PointSpread(settings)
         self._is_predicted = settings.processing.method == "fast"
         self._deviation = deviation_of(settings, directions)
@@ -112,7 +111,7 @@ class PeakInterpolator:
         if self._is_predicted and not image.settings.processing.is_adaptive:
             found = self._corrected(found, directions, measured, (rows, columns), step_m, image)
         shift_m, offset = found[:, 0].clip(-0.5, 0.5) * step_m, found[:, 1:4]
-        offset, width_rad = self._fits.within_cells(self._row[directions], offset, n_axes=self._n_axes)
+        offset, width_rad = self._fits.within_cells(self._row[directions], offset)
         top = self._directions[directions] + offset
         top /= np.linalg.norm(top, axis=1)[:, None]
         return Tops(

@@ -46,6 +46,8 @@ class QuadricFits:
         Numbers of the directions in the grid.
     grid : KDTree
         All directions. The cell of a direction ends half-way to each of the others.
+    n_axes_of_grid : int
+        1 if all directions lie at one elevation, otherwise 2.
     """
 
     axes: Floats
@@ -55,6 +57,7 @@ class QuadricFits:
     width_rad: Floats
     wanted: NDArray[np.int64]
     grid: KDTree
+    n_axes_of_grid: int
 
     @classmethod
     def of(
@@ -90,7 +93,8 @@ class QuadricFits:
         distance = np.linalg.norm(offsets, axis=2)
         width_rad = np.where(distance > _SAME, distance, np.inf).min(axis=1, initial=np.inf)
         n_axes = np.where(reach > 0, n_axes, 0)
-        return cls(axes, inverse, n_axes, reach, width_rad, wanted, KDTree(directions))
+        n_axes_of_grid = 1 if np.ptp(directions[:, 2]) == 0 else 2
+        return cls(axes, inverse, n_axes, reach, width_rad, wanted, KDTree(directions), n_axes_of_grid)
 
     def tops(self, directions: NDArray[np.int64], rises: Floats) -> tuple[Floats, Floats]:
         """Return offsets from directions to the maxima of their quadrics, (place, axis) float64, and the rise there.
@@ -115,17 +119,16 @@ class QuadricFits:
         offset = x[:, None] * self.axes[directions, 0] + y[:, None] * self.axes[directions, 1]
         return offset, 0.5 * (slope_x * x + slope_y * y)
 
-    def within_cells(self, directions: NDArray[np.int64], offset: Floats, *, n_axes: int) -> tuple[Floats, Floats]:
+    def within_cells(self, directions: NDArray[np.int64], offset: Floats) -> tuple[Floats, Floats]:
         """Return offsets that end within their cells, (place, axis) float64, and the width of cells: (place,) float64.
 
-        A width is 0 if the direction is interpolated along as many axes as the grid has, ``n_axes``.
+        A width is 0 if the direction is interpolated along as many axes as the grid has.
 
         Parameters
         ----------
         directions : (place,) int64
         offset : (place, axis) float64
             Result of `tops`; longer ones are shortened.
-        n_axes : int
         """
         here = self.grid.data[self.wanted[directions]]
         share = np.ones(len(offset))
@@ -138,7 +141,7 @@ class QuadricFits:
             if not is_beyond.any():
                 break
             share[is_beyond] = half[is_beyond] / along[is_beyond]
-        is_between = offset.any(axis=1) & (share > _BESIDE) & (self.n_axes[directions] >= n_axes)
+        is_between = offset.any(axis=1) & (share > _BESIDE) & (self.n_axes[directions] >= self.n_axes_of_grid)
         return offset * share[:, None], np.where(is_between, 0.0, self.width_rad[directions])
 
 

@@ -47,15 +47,14 @@ class _Top(NamedTuple):
 
 
 class _Grid(NamedTuple):
-    """Directions with their neighbours, and the number of their axes."""
+    """Directions with their neighbours."""
 
     directions: Floats
     neighbours: NDArray[np.int64]
-    n_axes: int
 
     @classmethod
     def of(cls, directions: Floats) -> "_Grid":
-        return cls(directions, neighbours_of(directions), 1 if np.ptp(directions[:, 2]) == 0 else 2)
+        return cls(directions, neighbours_of(directions))
 
     def spacing_rad(self, place: int) -> float:
         """Return the distance from a direction to its nearest neighbour; infinite if there is none."""
@@ -205,7 +204,7 @@ def _maxima(power: Floats, grid: _Grid, passive: Passive, loss_of: _LossOf) -> I
     else:  # Beyond the main lobe, the logarithm falls steeply, so weights are small there.
         fits = QuadricFits.of(grid.directions, grid.neighbours, places, relative ** (1 / order))
         offsets, rises = fits.tops(np.arange(len(places)), np.log(relative))
-    offsets, widths = fits.within_cells(np.arange(len(places)), offsets, n_axes=grid.n_axes)
+    offsets, widths = fits.within_cells(np.arange(len(places)), offsets)
     tops = grid.directions[places] + offsets
     tops /= np.linalg.norm(tops, axis=1)[:, None]
     if passive.method != "music":  # Its numbers have no level, and no main lobe of delay-and-sum.
