@@ -247,14 +247,14 @@ def test_doubtful_rows_are_refused_with_their_lines(tmp_path, name, text, messag
 @pytest.mark.parametrize(
     ("start", "message"),
     [
-        (b"#ROSBAG V2.0\n", r"is a bag of ROS 1; convert it with .*rosbags-convert --src \S+a.bag --dst BAG"),
+        (b"#ROSBAG V2.0\n", r"is a bag of ROS 1; convert it with .*rosbags-convert --src \"\S+a b.bag\" --dst BAG"),
         (b"SQLite format 3\0", r"is a bag of ROS 2 in SQLite; convert it with"),
-        (b"\x89HDF\r\n\x1a\n", r"is HDF5, not text; if it is a recording, write"),
+        (b"\x89HDF\r\n\x1a\n", r"if it is a recording, write its poses with 'ertis export \"\S+a b.bag\" -o"),
         (b"PK\x03\x04", r"is an archive or a spreadsheet; unpack it or save it as CSV"),
     ],
 )
 def test_other_formats_are_refused_by_name(tmp_path, start, message):
-    path = tmp_path / "a.bag"
+    path = tmp_path / "a b.bag"
     path.write_bytes(start + bytes(range(256)))
     with pytest.raises(DataError, match=message):
         read_trajectory(path)

@@ -8,7 +8,7 @@ from typing import Final
 from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.file_kinds import kind_of
+from ertis_numba.file_kinds import kind_of, quoted
 from ertis_numba.frames import PoseAxes, Trajectory
 from ertis_numba.interop._pose_messages import read_messages
 from ertis_numba.interop._pose_rows import trajectory_of
@@ -25,9 +25,9 @@ _CONVERT: Final = (
 )
 _MCAP = b"\x89MCAP0\r\n"
 _SIGNATURES: Final = {
-    b"#ROSBAG": f"is a bag of ROS 1; {_CONVERT.format('{path}')}",
-    b"SQLite format 3": f"is a bag of ROS 2 in SQLite; {_CONVERT.format('{path.parent}')}",
-    b"\x89HDF": "is HDF5, not text; if it is a recording, write its poses with 'ertis export {path} -o POSES.tum'",
+    b"#ROSBAG": f"is a bag of ROS 1; {_CONVERT.format('{file}')}",
+    b"SQLite format 3": f"is a bag of ROS 2 in SQLite; {_CONVERT.format('{folder}')}",
+    b"\x89HDF": "is HDF5, not text; if it is a recording, write its poses with 'ertis export {file} -o POSES.tum'",
     b"PK\x03\x04": f"is an archive or a spreadsheet; unpack it or save it as CSV, and use {_KINDS}",
 }
 """First bytes of files that are refused by name."""
@@ -120,7 +120,7 @@ def _require_poses(path: Path) -> None:
         start = file.read(16)
     for signature, fault in _SIGNATURES.items():
         if start.startswith(signature):
-            raise DataError(f"trajectory {path} {fault.format(path=path)}")
+            raise DataError(f"trajectory {path} {fault.format(file=quoted(path), folder=quoted(path.parent))}")
     kind, is_mcap = kind_of(path), path.suffix.lower() == ".mcap"
     found = f"is {kind.name}" if kind else "has content of an unknown format" if start else "is empty"
     if is_mcap and not start.startswith(_MCAP):
