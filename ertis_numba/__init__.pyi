@@ -13,6 +13,7 @@ from .devices.setup import Setup as Setup
 from .errors import (
     ArgumentError as ArgumentError,
     CallMismatchWarning as CallMismatchWarning,
+    CoarseGridWarning as CoarseGridWarning,
     DamagedError as DamagedError,
     DataError as DataError,
     DeviceError as DeviceError,
@@ -25,6 +26,7 @@ from .errors import (
     LayoutMismatchWarning as LayoutMismatchWarning,
     LayoutUnitWarning as LayoutUnitWarning,
     NetworkError as NetworkError,
+    OutsideBandsWarning as OutsideBandsWarning,
     PoseWarning as PoseWarning,
     RefusedError as RefusedError,
     SettingsError as SettingsError,
