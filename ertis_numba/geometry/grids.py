@@ -81,6 +81,13 @@ def named_grid(processing: Processing) -> tuple[str, tuple[float, float], tuple[
     Parameters
     ----------
     processing : Processing
+
+    Examples
+    --------
+    >>> from ertis_numba.settings import Processing
+    >>> from ertis_numba.geometry import named_grid
+    >>> named_grid(Processing(directions="1850"))
+    ('3d', (-45.0, 45.0), (-45.0, 45.0))
     """
     name = processing.directions
     if not isinstance(name, str) or grid_count(name) is None:
