@@ -51,6 +51,13 @@ def test_points_are_joined_in_the_frame_of_the_platform():
     assert both.amplitude.tolist() == [1.0, 0.5, 1.0]
 
 
+def test_mountings_may_be_arrays_as_recordings_return_them():
+    place = (np.array([0.0, 0.5, 0.2]), np.array([0.0, 0.0, 0.0, 1.0]))
+    assert joined({"left": cloud("left", 3, place=place, n_points=1)}).position_m.tolist() == [
+        [1.0, 2.5, pytest.approx(3.2)]
+    ]
+
+
 def test_group_is_returned_once_all_expected_sensors_are_there():
     fused = FusedPoints()
     assert counts(fused.add(cloud("front", 0))) == [(0, 2)]  # Nobody else is known.

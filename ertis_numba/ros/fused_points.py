@@ -48,7 +48,7 @@ def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:
         np.full((len(cloud), 2), np.nan, np.float32) if cloud.uncertainty_m is None else cloud.uncertainty_m
         for cloud in each
     ]
-    origin_m = _origin_m(each[0].translation_m or (0.0, 0.0, 0.0))
+    origin_m = _origin_m((0.0, 0.0, 0.0) if each[0].translation_m is None else each[0].translation_m)
     position_m = np.concatenate([cloud.on_platform_m() for cloud in each]) - origin_m
     return each[0].replace(
         position_m=position_m.astype(np.float32),
