@@ -19,7 +19,16 @@ from ertis_numba.interop.time_expansion import true_rate_hz
 from ertis_numba.settings import Recording, Settings
 from ertis_numba.wav import Samples, read_wav
 
-__all__ = ["PcmFile", "first_stated_times", "inspect", "joined", "natural_order", "per_file", "require_alike"]
+__all__ = [
+    "PcmFile",
+    "PcmSamples",
+    "first_stated_times",
+    "inspect",
+    "joined",
+    "natural_order",
+    "per_file",
+    "require_alike",
+]
 
 _ACOULAR: Final = {".h5", ".hdf5", ".hdf"}
 _MIDDLE_OF_BYTES: Final = 128
