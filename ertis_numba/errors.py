@@ -21,8 +21,8 @@ Each class also inherits the built-in exception in brackets. Seven warnings, all
 ``ErrorBudgetWarning`` for images that may exceed their error budget, ``CallMismatchWarning`` for echoes that do not
 match the call, ``LayoutMismatchWarning`` for echoes that do not match the layout, ``LayoutUnitWarning`` for files of
 positions that state no unit, ``CoarseGridWarning`` for directions that miss sources between them,
-``OutsideBandsWarning`` for sound that the bands of acoustic maps leave out, and ``PoseWarning`` for poses that
-tilt a platform by more than 30°.
+``OutsideBandsWarning`` for sound that the bands of acoustic maps leave out, and ``PoseWarning`` for files of poses
+with doubtful rows, and poses that are hardly those of a platform.
 """
 
 __all__ = [
@@ -131,4 +131,4 @@ class OutsideBandsWarning(UserWarning):
 
 
 class PoseWarning(UserWarning):
-    """Most poses tilt a platform by more than 30°, as those of a camera do, so that its map may be wrong."""
+    """Poses are doubtful, such as those of a camera, so that a map may be wrong."""

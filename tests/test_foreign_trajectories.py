@@ -4,9 +4,14 @@ import re
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ertis_numba import read_trajectory
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.errors import ArgumentError, DataError, PoseWarning
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::ertis_numba.PoseWarning"
+)  # These tests examine notes, which say the same.
 
 TIME_NS = 1_700_000_000_123_456_789
 START = "1.0 0 0 0 0 0 0 1"
@@ -206,10 +211,14 @@ def test_poses_of_kitti_that_do_not_fit_are_refused(tmp_path, text, times, messa
         ),
         (
             "a.csv",
-            "timestamp,x,y,z,qx,qy,qz,qw\n1,1,2,3,0,0,0,1\n",
-            r"names the columns timestamp, x, y, z, qx, qy, qz, qw; they must be time_ns or time_s, x_m",
+            "id,x,y,z,qx,qy,qz,qw\n1,1,2,3,0,0,0,1\n",
+            r"columns id, x, y.*; they must be time_ns or time_s \(or",
         ),
-        ("a.csv", "t,x [mm],y [mm],z [mm],qx,qy,qz,qw\n1,1,2,3,0,0,0,1\n", r"names the columns t, x \[mm\]"),
+        (
+            "a.csv",
+            "t,x [mm],y [mm],z [mm],qx,qy,qz,qw\n1,1,2,3,0,0,0,1\n",
+            r"column 'x \[mm\]' is not in metres; convert the column, and name it x_m",
+        ),
         (
             "a.csv",
             "t,tx [mm],ty [mm],qx,qy,qz,qw\n1,1,2,0,0,0,1\n",
@@ -392,3 +401,85 @@ def test_frame_of_another_part_of_the_platform_is_noted(tmp_path):
     assert read.notes == (
         "poses are those of the frame 'lidar'; the mountings of sensors must be relative to this frame",
     )
+
+
+LEVEL = "time_s,x_m,y_m,z_m,{}\n1.0,0,0,0,{}\n1.1,1,0,0,{}\n"
+
+
+@pytest.mark.parametrize(
+    ("names", "cells", "angles_deg"),
+    [
+        ("yaw_deg", "90", (90.0, 0.0, 0.0)),
+        ("yaw_rad", "1.5707963267948966", (90.0, 0.0, 0.0)),
+        ("yaw [rad]", "-0.5", (-28.64788975654116, 0.0, 0.0)),
+        ("roll_deg,pitch_deg,yaw_deg", "10,-20,100", (100.0, -20.0, 10.0)),
+        ("yaw_rad,roll_rad", "0.5,0.1", (28.64788975654116, 0.0, 5.729577951308232)),
+        ("qw,qx,qy,qz,heading_deg", "0.8,0,0,0.6,7", (73.73979529168804, 0.0, 0.0)),
+    ],
+)
+def test_angles_of_tables_turn_about_fixed_axes_as_in_ros(tmp_path, names, cells, angles_deg):
+    read = read_trajectory(written(tmp_path, "a.csv", LEVEL.format(names, cells, cells)))
+    wanted = Rotation.from_euler("ZYX", angles_deg, degrees=True)
+    assert (Rotation.from_quat(read.rotation_xyzw) * wanted.inv()).magnitude() == pytest.approx(0, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        (LEVEL.format("yaw", "1", "1"), "of which yaw would not be read; give .* yaw_deg or yaw_rad"),
+        (LEVEL.format("yaw_deg,pitch", "1,40", "1,40"), "of which pitch would not be read"),
+        ("time_s,x_m,y_m,z_mm,yaw_deg\n1,0,0,400,0\n", "of which z_mm would not be read"),
+        ("time_s,x_m,y_m,altitude,yaw_deg\n1,0,0,400,0\n", "of which altitude would not be read"),
+        (LEVEL.format("yaw_rad", "0", "-90"), "yaw in radians reaches 90; if it is in degrees, name it yaw_deg"),
+        (LEVEL.replace("1.1", "1_1").format("yaw_deg", "0", "0"), "line 3: time '1_1' is not a number"),
+        (LEVEL.replace("1,0,0,{}\n", "1_0,0,0,{}\n").format("yaw_deg", "0", "0"), "line 3: '1_0' is not a number"),
+        (
+            LEVEL.replace("1.0", "nan").replace("1.1", "").format("yaw_deg", "0", "0"),
+            "there are no poses; 2 lines of 2",
+        ),
+        ("time,x,y,yaw_deg\n2023-02-30T00:00:00,0,0,0\n", "line 2: '2023-02-30T00:00:00' is no date; give dates as in"),
+        ("time,x,y,yaw_deg\n2023-02-20T00:00:00,0,0,0\n7,0,0,0\n", "line 3: '7' is no date"),
+    ],
+)
+def test_columns_that_would_be_ignored_and_cells_that_are_no_numbers_are_refused(tmp_path, text, match):
+    with pytest.raises(DataError, match=match):
+        read_trajectory(written(tmp_path, "a.csv", text))
+
+
+@pytest.mark.parametrize(
+    ("date", "time_ns", "has_note"),
+    [
+        ("2023-11-14T22:13:20Z", 1_700_000_000_000_000_000, False),
+        ("2023-11-14T22:13:20.123456789Z", 1_700_000_000_123_456_789, False),
+        ("2023-11-15 00:13:20.5+02:00", 1_700_000_000_500_000_000, False),
+        ("2023-11-14 22:13:20", 1_700_000_000_000_000_000, True),
+        ("1969-12-31T23:59:59.5Z", -500_000_000, False),
+    ],
+)
+def test_dates_are_times(tmp_path, date, time_ns, has_note):
+    read = read_trajectory(written(tmp_path, "a.csv", f"time,x,y,yaw_deg\n{date},1,2,0\n"))
+    assert (read.time_ns.tolist(), read.position_m.tolist()) == ([time_ns], [[1.0, 2.0, 0.0]])
+    [*zone, unit] = read.notes
+    assert unit == "columns of positions state no unit and are read as metres; name them x_m, y_m and z_m"
+    assert [each.startswith("dates without a time zone read as UTC") for each in zone] == [True] * has_note
+
+
+def test_rows_without_a_time_are_left_out(tmp_path):
+    text = rows(START, "nan nan nan nan nan nan nan nan", END)
+    read = read_trajectory(written(tmp_path, "a.tum", text))
+    assert (len(read), read.notes) == (2, ("1 line of 3 without a time (NaN) left out, the first is line 2",))
+
+
+@pytest.mark.parametrize("start_ns", [0, 4_321 * 10**9])
+def test_times_since_a_start_in_nanoseconds_are_doubtful(tmp_path, start_ns):
+    text = rows(*(f"{start_ns + 10**8 * number}.0 0 0 0 0 0 0 1" for number in range(20)))
+    [note] = read_trajectory(written(tmp_path, "a.tum", text)).notes
+    assert note.endswith("if they have another unit, choose it (time_unit, --time-unit)")
+    assert read_trajectory(tmp_path / "a.tum", time_unit="ns").time_ns[1] - start_ns == 10**8
+
+
+@pytest.mark.filterwarnings("default::ertis_numba.PoseWarning")
+def test_notes_are_warnings_as_well(tmp_path):
+    path = written(tmp_path, "a.tum", rows(START, START, END))
+    with pytest.warns(PoseWarning, match=r"a\.tum: 1 line left out"):
+        read_trajectory(path)

@@ -1,5 +1,6 @@
 """Options of commands that read the poses of a platform from a file."""
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +21,12 @@ def reading(command: "Callable[..., Any]") -> "Callable[..., Any]":
     for option in (
         click.option(
             "--pose-axes",
-            type=click.Choice(("platform", "camera", "camera-world")),
+            type=click.Choice(("platform", "camera", "camera-world", "ned")),
             default="platform",
             show_default=True,
             help="Axes of the poses. platform: x forward, z up. camera: z forward and y down, in a world with z up. "
-            "camera-world: as camera, and the world has the axes of the first camera.",
+            "camera-world: as camera, and the world has the axes of the first camera. ned: x forward, z down, in a "
+            "world of north, east and down.",
         ),
         click.option(
             "--times", type=click.Path(path_type=Path), metavar="FILE", help="Text file with the times of KITTI poses."
@@ -47,8 +49,10 @@ def reading(command: "Callable[..., Any]") -> "Callable[..., Any]":
 def trajectory_of(path: Path, *, quiet: bool, **chosen: Any) -> "Trajectory":
     """Return the trajectory in a file, and print its notes."""
     from ertis_numba import read_trajectory
+    from ertis_numba.errors import PoseWarning
 
-    found = read_trajectory(path, **chosen)
+    with warnings.catch_warnings(category=PoseWarning, action="ignore"):  # Notes say the same.
+        found = read_trajectory(path, **chosen)
     print_notes(path, found.notes, quiet=quiet)
     return found
 

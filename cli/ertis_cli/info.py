@@ -234,14 +234,14 @@ def _maps_of_sound(reader: "AcousticMapReader") -> dict[str, Any]:
 
 def _placement(reader: "_Reader") -> dict[str, Any]:
     """Return the mounting of the sensor, and a summary of the platform's poses."""
-    from ertis_numba.frames.platform_tilt import tilt_note
+    from ertis_numba.frames.pose_doubts import pose_doubts
 
     found: dict[str, Any] = {"mounting": "unknown"}
     if reader.translation_m is not None and reader.rotation_xyzw is not None:
         found = {"translation_m": reader.translation_m.tolist(), "rotation_xyzw": reader.rotation_xyzw.tolist()}
     if reader.trajectory is None:
         return found | {"poses": 0}
-    note = tilt_note(reader.trajectory.rotation_xyzw, reader.trajectory.position_m)
+    note = "; ".join(pose_doubts(reader.trajectory))
     return found | {
         "poses": len(reader.trajectory),
         "poses_source": reader.trajectory.source or "unknown",

@@ -170,7 +170,7 @@ def _trajectory(
     poses_file: Path | None, paths: "Sequence[Path]", *, quiet: bool, pose_axes: Any, **reading: Any
 ) -> "Trajectory":
     """Return the poses of a file, or else those of the recordings, and print notes on them."""
-    from ertis_numba.frames.platform_tilt import tilt_note
+    from ertis_numba.frames.pose_doubts import pose_doubts
     from ertis_numba.storage import platform_trajectory
 
     if poses_file is not None:
@@ -188,8 +188,7 @@ def _trajectory(
             click.get_current_context(),
         )
     found = found.converted(pose_axes)
-    note = tilt_note(found.rotation_xyzw, found.position_m)
-    found = found.replace(notes=(note,) if note else ())
+    found = found.replace(notes=pose_doubts(found))
     _poses.print_notes(paths[0], found.notes, quiet=quiet)
     return found
 

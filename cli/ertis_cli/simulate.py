@@ -1,5 +1,6 @@
 """``ertis simulate``: simulate a scene and write a recording."""
 
+import warnings
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -68,6 +69,7 @@ def simulate(
     position at which an image should show each reflector. Only effects that matter in the scene are simulated. Scene,
     seed, sensor and measurement index determine every bit.
     """
+    from ertis_numba.errors import PoseWarning
     from ertis_numba.simulation import load_scene
     from ertis_numba.storage import check_target, write_recording
 
@@ -104,15 +106,16 @@ def simulate(
                 quiet=quiet,
             )
         )
-        write_recording(
-            target,
-            shown,
-            overwrite=force,
-            source=path.name,
-            truth=logs,
-            mounting={simulator.sensor.name: _mounting(simulator) for simulator in simulators},
-            poses=_poses(scene),
-        )
+        with warnings.catch_warnings(category=PoseWarning, action="ignore"):  # The scene defines them.
+            write_recording(
+                target,
+                shown,
+                overwrite=force,
+                source=path.name,
+                truth=logs,
+                mounting={simulator.sensor.name: _mounting(simulator) for simulator in simulators},
+                poses=_poses(scene),
+            )
         n_reflectors = max(log.n_own_targets for log in logs.values())
     options.say(_summary(target, scene, n_sensors=len(names), n_reflectors=n_reflectors), quiet=quiet)
     if plan.left_out:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement, Stamp
-from ertis_numba.frames.platform_tilt import tilt_note
+from ertis_numba.frames.pose_doubts import pose_doubts
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.storage import RecordingReader
 
@@ -31,7 +31,7 @@ class Attitudes:
     Attributes
     ----------
     note : str or None
-        Note that most poses tilt the platform by more than 30°, if they do.
+        Notes on poses that are hardly those of a platform, such as those that tilt it.
 
     Raises
     ------
@@ -60,7 +60,7 @@ class Attitudes:
                 "import-poses', or leave out --level"
             )
         poses = recording.trajectory.at(times_ns)
-        self.note = tilt_note(poses.rotation_xyzw, poses.position_m)
+        self.note = "; ".join(pose_doubts(poses)) or None
         platform = Rotation.from_quat(poses.rotation_xyzw)
         self._attitudes = dict(zip(times_ns.tolist(), (platform * Rotation.from_quat(place)).as_quat(), strict=True))
 

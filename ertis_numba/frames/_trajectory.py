@@ -13,7 +13,7 @@ from ertis_numba.frames.platform_tilt import turned_axes
 
 __all__ = ["PoseAxes", "Trajectory"]
 
-PoseAxes: TypeAlias = Literal["platform", "camera", "camera-world"]
+PoseAxes: TypeAlias = Literal["platform", "camera", "camera-world", "ned"]
 """Axes of the frame to which poses belong."""
 
 _NS_PER_S: Final = 1e9
@@ -153,10 +153,11 @@ class Trajectory:
 
         Parameters
         ----------
-        pose_axes : {"platform", "camera", "camera-world"}
+        pose_axes : {"platform", "camera", "camera-world", "ned"}
             Axes of this trajectory. "platform": x forward, y left, z up, which changes nothing. "camera": z forward, x
             right, y down, in a world whose z axis is up. "camera-world": the world has the axes of a camera as well, as
-            in KITTI and in visual odometry whose world is its first camera.
+            in KITTI and in visual odometry whose world is its first camera. "ned": x forward, y right, z down, in a
+            world of north, east and down, as on aircraft and vessels; the result has x north, y west, z up.
 
         Returns
         -------

@@ -11,7 +11,12 @@ Floats = NDArray[np.float64]
 
 _FROM_PLATFORM_XYZW: Final = (0.5, -0.5, 0.5, 0.5)
 """Rotation from the axes of a platform, x forward and z up, to those of a camera, z forward and y down."""
-_UPRIGHT: Final = float(np.cos(np.radians(30.0)))
+_HALF_TURN_XYZW: Final = (1.0, 0.0, 0.0, 0.0)
+"""Rotation from the axes of a platform to x forward, y right, z down."""
+_MOST_DEG: Final = 30.0
+_UPRIGHT: Final = float(np.cos(np.radians(_MOST_DEG)))
+_LEVEL: Final = float(np.cos(np.radians(3.0)))
+_TURN_DEG: Final = 20.0  # Change of tilt that is no ramp.
 _AXIS: Final = 0.6  # Mean vertical share of an axis that points up or down.
 _STEEP: Final = float(np.tan(np.radians(30.0)))
 _SHORT_M: Final = 0.5  # Path whose slope says nothing.
@@ -19,7 +24,10 @@ _USE: Final = "use --pose-axes {0} of 'ertis import-poses' or 'ertis map' (in Py
 
 
 def tilt_note(rotation_xyzw: Floats, position_m: Floats) -> str | None:
-    """Return a note if most poses tilt the platform by more than 30°, or if the path is steeper than 30°.
+    """Return a note if poses tilt the platform as those of other frames or orders do.
+
+    Most poses tilt it by more than 30°, the path is steeper than 30°, it turns about its x or y axis only, or it is
+    level in the order w, x, y, z only.
 
     Poses of a camera, with z forward and y down, lay the platform on its side. If the world has the axes of a camera as
     well, the platform seems to climb.
@@ -35,9 +43,11 @@ def tilt_note(rotation_xyzw: Floats, position_m: Floats) -> str | None:
     str or None
     """
     up = _vertical_shares(rotation_xyzw)
+    if (note := _order_note(rotation_xyzw, up)) is not None:
+        return note
     is_tilted = up[:, 2] < _UPRIGHT
     if 2 * np.count_nonzero(is_tilted) > len(is_tilted):
-        tilt_deg = float(np.degrees(np.median(np.arccos(np.clip(up[:, 2], -1.0, 1.0)))))
+        tilt_deg = float(np.median(_degrees(up[:, 2])))
         along_y = 1 - 2 * (rotation_xyzw[:, 0] ** 2 + rotation_xyzw[:, 2] ** 2)  # of the y axes of platform and world
         return (
             f"most poses tilt the platform by more than 30°: its z axis is {tilt_deg:.0f}° from vertical"
@@ -49,7 +59,7 @@ def tilt_note(rotation_xyzw: Floats, position_m: Floats) -> str | None:
             f"the path is {spread_m[2]:.3g} m high and {np.hypot(*spread_m[:2]):.3g} m long on the ground; if the z "
             f"axis of the world does not point up, as with many cameras, {_USE.format('camera-world')}"
         )
-    return None
+    return _other_axis_note(rotation_xyzw, up)
 
 
 def turned_axes(rotation_xyzw: Floats, axes: str) -> tuple[Floats, Floats]:
@@ -58,7 +68,7 @@ def turned_axes(rotation_xyzw: Floats, axes: str) -> tuple[Floats, Floats]:
     Parameters
     ----------
     rotation_xyzw : (pose, 4) float64
-    axes : {"platform", "camera", "camera-world"}
+    axes : {"platform", "camera", "camera-world", "ned"}
 
     Returns
     -------
@@ -69,12 +79,48 @@ def turned_axes(rotation_xyzw: Floats, axes: str) -> tuple[Floats, Floats]:
 
     if axes == "platform":
         return rotation_xyzw, np.eye(3)
+    turned = Rotation.from_quat(rotation_xyzw)
+    if axes == "ned":
+        over = Rotation.from_quat(_HALF_TURN_XYZW)
+        return (over * turned * over).as_quat(), over.as_matrix()
     from_platform = Rotation.from_quat(_FROM_PLATFORM_XYZW)
-    turned = Rotation.from_quat(rotation_xyzw) * from_platform
+    turned = turned * from_platform
     if axes == "camera":
         return turned.as_quat(), np.eye(3)
     to_platform = from_platform.inv()
     return (to_platform * turned).as_quat(), to_platform.as_matrix()
+
+
+def _order_note(rotation_xyzw: Floats, up: Floats) -> str | None:
+    """Return a note if the platform is level with quaternions in the order w, x, y, z, but tilted in the usual one."""
+    tilts_deg = _degrees(up[:, 2])
+    is_tilted = np.median(tilts_deg) > _MOST_DEG or np.ptp(tilts_deg) > _TURN_DEG
+    if not is_tilted or _vertical_shares(np.roll(rotation_xyzw, -1, axis=1))[:, 2].min() < _LEVEL:
+        return None
+    return (
+        f"quaternions in the order x, y, z, w tilt the platform by up to {tilts_deg.max():.0f}°, but it is level if "
+        "their order is w, x, y, z; then name the columns in a first line, as in 'timestamp tx ty tz qw qx qy qz' "
+        "(np.roll(q, -1, axis=1) in Python)"
+    )
+
+
+def _other_axis_note(rotation_xyzw: Floats, up: Floats) -> str | None:
+    """Return a note if the platform turns about its x or y axis only, as where another axis than z is up."""
+    tilts_deg = _degrees(up[:, 2])
+    along = 1 - 2 * (np.sum(rotation_xyzw[:, :3] ** 2, axis=1)[:, None] - rotation_xyzw[:, :2] ** 2)
+    axis = int(np.argmax(along.min(axis=0)))
+    if np.ptp(tilts_deg) < _TURN_DEG or along[:, axis].min() < _LEVEL:
+        return None
+    name = "xy"[axis]
+    return (
+        f"the platform turns about its {name} axis only, by up to {np.ptp(tilts_deg):.0f}°, as if {name} were up or "
+        "down; poses of the platform have x forward, y left and z up, so correct them, or ignore this if the platform "
+        "really moves so"
+    )
+
+
+def _degrees(shares: Floats) -> Floats:
+    return np.asarray(np.degrees(np.arccos(np.clip(shares, -1.0, 1.0))))
 
 
 def _vertical_shares(rotation_xyzw: Floats) -> Floats:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import PoseAxes, Trajectory
-from ertis_numba.frames.platform_tilt import tilt_note
+from ertis_numba.frames.pose_doubts import pose_doubts
 
 __all__ = ["PoseRows", "trajectory_of"]
 
@@ -81,7 +81,7 @@ def trajectory_of(rows: PoseRows, pose_axes: PoseAxes = "platform") -> Trajector
     Parameters
     ----------
     rows : PoseRows
-    pose_axes : {"platform", "camera", "camera-world"}
+    pose_axes : {"platform", "camera", "camera-world", "ned"}
         Axes of the rows.
 
     Raises
@@ -100,8 +100,7 @@ def trajectory_of(rows: PoseRows, pose_axes: PoseAxes = "platform") -> Trajector
     except ArgumentError as error:
         raise DataError(str(error)) from error
     made = made.converted(pose_axes)
-    found = (_gap_note(rows), tilt_note(made.rotation_xyzw, made.position_m))
-    return made.replace(notes=(*rows.notes, *filter(None, found)))
+    return made.replace(notes=(*rows.notes, *filter(None, [_gap_note(rows)]), *pose_doubts(made)))
 
 
 def _gap_note(rows: PoseRows) -> str | None:

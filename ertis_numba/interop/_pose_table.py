@@ -22,11 +22,21 @@ TUM: Final = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 """Columns of a text file of TUM."""
 _N_KITTI: Final = 12
 _DIGITS_OF_NS: Final = 17
-_COLUMNS: Final = "time_ns or time_s, x_m, y_m, z_m (optional), and either qx, qy, qz, qw or yaw_deg"
+_COLUMNS: Final = (
+    "time_ns or time_s (or dates as time), x_m, y_m, z_m (optional), and either qx, qy, qz, qw or yaw_deg or yaw_rad, "
+    "with roll and pitch likewise (optional)"
+)
 _TIME: Final = re.compile(r"(?:time|timestamp|stamp|t)(?:_(s|ms|us|ns))?")
 _POSITION: Final = re.compile(r"(?:([xyz])_m|t([xyz])|p_([xyz])|p_rs_r_([xyz]))")
 _IN_METRES: Final = re.compile(r"(?:p|pos|position|t)?_?([xyz])")
 _ROTATION: Final = re.compile(r"(?:q|q_|q_rs_|quat_|rot_|rotation_|orientation_)([xyzw])")
+_BARE: Final = "columns of positions state no unit and are read as metres; name them x_m, y_m and z_m"
+_ANGLE: Final = re.compile(r"(roll|pitch|yaw)(?:_(deg|rad))?")
+_DEGREES: Final = {"deg": 1.0, "°": 1.0, "degrees": 1.0, "rad": 180 / math.pi, "radians": 180 / math.pi}
+_PLACES: Final = re.compile(r"[xyz]_|alt|height", re.IGNORECASE)
+_UNREAD: Final = re.compile(r"[xyz]_[mcd]m|(?:alt|altitude|height)(?:_m)?|(?:roll|pitch|yaw|heading|theta)(?:_\w+)?")
+"""Names that change poses, if they are not read otherwise."""
+_MANY_TURNS_RAD: Final = 50.0
 _NAMED: Final = re.compile(r"([^\[(]+?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?")  # name [unit]
 _SPACED_UNIT: Final = re.compile(r"\s+(?=[\[(])")
 _UNKNOWN: Final = ("", "null", "none", "na", "n/a", "nan(ind)", "-nan(ind)")
@@ -40,16 +50,19 @@ class _Columns(NamedTuple):
     unit: str | None
     axes: dict[str, int]
     quaternion: dict[str, int]
-    yaw_deg: int | None
+    angles: dict[str, tuple[int, float]]
+    """Places of roll, pitch and yaw, and the degrees in their unit."""
     n_fields: int
+    is_bare: bool = False
+    """Whether positions have names without a unit."""
 
     @property
     def is_complete(self) -> bool:
-        has_rotation = len(self.quaternion) == len("xyzw") or (self.yaw_deg is not None and not self.quaternion)
+        has_rotation = len(self.quaternion) == len("xyzw") or ("yaw" in self.angles and not self.quaternion)
         return self.time >= 0 and {*"xy"} <= self.axes.keys() and has_rotation
 
 
-_ORDER_OF_TUM: Final = _Columns(0, None, {"x": 1, "y": 2, "z": 3}, {"x": 4, "y": 5, "z": 6, "w": 7}, None, len(TUM))
+_ORDER_OF_TUM: Final = _Columns(0, None, {"x": 1, "y": 2, "z": 3}, {"x": 4, "y": 5, "z": 6, "w": 7}, {}, len(TUM))
 
 
 def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: str | None = None) -> PoseRows:
@@ -95,11 +108,27 @@ def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: s
             f"the file states that its times are in {columns.unit}, but time_unit is {time_unit}; remove time_unit "
             "(--time-unit)"
         )
+    rows, unknown = _with_times(rows, columns.time)
     time_ns, notes = times_of([(number, row[columns.time]) for number, row in rows], columns.unit or time_unit)
     position_m = np.zeros((len(rows), 3))
     for axis, place in columns.axes.items():
         position_m[:, "xyz".index(axis)] = _numbers(rows, place)
+    notes = (*unknown, *notes, *[_BARE] * (needs_header and columns.is_bare))
     return PoseRows("line", _line_numbers(rows), time_ns, position_m, _rotations(rows, columns), None, notes)
+
+
+def _with_times(rows: list[Row], place: int) -> tuple[list[Row], tuple[str, ...]]:
+    """Return the rows with a time, and a note on the others, which are empty or NaN."""
+    kept = [(number, cells) for number, cells in rows if cells[place].lower() not in (*_UNKNOWN, "nan", "-nan")]
+    if len(kept) == len(rows):
+        return rows, ()
+    numbers = {number for number, _ in kept}
+    first = next(number for number, _ in rows if number not in numbers)
+    n_left = len(rows) - len(kept)
+    note = f"{n_left} line{'s' * (n_left != 1)} of {len(rows)} without a time (NaN) left out, the first is line {first}"
+    if not kept:
+        raise DataError(f"there are no poses; {note}; give at least one")
+    return kept, (note,)
 
 
 def _header(text: str, *, needs_header: bool) -> tuple[_Columns | None, list[Row]]:
@@ -112,7 +141,7 @@ def _header(text: str, *, needs_header: bool) -> tuple[_Columns | None, list[Row
             names = _names(line.strip().lstrip("#%/").strip())
             is_stated = bool(content) and (needs_header or not any(map(_is_number, names)))
             _require_no_sensor(names)
-            found = _columns(names, is_stated=is_stated, in_metres=not needs_header)
+            found = _columns(names, is_stated=is_stated)
             _require_rotations(number, found, names)
             if is_stated and not found.is_complete:
                 raise DataError(f"the first line names the columns {', '.join(names)}; they must be {_COLUMNS}")
@@ -138,12 +167,11 @@ def _names(line: str) -> list[str]:
     return _cells(line if {*",;"} & {*line} else _SPACED_UNIT.sub("", line))
 
 
-def _columns(names: Sequence[str], *, is_stated: bool, in_metres: bool) -> _Columns:
-    """Return the places of known columns; refuse ambiguous ones if they are stated to be a header.
-
-    With ``in_metres``, positions without a unit are in metres, as in TUM.
-    """
-    time, unit, yaw = -1, None, None
+def _columns(names: Sequence[str], *, is_stated: bool) -> _Columns:
+    """Return the places of known columns; refuse ambiguous ones if they are stated to be a header."""
+    time, unit, is_bare = -1, None, False
+    angles: dict[str, tuple[int, float]] = {}
+    unread: list[str] = []
     axes: dict[str, int] = {}
     quaternion: dict[str, int] = {}
     repeated: list[str] = []
@@ -155,33 +183,41 @@ def _columns(names: Sequence[str], *, is_stated: bool, in_metres: bool) -> _Colu
             repeated += [full] * (time >= 0)
             time, unit = place, found[1] or (bracket if bracket in {"s", "ms", "us", "ns"} else None)
         elif found := _POSITION.fullmatch(name) or _IN_METRES.fullmatch(name):
-            if bracket != "m" and not in_metres and not _POSITION.fullmatch(name):
-                continue  # Its unit is unknown.
             if bracket not in {"", "m"}:
                 raise DataError(f"column {full!r} is not in metres; convert the column, and name it {name[-1]}_m")
+            is_bare |= bracket != "m" and found.re is _IN_METRES
             axis = next(filter(None, found.groups()))
             repeated += [full] * (axis in axes)
             axes[axis] = place
         elif found := _ROTATION.fullmatch(name):
             repeated += [full] * (found[1] in quaternion)
             quaternion[found[1]] = place
-        elif name == "yaw_deg":
-            repeated += [full] * (yaw is not None)
-            yaw = place
+        elif (found := _ANGLE.fullmatch(name)) and (found[2] or bracket) in _DEGREES:
+            repeated += [full] * (found[1] in angles)
+            angles[found[1]] = place, _DEGREES[found[2] or bracket]
+        elif _UNREAD.fullmatch(name):
+            unread.append(full)
+    is_known = {True: "z" in axes, False: len(quaternion) == len("xyzw")}
+    unread = [each for each in unread if not is_known[_PLACES.match(each) is not None]]
+    if unread and is_stated and axes:
+        raise DataError(
+            f"the first line names the columns {', '.join(names)}, of which {', '.join(unread)} would not be read; "
+            f"give {_COLUMNS}, and remove or rename other columns"
+        )
     if repeated and is_stated:
         raise DataError(
             f"the first line names {', '.join(names)}, but each column must occur once, and only one may be a time; "
             "rename or remove columns"
         )
-    return _Columns(-1 if repeated else time, unit, axes, quaternion, yaw, len(names))
+    return _Columns(-1 if repeated else time, unit, axes, quaternion, angles, len(names), is_bare)
 
 
 def _require_rotations(number: int, columns: _Columns, names: Sequence[str]) -> None:
     """Refuse a header with times and positions, but without rotations."""
-    if columns.time >= 0 and {*"xy"} <= columns.axes.keys() and not columns.quaternion and columns.yaw_deg is None:
+    if columns.time >= 0 and {*"xy"} <= columns.axes.keys() and not columns.quaternion and "yaw" not in columns.angles:
         raise DataError(
-            f"line {number} names the columns {', '.join(names)}, but none contains a rotation; add qx, qy, qz, qw or "
-            "yaw_deg"
+            f"line {number} names the columns {', '.join(names)}, but none contains a rotation; add qx, qy, qz, qw, "
+            "yaw_deg or yaw_rad"
         )
 
 
@@ -248,11 +284,37 @@ def _lines(text: str) -> Iterator[Row]:
 
 
 def _rotations(rows: list[Row], columns: _Columns) -> Floats:
-    if columns.yaw_deg is None:
+    if columns.quaternion:
         return np.stack([_numbers(rows, columns.quaternion[axis]) for axis in "xyzw"], axis=1)
-    half_rad = np.radians(_numbers(rows, columns.yaw_deg)) / 2
-    level = np.zeros(len(half_rad))
-    return np.stack([level, level, np.sin(half_rad), np.cos(half_rad)], axis=1)
+    x, y, z = (_half_turns(rows, columns, name) for name in ("roll", "pitch", "yaw"))
+    return np.stack(  # Fixed axes, as in ROS: first roll about x, then pitch about y, then yaw about z.
+        [
+            x.imag * y.real * z.real - x.real * y.imag * z.imag,
+            x.real * y.imag * z.real + x.imag * y.real * z.imag,
+            x.real * y.real * z.imag - x.imag * y.imag * z.real,
+            x.real * y.real * z.real + x.imag * y.imag * z.imag,
+        ],
+        axis=1,
+    )
+
+
+def _half_turns(rows: list[Row], columns: _Columns, name: str) -> NDArray[np.complex128]:
+    """Return the cosines and sines of half an angle, as complex numbers; an angle without a column is 0.
+
+    Raises
+    ------
+    DataError
+        Angles in radians are so large that they are degrees.
+    """
+    if name not in columns.angles:
+        return np.ones(len(rows), np.complex128)
+    place, degrees = columns.angles[name]
+    numbers = _numbers(rows, place)
+    if degrees > 1 and np.nanmax(np.abs(numbers), initial=0.0) > _MANY_TURNS_RAD:
+        raise DataError(
+            f"{name} in radians reaches {np.nanmax(np.abs(numbers)):g}; if it is in degrees, name it {name}_deg"
+        )
+    return np.exp(0.5j * np.radians(degrees * numbers))
 
 
 def _numbers(rows: list[Row], place: int) -> Floats:
@@ -260,7 +322,7 @@ def _numbers(rows: list[Row], place: int) -> Floats:
     found = []
     for number, cells in rows:
         try:
-            found.append(math.nan if cells[place].lower() in _UNKNOWN else float(cells[place]))
+            found.append(math.nan if cells[place].lower() in _UNKNOWN else _number(cells[place]))
         except ValueError as error:
             raise DataError(f"line {number}: {error}; use decimal numbers") from None
     return np.array(found, np.float64)
@@ -270,9 +332,15 @@ def _line_numbers(rows: list[Row]) -> NDArray[np.int64]:
     return np.array([number for number, _ in rows], np.int64)
 
 
+def _number(cell: str) -> float:
+    if "_" in cell:
+        raise ValueError(f"{cell!r} is not a number")
+    return float(cell)
+
+
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        _number(cell)
     except ValueError:
         return False
     return True

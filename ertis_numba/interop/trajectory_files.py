@@ -1,5 +1,6 @@
 """Trajectories in text files of TUM, tables, poses of KITTI, and messages in MCAP."""
 
+import warnings
 from collections.abc import Iterable
 from decimal import Decimal
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Final
 
 from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.errors import ArgumentError, DataError, PoseWarning
 from ertis_numba.file_kinds import kind_of, quoted
 from ertis_numba.frames import PoseAxes, Trajectory
 from ertis_numba.interop._pose_messages import read_messages
@@ -59,14 +60,20 @@ def read_trajectory(
         and otherwise seconds.
     times : str or Path, optional
         Text file with one time per line, for poses of KITTI.
-    pose_axes : {"platform", "camera", "camera-world"}
+    pose_axes : {"platform", "camera", "camera-world", "ned"}
         Axes of the poses, as for `Trajectory.converted`.
 
     Returns
     -------
     Trajectory
         Its source is "file". Its ``notes`` state rows without numbers, several rows for one time, quaternions that were
-        scaled by more than rounding, doubtful units of time, and poses that tilt the platform by more than 30°.
+        scaled by more than rounding, doubtful units of time, and poses that are hardly those of a platform: they tilt
+        it, are mirrored or in other units, leap, or are relative to the centre of the Earth.
+
+    Warns
+    -----
+    PoseWarning
+        For each note.
 
     Raises
     ------
@@ -104,9 +111,12 @@ def read_trajectory(
             if is_mcap
             else read_table(text, needs_header=path.suffix.lower() == ".csv", time_unit=time_unit, times=stamps)
         )
-        return trajectory_of(rows, pose_axes)
+        found = trajectory_of(rows, pose_axes)
     except (ArgumentError, DataError) as error:
         raise type(error)(f"{path}: {error}") from error
+    for note in found.notes:
+        warnings.warn(f"{path}: {note}", PoseWarning, stacklevel=2)
+    return found
 
 
 def _require_poses(path: Path) -> None:

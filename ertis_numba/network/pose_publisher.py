@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, NetworkError, RefusedError
 from ertis_numba.frames import Trajectory
+from ertis_numba.frames.pose_doubts import PoseWatch
 from ertis_numba.network import addresses, messages
 from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys
@@ -74,6 +75,7 @@ class PosePublisher:
         if not 1 <= len(source) <= _MAX_SOURCE:
             raise ArgumentError(f"source has {len(source)} characters; give 1 to {_MAX_SOURCE}")
         self._source, self._session_id = source, secrets.randbits(62)
+        self._watch = PoseWatch()
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         self._connection: Connection | None = None
         self._waiting: collections.deque[bytes] = collections.deque()
@@ -125,6 +127,11 @@ class PosePublisher:
         bool
             False if a waiting pose was discarded, because there is no connection.
 
+        Warns
+        -----
+        PoseWarning
+            Most poses tilt the platform by more than 30°; once per publisher.
+
         Raises
         ------
         ArgumentError
@@ -140,6 +147,7 @@ class PosePublisher:
         place: Any = [position_m]
         turn: Any = [rotation_xyzw]
         pose = Trajectory(np.array([timestamp_ns]), place, turn, known, self._source)  # It converts and checks them.
+        self._watch(pose.position_m[0], pose.rotation_xyzw[0], stacklevel=2)
         connection = self._opened()
         message = PlatformPose(
             sensors=self._sensors,

@@ -3,7 +3,6 @@
 import filecmp
 import os
 import shutil
-import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -14,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ertis_numba.atomic_files import atomic_write, check_target, reason, remedy, require_free_space
-from ertis_numba.errors import ArgumentError, DataError, ErtisError, PoseWarning
+from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Trajectory
-from ertis_numba.frames.platform_tilt import tilt_note
+from ertis_numba.frames.pose_doubts import warn_of_poses
 from ertis_numba.storage._poses import MAX_GAP_S, checked_poses, remove_poses, require_times, write_poses
 from ertis_numba.storage._reader import file_kind, sensor_names
 from ertis_numba.storage.acoustic_maps import AcousticMapReader, open_acoustic_maps
@@ -89,7 +88,7 @@ def add_poses(
     Warns
     -----
     PoseWarning
-        Most poses tilt the platform by more than 30°, or the path is steeper than 30°.
+        The poses are hardly those of a platform: they tilt it, are mirrored or in other units, or are in ECEF.
 
     Examples
     --------
@@ -109,9 +108,7 @@ def add_poses(
     if not isinstance(trajectory, Trajectory):
         raise ArgumentError(f"trajectory is of type {type(trajectory).__name__}; give a Trajectory")
     checked_poses(trajectory)
-    note = tilt_note(trajectory.rotation_xyzw, trajectory.position_m)
-    if note is not None:
-        warnings.warn(note, PoseWarning, stacklevel=2)
+    warn_of_poses(trajectory, stacklevel=2)
     target = source if output is None else Path(output)
     if output is None:
         check_target(source, overwrite=True)

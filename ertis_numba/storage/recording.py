@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.frames import Measurement, SequenceGap, Trajectory
+from ertis_numba.frames.pose_doubts import warn_of_poses
 from ertis_numba.geometry import Layout, microphones, mounting as mounted, self_contained, storable
 from ertis_numba.sample_format import SampleFormat, sample_format
 from ertis_numba.settings import Air, Settings
@@ -85,6 +86,11 @@ class RecordingWriter(FileWriter[Measurement]):
     poses : Trajectory, or mapping of str to Trajectory, optional
         Trajectory of the platform, or of each sensor's platform, by name of the sensor. The recording stores the pose
         at each measurement, which the trajectory must cover unless it has a `max_gap_s`. Unknown by default.
+
+    Warns
+    -----
+    PoseWarning
+        Poses are hardly those of a platform, as for `add_poses`.
     """
 
     _kind: ClassVar[str] = "recording"
@@ -113,6 +119,13 @@ class RecordingWriter(FileWriter[Measurement]):
         self._firmware = firmware or {}
         self._noted: dict[str, list[SequenceGap]] = {}
         self._poses = checked_poses(poses)
+        self._warn_of_poses()
+
+    def _warn_of_poses(self) -> None:
+        several = self._poses.values() if isinstance(self._poses, Mapping) else [self._poses]
+        for each in several:
+            if each is not None:
+                warn_of_poses(each, stacklevel=3)
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, session_id: int = 0) -> None:
         """Store why sequence numbers are missing, ``first`` and ``last`` included; in any order, at any time.

@@ -207,6 +207,9 @@ class _SealingWriter(RecordingWriter):
     def _require_samples(self, item: Measurement) -> None:
         """Accept all samples: the journal has checked their type; non-finite numbers must not prevent sealing."""
 
+    def _warn_of_poses(self) -> None:
+        """Leave warnings to the programs that send poses."""
+
     def _require_sensors(self, name: str, given: Iterable[str]) -> None:
         """Accept data of sensors without measurements: the history mentions them."""
 
