@@ -137,7 +137,7 @@ def test_import_poses_reads_tables_and_refuses_other_topics(recording, tmp_path)
     first_ns, last_ns = TIMES_NS[0] - SECOND_NS, TIMES_NS[-1] + SECOND_NS
     table.write_text(f"time_ns,x_m,y_m,yaw_deg\n{first_ns},0,0,0\n{last_ns},2.1,0,0\n")
     done = run("import-poses", recording, table, "--topic", "/odom", code=1)
-    assert "--topic is '/odom', but" in done.stderr
+    assert "topic (--topic) is for .mcap files, but" in done.stderr
     run("import-poses", recording, table)
     with open_recording(recording, sensor="left") as posed:
         np.testing.assert_allclose(posed.trajectory.position_m[:, 0], [1.0, 1.05, 1.1], rtol=0, atol=1e-9)
