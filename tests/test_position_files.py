@@ -268,6 +268,11 @@ REFUSED = {
         b"positions_mm = [[0, 0], [1.2, 0]]",
         r"span 1\.2 mm, .*rename the key of the positions to positions",
     ),
+    "metres of a large array": (
+        "a.toml",
+        b"positions_mm = [[1.2, 0], [0.85, 0.85], [0, 1.2], [-1.2, 0]]",
+        r"only 0\.919 mm apart; .*rename the key of the positions to positions.*do the same with \"mm\"",
+    ),
     "no unit": (
         "a.toml",
         b"positions = [[0, 0], [1.2, 0]]",

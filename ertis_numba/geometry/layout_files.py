@@ -192,8 +192,10 @@ def parse_layout(path: str, text: str) -> ReadLayout:
     for channel in file.disabled:
         enabled[checks.integer(f"{source}: a disabled channel", channel, 0, len(rows) - 1)] = False
     checks.finite_array(f"{source}: {key}", np.where(enabled[:, None], positions_m, 0.0))
-    named = file if file.name else file.replace(name=path)
-    return ReadLayout(_checked(source, positions_m, enabled, named), _lying(source, positions_m[enabled]))
+    array = _checked(source, positions_m, enabled, file if file.name else file.replace(name=path))
+    if file.positions is None:
+        _require_room(source, positions_m[enabled])
+    return ReadLayout(array, _lying(source, positions_m[enabled]))
 
 
 def _checked(source: str, positions_m: NDArray[np.float64], enabled: NDArray[np.bool_], file: LayoutFile) -> Array:
@@ -256,11 +258,25 @@ def _require_clear_unit(source: str, positions: NDArray[np.float64]) -> None:
     if not 1 < len(positions) <= MAX_MICROPHONES:
         return
     span = float(np.ptp(positions, axis=0).max())
-    apart = np.linalg.norm(positions[:, None] - positions, axis=2)
-    spacing_m = LENGTH_UNITS_M[_DEFAULT_UNIT] * float(apart[apart > 0].min(initial=np.inf))
+    spacing_m = LENGTH_UNITS_M[_DEFAULT_UNIT] * _spacing(positions)
     span_m = LENGTH_UNITS_M[_DEFAULT_UNIT] * span
     if 0 < span_m < _LIKELY_SPAN_M or (spacing_m < _MIN_SPACING_M and span <= MAX_SPAN_M):
         raise ArgumentError(unclear_unit(source, span))
+
+
+def _require_room(source: str, positions_m: NDArray[np.float64]) -> None:
+    """Refuse ``positions_mm`` of microphones that would overlap, as metres in this key do."""
+    if 1 < len(positions_m) <= MAX_MICROPHONES and (spacing_m := _spacing(positions_m)) < _MIN_SPACING_M:
+        raise ArgumentError(
+            f"{source}: two microphones are only {_length(spacing_m)} apart; if positions_mm are not in millimetres, "
+            f'{_remedy(source)}; if they are, do the same with "mm"'
+        )
+
+
+def _spacing(positions: NDArray[np.float64]) -> float:
+    """Return the smallest distance between microphones in different places; infinite if there is none."""
+    apart = np.linalg.norm(positions[:, None] - positions, axis=2)
+    return float(apart[apart > 0].min(initial=np.inf))
 
 
 def unclear_unit(source: str, span: float, reason: str = "") -> str:
