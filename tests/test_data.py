@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ertis_bench.furnished_rooms import hall
+from ertis_bench.platform_trials.furnished_rooms import hall
 from numpy.testing import assert_allclose, assert_array_equal
 
 from ertis_numba.air import sound_speed_m_s

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import scipy.stats
-from ertis_bench.furnished_rooms import PlatformImager, mountings, random_motion, random_room
+from ertis_bench.platform_trials.furnished_rooms import PlatformImager, mountings, random_motion, random_room
 
 import ertis_numba as ertis
 from ertis_numba.air import sound_speed_m_s

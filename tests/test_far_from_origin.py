@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import plyfile
 import pytest
-from ertis_bench.furnished_rooms import mountings
+from ertis_bench.platform_trials.furnished_rooms import mountings
 from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis

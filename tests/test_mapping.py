@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ertis_bench import mapping
-from ertis_bench.furnished_rooms import Motion, PlatformImager, mountings
+from ertis_bench.platform_trials import mapping
+from ertis_bench.platform_trials.furnished_rooms import Motion, PlatformImager, mountings
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 

@@ -13,7 +13,7 @@ from ertis_cli import _examples
 from ertis_cli.main import cli
 
 ROOT = Path(__file__).parents[1]
-IN_THE_REPOSITORY_ONLY = {f"ertis_bench.{name}" for name in ("health_trials", "passive", "peers")}
+IN_THE_REPOSITORY_ONLY = {f"ertis_bench.{name}" for name in ("health_trials", "passive", "peers", "platform_trials")}
 
 
 def test_every_package_is_listed():
@@ -61,10 +61,10 @@ def test_wheel_contains_every_example(wheel):
     assert {path.name for path in (ROOT / "ertis_numba" / "layouts").glob("*.toml")} <= layouts
 
 
-@pytest.mark.parametrize("name", ["health", "passive", "peers"])
+@pytest.mark.parametrize("name", ["fusion", "health", "map", "motion", "passive", "peers"])
 def test_benchmark_that_the_wheel_lacks_names_the_source_folder(monkeypatch, name):
-    for package in IN_THE_REPOSITORY_ONLY:
-        monkeypatch.setitem(sys.modules, package, None)
+    for module in [*IN_THE_REPOSITORY_ONLY, *(each for each in sys.modules if "platform_trials." in each)]:
+        monkeypatch.setitem(sys.modules, module, None)
     done = CliRunner().invoke(cli, ["bench", name])
     assert done.exit_code == 1
     assert (

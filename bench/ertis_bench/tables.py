@@ -10,12 +10,9 @@ from ertis_bench.budgets import form as budgets
 from ertis_bench.calibration import form as calibration
 from ertis_bench.campaign_scaling import many
 from ertis_bench.delay_interpolation import form as interpolation
-from ertis_bench.fusion import form as fusion
 from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.machine import sentence
-from ertis_bench.mapping import form as mapping
 from ertis_bench.markdown import table as _table
-from ertis_bench.motion import form as motion
 from ertis_bench.network.latency import latency
 from ertis_bench.network.table import network
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RESTRICTED
@@ -30,13 +27,10 @@ __all__ = [
     "accuracy_front",
     "calibration",
     "factorisation",
-    "fusion",
     "gpu",
     "gpu_short",
     "latency",
     "many",
-    "mapping",
-    "motion",
     "network",
     "paper",
     "points",
@@ -304,8 +298,5 @@ FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "budgets": {"budgets": budgets},
     "points": {"points": points},
     "calibration": {"calibration": calibration},
-    "fusion": {"fusion": fusion},
-    "motion": {"motion": motion},
-    "map": {"map": mapping},
 }
 """Forms of the table of each command, by the name in the markers. The markers of a file select the form."""

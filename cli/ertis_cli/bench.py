@@ -268,9 +268,7 @@ def calibration(**given: Any) -> None:
 @options.as_json
 def fusion(**given: Any) -> None:
     """Measure ghosts and positions in fused images of four sensors."""
-    from ertis_bench import fusion as benchmark
-
-    _run("fusion", benchmark, **given)
+    _run("fusion", _in_source_folder("fusion", "platform_trials.fusion"), **given)
 
 
 @bench.command()
@@ -290,9 +288,7 @@ def fusion(**given: Any) -> None:
 @options.as_json
 def motion(**given: Any) -> None:
     """Measure errors of ego-velocity and odometry."""
-    from ertis_bench import motion as benchmark
-
-    _run("motion", benchmark, **given)
+    _run("motion", _in_source_folder("motion", "platform_trials.motion"), **given)
 
 
 @bench.command("map")
@@ -330,9 +326,7 @@ def motion(**given: Any) -> None:
 @options.as_json
 def mapping(**given: Any) -> None:
     """Measure errors of occupancy maps."""
-    from ertis_bench import mapping as benchmark
-
-    _run("map", benchmark, **given)
+    _run("map", _in_source_folder("map", "platform_trials.mapping"), **given)
 
 
 @bench.command()
@@ -594,7 +588,7 @@ def _in_source_folder(name: str, package: str | None = None) -> ModuleType:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        if error.name != module:
+        if error.name not in {module, module.rpartition(".")[0]}:
             raise
         from ertis_numba.errors import ArgumentError
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ertis_bench.furnished_rooms import hall
+from ertis_bench.platform_trials.furnished_rooms import hall
 
 PATH = Path(__file__).parent / "scenes" / "hall.toml"
 HEAD = """\

@@ -12,11 +12,18 @@ import numpy as np
 
 import ertis_numba as ertis
 from ertis_bench import machine
-from ertis_bench.furnished_rooms import Motion, PlatformImager, hall, mountings, random_motion, random_room
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
+from ertis_bench.platform_trials.furnished_rooms import (
+    Motion,
+    PlatformImager,
+    hall,
+    mountings,
+    random_motion,
+    random_room,
+)
 
-__all__ = ["form", "run"]
+__all__ = ["FORMS", "form", "run"]
 
 _TIME_S: Final = 0.1
 _EVERY: Final = 2  # pulses of the hall, so that groups are 0.14 m apart
@@ -129,3 +136,7 @@ def form(report: dict[str, Any]) -> str:
             f"{hall['normalised']:.2f} times its expectation."
         )
     return f"{text} {sentence(report['machine'])}"
+
+
+FORMS = {"motion": form}
+"""Forms of the table, by the name in its markers."""

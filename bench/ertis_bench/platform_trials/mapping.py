@@ -14,7 +14,9 @@ from scipy.spatial import KDTree
 
 import ertis_numba as ertis
 from ertis_bench import machine
-from ertis_bench.furnished_rooms import (
+from ertis_bench.machine import sentence
+from ertis_bench.markdown import table
+from ertis_bench.platform_trials.furnished_rooms import (
     HALL_M,
     HEIGHT_M,
     Motion,
@@ -26,12 +28,10 @@ from ertis_bench.furnished_rooms import (
     random_room,
     random_space,
 )
-from ertis_bench.machine import sentence
-from ertis_bench.markdown import table
 from ertis_numba.frames import OccupancyMap, Trajectory
 from ertis_numba.simulation import Box, Point
 
-__all__ = ["MappedPlace", "form", "rated", "run"]
+__all__ = ["FORMS", "MappedPlace", "form", "rated", "run"]
 
 Floats = NDArray[np.float64]
 
@@ -315,3 +315,7 @@ def _around(motion: Motion, time_ns: int) -> Trajectory:
         np.stack([[pose.x_m for pose in poses], [pose.y_m for pose in poses], zeros], axis=1),
         np.stack([zeros, zeros, np.sin(yaw_rad), np.cos(yaw_rad)], axis=1),
     )
+
+
+FORMS = {"map": form}
+"""Forms of the table, by the name in its markers."""

@@ -5,9 +5,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_bench.differing_calls import compared, points_of
 from ertis_bench.markdown import table
 from ertis_bench.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
+from ertis_bench.platform_trials.differing_calls import compared, points_of
 
 __all__ = ["form", "run"]
 

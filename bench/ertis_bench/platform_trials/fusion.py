@@ -11,10 +11,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench import clock_checks, differing_calls, emission_delays, machine
+from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
+from ertis_bench.platform_trials import clock_checks, differing_calls, emission_delays
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion import Fused, Fuser
@@ -22,7 +23,7 @@ from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Point, Scene, Sensor
 from ertis_numba.simulation.render import Simulator
 
-__all__ = ["form", "run"]
+__all__ = ["FORMS", "form", "run"]
 
 Floats = NDArray[np.float64]
 
@@ -262,3 +263,7 @@ def _nearest_m(cloud_m: Floats, place_m: Floats) -> float:
 
 def _decibels(power: float, reference: float) -> float:
     return 10 * math.log10(max(power, 1e-12) / reference)
+
+
+FORMS = {"fusion": form}
+"""Forms of the table, by the name in its markers."""

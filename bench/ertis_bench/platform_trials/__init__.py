@@ -1,0 +1,1 @@
+"""Trials of fusion, motion and maps of moving platforms with several sensors."""
