@@ -66,6 +66,11 @@ class ArrayAxes:
         """Return points whose distance is the standard deviation of differences of paths: (n, axis) float64."""
         return np.asarray((directions @ self._axes) * self._sizes_m)
 
+    @property
+    def longest_m(self) -> float:
+        """Standard deviation of positions along the longest axis in metres."""
+        return float(self._sizes_m[-1])
+
 
 class ToneResponse:
     """Response to a tone.
@@ -92,12 +97,15 @@ class ToneResponse:
     def side_lobe(self, places: Floats) -> float:
         """Return the highest amplitude in some places outside of the main lobes of others; 0 without any."""
         targets = np.random.default_rng(0).permutation(places)[:_N_TARGETS]
-        waves = np.exp(1j * self._omega_rad_s * self._delays(targets)).astype(np.complex64)
-        amplitude = np.abs(waves[:_N_SOURCES].conj() @ waves.T) / waves.shape[1]
+        phases_rad = (self._omega_rad_s * self._delays(targets)).astype(np.float32)
+        waves = np.empty(phases_rad.shape, np.complex64)
+        waves.real, waves.imag = np.cos(phases_rad), np.sin(phases_rad)
+        sums = waves[:_N_SOURCES].conj() @ waves.T
         scaled = self._wave_1_m * self.axes.scaled_m(targets)
         squares = (scaled**2).sum(axis=1)
         far = squares[:_N_SOURCES, None] + squares - 2 * scaled[:_N_SOURCES] @ scaled.T > _FAR**2
-        return float(amplitude.max(initial=0.0, where=far))
+        power = (sums.real**2 + sums.imag**2).max(initial=0.0, where=far)
+        return math.sqrt(float(power)) / len(phases_rad.T)
 
 
 class CallResponse:

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.geometry import grid_count, named_grid, unit_vectors
+from ertis_numba.geometry import grid_count, named_grid, spacing_rad, unit_vectors
 from ertis_numba.settings import Processing
 
 __all__ = ["Between", "farthest_places"]
@@ -64,6 +64,14 @@ class Between:
         turned = [_middles(self._directions, share) for share in np.linspace(0, 1, _ARC_STEPS)]
         return np.concatenate([*turned, self._directions])
 
+    def step_rad(self) -> float:
+        """Return the largest step of a search that starts in the places, in radians."""
+        if self._limits_rad is None:
+            return spacing_rad(self._directions) / (2 * _PARTS)  # Places are dense, and have no limits.
+        (west, east), (low, high) = self._limits_rad
+        count = len(self._directions)
+        return max(math.sqrt((east - west) * (math.sin(high) - math.sin(low)) / count), (east - west) / count) / 2
+
     def clip(self, places: Floats) -> Floats:
         """Return unit vectors in the same directions, moved into the limits."""
         if self._limits_rad is None:
@@ -76,7 +84,7 @@ class Between:
         return unit_vectors(np.clip(azimuth, west, east), np.clip(elevation, low, high))
 
 
-def farthest_places(between: Between, distance: Callable[[Floats], Floats], spacing_rad: float) -> Floats:
+def farthest_places(between: Between, distance: Callable[[Floats], Floats]) -> Floats:
     """Return the places with the largest distance from a grid: (place, axis) float64.
 
     Parameters
@@ -84,13 +92,11 @@ def farthest_places(between: Between, distance: Callable[[Floats], Floats], spac
     between : Between
     distance : callable
         Returns the distances of places, (place,), from (place, axis).
-    spacing_rad : float
-        Spacing of the directions in radians.
     """
     places = between.places[np.argsort(-distance(between.places))[:_TOP]]
     if between.is_planar:
         return np.asarray(places)
-    random, step = np.random.default_rng(0), spacing_rad / 2
+    random, step = np.random.default_rng(0), between.step_rad()
     for _ in range(_STEPS):
         moved = places[:, None] + step * random.normal(size=(len(places), _TRIES, 3))
         tried = np.concatenate([places[:, None], between.clip(moved)], axis=1)

@@ -31,6 +31,11 @@ _NEAREST: Final = 6
 _ABOVE: Final = 1.03  # Least amplitude of the weakest source relative to the highest side lobe …
 _AS_STRONG: Final = 0.94  # … up to this one, -0.5 dB, which no grid tells from a source.
 _STEP: Final = 1.12
+_NARROWEST_RAD: Final = 1e-5
+_ANGLES: Final = 1200
+_FIRST_COUNT: Final = 4000  # Largest grid from which the size of a finer one is estimated.
+_BELOW: Final = 0.94  # First size that is tried relative to the estimated one …
+_MUCH_ABOVE: Final = 1.5  # … which counts as impossible above this many of the largest.
 _MOST_DB: Final = 40.0
 _LEAST: Final = 1e-9
 
@@ -56,22 +61,13 @@ class Lobe(NamedTuple):
         """Return the loss of a source with an amplitude of delay-and-sum, in dB."""
         return -20 * math.log10(max(float(self.peak(np.array([amplitude]))[0]), _LEAST))
 
-    def suffices(self, amplitude: float, side_lobe: float) -> bool:
-        """Return True if the weakest source loses little, and exceeds the side lobes of others.
-
-        Parameters
-        ----------
-        amplitude : float
-            Amplitude of delay-and-sum of the weakest source.
-        side_lobe : float
-            Amplitude of the highest side lobe; one that is as strong as a source does not count.
-        """
-        is_loud = self.loss_db(amplitude) <= self.max_loss_db - _MARGIN_DB
-        return is_loud and (side_lobe > _AS_STRONG or amplitude >= _ABOVE * side_lobe)
+    def is_loud(self, amplitude: float) -> bool:
+        """Return True if a source with an amplitude of delay-and-sum loses little."""
+        return self.loss_db(amplitude) <= self.max_loss_db - _MARGIN_DB
 
     def largest_rad(self, side_lobe: float) -> float:
         """Return the angle, along the longest axis of the array, at which a source is as weak as it may be."""
-        away_rad = np.linspace(0.0, math.pi / 2, 8001)[1:, None]
+        away_rad = np.append(0.0, np.geomspace(_NARROWEST_RAD, math.pi / 2, _ANGLES))[:, None]
         along = self.response.axes.longest
         ahead = np.eye(3)[int(np.abs(along).argmin())]
         ahead = ahead - (ahead @ along) * along
@@ -82,7 +78,7 @@ class Lobe(NamedTuple):
         least = _ABOVE * side_lobe if side_lobe <= _AS_STRONG else 0.0
         loss_db = -20 * np.log10(np.maximum(self.peak(amplitude), _LEAST))
         is_weak = (loss_db > self.max_loss_db - _MARGIN_DB) | (amplitude < least)
-        return float(away_rad[int(is_weak.argmax()), 0]) if is_weak.any() else math.pi / 2
+        return float(away_rad[max(1, int(is_weak.argmax()) - 1), 0]) if is_weak.any() else math.pi / 2
 
 
 class GridCheck:
@@ -101,8 +97,8 @@ class GridCheck:
         self, grid: DegreesFromRadians, processing: Processing, *, side_lobes: dict[Response, float] | None = None
     ) -> None:
         self._directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
-        self._processing, self._between = processing, Between(self._directions, processing)
-        self._farthest: tuple[Floats, NDArray[np.intp]] | None = None
+        self.processing, self._between = processing, Between(self._directions, processing)
+        self._farthest: tuple[Floats, NDArray[np.intp], float] | None = None
         self._side_lobes = {} if side_lobes is None else side_lobes
         self.is_single = not len(self._between.places)
 
@@ -118,16 +114,20 @@ class GridCheck:
 
     def weakest(self, lobe: Lobe) -> float:
         """Return the amplitude of delay-and-sum in the direction nearest to the weakest source."""
-        if self._farthest is None:
-            scaled_m, count = lobe.response.axes.scaled_m, min(_NEAREST, len(self._directions))
-            tree = KDTree(scaled_m(self._directions))
-            sources = farthest_places(self._between, lambda places: tree.query(scaled_m(places))[0], self.spacing_rad)
-            near = tree.query(scaled_m(sources), k=count)[1].reshape(len(sources), count)
-            self._farthest = sources, near
-        sources, near = self._farthest
+        sources, near, _ = self.farthest_of(lobe.response.axes)
         directions = self._directions[near].reshape(-1, 3)
         amplitude = lobe.response(np.repeat(sources, near.shape[1], axis=0), directions)
         return float(amplitude.reshape(near.shape).max(axis=1).min())
+
+    def farthest_of(self, axes: ArrayAxes) -> tuple[Floats, NDArray[np.intp], float]:
+        """Return the places farthest from all directions, the directions nearest to them, and their distance in m."""
+        if self._farthest is None:
+            tree, count = KDTree(axes.scaled_m(self._directions)), min(_NEAREST, len(self._directions))
+            sources = farthest_places(self._between, lambda places: tree.query(axes.scaled_m(places))[0])
+            apart_m, near = tree.query(axes.scaled_m(sources), k=count)
+            farthest_m = float(apart_m.reshape(len(sources), count)[:, 0].max())
+            self._farthest = sources, near.reshape(len(sources), count), farthest_m
+        return self._farthest
 
     def side_lobe(self, lobe: Lobe) -> float:
         """Return the highest side lobe between the directions, 0 to 1."""
@@ -136,8 +136,14 @@ class GridCheck:
         return self._side_lobes[lobe.response]
 
     def suffices(self, lobe: Lobe) -> bool:
-        """Return True if no source between the directions is too weak, or weaker than side lobes."""
-        return self.is_single or lobe.suffices(self.weakest(lobe), self.side_lobe(lobe))
+        """Return True if no source between the directions is too weak, or weaker than side lobes.
+
+        Side lobes that are as strong as a source do not count.
+        """
+        if self.is_single:
+            return True
+        amplitude = self.weakest(lobe)
+        return lobe.is_loud(amplitude) and (amplitude >= _ABOVE * self.side_lobe(lobe) or self.is_ambiguous(lobe))
 
     def is_ambiguous(self, lobe: Lobe) -> bool:
         """Return True if side lobes are as strong as a source."""
@@ -164,27 +170,37 @@ class GridCheck:
         width_rad = float(np.ptp(processing.azimuth_limits_rad))
         area = width_rad * float(np.ptp(np.sin(processing.elevation_limits_rad)))
         # A square whose middle is as far from its corners has twice the area of the square of this distance.
-        count = max(width_rad / 8, area / (4 * largest_rad)) if kind == "3d" else width_rad / 2
+        count = (
+            max(width_rad / 8, area / (4 * largest_rad)) / largest_rad if kind == "3d" else width_rad / 2 / largest_rad
+        )
         side_lobes: dict[Response, float] = {}
-        for tried in _counts(count / largest_rad):
-            named = processing.replace(directions=f"{kind}:{tried}")
-            shared = side_lobes if kind == "3d" else None  # Their places depend on the limits only.
-            if GridCheck(direction_grid(named), named, side_lobes=shared).suffices(lobe):
-                return named
+        shared = side_lobes if kind == "3d" else None  # Their places depend on the limits only.
+        if count > _FIRST_COUNT and kind == "3d":  # Large grids take long, and distances follow from a smaller one.
+            smaller = _named(processing, kind, _FIRST_COUNT, shared)
+            relative = smaller.farthest_of(lobe.response.axes)[2] / (
+                2 * math.sin(largest_rad / 2) * lobe.response.axes.longest_m
+            )
+            count = max(count, _BELOW * _FIRST_COUNT * relative**2)
+            if count > _MUCH_ABOVE * LARGEST_GRID:
+                return None
+        for tried in _counts(count):
+            check = _named(processing, kind, tried, shared)
+            if check.suffices(lobe):
+                return check.processing
         return None
 
     def _kind_and_limits(self) -> tuple[str, Processing]:
         """Return the kind of the grid, and settings with its limits."""
-        named = named_grid(self._processing)
+        named = named_grid(self.processing)
         if named is None:
-            return "2d" if self._between.is_planar else "3d", self._processing
+            return "2d" if self._between.is_planar else "3d", self.processing
         kind, azimuth_deg, elevation_deg = named
         limits = {"azimuth_limits_deg": azimuth_deg, "elevation_limits_deg": elevation_deg}
-        return kind, self._processing.replace(**limits if kind == "3d" else {"azimuth_limits_deg": azimuth_deg})
+        return kind, self.processing.replace(**limits if kind == "3d" else {"azimuth_limits_deg": azimuth_deg})
 
     def _worded(self, named: Processing, largest_rad: float, verb: str) -> str:
         """Return the name of a grid, with its limits unless they are those of the settings, or a spacing."""
-        words, ours = f"{verb} at least {named.directions} directions", self._processing
+        words, ours = f"{verb} at least {named.directions} directions", self.processing
         (west, east), (low, high) = named.azimuth_limits_deg, named.elevation_limits_deg
         if (west, east) != ours.azimuth_limits_deg or (low, high) != ours.elevation_limits_deg:
             words += f" within azimuths {west:g}:{east:g} and elevations {low:g}:{high:g}"
@@ -194,6 +210,12 @@ class GridCheck:
         closer = f"list directions at most {rounded_down(math.degrees(factor * largest_rad)):g}° apart"
         is_aside = self._between.is_planar and np.ptp(self._directions[:, 2]) > 0  # No grid has a name.
         return closer if is_aside else f"{words}, or {closer}"
+
+
+def _named(processing: Processing, kind: str, count: int, side_lobes: dict[Response, float] | None) -> GridCheck:
+    """Return the check of a grid with a name."""
+    named = processing.replace(directions=f"{kind}:{count}")
+    return GridCheck(direction_grid(named), named, side_lobes=side_lobes)
 
 
 def rounded_down(number: float) -> float:

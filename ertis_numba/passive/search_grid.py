@@ -227,10 +227,12 @@ def _lowest(bands_hz: NDArray[np.float64], is_fine: Callable[[float], bool]) -> 
 
 def _highest_hz(is_fine: Callable[[float], bool], highest_hz: float) -> float:
     """Return the highest frequency that is fine, with two digits."""
-    tried_hz = rounded_down(highest_hz)
-    while tried_hz > 1.0 and not is_fine(tried_hz):
-        tried_hz = rounded_down(tried_hz / _STEP)
-    return tried_hz
+    coarse, fine = 0, 1 + math.ceil(math.log(highest_hz) / math.log(_STEP))  # Numbers of steps below the highest.
+    while fine - coarse > 1:
+        middle = (fine + coarse) // 2
+        is_low = is_fine(rounded_down(highest_hz / _STEP**middle))
+        coarse, fine = (coarse, middle) if is_low else (middle, fine)
+    return rounded_down(highest_hz / _STEP**fine)
 
 
 def _lobes(settings: Settings, peak: Peak, max_loss_db: float = MAX_LOSS_DB) -> Callable[[float], Lobe]:
