@@ -5,6 +5,7 @@ import os
 import re
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,6 +21,7 @@ __all__ = [
     "reason",
     "remedy",
     "require_free_space",
+    "require_writable",
     "temporary_path",
 ]
 
@@ -69,6 +71,22 @@ def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -
         raise ArgumentError(f"output {path} is the input itself; give another name")
     if path.exists() and not overwrite:
         raise ArgumentError(f"output {path} exists; give another name, or ask to overwrite it (--force)")
+
+
+def require_writable(folder: Path) -> None:
+    """Create a file in a folder, and remove it.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Raises
+    ------
+    OSError
+        No file can be created.
+    """
+    with tempfile.TemporaryFile(dir=folder):
+        pass
 
 
 def reason(error: Exception) -> str:

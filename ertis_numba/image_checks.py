@@ -1,12 +1,19 @@
-"""Checks of the images of a pipeline: echoes that match neither call nor layout, and errors beyond the budget."""
+"""Checks of the images of a pipeline: coarse directions, echoes of another call or layout, and errors."""
 
 import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ertis_numba.analysis.call_match import call_match
+from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.analysis.layout_match import layout_match
-from ertis_numba.errors import CallMismatchWarning, DeviceError, ErrorBudgetWarning, LayoutMismatchWarning
+from ertis_numba.errors import (
+    CallMismatchWarning,
+    CoarseGridWarning,
+    DeviceError,
+    ErrorBudgetWarning,
+    LayoutMismatchWarning,
+)
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.kernels import KernelSet
 from ertis_numba.prediction import BudgetMonitor
@@ -41,6 +48,7 @@ class ImageChecks:
         has_budget = settings.processing.method == "fast" and not kernel_set.simulated
         self._monitor = BudgetMonitor(kernel_set, threads) if has_budget else None
         self._warned = False
+        self._is_grid_checked = kernel_set.simulated
         self._remaining = {} if kernel_set.simulated else dict.fromkeys(_MATCHES, _MAX_CHECKS)
 
     @property
@@ -49,9 +57,19 @@ class ImageChecks:
         return None if self._monitor is None else self._monitor.prediction
 
     def check(self, image: Energyscape, measurement: Measurement) -> None:
-        """Check an image, before it is cleaned, and its measurement."""
+        """Check an image, before it is cleaned, its directions, and its measurement."""
+        self._check_grid(image)
         self._check_sound(measurement)
         self._check_budget(image, measurement)
+
+    def _check_grid(self, image: Energyscape) -> None:
+        """Compare the directions of the first image with the array."""
+        if self._is_grid_checked:
+            return
+        self._is_grid_checked = True
+        text = spacing_warning(self._settings, image)
+        if text is not None:
+            warnings.warn(text, CoarseGridWarning, stacklevel=_CALLER)
 
     def _check_sound(self, measurement: Measurement) -> None:
         """Compare echoes with call and layout in the first measurements, until one has sound above the noise."""

@@ -68,7 +68,8 @@ class Pipeline:
         an `ErrorBudgetWarning`, once, if images may exceed the budget. A prediction takes some 0.2 s and memory for
         another image. It is omitted if it would need more than 256 MB, and for the paper's method. Also compare echoes
         with the call and with the layout, once, and issue a `CallMismatchWarning` or `LayoutMismatchWarning` if they
-        do not match.
+        do not match, and the directions with the array, and issue a `CoarseGridWarning` if a reflector between them may
+        lose half of its power.
     plan : {"nominal", "measured"}
         Costs of kernels by which the planner chooses the fastest plan. ``nominal`` costs are published with this
         package: the same settings give the same plan, hence the same bits, on all machines with the same instruction

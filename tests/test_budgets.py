@@ -172,7 +172,8 @@ def test_process_suggests_verify_unless_it_was_given(tmp_path):
 
 
 def test_process_quiet_prints_neither_plan_nor_verification(tmp_path):
-    write_recording(tmp_path / "loud.h5", [pcm(PCM, echo=0.3)])
+    fine = PCM.replace("processing.directions", "2d:61")  # A warning of a coarse grid is printed.
+    write_recording(tmp_path / "loud.h5", [pcm(fine, echo=0.3)])
     done = CliRunner().invoke(cli, ["process", str(tmp_path / "loud.h5"), "--explain", "--verify", "--quiet"])
     assert (done.exit_code, done.output) == (0, "")
 

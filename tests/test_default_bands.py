@@ -41,7 +41,7 @@ def heard(rate_hz, frequency_hz, *, noise=1e-3, offset=0.0, amplitude=0.2, n_sam
 def mapped(measurement):
     """Return the map of a measurement, and the note on sound outside of its bands."""
     with ertis.AcousticCamera(measurement.settings, check=False) as camera:
-        return camera.process(measurement), camera.outside_note
+        return camera.process(measurement), camera.band_note
 
 
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
@@ -125,3 +125,58 @@ def test_spectra_reach_half_the_rate(rate_hz):
     spectrum = power.mean(axis=1)
     assert bins_hz[spectrum.argmax()] == pytest.approx(frequency_hz, abs=bins_hz[1])
     assert 10 * math.log10(spectrum.sum()) == pytest.approx(TONE_DBFS, abs=0.5)
+
+
+def edges_of(measurement):
+    with ertis.AcousticCamera(measurement.settings, check=False) as camera:
+        return camera.band_hz, float(camera.frequency_hz[1] - camera.frequency_hz[0])
+
+
+@pytest.mark.parametrize("method", ["delay_and_sum", "functional", "capon"])
+@pytest.mark.parametrize("rate_hz", [44.1e3, 384e3])
+def test_tones_at_edges_of_bands_are_named_with_their_level(rate_hz, method):
+    edges, spacing_hz = edges_of(heard(rate_hz, 0.1 * rate_hz))
+    for edge_hz in (edges[1, 1], edges[len(edges) // 2, 1], edges[-2, 1]):
+        for steps in (-0.5, 0, 0.4):
+            frequency_hz = float(edge_hz) + steps * spacing_hz
+            measurement = heard(rate_hz, frequency_hz, **{"passive.method": method})
+            _, note = mapped(measurement)
+            named, level, low_hz, high_hz = re.search(
+                r"tone at (\S+) kHz of (\S+) dBFS lies at the edge of two bands.* --bands (\d+):(\d+) ", note
+            ).groups()
+            assert 1e3 * float(named) == pytest.approx(
+                frequency_hz, abs=(0.4 if method == "capon" else 0.12) * spacing_hz
+            )
+            assert float(level) == pytest.approx(TONE_DBFS, abs=1.0)
+            own = measurement.settings.replace("passive.bands_hz", ((float(low_hz), float(high_hz)),))
+            found, note = mapped(ertis.Measurement(measurement.data, own, measurement.stamp))
+            assert ertis.find_sound_sources(found)[0].level_dbfs == pytest.approx(TONE_DBFS, abs=1.0)
+            assert note is None
+
+
+@pytest.mark.parametrize("rate_hz", [44.1e3, 384e3])
+def test_bands_note_every_tone_that_they_show_half_a_decibel_low(rate_hz):
+    edges, spacing_hz = edges_of(heard(rate_hz, 0.1 * rate_hz))
+    for edge_hz in (edges[0, 0], edges[2, 0], edges[-1, 1]):
+        for steps in np.arange(-3, 3.1, 0.6):
+            found, note = mapped(heard(rate_hz, float(edge_hz) + steps * spacing_hz))
+            loudest = max(ertis.find_sound_sources(found), key=lambda source: source.level_dbfs)
+            assert note is not None or loudest.level_dbfs == pytest.approx(TONE_DBFS, abs=0.6)
+
+
+def test_tones_at_the_highest_edge_need_a_higher_rate():
+    _, note = mapped(heard(96e3, 38.3e3))
+    assert re.search(r"38.3\d? kHz of about -1[67]\S+ dBFS lies at the edge of the bands, 38.4 kHz.* higher rate", note)
+
+
+@pytest.mark.parametrize("method", ["delay_and_sum", "capon", "functional"])
+@pytest.mark.parametrize("n_samples", [1024, 2048, 16_384])
+def test_noise_at_edges_is_no_tone(n_samples, method):
+    for seed in range(6):
+        measurement = heard(96e3, 1.0, amplitude=0.0, noise=0.0, n_samples=n_samples, **{"passive.method": method})
+        white = np.random.default_rng(seed).normal(0, 0.1, n_samples + 400)
+        shapes = (white, np.cumsum(white) * 0.1, np.convolve(white, np.hanning(9)))  # White, red, and low pass.
+        for source in shapes:
+            shared = source[100 : 100 + n_samples, None]  # From ahead of a ring in one plane.
+            _, note = mapped(ertis.Measurement((measurement.data + shared).astype("f4"), measurement.settings))
+            assert note is None or "edge" not in note

@@ -116,24 +116,32 @@ def draw(
 ) -> "tuple[Figure, str]":
     """Return the figure of a kind, and the name of its sensor."""
     from ertis_numba import figures
-    from ertis_numba.passive.search_grid import coarse_map_warning
     from ertis_numba.storage import file_kind
 
     if kind == "acoustic_map":
         _require_pair(photo, photo_fov_deg)
-        found = _map(path, sensor, index, quiet=quiet)
+        found, note = _map(path, sensor, index, quiet=quiet)
         figure = figures.acoustic_map(found, band_hz=band_hz, photo=photo, photo_fov_deg=photo_fov_deg, **look)
-        options.warn_of(found.stamp.sensor, coarse_map_warning(found.settings, found))
+        _warn_of_map(found, note)
+        return figure, found.stamp.sensor
+    if kind == "spectrum" and file_kind(path) == "acoustic_map":
+        found, note = _map(path, sensor, index, quiet=quiet)
+        figure = figures.spectrum(found, direction_deg=steer, **look)
+        _warn_of_map(found, note)
         return figure, found.stamp.sensor
     if kind == "spectrum":
-        source = (
-            _map(path, sensor, index, quiet=quiet)
-            if file_kind(path) == "acoustic_map"
-            else _measurement(path, sensor, index)
-        )
+        source = _measurement(path, sensor, index)
         return figures.spectrum(source, direction_deg=steer, **look), source.stamp.sensor
     heard = _measurement(path, sensor, index)
     return figures.spectrogram(heard, direction_deg=steer, **look), heard.stamp.sensor
+
+
+def _warn_of_map(found: "AcousticMap", note: str | None) -> None:
+    """Print warnings of a map that is drawn: coarse directions, and sound that its bands do not show."""
+    from ertis_numba.passive.search_grid import coarse_map_warning
+
+    options.warn_of(found.stamp.sensor, coarse_map_warning(found.settings, found))
+    options.warn_of(found.stamp.sensor, note)
 
 
 def _require_pair(photo: Path | None, photo_fov_deg: tuple[float, float] | None) -> None:
@@ -145,18 +153,19 @@ def _require_pair(photo: Path | None, photo_fov_deg: tuple[float, float] | None)
         raise click.UsageError("--photo-fov needs --photo PICTURE; add it, or leave out --photo-fov", context)
 
 
-def _map(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "AcousticMap":
+def _map(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "tuple[AcousticMap, str | None]":
+    """Return a map, and a note on sound that its bands do not show."""
     from ertis_numba.storage import file_kind, open_acoustic_maps
 
     if file_kind(path) == "acoustic_map":
         with open_acoustic_maps(path, sensor=sensor) as maps:
-            return maps[options.place(index, len(maps))]
+            return maps[options.place(index, len(maps))], maps.band_note
     heard = _measurement(path, sensor, index)
     with options.note_when_slow(options.PREPARING, quiet=quiet):
         from ertis_numba.passive import AcousticCamera
 
         with AcousticCamera(heard.settings, check=False) as camera:
-            return camera.process(heard)
+            return camera.process(heard), camera.band_note
 
 
 def _measurement(path: Path, sensor: str | None, index: int) -> "Measurement":

@@ -53,9 +53,9 @@ def listen_bearings(
         if (sensor := found.stamp.sensor) not in checked:
             checked.add(sensor)
             options.warn_of(sensor, search_warning(found.settings))
-        if subscribers[0].outside_note is not None and sensor not in outside:
+        if subscribers[0].band_note is not None and sensor not in outside:
             outside.add(sensor)
-            options.warn_of(sensor, subscribers[0].outside_note)
+            options.warn_of(sensor, subscribers[0].band_note)
         _show(found, subscribers[0].bearings, _age_ms(subscribers[0]), as_json=as_json)
 
     def report_active(subscriber: AcousticMapSubscriber) -> None:

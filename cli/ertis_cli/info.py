@@ -227,6 +227,7 @@ def _maps_of_sound(reader: "AcousticMapReader") -> dict[str, Any]:
         "band_hz": [round(float(edge_hz), 1) for edge_hz in (reader.band_hz.min(), reader.band_hz.max())],
         "method": passive.method,
         "averages": passive.averages,
+        **({"band_note": reader.band_note} if reader.band_note else {}),
         **({} if passive.focus_m is None else {"focus_m": passive.focus_m}),
         **_placement(reader),
     }

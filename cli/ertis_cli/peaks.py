@@ -195,6 +195,7 @@ def _list_sources(
         with open_acoustic_maps(path, sensor=name) as maps:
             options.note_unknown_angles(name, maps.settings, maps)
             options.warn_of(name, coarse_map_warning(maps.settings, maps))
+            options.warn_of(name, maps.band_note)
             for index in options.places(measurement, len(maps)):
                 found = find_sound_sources(maps[index], top=top, min_level_db=min_level_db)
                 rows += [{"sensor": name, "map": index, **each.as_dict()} for each in found]

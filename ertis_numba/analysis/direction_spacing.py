@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from ertis_numba.analysis.array_response import CallResponse, Response
+from ertis_numba.analysis.array_response import ArrayAxes, CallResponse, Response
 from ertis_numba.analysis.between_directions import Between, farthest_places
 from ertis_numba.angles import DegreesFromRadians
 from ertis_numba.geometry import direction_grid, microphones, named_grid, spacing_rad, unit_vectors

@@ -102,8 +102,9 @@ class _MapsOfSensor:
                 camera.reset()
                 elapsed_s = 0.0
             yield
-        if camera.outside_note is not None:
-            self._warn(f"{recording.path}: sensor {recording.sensor}: {camera.outside_note}")
+        if camera.band_note is not None:
+            writer.note_bands(recording.sensor, camera.band_note)
+            self._warn(f"{recording.path}: sensor {recording.sensor}: {camera.band_note}")
         if self._masked_s:
             n_emitted = sum(stamp.behaviour == "active" for stamp in recording.stamps())
             self._warn(
@@ -131,6 +132,7 @@ class _MapsOfSensor:
             "directions": len(mean.azimuth_rad),
             "bands": len(mean.band_hz),
             "median_ms": round(statistics.median(self.times_ms), 3),
+            **({"band_note": note} if (note := self._camera.band_note) else {}),
             "loudest": [each.as_dict() for each in find_sound_sources(mean, top=1)],
         }
 

@@ -49,8 +49,8 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
         Counts of the measurements.
     bearings : list of Bearing
         Bearings of the last map, as by `BearingFinder`; empty without ``false_alarm``.
-    outside_note : str or None
-        Note of `AcousticCamera.outside_note` on the sensor of the last map.
+    band_note : str or None
+        Note of `AcousticCamera.band_note` on the sensor of the last map.
     n_active : int
         Measurements with a call. They are left out unless ``processing.mode`` is ``passive``.
 
@@ -83,7 +83,7 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
         self._hearer_of(Settings()).close()  # refuses changes, and loads kernels
         self._hearers: dict[str, _Hearer] = {}
         self.bearings: list[Bearing] = []
-        self.outside_note: str | None = None
+        self.band_note: str | None = None
         self.n_active = 0
         self._subscriber: Subscriber[Measurement] = Subscriber(
             address, sensors=sensors, products=["raw"], keys=keys, on_note=on_note, credit=8
@@ -112,7 +112,7 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
         if camera.n_measurements < camera.settings.passive.averages:
             return None
         found = camera.map()
-        self.outside_note = camera.outside_note
+        self.band_note = camera.band_note
         self.bearings = [] if hearer.finder is None else hearer.finder.find()
         camera.reset()
         return found

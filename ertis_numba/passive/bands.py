@@ -9,7 +9,7 @@ from ertis_numba.constants import SHAPED_NOISE_SHARE
 from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import HIGHEST_SHARE, Passive, Recording, Settings
 
-__all__ = ["band_edges", "bin_shares", "octave_bands", "shaped_noise_warning"]
+__all__ = ["band_edges", "bin_shares", "octave_bands", "shaped_noise_warning", "typed_hz"]
 
 _ROUNDING = 1e-6  # relative, so that limits include the bands whose edges they name
 
@@ -110,6 +110,11 @@ def shaped_noise_warning(settings: Settings, bands_hz: NDArray[np.float64]) -> s
         f"the quantisation noise of one-bit microphones dominates above {limit_hz / 1e3:g} kHz, and therefore in "
         f"{named}{more}; choose lower bands to hear sources"
     )
+
+
+def typed_hz(frequency_hz: float) -> str:
+    """Return a frequency as it is typed, with at least three digits."""
+    return f"{frequency_hz:.0f}" if frequency_hz >= 100 else f"{frequency_hz:.3g}"
 
 
 def bin_shares(bands_hz: NDArray[np.float64], frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:

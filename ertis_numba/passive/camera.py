@@ -17,12 +17,13 @@ from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.block_spectra import BlockSpectra
 from ertis_numba.passive.components import gathered
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
+from ertis_numba.passive.edge_tones import EdgeTones
 from ertis_numba.passive.methods import METHODS
 from ertis_numba.passive.outside_bands import OutsideBands
 from ertis_numba.passive.search_grid import coarse_map_warning
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.passive.waves import Waves
-from ertis_numba.settings import Settings
+from ertis_numba.settings import HIGHEST_SHARE, Settings
 from ertis_numba.stages.interpolation_fit import one_thread
 
 __all__ = ["AcousticCamera"]
@@ -47,8 +48,8 @@ class AcousticCamera:
     threads : int, optional
         Number of threads; all cores by default.
     check : bool, default True
-        Issue a `CoarseGridWarning` if ``warning`` is not None, and an `OutsideBandsWarning`, once, if ``outside_note``
-        is not None when a map is made.
+        Issue a `CoarseGridWarning` if ``warning`` is not None, and an `OutsideBandsWarning`, once, if ``band_note`` is
+        not None when a map is made.
 
     Attributes
     ----------
@@ -112,6 +113,12 @@ class AcousticCamera:
         delay_s = WaveDelays(settings)(directions)
         self.waves = Waves(delay_s, self._blocks.bins, self._blocks.spacing_hz, kernel_set, threads=self._threads)
         self._outside, self._check = OutsideBands(settings, self.band_hz), check
+        self._edge_tones = EdgeTones(
+            self.band_hz,
+            self.frequency_hz,
+            HIGHEST_SHARE * settings.recording.sample_rate_hz / 2,
+            settings.passive.method,
+        )
         self._masked_s = 0.0
         self._shape = len(self.frequency_hz), delay_s.shape[1], delay_s.shape[1]
         self.reset()
@@ -127,13 +134,15 @@ class AcousticCamera:
         return coarse_map_warning(self.settings, self.grid)
 
     @property
-    def outside_note(self) -> str | None:
-        """Note on sound outside of the default bands in all measurements so far; None if none is louder than inside.
+    def band_note(self) -> str | None:
+        """Note on sound that the bands of all maps so far do not show, or only in part; None if there is none.
 
-        It states the share of the power, and the frequency and level of its maximum. Bands or limits of your own, PDM,
-        and measurements with a call yield no note.
+        If sound outside of the default bands is louder than inside, it states the share of the power, and the frequency
+        and level of its maximum; bands or limits of your own, PDM, and measurements with a call yield no such note. A
+        tone at the edge of a band is named with its level, because a band shows only a part of its power.
         """
-        return self._outside.note
+        outside = self._outside.note
+        return "; also, ".join(filter(None, (outside, self._edge_tones.note(within=outside is not None)))) or None
 
     def add(self, measurement: Measurement) -> None:
         """Add a measurement to the mean.
@@ -150,8 +159,7 @@ class AcousticCamera:
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         masked = measurement.stamp.behaviour == "active"
         products, n_blocks = self._blocks.products(measurement, masked=masked)
-        if self.settings.passive.follows_record and not masked:
-            self._outside.add(measurement)
+        self._outside.add(measurement)
         self._sums += products
         self._n_blocks += n_blocks
         self._masked_s = max(self._masked_s, self._blocks.masked_s if masked else 0.0)
@@ -199,11 +207,14 @@ class AcousticCamera:
         DataError
             There is no measurement, or too few blocks for the method.
         """
-        if self._check and self.outside_note is not None:
-            self._check = False
-            warnings.warn(self.outside_note, OutsideBandsWarning, stacklevel=3)
         with one_thread():
-            power = (self._shares @ self.powers()).T
+            powers = self.powers()
+            power = (self._shares @ powers).T
+        if self.settings.passive.method != "music":  # It has no levels.
+            self._edge_tones.add(powers, power, self.n_measurements)
+        if self._check and (note := self.band_note) is not None:
+            self._check = False
+            warnings.warn(note, OutsideBandsWarning, stacklevel=3)
         found = AcousticMap(
             np.ascontiguousarray(power),
             self.grid.azimuth_rad,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.passive.bands import typed_hz
 from ertis_numba.settings import HIGHEST_SHARE, Settings
 
 __all__ = ["OutsideBands"]
@@ -26,7 +27,8 @@ class OutsideBands:
 
     Its mean over time is taken in up to four microphones, without their offsets. Sound outside of the bands is worth a
     note if its power per hertz, or its loudest bin, exceeds that inside by 3 dB. White noise never does. One-bit
-    microphones have noise of their own beyond the bands, so that PDM yields no note.
+    microphones have noise of their own beyond the bands, so that PDM yields no note; neither do bands and limits of
+    your own, and measurements with a call.
 
     Parameters
     ----------
@@ -36,6 +38,7 @@ class OutsideBands:
 
     def __init__(self, settings: Settings, bands_hz: NDArray[np.float64]) -> None:
         self._recording = recording = settings.recording
+        self._is_left_out = recording.is_pdm or not settings.passive.follows_record
         enabled = np.flatnonzero(microphones(settings.array).enabled)
         self._channels = enabled[np.linspace(0, len(enabled) - 1, min(_CHANNELS, len(enabled))).astype(int)]
         self._size = max(8, 2 * (min(_BLOCK, recording.n_samples // _LEAST_BLOCKS) // 2))
@@ -48,13 +51,14 @@ class OutsideBands:
         self._count = 0
 
     def add(self, measurement: Measurement) -> None:
-        """Add the spectra of a measurement; those of PDM are left out.
+        """Add the spectra of a measurement, unless it is left out.
 
         Parameters
         ----------
         measurement : Measurement
         """
-        if self._recording.is_pdm or len(measurement.data) < self._size:
+        has_call = measurement.stamp.behaviour == "active"
+        if self._is_left_out or has_call or len(measurement.data) < self._size:
             return
         hop = self._size // 2
         scale = 2 / (self._size * float((self._window**2).sum()) * self._recording.full_scale**2)
@@ -90,4 +94,4 @@ class OutsideBands:
         low_hz, high_hz = 0.8 * frequency_hz, min(1.2 * frequency_hz, highest_hz)
         if frequency_hz >= 0.98 * highest_hz:
             return f"to locate this sound, record at a higher rate: bands end at {highest_hz / 1e3:.4g} kHz"
-        return f"to locate this sound, use --bands {low_hz:.4g}:{high_hz:.4g} (passive.bands_hz)"
+        return f"to locate this sound, use --bands {typed_hz(low_hz)}:{typed_hz(high_hz)} (passive.bands_hz)"

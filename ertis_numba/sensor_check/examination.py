@@ -17,6 +17,8 @@ from ertis_numba.atomic_files import remedy
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.passive.heard_signals import heard_bands
+from ertis_numba.passive.outside_bands import OutsideBands
 from ertis_numba.sensor_check import items
 from ertis_numba.sensor_check.clock import check_clock
 from ertis_numba.sensor_check.lost_words import find_lost_words
@@ -171,7 +173,7 @@ def _check_sensor(
     layout = microphones(used.array)
     found: dict[str, items.CheckResult] = {
         items.MICROPHONES: items.of_microphones(report),
-        items.NOISE: items.of_noise(report, used),
+        items.NOISE: items.of_noise(report, used, _band_note(heard, used)),
         items.SAMPLES: items.of_samples(report, words, shift),
         items.MEASUREMENTS: items.of_storage(stored),
         items.TIMING: items.of_timing(clock),
@@ -206,6 +208,18 @@ def _spread(indices: Sequence[int], largest: int) -> list[int]:
 def _with_settings(measurement: Measurement, used: Settings) -> Measurement:
     """Return a measurement with the settings in use, and the air in which it was recorded."""
     return replace(measurement, settings=used.replace(air=measurement.settings.air))
+
+
+def _band_note(heard: Sequence[Measurement], used: Settings) -> str | None:
+    """Return a note on sound outside of the default bands in measurements without a call, if it is louder."""
+    try:
+        outside = OutsideBands(used, heard_bands(used))
+    except ArgumentError:
+        return None  # No band suits the record, which processing reports.
+    for measurement in heard:
+        if measurement.stamp.behaviour == "passive":
+            outside.add(measurement)
+    return outside.note
 
 
 def _best_call_match(heard: Sequence[Measurement]) -> CallMatch | None:

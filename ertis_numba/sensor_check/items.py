@@ -59,6 +59,7 @@ _BITS: Final = {
 """Faults by the reasons of `BitCheck`."""
 COPY: Final = "copy the file again, or record again"
 """Remedy for damaged files."""
+_NO_NOISE: Final = "no microphone without a fault has a measurable noise"
 NO_CALL: Final = "no call was emitted"
 
 _FITS_ANOTHER: Final = re.compile(r"does not fit the recordings .*, but layout \S+ does; ")
@@ -103,12 +104,12 @@ def of_microphones(report: Health | None) -> CheckResult:
     return _result_of(faults, detail)
 
 
-def of_noise(report: Health | None, used: Settings) -> CheckResult:
-    """Return the noise and the dynamic range, if any; noise as that of random bits is a fault."""
+def of_noise(report: Health | None, used: Settings, note: str | None = None) -> CheckResult:
+    """Return the noise and the dynamic range, if any, and a note; noise as that of random bits is a fault."""
     if report is None:
         return _NOTHING
     if report.noise_dbfs is None:
-        return CheckResult("not known", "no microphone without a fault has a measurable noise")
+        return CheckResult("not known", "; ".join(filter(None, (_NO_NOISE, note))))
     low_hz, high_hz = used.call.low_frequency_hz, used.call.high_frequency_hz
     detail = f"{report.noise_dbfs:.1f} dBFS in the call's band, dynamic range {report.dynamic_range_db or 0.0:.1f} dB"
     if report.dynamic_range_db is None:
@@ -117,7 +118,7 @@ def of_noise(report: Health | None, used: Settings) -> CheckResult:
         detail = (
             f"{report.noise_dbfs:.1f} dBFS from {low_hz / 1e3:g} to {high_hz / 1e3:g} kHz, including the sound of "
             "sources; the dynamic range needs a call"
-        )
+        ) + (f"; {note}" if note else "")
     white_dbfs = 10 * math.log10(2 * (high_hz - low_hz) / used.recording.sample_rate_hz)
     if not used.recording.is_pdm or report.noise_dbfs <= white_dbfs + MAX_WHITE_DB:
         return CheckResult("ok", detail)

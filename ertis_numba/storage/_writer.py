@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import h5py
 from numpy.typing import NDArray
 
-from ertis_numba.atomic_files import atomic_write, check_target, reason, remedy, require_free_space
+from ertis_numba.atomic_files import atomic_write, check_target, reason, remedy, require_free_space, require_writable
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import AcousticMap, Energyscape, Measurement
 from ertis_numba.storage._rows import RowReader, RowWriter
@@ -73,6 +73,10 @@ class FileWriter(ABC, Generic[Item]):
                 f"output {self.path} ends in {self.path.suffix}, but the file is HDF5; give a name in .h5"
             )
         check_target(self.path, overwrite=overwrite)
+        try:  # before warnings on what is to be written
+            require_writable(self.path.parent)
+        except OSError as error:
+            raise DataError(f"{self.path} cannot be written ({reason(error)}); {remedy(error)}") from error
 
     @abstractmethod
     def _begin(self, group: h5py.Group, first: Item) -> None:

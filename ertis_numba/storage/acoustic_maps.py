@@ -4,14 +4,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.frames import AcousticMap
 from ertis_numba.storage._results import ResultFile, ResultReader, ResultWriter
+from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import ACOUSTIC_MAP, POSES, Variable
+from ertis_numba.storage.schema import ACOUSTIC_MAP, POSES, Variable, set_attributes, to_python
 
 __all__ = ["AcousticMapReader", "AcousticMapWriter", "open_acoustic_maps", "write_acoustic_maps"]
 
@@ -63,6 +65,20 @@ class AcousticMapWriter(_AcousticMapFile, ResultWriter[AcousticMap]):
         overwrite: bool = False,
     ) -> None:
         super().__init__(path, recording=recording, mounting=mounting, dtype="float32", overwrite=overwrite)
+        self._band_notes: dict[str, str] = {}
+
+    def note_bands(self, sensor: str, band_note: str) -> None:
+        """Store a note on sound that the bands of a sensor's maps do not show: `AcousticCamera.band_note`.
+
+        Call this before the file is closed.
+        """
+        self._band_notes[sensor] = band_note
+
+    def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
+        super()._complete(group, rows)
+        note = self._band_notes.get(group.name.rpartition("/")[2])
+        if note:
+            set_attributes(group, {"band_note": note})
 
 
 class AcousticMapReader(_AcousticMapFile, ResultReader[AcousticMap]):
@@ -84,16 +100,20 @@ class AcousticMapReader(_AcousticMapFile, ResultReader[AcousticMap]):
         Unit quaternion that rotates the sensor frame into the platform frame; None if the mounting is unknown.
     trajectory : Trajectory, or None
         Pose of the platform at the last measurement of each map, by increasing time; None if the poses are unknown.
+    band_note : str
+        Note on sound that the bands of the maps do not show, or only in part; empty if there is none.
     """
 
     _row_name: ClassVar[str] = "acoustic map"
 
     band_hz: NDArray[np.float64]
     n_measurements: NDArray[np.int64]
+    band_note: str
 
     def _load(self) -> None:
         super()._load()
         self.n_measurements = np.asarray(self._group["n_measurements"][:])
+        self.band_note = str(to_python(self._group.attrs.get("band_note", "")))
 
 
 def open_acoustic_maps(path: str | Path, *, sensor: str | None = None) -> AcousticMapReader:

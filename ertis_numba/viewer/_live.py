@@ -13,6 +13,7 @@ from ertis_numba.network.status import Status
 from ertis_numba.network.subscriber import Arrival, Subscriber
 from ertis_numba.storage.recording import Mounting
 from ertis_numba.viewer._acoustic_maps import masked_note
+from ertis_numba.viewer._result_notes import ResultNotes
 from ertis_numba.viewer._shapes import Pose, ReceivedImage
 from ertis_numba.viewer._time_steps import usual_s
 
@@ -99,6 +100,7 @@ class Live:
         self._arrived_s: dict[str, deque[float]] = {}
         self._failure: Exception | None = None
         self._superseded = 0
+        self._result_notes = ResultNotes()
         self._masked: set[str] = set()  # Sensors whose measurements have a call.
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="ertis-view", daemon=True)
@@ -207,6 +209,8 @@ class Live:
                 if isinstance(item, AcousticMap) and item.masked_s and sensor not in self._masked:
                     self._masked.add(sensor)
                     self._notes.append(masked_note(sensor))
+                band_note = getattr(self._subscriber, "band_note", None)  # Of the last map.
+                self._notes.extend(self._result_notes.of(item, band_note))
                 with self._turn:
                     self.received += 1
                     self._superseded += sensor in self._waiting

@@ -40,6 +40,11 @@ class MapSequence:
         self._next = number + 1
         return self._camera.map()
 
+    @property
+    def band_note(self) -> str | None:
+        """Note on sound that the bands do not show, in all measurements so far."""
+        return self._camera.band_note
+
     def close(self) -> None:
         """Free the memory of the device."""
         self._camera.close()

@@ -25,6 +25,7 @@ from ertis_numba.storage import (
 from ertis_numba.storage.recording import Mounting
 from ertis_numba.viewer._acoustic_maps import masked_note
 from ertis_numba.viewer._map_sequence import MapSequence
+from ertis_numba.viewer._result_notes import ResultNotes
 from ertis_numba.viewer._shapes import Pose, ReceivedImage
 from ertis_numba.viewer._time_steps import UNTIMED_S, SensorTimeline, TimeStep, time_steps_of
 
@@ -131,6 +132,7 @@ class Playback:
                 ]
             self._stack = self._stack.pop_all()
         self._tracks = {name: SensorTimeline.of(name, self.time_steps) for name in self._readers}
+        self._result_notes = ResultNotes()
         self.playing, self.place, self.shown, self.anew = True, 0, 0, True
         self.held = False
         self.received = self.skipped = 0
@@ -182,8 +184,7 @@ class Playback:
 
     def notes(self) -> list[str]:
         """Return notes on the times in the file, once."""
-        reported, self._notes = self._notes, []
-        return reported
+        return [self._notes.pop(0) for _ in range(len(self._notes))]  # A thread appends others.
 
     def play(self, *, playing: bool) -> None:
         """Start the playback, from the beginning if it has ended; or stop it."""
@@ -300,10 +301,17 @@ class Playback:
         else:
             item = reader[number]
             image = self._processed(name, item) if isinstance(item, Measurement) else item
+        self._notes += self._result_notes.of(image, self._band_note(name, reader))
         pose = self._given.get(name) or Pose.of(reader.translation_m, reader.rotation_xyzw)
         if image.settings.processing.level_directions:
             pose = None  # A mounting applies to directions in the frame of the sensor.
         return ReceivedImage(image, pose, self.time_steps[place].time_s, self._tracks[name].interval_s)
+
+    def _band_note(self, name: str, reader: Reader) -> str | None:
+        """Return the note on sound that the bands of a sensor's maps do not show."""
+        if name in self._map_sequences:
+            return self._map_sequences[name].band_note
+        return reader.band_note if isinstance(reader, AcousticMapReader) else None
 
     def _are_maps(self, stamps: Mapping[str, Sequence[Stamp]]) -> bool:
         """Return True for a recording without any measurement for images."""

@@ -68,7 +68,19 @@ class Predictions:
                 self._found.append(Predicted(sensor=sensor, event=event, warning=text))
                 return  # The filter of another call does not find the times of arrival.
 
+    def _report_grid(self, sensor: str, image: "Energyscape") -> None:
+        """Report directions that are too far apart for the array."""
+        from ertis_numba.analysis.direction_spacing import spacing_warning  # noqa: PLC0415
+
+        try:
+            text = spacing_warning(image.settings, image)
+        except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images
+            text = f"directions were not compared with the array: {type(error).__name__}: {error}"
+        if text:
+            self._found.append(Predicted(sensor=sensor, event="coarse_grid", warning=text))
+
     def _predict(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
+        self._report_grid(sensor, image)
         self._report_matches(sensor, measurement)
         if image.settings.processing.method == "paper" or not image.amplitude.any():
             return  # The paper's method has no plan, and silence no relative error.

@@ -138,7 +138,7 @@ class Predicted(_Note, frozen=True, kw_only=True):
     """Warning about a sensor's images, and the log event that reports it."""
 
     sensor: str
-    event: Literal["error_budget", "call_mismatch", "layout_mismatch"]
+    event: Literal["error_budget", "call_mismatch", "layout_mismatch", "coarse_grid"]
     warning: str
 
 

@@ -1,0 +1,43 @@
+"""Notes on the images and maps of a view: coarse directions, and sound that bands do not show."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from ertis_numba.analysis.direction_spacing import spacing_warning
+from ertis_numba.frames import AcousticMap, Energyscape
+from ertis_numba.fusion import PLATFORM
+from ertis_numba.passive.search_grid import coarse_map_warning
+
+if TYPE_CHECKING:
+    from ertis_numba.settings import Settings
+
+__all__ = ["ResultNotes"]
+
+
+class ResultNotes:
+    """Notes of each sensor, once; the directions are checked again after a change of settings."""
+
+    def __init__(self) -> None:
+        self._checked: dict[str, Settings] = {}
+        self._with_band_note: set[str] = set()
+
+    def of(self, item: Energyscape | AcousticMap, band_note: str | None = None) -> Iterator[str]:
+        """Yield the new notes on an image or a map.
+
+        Parameters
+        ----------
+        item : Energyscape or AcousticMap
+        band_note : str, optional
+            Note on sound that the bands of the map do not show.
+        """
+        sensor = item.stamp.sensor
+        if band_note and sensor not in self._with_band_note:
+            self._with_band_note.add(sensor)
+            yield f"sensor {sensor}: {band_note}"
+        known, settings = self._checked.get(sensor), item.settings
+        if sensor == PLATFORM or (known is not None and known == settings.replace(air=known.air)):
+            return
+        self._checked[sensor] = settings
+        warning_of = coarse_map_warning if isinstance(item, AcousticMap) else spacing_warning
+        if text := warning_of(settings, item):
+            yield f"sensor {sensor}: {text}"
