@@ -142,7 +142,7 @@ def test_tones_at_edges_of_bands_are_named_with_their_level(rate_hz, method):
             measurement = heard(rate_hz, frequency_hz, **{"passive.method": method})
             _, note = mapped(measurement)
             named, level, low_hz, high_hz = re.search(
-                r"tone at (\S+) kHz of (\S+) dBFS lies at the edge of two bands.* --bands (\d+):(\d+) ", note
+                r"tone at (\S+) kHz of about (\S+) dBFS lies at the edge of two bands.* --bands (\d+):(\d+) ", note
             ).groups()
             assert 1e3 * float(named) == pytest.approx(
                 frequency_hz, abs=(0.4 if method == "capon" else 0.12) * spacing_hz

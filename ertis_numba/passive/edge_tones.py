@@ -35,7 +35,6 @@ class _Edge(NamedTuple):
 class _Tone(NamedTuple):
     frequency_hz: float
     power: float
-    is_whole: bool
 
 
 class EdgeTones:
@@ -110,8 +109,7 @@ class EdgeTones:
         where = "lies at the edge of two bands, each of which shows a part of its power"
         if len(edge.bands) == 1:
             where = f"lies at the edge of the bands, {edge.edge_hz / 1e3:.4g} kHz, which show a part of its power"
-        of = "" if tone.is_whole else "about "
-        return f"a tone at {frequency} of {of}{level} {where}; {self._remedy(tone.frequency_hz)}"
+        return f"a tone at {frequency} of about {level} {where}; {self._remedy(tone.frequency_hz)}"
 
     def _remedy(self, frequency_hz: float) -> str:
         low_hz, high_hz = (1 - _WIDTH) * frequency_hz, min((1 + _WIDTH) * frequency_hz, self._highest_hz)
@@ -137,7 +135,7 @@ class EdgeTones:
             places, power = _of_part(bins, tone)
         if inside < _MOST * self._bands[band] or power - inside < _LOSS * power:
             return None
-        return _Tone(float(self._frequency_hz[0]) + self._spacing_hz * places, power, bool(known.all()))
+        return _Tone(float(self._frequency_hz[0]) + self._spacing_hz * places, power)
 
 
 def _of_part(bins: NDArray[np.intp], tone: Floats) -> tuple[float, float]:
