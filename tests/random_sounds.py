@@ -9,6 +9,7 @@ from ertis_numba.geometry import direction_grid, layout_names, load_layout, unit
 from ertis_numba.settings import Array, Passive, Processing, Settings
 
 C_M_S = 343.2
+NO_DIAGONAL = ("delay_and_sum", "clean_sc", "hr_clean_sc")  # Others need the powers of single microphones.
 METHODS = ("delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc")
 BEAMFORMERS = (
     ("delay_and_sum", "none"),
@@ -90,12 +91,13 @@ def random_map(seed, most=2000):
     array, method = random_array(rng), str(rng.choice(METHODS))
     places_m = positions_m(array)
     settings = settings_of(array, random_directions(rng, most))
-    order = float(rng.choice([1, 2, 8, 20]))
-    settings = settings.replace(passive=Passive(method=method, functional_order=order))
+    order, removed = float(rng.choice([1, 2, 8, 20])), bool(rng.integers(2)) and method in NO_DIAGONAL
+    passive = Passive(method=method, functional_order=order, diagonal_removal=removed)
+    settings = settings.replace(passive=passive)
     grid = direction_grid(settings.processing)
     directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
     sources, noise = random_sources(rng, directions), 10 ** rng.uniform(-6, 0) * rng.choice([0, 1, 1, 1])
-    removed, bands = bool(rng.integers(2)), []
+    bands = []
     edges_hz = np.sort(10 ** rng.uniform(3, 4.9, 4)).reshape(2, 2)[: rng.integers(1, 3)]
     levels = 10 ** rng.uniform(-3, 0, len(sources))
     for low_hz, high_hz in edges_hz:
@@ -143,8 +145,8 @@ def form(waves, matrix):
     return np.einsum("di,di->d", waves.conj() @ matrix, waves).real
 
 
-def random_image(seed, most=600):
-    """An image of echoes, noise, or silence, with a random beamformer."""
+def random_image(seed, most=600, n_ranges=None):
+    """An image of echoes, noise, or silence, with a random beamformer; by default of up to 19 ranges."""
     rng = np.random.default_rng([2, seed])
     array, (beamformer, weighting) = random_array(rng, largest=12), BEAMFORMERS[rng.integers(len(BEAMFORMERS))]
     places_m = positions_m(array)
@@ -159,7 +161,7 @@ def random_image(seed, most=600):
     settings = settings_of(array, random_directions(rng, most), **processing)
     grid = direction_grid(settings.processing)
     directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
-    range_m = 1.0 + np.arange(int(rng.integers(1, 20))) * float(rng.choice([2e-3, 4e-3]))
+    range_m = 1.0 + np.arange(n_ranges or int(rng.integers(1, 20))) * float(rng.choice([2e-3, 4e-3]))
     wave_1_m = 2 * math.pi * np.linspace(25e3, 50e3, 12) / C_M_S
     heard = 10 ** rng.uniform(-6, -1) * rng.choice([0, 1, 1]) * complex_normal(rng, len(directions), len(range_m), 1)
     signals = np.repeat(heard, len(places_m), axis=2) + heard.any() * 1e-3 * complex_normal(rng, 1, 1, len(places_m))

@@ -37,6 +37,12 @@ def test_fine_grids_cause_no_warning(directions):
     assert warning_of(directions) is None
 
 
+def test_one_microphone_hears_no_direction_that_a_grid_could_miss():
+    one = ertis.Settings().replace(**{"array.disabled": tuple(range(1, 32))}).array
+    assert warning_of("2d:181", array=one) is None
+    assert warning_of("2d:20", array=one) is None
+
+
 @pytest.mark.parametrize(("directions", "spacing"), [("2d:20", "9.5"), ("3d:400", "7.1")])
 def test_coarse_grids_cause_a_warning_with_a_grid_that_is_fine(directions, spacing):
     text = warning_of(directions)

@@ -1,6 +1,7 @@
 """No listed level exceeds its image or acoustic map by more than 1 dB, and no listed direction leaves its cell.
 
-``ERTIS_RANDOM_CASES=10000 pytest tests/test_invented_sources.py`` tries more random cases.
+``ERTIS_RANDOM_CASES=10000 pytest --timeout 0 tests/test_invented_sources.py`` tries more random cases, and
+``ERTIS_RANDOM_CASES=2500:5000`` a part of them.
 """
 
 import os
@@ -24,8 +25,14 @@ from tests.random_sounds import C_M_S, map_power, random_image, random_map, sett
 from tests.test_detect import image_of
 
 MANY = os.environ.get("ERTIS_RANDOM_CASES")
-N_MAPS, N_IMAGES = (int(MANY), int(MANY)) if MANY else (120, 80)
+FIRST, _, LAST = MANY.rpartition(":") if MANY else ("", "", "")
+MAPS, IMAGES = ([range(int(FIRST or 0), int(LAST))] * 2) if MANY else (range(120), range(80))
 LIMIT_DB = 1.0
+
+
+def is_wide(seed):
+    """True for seeds of images with so many ranges that many maxima are listed."""
+    return seed % (2 if MANY else 16) == 1
 
 
 def are_in_cells(grid, level, listed, tolerance=1e-7):
@@ -40,8 +47,8 @@ def are_in_cells(grid, level, listed, tolerance=1e-7):
 
 
 def test_no_source_is_louder_than_its_map():
-    for seed in range(N_MAPS):
-        found = random_map(seed, most=10_000 if MANY else 2000)
+    for seed in MAPS:
+        found = random_map(seed, most=10_000 if MANY and seed % 10 == 0 else 1000)
         sources = sources_of_grid(found, top=None)
         assert len(sources) == len(find_sound_sources(found, top=None)) > 0, seed
         for each in sources:
@@ -56,10 +63,10 @@ def test_no_source_is_louder_than_its_map():
 
 
 def test_no_peak_is_louder_than_its_image():
-    for seed in range(N_IMAGES):
-        image = random_image(seed)
+    for seed in IMAGES:
+        image = random_image(seed, most=200, n_ranges=64 + seed % 7) if is_wide(seed) else random_image(seed)
         highest_dbfs = image.level_dbfs.max()
-        peaks = peaks_of_grid(image, top=20)
+        peaks = peaks_of_grid(image, top=40)
         assert all(peak.level_dbfs <= highest_dbfs + LIMIT_DB for peak in peaks), (seed, peaks)
         if peaks:
             listed = unit_vectors(*np.transpose([(peak.azimuth_rad, peak.elevation_rad) for peak in peaks]))
@@ -143,6 +150,55 @@ def test_peak_states_the_error_that_the_grid_causes(directions, error_deg):
     if directions == "3d:900":
         (peak,) = find_peaks(image_of([(91.0, 5.0, 1.2, 1.0)], directions=directions, range_m=(1.1, 1.3)), top=1)
         assert 1 < peak.grid_error_deg < 2  # directions are 4.8° apart
+
+
+@pytest.mark.parametrize("azimuth_deg", [-180, -179.6, -178.7, 178.7, 179.3, 180])
+@pytest.mark.parametrize("limits_deg", [(-180.0, 180.0), (-180.0, 178.0)])
+def test_maximum_at_the_seam_of_a_full_circle_is_interpolated_across_it(azimuth_deg, limits_deg):
+    n_directions = 181 if limits_deg[1] == 180 else 180  # The first circle ends where it starts.
+    azimuth_rad = np.radians(np.linspace(*limits_deg, n_directions))
+    level = -(np.degrees(np.angle(np.exp(1j * (azimuth_rad - np.radians(azimuth_deg))))) ** 2)
+    directions = unit_vectors(azimuth_rad, 0 * azimuth_rad)
+    neighbours, here = neighbours_of(directions), np.array([level.argmax()])
+    fits = QuadricFits.of(directions, neighbours, here)
+    offset, _ = fits.tops(np.array([0]), level[neighbours[here]] - level[here][:, None])
+    offset, width_rad = fits.within_cells(np.array([0]), offset)
+    found = np.angle(np.dot(directions[here[0]] + offset[0], [1, 1j, 0]) * np.exp(-1j * np.radians(azimuth_deg)))
+    assert np.degrees(found) == pytest.approx(0, abs=0.01)
+    assert width_rad == pytest.approx(0)
+
+
+@pytest.mark.parametrize(
+    "azimuth_deg", [np.linspace(-180, 180, 37), np.repeat(np.arange(-30.0, 31, 5), 2), np.tile([5.0, 6, 7], 4)]
+)
+def test_neighbours_of_equal_directions_are_different_ones(azimuth_deg):
+    directions = unit_vectors(np.radians(azimuth_deg), 0 * azimuth_deg)
+    for place, row in enumerate(neighbours_of(directions)):
+        equal = np.flatnonzero(np.linalg.norm(directions - directions[place], axis=1) < 1e-9)
+        assert row[0] == equal[0]
+        assert set(equal) <= set(row)
+        others = np.linalg.norm(directions[row[1:3]] - directions[place], axis=1)
+        assert others[0] > 1e-9
+        assert len(np.unique(row[:3])) == 3
+
+
+@pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")
+def test_direction_that_is_listed_twice_is_one_source():
+    for copies in (1, 2, 9):
+        azimuth_deg = np.repeat(np.arange(-20.0, 21), copies)
+        found = edge_map(7.2, 0, tuple((float(each), 0.0) for each in azimuth_deg))
+        (source,) = find_sound_sources(found, top=None, min_level_db=-1)
+        assert np.degrees(source.azimuth_rad) == pytest.approx(7.2, abs=0.1)
+
+
+def test_direction_that_is_held_at_its_border_has_the_error_of_what_was_cut():
+    directions = unit_vectors(np.radians(np.arange(-6.0, 7, 2)), np.zeros(7))
+    fits = QuadricFits.of(directions, neighbours_of(directions), np.array([3]))
+    for wanted_deg, error_deg in ((0.9, 0.0), (1.2, 0.2), (1.32, 0.32), (1.6, 2 / np.sqrt(12))):
+        offset = unit_vectors(np.radians([wanted_deg]), np.zeros(1)) - directions[3]
+        cut, width_rad = fits.within_cells(np.array([0]), offset)
+        assert np.degrees(np.linalg.norm(cut)) == pytest.approx(min(wanted_deg, 1.0), abs=0.02)
+        assert np.degrees(width_rad[0]) / np.sqrt(12) == pytest.approx(error_deg, abs=0.02)
 
 
 def angles_of(directions, *, shown):

@@ -81,6 +81,7 @@ def test_unknown_angles_are_not_listed(positions_m, known):
     (peak,) = ertis.find_peaks(heard_by(positions_m, [(20, 10, 1.1, 1.0)], directions="3d:600"), min_level_db=-10)
     for name in ("azimuth_deg", "elevation_deg"):
         assert np.isnan(getattr(peak, name)) == (name != known)
+    assert np.isnan(peak.grid_error_deg) == (known is None)  # There is no direction that could be in error.
     assert peak.range_m == pytest.approx(1.1, abs=2e-3)
     if known is not None:
         assert peak.elevation_deg == pytest.approx(10, abs=1.5)

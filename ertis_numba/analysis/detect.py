@@ -18,6 +18,7 @@ from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vecto
 
 __all__ = ["find_peaks", "neighbours_of", "peaks_of_grid"]
 
+_SAME_DIGITS = 9  # Decimals in which the unit vectors of equal directions agree.
 _NEIGHBOURS = 8  # Number of directions around each direction of a dense grid.
 
 
@@ -85,7 +86,8 @@ def _observed(peak: Peak, seen: ObservableAngles, *, is_planar: bool) -> Peak:
         return peak
     angles_rad = seen.observed_rad(peak.azimuth_rad, peak.elevation_rad, is_planar=is_planar)
     azimuth_deg, elevation_deg = map(math.degrees, angles_rad)
-    return replace(peak, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
+    error_deg = math.nan if math.isnan(azimuth_deg) and math.isnan(elevation_deg) else peak.grid_error_deg
+    return replace(peak, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, grid_error_deg=error_deg)
 
 
 def peaks_of_grid(
@@ -148,7 +150,8 @@ def peaks_of_grid(
 def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return each direction with its nearest neighbours.
 
-    Directions of a single elevation have two neighbours, others have eight.
+    Directions of a single elevation have two neighbours, others have eight. Equal directions, such as azimuths of -180°
+    and 180°, count as one neighbour, and are added to each other's rows.
 
     Parameters
     ----------
@@ -158,11 +161,22 @@ def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
     Returns
     -------
     (direction, neighbour) int64
-        Indices of the direction itself and of its neighbours; fewer if there are too few directions.
+        Indices of the direction, or the first one equal to it, and of its neighbours; fewer if there are too few
+        directions. Further columns, which exist if directions are equal, hold those that are.
     """
     count = 2 if np.ptp(directions[:, 2]) == 0 else _NEIGHBOURS
-    _, nearest = scipy.spatial.KDTree(directions).query(directions, k=min(count + 1, len(directions)))
-    return np.asarray(nearest, dtype=np.int64).reshape(len(directions), -1)
+    # Adding 0 turns -0 into 0.
+    rounded = np.round(directions, _SAME_DIGITS) + 0.0
+    _, first, group, sizes = np.unique(rounded, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    group, kept = group.reshape(-1), np.sort(first)
+    _, nearest = scipy.spatial.KDTree(directions[kept]).query(directions, k=min(count + 1, len(kept)))
+    rows = kept[np.asarray(nearest, dtype=np.int64).reshape(len(directions), -1)]
+    if len(first) == len(directions):
+        return rows
+    members = np.repeat(first[:, None], sizes.max(), axis=1)
+    order = np.argsort(group, kind="stable")
+    members[group[order], np.arange(len(order)) - (np.cumsum(sizes) - sizes)[group[order]]] = order
+    return np.concatenate([rows, members[group][:, 1:]], axis=1)
 
 
 def _local_maxima(

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from ertis_numba.analysis.array_response import ArrayAxes, CallResponse, Response
 from ertis_numba.analysis.between_directions import Between, farthest_places
 from ertis_numba.angles import DegreesFromRadians
-from ertis_numba.geometry import direction_grid, microphones, named_grid, spacing_rad, unit_vectors
+from ertis_numba.geometry import direction_grid, microphones, named_grid, observable_angles, spacing_rad, unit_vectors
 from ertis_numba.settings import Processing, Settings
 
 __all__ = ["LARGEST_GRID", "MAX_LOSS_DB", "GridCheck", "Lobe", "Peak", "image_peak", "rounded_down", "spacing_warning"]
@@ -267,7 +267,8 @@ def spacing_warning(settings: Settings, grid: DegreesFromRadians) -> str | None:
     Returns
     -------
     str or None
-        None for fine grids, and for grids of a single direction. The warning names a grid that suffices.
+        None for fine grids, for grids of a single direction, and for arrays that observe no direction. The warning
+        names a grid that suffices.
 
     Examples
     --------
@@ -277,6 +278,8 @@ def spacing_warning(settings: Settings, grid: DegreesFromRadians) -> str | None:
     ...     spacing_warning(recording.settings, ertis.Pipeline(recording.settings).grid) is None
     True
     """
+    if not any(observable_angles(settings.array)[:2]):
+        return None
     lobe = Lobe(CallResponse(settings), image_peak(settings))
     check = GridCheck(grid, settings.processing)
     if check.suffices(lobe):

@@ -1,5 +1,6 @@
 """Quadrics through values at neighbouring directions, whose maxima stay within the cell of a direction."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,7 +123,8 @@ class QuadricFits:
     def within_cells(self, directions: NDArray[np.int64], offset: Floats) -> tuple[Floats, Floats]:
         """Return offsets that end within their cells, (place, axis) float64, and the width of cells: (place,) float64.
 
-        A width is 0 if the direction is interpolated along as many axes as the grid has.
+        A width is 0 if the direction is interpolated along as many axes as the grid has, and less than that
+        of the cell if the offset was shortened a little.
 
         Parameters
         ----------
@@ -137,12 +139,14 @@ class QuadricFits:
             _, nearest = self.grid.query(top / np.linalg.norm(top, axis=1)[:, None])
             other = self.grid.data[nearest] - here
             half, along = 0.5 * (other**2).sum(axis=1), (other * offset).sum(axis=1)
-            is_beyond = share * along > half * (1 + _SAME)
+            is_beyond = (share * along > half * (1 + _SAME)) & (half > _SAME**2)  # Equal directions share a cell.
             if not is_beyond.any():
                 break
             share[is_beyond] = half[is_beyond] / along[is_beyond]
         is_between = offset.any(axis=1) & (share > _BESIDE) & (self.n_axes[directions] >= self.n_axes_of_grid)
-        return offset * share[:, None], np.where(is_between, 0.0, self.width_rad[directions])
+        cut_rad = (1 - share) * np.linalg.norm(offset, axis=1)  # The error is about as large: that of a wider cell.
+        width_rad = self.width_rad[directions]
+        return offset * share[:, None], np.where(is_between, np.minimum(math.sqrt(12) * cut_rad, width_rad), width_rad)
 
 
 def _are_around(x: Floats, y: Floats) -> NDArray[np.bool_]:

@@ -118,7 +118,8 @@ def find_sound_sources(
 def _observed(source: SoundDirection, seen: ObservableAngles, *, is_planar: bool) -> SoundDirection:
     """Return a source without the angles that the array cannot observe."""
     azimuth_rad, elevation_rad = seen.observed_rad(source.azimuth_rad, source.elevation_rad, is_planar=is_planar)
-    return source._replace(azimuth_rad=azimuth_rad, elevation_rad=elevation_rad)
+    error_rad = math.nan if math.isnan(azimuth_rad) and math.isnan(elevation_rad) else source.grid_error_rad
+    return source._replace(azimuth_rad=azimuth_rad, elevation_rad=elevation_rad, grid_error_rad=error_rad)
 
 
 def sources_of_grid(
