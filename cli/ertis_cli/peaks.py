@@ -212,7 +212,7 @@ def _list_sources(
 
 def _has_grid_errors(rows: list[dict[str, Any]]) -> bool:
     """Return True if the direction of a row is not interpolated between directions of the grid."""
-    return any(row["grid_error_deg"] != 0 for row in rows)
+    return any(row["grid_error_deg"] != 0 for row in rows if (row["azimuth_deg"], row["elevation_deg"]) != (None, None))
 
 
 def _source_cells(row: dict[str, Any], more: dict[str, str]) -> tuple[str, ...]:
