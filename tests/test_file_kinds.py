@@ -208,7 +208,7 @@ def test_import_refuses_other_formats_under_any_name(tmp_path, raw_settings, nam
 def test_import_reads_wav_by_its_content(tmp_path, name):
     wavfile.write(tmp_path / "a", 96_000, np.tile(VALUES, (4, 1)))
     (tmp_path / "a").rename(tmp_path / name)
-    (tmp_path / "pair.csv").write_text("0,0,0\n0,10,0\n")
+    (tmp_path / "pair.csv").write_text("0,0,0\n0,20,0\n")
     done = invoke("import", tmp_path / name, "--layout", tmp_path / "pair.csv", "--passive", "-o", tmp_path / "out.h5")
     assert done.exit_code == 0, done.stderr
     with ertis.open_recording(tmp_path / "out.h5") as recording:

@@ -203,12 +203,13 @@ class EdgeFloor:
         if len(floor) < 3 or len(self._samples) < _LEAST_DIRECTIONS:
             return floor
         reach_m = min(self._spread.reach_m, _SHARE * float(image.range_m[-1] - image.range_m[0]))
-        ends = (image.range_m - image.range_m[0] < reach_m) | (image.range_m[-1] - image.range_m < reach_m)
+        before = image.range_m[0] > image.range_m[1] - image.range_m[0]  # Nothing is nearer than range 0.
+        ends = (before & (image.range_m - image.range_m[0] < reach_m)) | (image.range_m[-1] - image.range_m < reach_m)
         places = np.flatnonzero(ends)
         level = np.quantile(image.amplitude[np.ix_(self._samples, places)], _QUARTILE, axis=0)
         floor[places] = level * min(_OWN / self._own, 1 / _LEAST_OWN)
         highest = image.amplitude.max(axis=0)
-        for inwards in (slice(None), slice(None, None, -1)):
+        for inwards in (slice(None), slice(None, None, -1))[0 if before else 1 :]:
             self._raise_skirt(
                 floor[inwards], highest[inwards], np.abs(image.range_m - image.range_m[inwards][0])[inwards]
             )

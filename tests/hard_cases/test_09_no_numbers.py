@@ -88,7 +88,8 @@ def test_settings_files_refuse_nan_and_infinity(section, field, bad):
 def test_layout_files_refuse_nan_and_infinity(tmp_path, bad, suffix):
     path = tmp_path / f"l.{suffix}"
     path.write_text(f"0, 0\n1, {bad}\n" if suffix == "csv" else f"positions_mm = [[0, 0], [1, {bad}]]\n")
-    with pytest.raises(ArgumentError, match=rf"l\.{suffix}.*positions_mm holds -?(nan|inf) at \[1, 2\]; give finite"):
+    fault = "line 2: z is " if suffix == "csv" else r"positions_mm holds -?(nan|inf) at \[1, 2\]"
+    with pytest.raises(ArgumentError, match=rf"l\.{suffix}.*{fault}.*finite"):
         load_layout(path)
 
 
