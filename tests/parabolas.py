@@ -141,6 +141,8 @@ def edge_floor(image, directions):
     highest = image.amplitude.max(axis=0)
     for place, range_m in enumerate(image.range_m):
         for edge, step in ((0, 1), (-1, -1)):
+            if edge == 0 and image.range_m[0] <= image.range_m[1] - image.range_m[0]:
+                continue
             offset_m = abs(range_m - image.range_m[edge])
             if offset_m < reach_m:
                 floor[place] = max(
