@@ -101,9 +101,7 @@ def find_other_array(
         every += [arrived[0] - layout.delay_s[picked] for arrived in wide if arrived is not None]
     for check in (_other_order, _other_size_of_direct_sound if is_near else _other_size):
         for times in every[::-1]:
-            if (
-                np.ptp(times) < _MIN_SPREAD_S
-            ):  # Equal in all channels, as a disturbance: no direction.
+            if np.ptp(times) < _MIN_SPREAD_S:  # Equal in all channels, as a disturbance: no direction.
                 continue
             finding = check(times, picked, layout, path_m, speed_m_s)
             if finding is not None:
