@@ -67,7 +67,7 @@ def faulty(tmp_path):
 
 
 # Converter noise is a larger part of so small an image than the default budget permits, which `process` reports, too.
-FAST = ["--directions", "2d:5", "--range", "0.8:1.2", "--quiet", "--max-error", "-25"]
+FAST = ["--directions", "2d:31", "--range", "0.8:1.2", "--quiet", "--max-error", "-25"]
 
 
 def test_process_warns_once_of_a_fault(faulty, tmp_path):

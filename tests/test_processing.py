@@ -340,7 +340,8 @@ def test_missed_error_budget_is_logged_once_per_sensor(cpu_loop, changes):
 
 @pytest.mark.parametrize("is_paper", [True, False])
 def test_images_of_no_plan_and_silence_are_not_predicted(is_paper):
-    settings = SHORT.replace(processing=SHORT.processing.replace(method="paper")) if is_paper else SHORT
+    method = "paper" if is_paper else "fast"
+    settings = SHORT.replace(processing=SHORT.processing.replace(method=method, directions="2d:31"))
     measurement = MEASUREMENT if is_paper else dataclasses.replace(MEASUREMENT, data=np.zeros_like(MEASUREMENT.data))
     with Pipeline(settings, predict=False) as pipeline:
         image = pipeline.process(dataclasses.replace(measurement, settings=settings))
