@@ -48,7 +48,7 @@ def files(tmp_path_factory):
     write_recording(folder / "rec.h5", noise())
     (folder / "settings.toml").write_text(Settings().to_toml())
     (folder / "layout.toml").write_text("positions_mm = [[0, 0], [5, 0], [0, 8]]\n")
-    (folder / "layout.csv").write_text("0, 0\n5, 0\n0, 8\n")
+    (folder / "layout.csv").write_text("y_mm, z_mm\n0, 0\n5, 0\n0, 8\n")
     return folder
 
 

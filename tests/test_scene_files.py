@@ -126,7 +126,7 @@ def test_positions_are_computed_from_direction_and_range():
 
 def test_scene_stores_the_layout_beside_its_file(tmp_path):
     """A relative layout path starts at the folder of the scene file."""
-    (tmp_path / "line.csv").write_text("0, 0\n10, 0\n20, 0\n")
+    (tmp_path / "line.csv").write_text("y_mm, z_mm\n0, 0\n10, 0\n20, 0\n")
     (tmp_path / "scene.toml").write_text('[[sensors]]\narray.layout = "line.csv"\n[[points]]\nrange_m = 1\n')
     scene = load_scene(tmp_path / "scene.toml")
     assert scene.points == (Point(range_m=1.0),)

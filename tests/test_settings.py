@@ -346,7 +346,7 @@ def test_range_decimation_without_a_useful_divisor_is_refused():
 
 def test_distant_microphones_are_refused():
     with pytest.raises(
-        ArgumentError, match=r"array.positions_m spans 40 m, more than 25 m; are the numbers millimetre"
+        ArgumentError, match=r"array.positions_m spans 40 m, more than 25 m; if the numbers are millimetres, divide"
     ):
         Array(positions_m=((0.0, 0.0, 0.0), (40.0, 0.0, 0.0)))
     with pytest.raises(ArgumentError, match=r"array.positions_m\[1\] is 4e\+07; give a number from -1e\+07 to 1e\+07"):
@@ -364,7 +364,7 @@ def test_settings_of_older_recordings_are_read():
 def test_files_named_in_settings_are_relative_to_the_settings_file(tmp_path, monkeypatch):
     folder = tmp_path / "mine"
     folder.mkdir()
-    (folder / "line.csv").write_text("0, 0\n10, 0\n")
+    (folder / "line.csv").write_text("y_mm, z_mm\n0, 0\n10, 0\n")
     (folder / "two.csv").write_text("-10, 0\n10, 0\n")
     (folder / "s.toml").write_text('[array]\nlayout = "line.csv"\n[processing]\ndirections = "two.csv"\n')
     monkeypatch.chdir(tmp_path)
