@@ -49,7 +49,7 @@ def test_journal_stores_all_sample_types(tmp_path, settings):
 
 def test_journal_needs_no_layout_file(tmp_path):
     layout = tmp_path / "layout.csv"
-    layout.write_text("0, 0\n10, 0\n0, 10\n")
+    layout.write_text("y_mm, z_mm\n0, 0\n10, 0\n0, 10\n")
     settings = TINY.replace(array=Array(layout=str(layout)))
     with create(tmp_path, [], settings=settings) as journal:
         journal.add_sensor("left", settings, firmware="3.1.4", translation_m=(1, -2, 0.1), rotation_xyzw=(1, 0, 0, 0))

@@ -62,7 +62,7 @@ def test_readers_are_sequences(tmp_path):
 
 def test_recording_needs_no_other_file(tmp_path):
     layout = tmp_path / "mine.csv"
-    layout.write_text("0, 0\n4, 0\n8, 1\n")
+    layout.write_text("y_mm, z_mm\n0, 0\n4, 0\n8, 1\n")
     settings = SMALL.replace(array=Array(layout=str(layout)))
     words = noise(count=1)[0].data
     write_recording(tmp_path / "rec.h5", [Measurement(words, settings)])
