@@ -12,7 +12,7 @@ from ertis_cli.main import cli
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
-from ertis_numba.geometry import layouts, load_layout
+from ertis_numba.geometry import load_layout, shipped_layouts
 from ertis_numba.simulation import Box, Point, Scene, Tone
 from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.engine import Engine
@@ -117,7 +117,7 @@ def test_ground_truth_log_names_the_unwritable_folder(tmp_path):
 
 def test_shipped_layout_is_read_once(monkeypatch):
     load_layout("eRTIS_v3D1")
-    monkeypatch.setattr(layouts.resources, "files", lambda _: pytest.fail("the layout was read again"))
+    monkeypatch.setattr(shipped_layouts.resources, "files", lambda _: pytest.fail("the layout was read again"))
     layout = load_layout("eRTIS_v3D1")
     layout.positions_m[:] = 0.0  # Each caller has its own copy.
     assert load_layout("eRTIS_v3D1").positions_m.any()
