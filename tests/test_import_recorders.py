@@ -136,7 +136,7 @@ def test_commands_of_the_page_run(tmp_path):
         for name in names:
             write(tmp_path / folder / f"{name}.wav", noise()[:, 0])
     (tmp_path / "one.csv").write_text("0, 0\n")
-    (tmp_path / "pair.csv").write_text("0, 0\n10, 0\n")
+    (tmp_path / "pair.csv").write_text("y_mm, z_mm\n0, 0\n10, 0\n")
     write(tmp_path / "loopback.wav", record([1.37e-3], 0.02).astype("f4"))
     ring_file(tmp_path).rename(tmp_path / "call.toml")
     for each in commands_in(page("recordings")):
