@@ -38,6 +38,7 @@ class ForkSafeLock:
 
     Examples
     --------
+    >>> from ertis_numba.forks import ForkSafeLock
     >>> lock = ForkSafeLock()
     >>> with lock:
     ...     print("alone")

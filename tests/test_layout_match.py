@@ -89,7 +89,7 @@ def test_size_of_direct_sound_is_named():
     given = heard(disc(0.1), source_m=(0.0, 0.0, 1e-6))
     assert not layout_match(given).warning
     found = layout_match(read_as(given, positions_m=10 * disc(0.1))).warning
-    assert "suits an array 0.1 times as large" in found
+    assert "fits an array 0.1 times as large" in found
 
 
 def test_silence_and_few_microphones_are_not_judged():

@@ -162,8 +162,8 @@ def search_warning(settings: Settings) -> str | None:
     >>> from ertis_numba.passive.search_grid import search_warning
     >>> settings = ertis.Settings().replace("passive.bands_hz", ((20e3, 30e3),))
     >>> search_warning(settings.replace("processing.directions", "3d:100")).split("; ")[-1]
-    'search at least 3d:210 directions'
-    >>> search_warning(settings.replace("processing.directions", "3d:210")) is None
+    'search at least 3d:230 directions'
+    >>> search_warning(settings.replace("processing.directions", "3d:230")) is None
     True
     """
     grid = direction_grid(settings.processing)
