@@ -468,7 +468,7 @@ def test_capture_dry_run_prints_commands_and_opens_no_port(tmp_path):
         (["--port", "{link}", "--name", "a", "--name", "b"], "2 names are given for 1 ports; give one --name", 2),
         (["--port", "nowhere"], "ertis: error: serial port 'nowhere' does not exist", 1),
         (["--port", "{link}", "--preset", "default_25_50"], "--preset and --settings exclude each other; give one", 2),
-        (["--port", "{link}", "-o", "settings.toml"], "output settings.toml exists; give another name, or ask", 1),
+        (["--port", "{link}", "-o", "settings.toml"], "output settings.toml is the input itself; give another name", 1),
         (["--port", "{link}", "--port", "{link}"], "is given 2 times; give each sensor once", 2),
         (["--port", "{link}", "--rate", "0"], "--rate is 0; give a number from", 2),
         (["--port", "{link}", "--temperature", "99"], "--temperature is 99; give a number from -40 to 60", 2),

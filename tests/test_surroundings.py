@@ -126,7 +126,7 @@ def test_scripts_get_the_backend_back(monkeypatch):
 
 
 REFUSED = {
-    "NUMBA_NUM_THREADS=0": "Numba refuses one of its environment variables .*NUMBA_NUM_THREADS=0",
+    "NUMBA_NUM_THREADS=0": "Numba refuses one of its environment variables.*NUMBA_NUM_THREADS=0",
     "NUMBA_NUM_THREADS=many": "NUMBA_NUM_THREADS=many .* could not be parsed",
     "NUMBA_THREADING_LAYER=fast": "NUMBA_THREADING_LAYER is 'fast'; use one of default,",
     "NUMBA_THREADING_LAYER_PRIORITY=omp": "must list tbb, omp and workqueue in any order; unset it",

@@ -148,8 +148,9 @@ def _other_size(
     is_possible = own.slowness <= _MAX_SLOWNESS
     if spread_s > _CLEAR * float(np.ptp(times_s)) or (is_possible and own.spread_s < _MIN_CURVED * spread_s):
         return None
+    is_plane = low == 0.0  # Waves from far away are flat, too, and fit an array of any size.
     low = max(low, own.slowness)
-    if is_possible and low <= _MAX_GROWTH and high >= _MIN_SHRINKAGE:
+    if is_possible and low <= _MAX_GROWTH and (is_plane or high >= _MIN_SHRINKAGE):
         return None
     factor, about = (low, "at least ") if low > 1 else (high, "at most ")
     return _of_size(channels, factor, about)
