@@ -611,7 +611,7 @@ def test_map_and_recording_are_told_apart(tmp_path):
         ertis.open_recording(tmp_path / "m.h5")
     with pytest.raises(DataError, match="not an occupancy map; give one, as from 'ertis map'"):
         ertis.read_map(REFLECTORS)
-    with pytest.raises(DataError, match="give an occupancy map"):
+    with pytest.raises(DataError, match="choose an occupancy map"):
         ertis.read_map(tmp_path / "none.h5")
 
 
