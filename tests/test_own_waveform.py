@@ -183,7 +183,7 @@ def test_call_refuses_invalid_waveforms(changes, message):
     ("name", "write", "message"),
     [
         ("own.wav", lambda path: wavfile.write(path, 192_000, np.ones((300, 2), np.int16)), "give one channel"),
-        ("own.wav", lambda path: path.write_bytes(b"RIFF"), "is not a WAV file"),
+        ("own.wav", lambda path: path.write_bytes(b"RIFF"), "is a RIFF file of another form than WAVE"),
         ("own.npy", lambda path: path.write_bytes(b"\x80\x04N."), "cannot be read"),
         ("own.npy", lambda path: path.write_bytes(b""), "cannot be read"),
         ("own.csv", lambda path: path.write_text("a,b"), "cannot be read"),
