@@ -150,7 +150,7 @@ CASES = {
     "unknown mounting": ("both.energy.h5 -o a.ply", 1, "choose one (--sensor), or give their --mounting"),
     "several sensors": ("both.h5 -o a.npz", 1, "sensors left and right cannot share the axes of one npz"),
     "several signals": ("rec.h5 -o a.h5", 1, "more than one measurement was given; give one (--measurement)"),
-    "no signals": ("img.h5 -o a.h5 -m 0", 1, "img.h5 is an energyscape file, wanted a recording; give"),
+    "no signals": ("img.h5 -o a.h5 -m 0", 1, "img.h5 is an energyscape file, wanted a recording; use the recording"),
     "topics of a cloud": (
         "img.h5 -o a.ply --topic points",
         1,
