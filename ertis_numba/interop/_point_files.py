@@ -109,7 +109,7 @@ def write_csv(path: Path, table: PointTable) -> None:
 
 
 def _shortest(column: NDArray[Any]) -> NDArray[np.str_]:
-    """Return the shortest texts that read back as the same numbers, of float32 if all of them are such numbers."""
+    """Return the shortest texts that read back as the same numbers, which are float32 if all of them fit it."""
     single = column.astype(np.float32) if column.dtype.kind == "f" else column
     return (single if np.array_equal(single, column, equal_nan=column.dtype.kind == "f") else column).astype(str)
 

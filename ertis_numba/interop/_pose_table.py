@@ -54,7 +54,7 @@ class _Columns(NamedTuple):
     """Places of roll, pitch and yaw, and the degrees in their unit."""
     n_fields: int
     is_bare: bool = False
-    """Whether positions have names without a unit."""
+    """True if the names of positions state no unit."""
 
     @property
     def is_complete(self) -> bool:
