@@ -299,10 +299,9 @@ def test_image_address_refuses_long_settings_admins_and_poses_with_the_other_add
         with CentralClient(publisher.address) as client, pytest.raises(RefusedError) as refused:
             client.configure("a", TINY, SOON_S)
         assert str(refused.value) == FOR_APPLICATIONS
-        with PosePublisher(publisher.address, ["a"]) as poses:
-            poses.send(5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-            with pytest.raises(RefusedError) as refused:
-                poses.flush(SOON_S)
+        with PosePublisher(publisher.address, ["a"]) as poses, pytest.raises(RefusedError) as refused:
+            poses.send(5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))  # It raises the refusal if that has already arrived.
+            poses.flush(SOON_S)
         assert str(refused.value) == FOR_APPLICATIONS
     finally:
         publisher.close()

@@ -226,10 +226,12 @@ def test_only_keys_of_all_sensors_may_send_poses(tmp_path):
     }
     with running(tmp_path / "a", keys=ServerKeys(server, tmp_path / "allow.toml")) as central:
         for (name, sensor), wanted in refusals.items():
-            with PosePublisher(central.address, ["left", sensor], keys=keys[name]) as publisher:
-                publisher.send(5, (0, 0, 0), IDENTITY)
-                with pytest.raises(RefusedError, match=wanted):
-                    publisher.flush()
+            with (
+                PosePublisher(central.address, ["left", sensor], keys=keys[name]) as publisher,
+                pytest.raises(RefusedError, match=wanted),
+            ):
+                publisher.send(5, (0, 0, 0), IDENTITY)  # It raises the refusal if that has already arrived.
+                publisher.flush()
         with PosePublisher(central.address, ["left"], keys=keys["robot"]) as publisher:
             publisher.flush()
             assert publisher.send(5, (0, 0, 0), IDENTITY)
