@@ -286,6 +286,12 @@ FOR_APPLICATIONS = (
 )
 
 
+def _send_pose(poses):
+    """Send a pose, and raise its refusal, which may arrive during either call."""
+    poses.send(5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    poses.flush(SOON_S)
+
+
 def test_image_address_refuses_long_settings_admins_and_poses_with_the_other_address():
     long = TINY.replace(call=Call(waveform=tuple(np.sin(np.arange(1500)).tolist())))
     text = long.to_toml().encode()
@@ -300,8 +306,7 @@ def test_image_address_refuses_long_settings_admins_and_poses_with_the_other_add
             client.configure("a", TINY, SOON_S)
         assert str(refused.value) == FOR_APPLICATIONS
         with PosePublisher(publisher.address, ["a"]) as poses, pytest.raises(RefusedError) as refused:
-            poses.send(5, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))  # It raises the refusal if that has already arrived.
-            poses.flush(SOON_S)
+            _send_pose(poses)
         assert str(refused.value) == FOR_APPLICATIONS
     finally:
         publisher.close()
