@@ -11,7 +11,7 @@ from ertis_cli.main import cli
 import ertis_numba as ertis
 from ertis_numba import figures
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import Grid, direction_grid, load_layout, observable_angles
+from ertis_numba.geometry import Grid, direction_grid, direction_note, load_layout, observable_angles
 from ertis_numba.interop import export
 from ertis_numba.settings import Array, Processing
 from ertis_numba.storage import write_energyscapes
@@ -57,6 +57,28 @@ def test_positions_determine_the_observable_angles(array, grid, angles, note):
     seen = observable_angles(array, grid)
     assert seen[:2] == angles
     assert (note is None and seen.note is None) or note in seen.note
+
+
+SPATIAL = array_of([(0, 0, 0), (0.01, 0, 0), (0, 0.01, 0), (0, 0, 0.01)])
+
+
+@pytest.mark.parametrize(
+    ("array", "directions", "is_passive", "note"),
+    [
+        (Array(), "3d:200", False, None),
+        (Array(), "3d:200", True, "sound from behind this plane appears in front of it"),
+        (SPATIAL, "3d:200", True, None),
+        (SPATIAL, "2d:31", True, "directions at one elevation, 0°"),
+        (Array(), "2d:31", True, "locate it; it also has its microphones in a plane, so sound from behind"),
+        (Array(), "2d:1", False, "one direction, azimuth 0°, elevation 0°, so sound from elsewhere appears there"),
+        (Array(), ((10.0, 5.0), (10.0, 5.0)), False, "one direction, azimuth 10°, elevation 5°"),
+        (array_of(LINES["y"]), "2d:31", True, "on a horizontal line; the elevation is unknown"),
+        (array_of(ONE), "2d:31", True, "has one microphone"),
+    ],
+)
+def test_note_names_directions_that_a_grid_cannot_show(array, directions, is_passive, note):
+    text = direction_note(array, direction_grid(Processing(directions=directions)), is_passive=is_passive)
+    assert text is None if note is None else note in text
 
 
 def heard_by(positions_m, reflectors, *, directions):

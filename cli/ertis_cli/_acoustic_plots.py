@@ -137,9 +137,10 @@ def draw(
 
 
 def _warn_of_map(found: "AcousticMap", note: str | None) -> None:
-    """Print warnings of a map that is drawn: coarse directions, and sound that its bands do not show."""
+    """Print notes on a map that is drawn: its directions, and sound that its bands do not show."""
     from ertis_numba.passive.search_grid import coarse_map_warning
 
+    options.note_unknown_angles(found.stamp.sensor, found.settings, found, is_passive=True)
     options.warn_of(found.stamp.sensor, coarse_map_warning(found.settings, found))
     options.warn_of(found.stamp.sensor, note)
 

@@ -52,6 +52,7 @@ def listen_bearings(
     def show(found: "AcousticMap") -> None:
         if (sensor := found.stamp.sensor) not in checked:
             checked.add(sensor)
+            options.note_unknown_angles(sensor, found.settings, found, is_passive=True)
             options.warn_of(sensor, search_warning(found.settings))
         if subscribers[0].band_note is not None and sensor not in outside:
             outside.add(sensor)

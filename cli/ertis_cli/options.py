@@ -451,11 +451,13 @@ def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
             note_unknown_angles(name, images.settings, images)
 
 
-def note_unknown_angles(sensor: str, settings: "Settings", grid: "DegreesFromRadians") -> None:
-    """Print a note if the array of a sensor cannot observe some angles."""
-    from ertis_numba.geometry import observable_angles
+def note_unknown_angles(
+    sensor: str, settings: "Settings", grid: "DegreesFromRadians", *, is_passive: bool = False
+) -> None:
+    """Print a note on angles that the array of a sensor, or its directions, cannot show."""
+    from ertis_numba.geometry import direction_note
 
-    text = observable_angles(settings.array, grid).note
+    text = direction_note(settings.array, grid, is_passive=is_passive)
     if text is not None:
         note(f"sensor {sensor} {text}")
 

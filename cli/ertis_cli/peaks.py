@@ -109,7 +109,8 @@ def peaks(
     CLEAN-SC and HR-CLEAN-SC yield their components, summed over neighbouring directions of the grid. Other maps yield
     local maxima above the floor of the map, interpolated between directions of the grid; side lobes of delay-and-sum
     are left out. grid_error_deg is the standard deviation of directions that are not interpolated, as at the edge of
-    the grid. The loudest direction of each band is always listed. level_dbfs is the mean square, where a full-scale
+    the grid. The loudest direction of each band is always listed, except in silence. Levels are those of the band;
+    level_dbfs is the mean square, where a full-scale
     tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones. source_level_db, in dB re 20 µPa
     at 1 m from the source, also needs the distance of the source (process --focus). Maps of the method music have no
     levels. Maps are counted from 0, regardless of the number of measurements that they average. --measurement chooses a
@@ -139,7 +140,6 @@ def peaks(
     if is_map:
         _list_sources(path, sensors, measurement, _TOP if top is None else top, min_level, as_json=as_json)
         return
-    options.note_unlisted_directions(path, sensors)
     if truth:
         compared: list[tuple[dict[str, Any], Comparison]] = [
             ({"sensor": name, "measurement": index}, comparison)
@@ -161,6 +161,7 @@ def peaks(
         more = {"level_dbfs": ".1f"} | ({"grid_error_deg": ".2f"} if _has_grid_errors(rows) else {})
         cells = [(*_cells(row, row), *_formatted(row, more)) for row in rows]
         table = _tables.TextTable(_COLUMNS | dict.fromkeys(more, "right"), cells)
+    options.note_unlisted_directions(path, sensors)
     if as_json:
         options.print_json(report)
         return
@@ -193,14 +194,17 @@ def _list_sources(
     rows: list[dict[str, Any]] = []
     for name in sensors:
         with open_acoustic_maps(path, sensor=name) as maps:
-            options.note_unknown_angles(name, maps.settings, maps)
             options.warn_of(name, coarse_map_warning(maps.settings, maps))
             options.warn_of(name, maps.band_note)
             for index in options.places(measurement, len(maps)):
                 found = find_sound_sources(maps[index], top=top, min_level_db=min_level_db)
                 rows += [{"sensor": name, "map": index, **each.as_dict()} for each in found]
+            options.note_unknown_angles(name, maps.settings, maps, is_passive=True)
     if as_json:
         options.print_json({"sources": rows})
+        return
+    if not rows:
+        click.echo("nothing found: the maps are silent", err=True)
         return
     optional = (name for name in ("level_db", "source_level_db") if any(row[name] is not None for row in rows))
     more = {"grid_error_deg": ".2f"} if _has_grid_errors(rows) else {}

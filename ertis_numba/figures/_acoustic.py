@@ -132,8 +132,8 @@ def draw_bands(canvas: Canvas, found: AcousticMap, *, direction_deg: tuple[float
 
 def _levels(
     canvas: Canvas, found: AcousticMap, band_hz: tuple[float, float] | None
-) -> tuple[Canvas, NDArray[np.float32], SoundDirection]:
-    """Return the levels of a band in all directions, a canvas with their scale, and the loudest source in them."""
+) -> tuple[Canvas, NDArray[np.float32], SoundDirection | None]:
+    """Return the levels of a band over direction, a canvas with their scale, and the loudest source, if any."""
     from ertis_numba.passive.components import gathered  # noqa: PLC0415  few plots need it, and it imports kernels
     from ertis_numba.passive.sound_sources import sources_of_grid  # noqa: PLC0415
 
@@ -147,12 +147,13 @@ def _levels(
     combined = gathered(found.replace(power=power[:, None].astype(np.float32), band_hz=limits_hz))
     is_narrow = found.settings.passive.method in _NARROW
     sources = sources_of_grid(combined, top=None if is_narrow else 1, min_level_db=_ALL_DB if is_narrow else None)
+    scaled = _scaled(canvas, found, reference, combined.power[:, 0].astype(np.float64))
+    if not sources:
+        return *scaled, None
     directions = unit_vectors(*np.transpose([(each.azimuth_rad, each.elevation_rad) for each in sources]))
     brightest = int(combined.power.argmax())
     drawn = unit_vectors(found.azimuth_rad[[brightest]], found.elevation_rad[[brightest]])[0]
-    return *_scaled(canvas, found, reference, combined.power[:, 0].astype(np.float64)), sources[
-        int(np.argmax(directions @ drawn))
-    ]
+    return *scaled, sources[int(np.argmax(directions @ drawn))]
 
 
 def _referred(found: AcousticMap, reference: LevelReference) -> NDArray[np.float64]:
@@ -172,12 +173,11 @@ def _scaled(
     return replace(canvas, top_db=top_db, unit=unit), np.asarray(top_db + below_db, np.float32)
 
 
-def _heading(canvas: Canvas, found: AcousticMap, loudest: SoundDirection, *parts: str) -> _captions.Heading:
-    level_db = loudest.level_dbfs  # relative to the reference of the canvas, as its powers are
-    level = "" if level_db is None or math.isinf(level_db) else f": {minus(f'{level_db:.1f}')} {canvas.unit}"
-    low_khz, high_khz = (_captions.number(edge_hz / 1e3) for edge_hz in loudest.band_hz)
-    towards = f"azimuth {angle(math.degrees(loudest.azimuth_rad))}, elevation "
-    towards += angle(math.degrees(loudest.elevation_rad))
+def _heading(canvas: Canvas, found: AcousticMap, loudest: SoundDirection | None, *parts: str) -> _captions.Heading:
+    low_khz, high_khz = (_captions.number(edge_hz / 1e3) for edge_hz in (found.band_hz.min(), found.band_hz.max()))
+    heard = "silence: all values are 0" if loudest is None else _loudest_text(canvas, loudest)
+    if loudest is not None:
+        low_khz, high_khz = (_captions.number(edge_hz / 1e3) for edge_hz in loudest.band_hz)
     note = observable_angles(found.settings.array, found).note
     parts = (*parts, f"array {note}") if note else parts
     return _captions.of_acoustic_map(
@@ -185,13 +185,23 @@ def _heading(canvas: Canvas, found: AcousticMap, loudest: SoundDirection, *parts
         found,
         f"{len(found.azimuth_rad)} directions",
         f"{low_khz}–{high_khz} kHz",
-        f"loudest at {towards}{level}",
+        heard,
         *parts,
     )
 
 
-def _with_loudest(canvas: Canvas, loudest: SoundDirection, panel: Panel) -> Panel:
+def _loudest_text(canvas: Canvas, loudest: SoundDirection) -> str:
+    """Return the direction and the level of the loudest source in words."""
+    level_db = loudest.level_dbfs  # relative to the reference of the canvas, as its powers are
+    level = "" if level_db is None or math.isinf(level_db) else f": {minus(f'{level_db:.1f}')} {canvas.unit}"
+    towards = f"azimuth {angle(math.degrees(loudest.azimuth_rad))}, elevation "
+    return f"loudest at {towards}{angle(math.degrees(loudest.elevation_rad))}{level}"
+
+
+def _with_loudest(canvas: Canvas, loudest: SoundDirection | None, panel: Panel) -> Panel:
     """Return a map with a ring around its loudest source."""
+    if loudest is None:
+        return panel
 
     def finish(axes: Axes) -> None:
         panel.finish(axes)

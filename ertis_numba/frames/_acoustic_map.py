@@ -18,6 +18,9 @@ from ertis_numba.settings import Settings
 __all__ = ["AcousticMap", "SoundDirection"]
 
 
+_SILENCE = 1e-25  # Power of rounding in maps of capon; sound of one-bit or float samples has more.
+
+
 class SoundDirection(NamedTuple):
     """Direction of sound in a band, with its level.
 
@@ -196,6 +199,12 @@ class AcousticMap(DegreesFromRadians):
         """True unless the method is ``music``, whose numbers find directions only."""
         return self.settings.passive.method != "music"
 
+    @property
+    def is_silent(self) -> NDArray[np.bool_]:
+        """True for bands without sound: (band,) bool. No direction of such a band is listed."""
+        highest = self.power.max(axis=0, initial=0.0)
+        return np.asarray(highest <= (_SILENCE if self.has_level else 0.0))
+
     def in_band(self, low_hz: float, high_hz: float) -> NDArray[np.float32]:
         """Return the power from each direction in the bands within limits.
 
@@ -225,7 +234,7 @@ class AcousticMap(DegreesFromRadians):
         return np.asarray(self.power[:, chosen].sum(axis=1), np.float32)
 
     def loudest(self) -> list[SoundDirection]:
-        """Return the loudest direction of the grid in each band.
+        """Return the loudest direction of the grid in each band; none in bands of silence.
 
         The true direction may lie between those of the grid, and its level may be higher. `find_sound_sources`
         interpolates both, and returns all sources.
@@ -243,6 +252,7 @@ class AcousticMap(DegreesFromRadians):
                 power=float(self.power[place, band]),
             )
             for band, place in enumerate(np.argmax(self.power, axis=0))
+            if not self.is_silent[band]
         ]
 
     def replace(self, **changes: Any) -> Self:

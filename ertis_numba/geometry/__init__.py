@@ -21,7 +21,7 @@ from ertis_numba.geometry.layouts import (
 from ertis_numba.geometry.levelling import levelled_grid
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
-from ertis_numba.geometry.observable import ObservableAngles, observable_angles
+from ertis_numba.geometry.observable import ObservableAngles, direction_note, observable_angles
 from ertis_numba.geometry.position_files import SENSOR_FRAME
 from ertis_numba.geometry.sector import Fan, plan_m, round_step
 from ertis_numba.geometry.shipped_layouts import layout_names, layout_text
@@ -42,6 +42,7 @@ __all__ = [
     "azimuth_columns",
     "delay_matrix",
     "direction_grid",
+    "direction_note",
     "effective_count",
     "far_field_delays",
     "grid_count",

@@ -11,10 +11,12 @@ from ertis_numba.geometry.delays import unit_vectors
 from ertis_numba.geometry.layouts import microphones
 from ertis_numba.settings import Array
 
-__all__ = ["ObservableAngles", "observable_angles"]
+__all__ = ["ObservableAngles", "direction_note", "observable_angles"]
 
 _FLAT: Final = 1e-3  # Width of an array relative to its length, below which it has no width.
+_SAME: Final = 1e-9  # Largest distance of equal unit vectors.
 _POINT_M: Final = 1e-6  # Microphones closer than this are in one place.
+_IN_PLANE: Final = "has its microphones in a plane"
 _UPRIGHT: Final = 0.05  # Component of a unit vector, below which it is 0: 3°.
 
 
@@ -99,15 +101,75 @@ def observable_angles(array: Array, grid: DegreesFromRadians | None = None) -> O
         )
     if sizes[1] < _FLAT * sizes[0]:
         return _of_line(axes[0])
-    if sizes[2] < _FLAT * sizes[0] and grid is not None:
-        heights = unit_vectors(grid.azimuth_rad, grid.elevation_rad) @ axes[2]
+    normal = _normal(positions_m)
+    if normal is not None and grid is not None:
+        heights = unit_vectors(grid.azimuth_rad, grid.elevation_rad) @ normal
         if heights.min() < -_UPRIGHT and heights.max() > _UPRIGHT:
-            return ObservableAngles(
-                azimuth=True,
-                elevation=True,
-                note="has its microphones in a plane, so it cannot distinguish the two sides of this plane",
-            )
+            note = f"{_IN_PLANE}, so it cannot distinguish the two sides of this plane"
+            return ObservableAngles(azimuth=True, elevation=True, note=note)
     return ObservableAngles(azimuth=True, elevation=True)
+
+
+def direction_note(array: Array, grid: DegreesFromRadians, *, is_passive: bool = False) -> str | None:
+    """Return a note on directions that an image or a map does not show, or shows elsewhere.
+
+    It names the angles of `observable_angles`, and the limits of the directions: sound from above or below directions
+    at one elevation, and from elsewhere than a single direction, appears in these directions. An array with microphones
+    in a plane shows sound from behind this plane in front of it.
+
+    Parameters
+    ----------
+    array : Array
+    grid : Grid, or a result with directions
+    is_passive : bool
+        Note the side of the plane that has no directions. By default, only the sides of grids with directions on both
+        are noted, because an emitter sends its call to the side of the directions.
+
+    Returns
+    -------
+    str or None
+        Predicate of the sensor; None without any limit.
+
+    Examples
+    --------
+    >>> from ertis_numba.geometry import direction_grid, direction_note
+    >>> from ertis_numba.settings import Array, Processing
+    >>> direction_note(Array(), direction_grid(Processing(directions="3d:1000"))) is None
+    True
+    >>> direction_note(Array(), direction_grid(Processing(directions="2d:91"))).partition(",")[0]
+    'has directions at one elevation'
+    """
+    seen = observable_angles(array, grid)
+    if not (seen.azimuth and seen.elevation):
+        return seen.note
+    sides = seen.note
+    if is_passive and not sides and _normal(microphones(array).enabled_positions_m) is not None:
+        sides = f"{_IN_PLANE}, so sound from behind this plane appears in front of it"
+    return "; it also ".join(filter(None, (_of_grid(grid), sides))) or None
+
+
+def _of_grid(grid: DegreesFromRadians) -> str | None:
+    """Return the note on directions at one elevation, or on a single one."""
+    azimuth_deg, elevation_deg = grid.azimuth_deg, grid.elevation_deg
+    directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+    if np.linalg.norm(directions - directions[0], axis=1).max() < _SAME:
+        return (
+            f"has one direction, azimuth {azimuth_deg[0]:g}°, elevation {elevation_deg[0]:g}°, so sound from elsewhere "
+            "appears there, and too weak; process with more directions to locate it"
+        )
+    if np.ptp(grid.elevation_rad) == 0:
+        return (
+            f"has directions at one elevation, {elevation_deg[0]:g}°, so sound from above or below may appear at a "
+            "wrong azimuth, and too weak; process with 3d:N directions to locate it"
+        )
+    return None
+
+
+def _normal(positions_m: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the unit vector across the plane of microphones, (axis,) float64; None if they lie in no plane."""
+    beside_m = np.concatenate([positions_m - positions_m.mean(axis=0), np.zeros((3, 3))])
+    _, sizes, axes = np.linalg.svd(beside_m, full_matrices=False)
+    return np.asarray(axes[2]) if sizes[2] < _FLAT * sizes[0] else None
 
 
 def _of_line(axis: NDArray[np.float64]) -> ObservableAngles:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import LEVEL_UNITS, Bearing, level_offset_db
-from ertis_numba.geometry import microphones, spacing_rad, unit_vectors
+from ertis_numba.geometry import direction_note, microphones, spacing_rad, unit_vectors
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.camera import AcousticCamera
 from ertis_numba.passive.noise_model import NoiseModel
@@ -54,6 +54,9 @@ class BearingFinder:
     ----------
     warning : str or None
         Warning that the camera's directions are planar or too far apart, with a grid that suffices; None if they do.
+    direction_note : str or None
+        Note on sound that bearings cannot locate, such as sound from behind a flat array, as a predicate of the sensor:
+        `ertis_numba.geometry.direction_note`.
 
     Raises
     ------
@@ -80,6 +83,7 @@ class BearingFinder:
         self._least = 10 ** (checks.between("min_level_db", min_level_db, -200.0, 0.0) / 10)
         self._false_alarm = 1 - (1 - false_alarm) ** (1 / len(camera.band_hz))
         self.warning = search_warning(camera.settings)
+        self.direction_note = direction_note(camera.settings.array, camera.grid, is_passive=True)
         directions = unit_vectors(camera.grid.azimuth_rad, camera.grid.elevation_rad)
         reach_rad = _REACH * min(spacing_rad(directions), _MAX_SPACING_RAD)
         delays = WaveDelays(camera.settings)

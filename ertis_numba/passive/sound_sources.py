@@ -72,7 +72,7 @@ def find_sound_sources(
     In other maps, a source is a local maximum. A quadric through the neighbouring directions interpolates its direction
     and its level. It fits the logarithm of the power, or for Capon and MUSIC its inverse. Maxima below twice the median
     over all directions belong to the floor of the map, and are left out. With delay-and-sum, so are maxima below twice
-    the side lobes of stronger sources. The strongest direction of each band is always returned.
+    the side lobes of stronger sources. The strongest direction of each band is always returned, except in silence.
 
     An interpolated maximum stays within half of the way to each neighbour, and within the main lobe through its
     direction. It exceeds the maximum of the map by less than 1 dB. At the edge of a grid, it is interpolated along the
@@ -137,6 +137,8 @@ def sources_of_grid(
     search = _components if method in COMPONENT_METHODS else _maxima
     delays, out = WaveDelays(found.settings), []
     for band, power in enumerate(found.power.T.astype(np.float64)):
+        if found.is_silent[band]:
+            continue
         highest = float(power.max(initial=0.0)) * 10 ** (MAX_RISE_DB / 10)
         loss_of = functools.partial(_loss, delays, found.band_hz[band])
         tops = sorted(search(power, grid, passive, loss_of), key=lambda each: -each.power)
@@ -173,7 +175,7 @@ def _without_side_lobes(tops: list[_Top], delays: WaveDelays, band_hz: Floats, *
     for place, each in enumerate(tops):
         if len(kept) == top:
             break
-        if each.power >= _SIDE_LOBES * explained[place]:  # Both are 0 in silence.
+        if each.power >= _SIDE_LOBES * explained[place]:
             kept.append(place)
             beams = np.exp(1j * omega * (delay_s - delay_s[place])).mean(axis=2)
             explained += each.power * (np.abs(beams) ** 2).mean(axis=0)
@@ -181,9 +183,9 @@ def _without_side_lobes(tops: list[_Top], delays: WaveDelays, band_hz: Floats, *
 
 
 def _components(power: Floats, grid: _Grid, *_: object) -> Iterator[_Top]:
-    """Yield the directions with more power than their neighbours, from the strongest on; one in silence."""
+    """Yield the directions with more power than their neighbours, from the strongest on."""
     is_left = np.ones(len(power), dtype=np.bool_)
-    for place in strongest_first(power) or [0]:
+    for place in strongest_first(power):
         if is_left[place]:
             is_left[grid.neighbours[place]] = False
             yield _Top(grid.directions[place], float(power[place]), grid.spacing_rad(place))
