@@ -10,7 +10,7 @@ from ertis_cli._pulses import PipelinesBySensor
 import ertis_numba as ertis
 from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.frames import Energyscape, Stamp
-from ertis_numba.geometry import direction_grid
+from ertis_numba.geometry import direction_grid, spacing_rad, unit_vectors
 from ertis_numba.settings import Processing
 
 
@@ -80,3 +80,12 @@ def test_commands_warn_once_of_the_first_sensor_with_a_coarse_grid(capsys):
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("ertis: warning: directions are 9.5° apart")
     assert pipelines.warnings == [line.removeprefix("ertis: warning: ")]
+
+
+@pytest.mark.parametrize(
+    ("azimuths_deg", "spacing_deg"), [((0, 0, 2, 2, 4, 4), 2), ((-180, 0, 180), 180), ((5, 5), 180)]
+)
+def test_spacing_counts_equal_directions_once(azimuths_deg, spacing_deg):
+    azimuth_rad = np.radians(np.array(azimuths_deg, dtype=np.float64))
+    spacing = spacing_rad(unit_vectors(azimuth_rad, np.zeros(len(azimuth_rad))))
+    assert np.degrees(spacing) == pytest.approx(spacing_deg)

@@ -14,11 +14,14 @@ __all__ = ["AzimuthColumns", "azimuth_columns", "spacing_rad"]
 Level = TypeVar("Level", bound=np.generic)
 
 _NEAREST_RAD = 1e-9  # directions closer than this are the same
+_SAME_DIGITS = 9  # decimals in which the unit vectors of equal directions agree
 _FINER = 4  # columns of a raster per spacing: a direction is displaced by at most an eighth of a spacing
 
 
 def spacing_rad(directions: NDArray[np.float64]) -> float:
-    """Return the median angle from a direction to its nearest neighbour in radians; π for fewer than two directions.
+    """Return the median angle from a direction to its nearest neighbour in radians; π for fewer than two.
+
+    Equal directions count once.
 
     Parameters
     ----------
@@ -43,6 +46,11 @@ def spacing_rad(directions: NDArray[np.float64]) -> float:
     if len(directions) < 2:
         return math.pi
     distance, _ = KDTree(directions).query(directions, k=2)
+    if distance[:, 1].min() < _NEAREST_RAD:  # Directions that are listed twice, such as -180° and 180°, count once.
+        rounded = np.unique(np.round(directions, _SAME_DIGITS) + 0.0, axis=0)  # Adding 0 turns -0 into 0.
+        if len(rounded) < 2:
+            return math.pi
+        distance, _ = KDTree(rounded).query(rounded, k=2)
     return 2 * math.asin(min(1.0, float(np.median(distance[:, 1])) / 2))
 
 
