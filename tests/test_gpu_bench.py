@@ -1,7 +1,9 @@
 """`ertis bench gpu` without a GPU: it refuses, keeps rows before a failure, and compares the images of its rivals."""
 
 import json
+import re
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -53,10 +55,22 @@ PARTS = {
                 "library": "CuPy",
                 "directions": "90",
                 "what": "host to host",
+                "plan": "a plan",
                 "off_db": -130.0,
                 "theirs_ms": 9.0,
                 "ours_ms": 0.5,
                 "times_faster": 18.0,
+            },
+            {
+                "library": "mach",
+                "directions": "90",
+                "what": "delay-and-sum",
+                "plan": "a plan",
+                "off_db": -48.0,
+                "theirs_ms": 0.262,
+                f"theirs_per_frame_of_{rival_mach.FRAMES}_ms": 0.023,
+                "ours_ms": 0.073,
+                "times_faster": 3.59,
             },
         ],
         "wall_s": 20.0,
@@ -153,8 +167,9 @@ def test_tables_show_the_newest_results_without_a_gpu(report, tmp_path):
         "| one at a time, words to image | not measured | 0.516 | not measured |",
         "| paper's time / shortest single time | – | 100× | – |",
         "| upload | 0.0200 |",
-        "| PyTorch: not installed |  | – | – | – | – |",
-        "| CuPy: host to host | 90 | 9.000 | 0.500 | 18.0× | -130 |",
+        "| PyTorch: not installed |  | – | – | – | – | – | – | – |",
+        "| CuPy: host to host | 90 | a plan | 9.000 | – | 0.500 | 18.0× | – | -130 |",
+        "| mach: delay-and-sum | 90 | a plan | 0.262 | 0.023 | 0.073 | 3.6× | 0.32× | -48 |",
         "| float32 multiply-add, Gop/s | 60,000 | 30 % |",
         "- paper: failed (1): DataError (0 s)",
         "- tests: done; 9 passed, 4 of them on the GPU; 0 failed, 1 skipped (0 s)",
@@ -172,6 +187,37 @@ def test_tables_show_the_newest_results_without_a_gpu(report, tmp_path):
         "streamed, images to the host",
         "the paper's GTX 1080 Ti",
     ]
+
+
+NEWEST = json.loads(max((Path(__file__).parents[1] / "bench" / "results").glob("*.json")).read_text("utf-8"))
+
+
+# The tables print medians, and what was reached as a share of the ceilings.
+NOT_PRINTED = {"mean_ms", "std_ms", "queued", "tighter", "float32_gop_s", "load_gb_s"}
+
+
+def _leaves(value):
+    """Return the numbers and texts of nested dictionaries that a table has to print."""
+    if isinstance(value, dict):
+        return [leaf for key, part in value.items() if key not in NOT_PRINTED for leaf in _leaves(part)]
+    return [value]
+
+
+def _is_printed(leaf, numbers):
+    """Return True if a figure, or its percentage, is among numbers, rounded as they are."""
+    exact = [leaf, 100 * leaf]
+    return any(
+        float(each) and float(each) in [round(x, len(each.partition(".")[2])) for x in exact] for each in numbers
+    )
+
+
+@pytest.mark.parametrize("part", [name for name, found in NEWEST["parts"].items() if "rows" in found])
+def test_no_measured_figure_is_left_out_of_the_tables(part):
+    text = tables.gpu(NEWEST).replace(",", "")
+    numbers = re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?", text)
+    for leaf in (leaf for row in NEWEST["parts"][part]["rows"] for leaf in _leaves(row)):
+        is_printed = leaf.replace(",", "") in text if isinstance(leaf, str) else _is_printed(leaf, numbers)
+        assert is_printed, leaf
 
 
 def test_tables_without_results_state_not_measured(tmp_path):

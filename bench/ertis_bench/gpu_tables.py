@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
+from ertis_bench import rival_mach
 from ertis_bench.markdown import table
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 
@@ -17,6 +18,7 @@ _STREAMS = {
     for where in ("to the host", "stay on the GPU")
     for without, how in (("", "graphs"), (_WITHOUT, "plain"))
 }
+_BATCH = f"theirs_per_frame_of_{rival_mach.FRAMES}_ms"
 _PAPER = f"the paper's {_PUBLISHED.removeprefix('GPU ')}"
 
 
@@ -80,6 +82,7 @@ def _stages(report: dict[str, Any]) -> str:
     if not rows:
         return ""
     lines = [[name, *(f"{row['stages_ms'][name]:.4f}" for row in rows)] for name in rows[0]["stages_ms"]]
+    lines.append(["sum", *(f"{row['sum_ms']:.4f}" for row in rows)])
     lines.append(["sum without transfers", *(f"{row['without_transfers_ms']:.4f}" for row in rows)])
     plans = "; ".join(
         f"{row['directions']} directions, {row['ranges']} ranges: {row['plan']}, error {row['error_db']:.1f} dB "
@@ -114,15 +117,18 @@ def _rivals(report: dict[str, Any]) -> str:
         [
             f"{row['library']}: {row.get('status') or row['what']}",
             row["directions"],
-            *(f"{row[key]:.3f}" if key in row else "–" for key in ("theirs_ms", "ours_ms")),
+            row.get("plan", "–"),
+            *(f"{row[key]:.3f}" if key in row else "–" for key in ("theirs_ms", _BATCH, "ours_ms")),
             f"{row['times_faster']:.1f}×" if "times_faster" in row else "–",
+            f"{row[_BATCH] / row['ours_ms']:.2f}×" if _BATCH in row else "–",
             f"{row['off_db']:.0f}" if "off_db" in row else "–",
         ]
         for row in rows
     ]
-    return table(
-        ["library", "directions", "library, ms", "this package, ms", "library / this package", "difference, dB"], cells
-    )
+    batch = f"batch of {rival_mach.FRAMES}, ms per frame"
+    head = ["library", "directions", "plan of this package", "library, ms", f"library, {batch}", "this package, ms"]
+    ratios = ["library / this package", "batch / this package", "difference, dB"]
+    return f"{table([*head, *ratios], cells)}\n\n{_BATCHES.format(frames=rival_mach.FRAMES)}"
 
 
 def _reached(report: dict[str, Any]) -> str:
@@ -188,6 +194,9 @@ def _machine(report: dict[str, Any]) -> str:
 
 _NO_RESULTS = """\
 No GPU has run these kernels yet. `make gpu` fills this table, which will confirm or refute the predictions below."""
+_BATCHES = """\
+mach can also beamform several frames per call, here {frames}. This package processes one frame per call. If a ratio is
+below 1, the library is faster."""
 _CONDITIONS = """\
 {date}, revision {revision}; the measurement is {source}, 0.5–5 m, with the default plan for this GPU. Images are
 checked before they are timed. They are compared with the exact image, with the CPU's image of the same plan, and

@@ -26,10 +26,10 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.stages.plan_elements import spectrum_of
 
-__all__ = ["problem", "race", "settings_for"]
+__all__ = ["FRAMES", "problem", "race", "settings_for"]
 
 _MAX_DIFFERENCE_DB = -25.0  # The budget is -30 dB, and mach adds the error of its linear interpolation.
-_FRAMES = 16
+FRAMES = 16
 # mach uses the third axis as depth and scales the aperture with it, so that 0 m would leave no aperture.
 _DEPTH_OFFSET_M = 8.0
 _F_NUMBER = 0.01
@@ -108,7 +108,7 @@ def race(settings: Settings, measurement: Measurement, count: int) -> dict[str, 
             f"image of mach differs from this package's by {difference_db:.1f} dB; "
             f"the limit is {_MAX_DIFFERENCE_DB:g} dB. The time is not reported, because the results differ"
         )
-    many = here | {"channel_data": cupy.ascontiguousarray(cupy.repeat(here["channel_data"], _FRAMES, axis=2))}
+    many = here | {"channel_data": cupy.ascontiguousarray(cupy.repeat(here["channel_data"], FRAMES, axis=2))}
     times_ms = timing.round_robin(
         {"one": functools.partial(run, here), "many": functools.partial(run, many)}, count=count, burst=count
     )
@@ -120,7 +120,7 @@ def race(settings: Settings, measurement: Measurement, count: int) -> dict[str, 
         "plan": in_words(plan.accuracy),
         "off_db": round(difference_db, 1),
         "theirs_ms": median_ms["one"],
-        f"theirs_per_frame_of_{_FRAMES}_ms": round(median_ms["many"] / _FRAMES, 3),
+        f"theirs_per_frame_of_{FRAMES}_ms": round(median_ms["many"] / FRAMES, 3),
         "ours_ms": ours_ms,
         "times_faster": round(median_ms["one"] / ours_ms, 2),
     }
