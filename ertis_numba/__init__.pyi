@@ -88,7 +88,7 @@ from .passive import (
     time_expanded as time_expanded,
 )
 from .pipeline import Pipeline as Pipeline
-from .settings import Settings as Settings, presets as presets
+from .settings import Call as Call, Settings as Settings, presets as presets
 from .simulation.render import Simulator as Simulator, render as render
 from .simulation.scene import Scene as Scene, load_scene as load_scene
 from .storage import (

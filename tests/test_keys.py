@@ -496,3 +496,23 @@ def test_allow_list_below_a_shared_folder_is_refused(tmp_path):
         AllowList.load(path)
     (tmp_path / "a").chmod(0o1777)  # the sticky bit, as in /tmp, keeps users from replacing files of others
     AllowList.load(path)
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("key", ["robot.public.toml", "robot"])
+def test_key_of_the_key_folder_is_allowed_by_its_file_or_name(tmp_path, monkeypatch, key):
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    made = json.loads(_run("new", "robot", "--json"))
+    assert json.loads(_run("allow", key, "--role", "admin", "--json"))["keys"][0]["public"] == made["public"]
+    other = KeyPair.new("other")
+    _, file = other.save(tmp_path / "other")
+    Path("robot.public.toml").write_bytes(file.read_bytes())  # A file here comes before one of the key folder.
+    assert other.public in _run("allow", "robot.public.toml", "--role", "admin")
+
+
+@pytest.mark.usefixtures("folder")
+@pytest.mark.parametrize("key", ["none.public.toml", ""])
+def test_key_that_is_nowhere_is_refused(key):
+    with pytest.raises(SettingsError, match="is neither a public key nor a file with one"):
+        _run("allow", key, "--role", "admin")

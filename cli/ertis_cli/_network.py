@@ -11,7 +11,17 @@ if TYPE_CHECKING:
     from ertis_numba.network.metrics import Metrics
     from ertis_numba.network.status import Status
 
-__all__ = ["allow", "client_keys", "key", "metrics", "require_address", "require_duration", "server_key", "server_keys"]
+__all__ = [
+    "allow",
+    "client_keys",
+    "key",
+    "key_file",
+    "metrics",
+    "require_address",
+    "require_duration",
+    "server_key",
+    "server_keys",
+]
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -46,7 +56,7 @@ def server_keys(key: str | None, allow: Path | None) -> "ServerKeys | None":
         if allow is not None:
             raise click.UsageError("--allow has no effect without --key; add --key")
         return None
-    return ServerKeys(KeyPair.load(_file(key, "secret")), allow or default_folder() / ALLOW_LIST)
+    return ServerKeys(KeyPair.load(key_file(key, "secret")), allow or default_folder() / ALLOW_LIST)
 
 
 def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
@@ -67,9 +77,9 @@ def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
         raise click.UsageError(
             f"{given} is given without {other}; give both, or neither for a central node on this machine"
         )
-    pair = KeyPair.load(_file(key, "secret"))
+    pair = KeyPair.load(key_file(key, "secret"))
     try:
-        return ClientKeys(pair, public_key(_file(server_key, "public"))[0])
+        return ClientKeys(pair, public_key(key_file(server_key, "public"))[0])
     except SettingsError as error:
         raise SettingsError(f"--server-key: {error}") from error
 
@@ -123,11 +133,11 @@ def require_duration(given: float | None) -> None:
         checks.positive("--duration", given)
 
 
-def _file(given: str, kind: str) -> str:
-    """Return the file of a key that was given by name; return any other text unchanged."""
+def key_file(given: str, kind: str) -> str:
+    """Return a file of the key folder that was given by its name or its key's; return any other text unchanged."""
     from ertis_numba.network.keys import default_folder
 
-    named = default_folder() / f"{given}.{kind}.toml"
-    if Path(given).name == given and not Path(given).is_file() and named.is_file():
-        return str(named)
-    return given
+    if Path(given).name != given or Path(given).is_file():
+        return given
+    names = (given, f"{given}.{kind}.toml") if given else ()
+    return next((str(file) for name in names if (file := default_folder() / name).is_file()), given)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _network, options
 
 if TYPE_CHECKING:
     from ertis_numba.network.allow_list import Permission
@@ -60,7 +60,7 @@ def new(*, name: str, folder: Path | None, as_json: bool) -> None:
 
 
 @keys.command()
-@click.argument("key", metavar="PUBLIC_FILE|KEY")
+@click.argument("key", metavar="PUBLIC_FILE|NAME|KEY")
 @click.option(
     "--role",
     required=True,
@@ -76,11 +76,14 @@ def new(*, name: str, folder: Path | None, as_json: bool) -> None:
 def allow(
     *, key: str, role: str, serials: tuple[str, ...], name: str | None, listed: Path | None, as_json: bool
 ) -> None:
-    """Allow a key within a second; earlier permissions of the key are replaced."""
+    """Allow a key within a second; earlier permissions of the key are replaced.
+
+    PUBLIC_FILE is searched for here, and then in the key folder of this user, where 'ertis keys new' writes.
+    """
     from ertis_numba.network.allow_list import ROLES, AllowList, Permission
     from ertis_numba.network.keys import public_key
 
-    public, named = public_key(key)
+    public, named = public_key(_network.key_file(key, "public"))
     if not (name or named):
         raise click.UsageError("a key that is not given as a file has no name; add --name")
     (chosen,) = (known for known in ROLES if known == role)
