@@ -300,6 +300,16 @@ def test_mcap_metadata_contains_the_settings(tmp_path):
     assert read(path)[0]["/tf_static", TIME_NS].transforms == []
 
 
+def test_mcap_has_no_transform_of_the_platform_to_itself(tmp_path):
+    fused = stamped(GIVEN[0], "base_link", 3, TIME_NS)
+    mounting = {"base_link": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
+    (path,) = export(tmp_path / "points.mcap", [fused], topics=["points"], mounting=mounting)
+    assert set(read(path)[2]) == {"/base_link/points"}
+    (path,) = export(tmp_path / "all.mcap", [fused], mounting=mounting)
+    children = [each.child_frame_id for each in read(path)[0]["/tf_static", TIME_NS].transforms]
+    assert children == ["base_link_sonar"]
+
+
 def test_mcap_export_refuses_invalid_input(tmp_path, monkeypatch):
     given = GIVEN[0]
     for items, options, message in (

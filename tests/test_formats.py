@@ -12,6 +12,7 @@ from ertis_numba.storage.schema import (
     ENERGYSCAPE,
     FORMAT_VERSION,
     OCCUPANCY_MAP,
+    POINTS,
     POSES,
     RECORDING,
     RECORDING_OF_PCM,
@@ -44,7 +45,7 @@ def rows(first):
         ("pose_position", POSES),
         ("scene", TRUTH),
         ("log_odds", OCCUPANCY_MAP),
-        ("amplitude", [variable for variable in ENERGYSCAPE if variable not in SHARED]),
+        ("amplitude", [*(variable for variable in ENERGYSCAPE if variable not in SHARED), *POINTS]),
         ("power", [variable for variable in ACOUSTIC_MAP if variable.name not in SHARED_NAMES]),
     ],
 )

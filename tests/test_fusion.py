@@ -1,9 +1,12 @@
 """Fusion of images of several sensors: foreign echoes, positions, geometry and bad input."""
 
+import csv
 import dataclasses
 import functools
+import json
 import math
 
+import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -11,7 +14,7 @@ from ertis_bench.platform_scenes import platform_scene, random_reflectors
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.fusion.pairs import hypothesis, pair_of
 from ertis_numba.fusion.polar_grid import PolarGrid, close_directions
 from ertis_numba.fusion.receivers import Receiver
@@ -19,7 +22,10 @@ from ertis_numba.fusion.rig import Emitters, mounted_sensors
 from ertis_numba.fusion.tables import FusionTables
 from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
-from ertis_numba.storage import open_energyscapes, open_recording, write_recording
+from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
+from ertis_numba.viewer._choices import Choices
+from ertis_numba.viewer._scene import ViewedScene
+from ertis_numba.viewer._shapes import Pose, ReceivedImage
 from tests.pages import commands_in, page, python_in, run_code_here, run_here
 
 YAWS = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
@@ -476,6 +482,105 @@ def test_process_fuses_all_sensors(recordings):
     with open_energyscapes(recordings / "all.fused.h5") as stored:
         np.testing.assert_array_equal(stored[0].amplitude, fused().image.amplitude)
         assert (stored.sensor, stored.translation_m.tolist()) == ("base_link", [0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def fused_file(recordings):
+    path = recordings / "points.h5"
+    assert run("process", recordings / "all.h5", "--fuse", "-o", path, "-q")[0] == 0
+    return path
+
+
+def test_fused_files_keep_the_points_of_the_fusion(fused_file):
+    located = fused().points
+    with open_energyscapes(fused_file) as stored:
+        image = stored[0]
+        assert stored.has_points
+        assert stored.points_note is None
+    for name in ("position_m", "amplitude", "uncertainty_m"):
+        np.testing.assert_array_equal(getattr(image.points, name), getattr(located, name))
+    assert image.points.stamp == image.stamp
+
+
+def test_peaks_plots_and_exports_of_fused_files_show_the_points_of_the_fusion(fused_file, tmp_path):
+    located = fused().points.strongest(None, -20.0)
+    path = fused_file
+    code, output = run("peaks", path, "--json", "--top", "100", "--min-level", "-20")
+    assert code == 0
+    listed = [(each["range_m"], each["azimuth_deg"]) for each in json.loads(output.splitlines()[-1])["peaks"]]
+    wanted = zip(np.hypot(*located.position_m[:, :2].T), np.degrees(located.azimuth_rad), strict=True)
+    np.testing.assert_allclose(listed, [*wanted], atol=1e-3)
+    assert run("export", path, "-o", tmp_path / "points.csv", "-q")[0] == 0
+    with (tmp_path / "points.csv").open() as file:
+        exported = [[float(row[f"{axis}_m"]) for axis in "xyz"] for row in csv.DictReader(file)]
+    np.testing.assert_allclose(exported, located.position_m, atol=1e-6)
+    assert run("plot", path, "-o", tmp_path / "fused.svg", "--kind", "polar")[0] == 0
+
+
+@pytest.mark.parametrize("option", [["--detector", "cfar"], ["--all"]])
+def test_peaks_refuses_searches_of_images_with_points(fused_file, option):
+    code, output = run("peaks", fused_file, *option)
+    assert code == 2
+    assert "has the points of a fusion; leave both out" in output.replace("\n", " ")
+
+
+def test_fused_files_without_points_are_noted(tmp_path):
+    path = write_energyscapes(tmp_path / "old.h5", [fused().image])
+    with open_energyscapes(path) as stored:
+        assert not stored.has_points
+    for line in (["peaks", path], ["plot", path, "-o", tmp_path / "a.svg"], ["export", path, "-o", tmp_path / "a.csv"]):
+        code, output = run(*line)
+        assert (code, "without the points of the fusion" in output) == (0, True), line
+
+
+def test_find_peaks_refuses_bins_for_images_with_points():
+    image = fused().image.replace(points=fused().points)
+    with pytest.raises(ArgumentError, match="where selects bins, but the image has the points of a fusion"):
+        ertis.find_peaks(image, where=image.amplitude > 0)
+
+
+def test_parts_of_fused_images_keep_only_their_points():
+    image = fused().image.replace(points=fused().points)
+    x_m, y_m, _ = image.points.position_m.T
+    chosen = (np.hypot(x_m, y_m) <= 2.0) & (np.abs(np.degrees(np.arctan2(y_m, x_m))) <= 60.0)
+    assert 0 < np.count_nonzero(chosen) < len(chosen)
+    part = image.select(azimuth_deg=(-60.0, 60.0), range_m=(0.1, 2.0))
+    np.testing.assert_array_equal(part.points.position_m, image.points.position_m[chosen])
+
+
+def test_view_draws_the_points_of_the_fusion():
+    view = ViewedScene()
+    for name, image in images().items():
+        view.take(ReceivedImage(image, Pose(*map(tuple, mountings()[name])), 0.0, 10.0))
+    frame = view.draw(Choices(threshold_db=-20.0))
+    drawn_m = np.concatenate([drawn.position_m for drawn in frame.sensors.values()])
+    wanted = fused().points
+    wanted = wanted.only(wanted.amplitude >= 0.1 * wanted.amplitude.max())
+    np.testing.assert_allclose(drawn_m, wanted.position_m, atol=1e-5)
+    saved_m = np.concatenate([cloud.position_m for _, cloud, _ in view.latest(Choices(threshold_db=-20.0))])
+    np.testing.assert_array_equal(saved_m, drawn_m)
+
+
+def test_images_with_and_without_points_are_refused_in_one_file(tmp_path):
+    image = fused().image
+    for several in ([image, image.replace(points=fused().points)], [image.replace(points=fused().points), image]):
+        with pytest.raises(ArgumentError, match="pass points with all images of a sensor, or with none"):
+            write_energyscapes(tmp_path / "mixed.h5", several)
+
+
+@pytest.mark.parametrize(
+    ("change", "reported"),
+    [
+        (lambda group: group.__delitem__("point_amplitude"), "points of images lack point_amplitude"),
+        (lambda group: group["point_count"].__setitem__(0, 3), "point_count does not match the number of points"),
+    ],
+)
+def test_damaged_points_are_refused(tmp_path, change, reported):
+    path = write_energyscapes(tmp_path / "damaged.h5", [fused().image.replace(points=fused().points)])
+    with h5py.File(path, "r+") as file:
+        change(file["sensors/base_link"])
+    with pytest.raises(DamagedError, match=reported):
+        open_energyscapes(path)
 
 
 def test_process_fuses_several_recordings(recordings):

@@ -340,7 +340,7 @@ def test_unchanged_view_is_not_drawn_again():
     first, second = scene.draw(choices, 0.1), scene.draw(choices, 0.2)
     assert first.fused is second.fused
     assert first.sensors["left"].picture is second.sensors["left"].picture
-    assert first.sensors["left"].share_left.sum() > second.sensors["left"].share_left.sum()
+    assert first.sensors["front"].share_left.sum() > second.sensors["front"].share_left.sum()  # all fused points
     other = scene.draw(Choices(decay_s=1.0, colours="viridis"), 0.2)
     assert other.fused is not first.fused
     assert not np.array_equal(other.sensors["left"].picture, first.sensors["left"].picture)

@@ -192,6 +192,10 @@ def _readers(
         open_recording if name == "acoular" or file_kind(path) == "recording" else open_energyscapes
     )
     readers = [stack.enter_context(open_file(path, sensor=each)) for each in options.sensors_of(path, sensor)]
+    for reader in readers:
+        missing = getattr(reader, "points_note", None)
+        if missing is not None and name != "npz":
+            options.note(missing)
     return readers, readers
 
 

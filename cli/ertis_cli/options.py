@@ -443,12 +443,18 @@ def note_layout(array: "Array", *, recorded: "Array | None" = None) -> None:
 
 
 def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
-    """Print a note for each sensor whose array cannot observe some angles, which are not listed."""
+    """Print a note for each sensor whose array cannot observe some angles, which are not listed.
+
+    Fused images have no array of their own. There is a note if their points are missing.
+    """
     from ertis_numba.storage import open_energyscapes
 
     for name in sensors:
         with open_energyscapes(path, sensor=name) as images:
-            note_unknown_angles(name, images.settings, images)
+            if images.points_note is not None:
+                note(images.points_note)
+            elif not images.has_points:
+                note_unknown_angles(name, images.settings, images)
 
 
 def note_unknown_angles(

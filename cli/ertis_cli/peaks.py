@@ -100,6 +100,9 @@ def peaks(
     strongest echo at its range. The noise is estimated from 32 bins of the same direction (OS-CFAR), so that
     --false-alarm is the probability per bin that noise alone is listed.
 
+    For fused images, the reflectors are the points that 'ertis process --fuse' has located from the images of all
+    sensors, not maxima of the image.
+
     With --truth, each true reflector comes first, with the errors of its matched peak or as missed. Then come peaks
     that no reflector explains, as spurious, and peaks of reflectors that do not count, as explained (see
     'ertis compare --help'). In JSON, "truth" of each peak is its true reflector or null, "spurious" is true or
@@ -140,6 +143,8 @@ def peaks(
     if is_map:
         _list_sources(path, sensors, measurement, _TOP if top is None else top, min_level, as_json=as_json)
         return
+    if detector == "cfar" or everything:
+        _require_single_sensors(path, sensors)
     if truth:
         compared: list[tuple[dict[str, Any], Comparison]] = [
             ({"sensor": name, "measurement": index}, comparison)
@@ -169,6 +174,20 @@ def peaks(
         click.echo("nothing found", err=True)
         return
     table.print()
+
+
+def _require_single_sensors(path: Path, sensors: tuple[str, ...]) -> None:
+    """Refuse detectors that search the image, for files whose images have the points of a fusion."""
+    from ertis_numba.storage import open_energyscapes
+
+    for name in sensors:
+        with open_energyscapes(path, sensor=name) as images:
+            if images.has_points:
+                raise click.UsageError(
+                    f"--detector cfar and --all search images of single sensors, but {path} has the points of a "
+                    "fusion; leave both out",
+                    click.get_current_context(),
+                )
 
 
 def _list_sources(

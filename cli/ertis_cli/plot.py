@@ -284,6 +284,8 @@ def _image(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "Energ
     if file_kind(path) == "energyscape":
         with open_energyscapes(path, sensor=sensor) as images:
             image = images[options.place(index, len(images))]
+            if images.points_note is not None:
+                options.note(images.points_note, quiet=quiet)
     else:
         measurement = _measurement(path, sensor, index)
         image = options.pipeline(measurement.settings, quiet=quiet).process(measurement)

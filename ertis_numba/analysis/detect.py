@@ -13,7 +13,7 @@ from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.side_lobes import EdgeFloor, SideLobes
 from ertis_numba.errors import ArgumentError
-from ertis_numba.frames import Energyscape, Peak
+from ertis_numba.frames import Energyscape, Peak, PointCloud
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
 
 __all__ = ["find_peaks", "neighbours_of", "peaks_of_grid"]
@@ -41,6 +41,9 @@ def find_peaks(
     Angles that the array cannot observe are NaN: both for one microphone, and the elevation for a horizontal line of
     microphones. See `ertis_numba.geometry.observable_angles`.
 
+    An image with `Energyscape.points` yields these points: fusion has located the reflectors from the images of all
+    sensors, and maxima of the fused image may be ghosts. ``false_alarm`` then has no effect.
+
     Parameters
     ----------
     image : Energyscape
@@ -62,8 +65,8 @@ def find_peaks(
     Raises
     ------
     ArgumentError
-        ``top`` is below 1, ``min_level_db`` is above 0, ``where`` has another shape than the image, or
-        ``false_alarm`` is not between 0 and 1.
+        ``top`` is below 1, ``min_level_db`` is above 0, ``where`` has another shape than the image, or is passed with
+        an image that has points, or ``false_alarm`` is not between 0 and 1.
 
     Examples
     --------
@@ -76,6 +79,8 @@ def find_peaks(
             print(f"{peak.range_m:.2f} m at {peak.azimuth_deg:.0f}°, {peak.level_db:.1f} dB")
     """
     peaks = peaks_of_grid(image, top=top, min_level_db=min_level_db, where=where, false_alarm=false_alarm)
+    if image.points is not None:
+        return peaks  # The array of the settings is that of one sensor only.
     seen = observable_angles(image.settings.array)
     return [_observed(peak, seen, is_planar=image.is_planar) for peak in peaks]
 
@@ -102,6 +107,13 @@ def peaks_of_grid(
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
     top = image.amplitude.size if top is None else checks.integer("top", top, 1)
     checks.between("min_level_db", min_level_db, -1000.0, 0.0)
+    if image.points is not None:
+        if where is not None:
+            raise ArgumentError(
+                "where selects bins, but the image has the points of a fusion; leave out where, or pass "
+                "image.replace(points=None) to search the image itself"
+            )
+        return _fused_peaks(image.points.strongest(top, min_level_db), is_planar=image.is_planar)
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     neighbours = neighbours_of(directions)
     highest = float(np.max(image.amplitude, initial=0.0))
@@ -144,6 +156,27 @@ def peaks_of_grid(
         )
         for k in sorted(range(len(found)), key=lambda k: -levels[k])
         for direction, range_m, _ in found[k : k + 1]
+    ]
+
+
+def _fused_peaks(cloud: PointCloud, *, is_planar: bool) -> list[Peak]:
+    """Return the points of a fusion as peaks of the image around the platform."""
+    with np.errstate(divide="ignore"):
+        level_dbfs = 20 * np.log10(cloud.amplitude.astype(np.float64))
+    across_m = np.hypot(cloud.position_m[:, 0], cloud.position_m[:, 1])
+    range_m = (across_m if is_planar else cloud.range_m).tolist()
+    elevation_deg = [0.0] * len(cloud) if is_planar else cloud.elevation_deg.tolist()
+    rows = zip(cloud.azimuth_deg.tolist(), elevation_deg, range_m, level_dbfs.tolist(), strict=True)
+    return [
+        Peak(
+            azimuth_deg=azimuth_deg,
+            elevation_deg=up_deg,
+            range_m=away_m,
+            level_db=level - level_dbfs[0],
+            level_dbfs=level,
+            grid_error_deg=0.0,
+        )
+        for azimuth_deg, up_deg, away_m, level in rows
     ]
 
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ertis_numba.analysis.points import PointExtractor
+from ertis_numba.analysis.points import MIN_LEVEL_DB, TOP, PointExtractor
 from ertis_numba.frames import AcousticMap, Energyscape, PointCloud
 from ertis_numba.geometry import Grid
 
@@ -26,7 +26,10 @@ class PointFinder:
         self._extractors: dict[str, tuple[Energyscape, PointExtractor]] = {}
 
     def __call__(self, image: Energyscape) -> PointCloud:
-        """Return the points of an image, in the coordinate frame of its sensor."""
+        """Return the points of an image, in the coordinate frame of its sensor; those of a fusion if it has them."""
+        if image.points is not None:
+            chosen = {"top": TOP, "min_level_db": MIN_LEVEL_DB} | self._finding
+            return image.points.strongest(chosen["top"], chosen["min_level_db"])
         known = self._extractors.get(image.stamp.sensor)
         if known is None or not _suits(known[0], image):
             grid = Grid(image.azimuth_rad, image.elevation_rad)

@@ -1,5 +1,7 @@
 """Point clouds of images, computed fast enough for every image of a stream."""
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,7 +15,12 @@ from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import Grid, direction_grid, observable_angles, unit_vectors
 from ertis_numba.settings import Settings
 
-__all__ = ["PointExtractor"]
+__all__ = ["MIN_LEVEL_DB", "TOP", "PointExtractor"]
+
+TOP: Final = 256
+"""Default of the largest number of points per image."""
+MIN_LEVEL_DB: Final = -20.0
+"""Default of the lowest level of points, relative to the strongest of the image."""
 
 _BINS_OF_POINT = 64
 """Maximum number of bins to examine per point; in noise, a third of the image would be candidates otherwise."""
@@ -61,7 +68,7 @@ class PointExtractor:
     """
 
     def __init__(
-        self, settings: Settings, grid: Grid | None = None, *, top: int = 256, min_level_db: float = -20.0
+        self, settings: Settings, grid: Grid | None = None, *, top: int = TOP, min_level_db: float = MIN_LEVEL_DB
     ) -> None:
         checks.instance("settings", settings, Settings, "an image or a recording holds")
         self._has_directions = any(observable_angles(settings.array)[:2])

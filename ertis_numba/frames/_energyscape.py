@@ -10,6 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 from ertis_numba import checks
 from ertis_numba.angles import DegreesFromRadians
 from ertis_numba.errors import ArgumentError
+from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames._stamp import Stamp
 from ertis_numba.frames._xarray import data_array
@@ -45,6 +46,9 @@ class Energyscape(DegreesFromRadians):
         Settings of the image, with its complete plan.
     stamp : Stamp
         Origin of the measurement.
+    points : PointCloud, optional
+        Reflectors that the fusion of several sensors has located, in the frame of the platform; None for the image of
+        one sensor. Lists, plots, exports and views show these points in place of maxima of the image.
 
     Raises
     ------
@@ -68,6 +72,7 @@ class Energyscape(DegreesFromRadians):
     range_m: NDArray[np.float64]
     settings: Settings
     stamp: Stamp = Stamp()
+    points: PointCloud | None = None
 
     def __post_init__(self) -> None:
         for name in ("amplitude", "azimuth_rad", "elevation_rad", "range_m"):
@@ -189,11 +194,32 @@ class Energyscape(DegreesFromRadians):
                 f"{self.range_m.max():g} m"
             )
         return self.replace(
+            points=None if self.points is None else self._points_within(azimuth_deg, elevation_deg, range_m),
             amplitude=self.amplitude[np.ix_(directions, ranges)],
             azimuth_rad=self.azimuth_rad[directions],
             elevation_rad=self.elevation_rad[directions],
             range_m=self.range_m[ranges],
         )
+
+    def _points_within(
+        self,
+        azimuth_deg: tuple[float, float] | None,
+        elevation_deg: tuple[float, float] | None,
+        range_m: tuple[float, float] | None,
+    ) -> PointCloud | None:
+        """Return the points within limits, which are included."""
+        cloud = self.points
+        if cloud is None:
+            return None
+        within = np.ones(len(cloud), dtype=np.bool_)
+        level_m = np.hypot(*cloud.position_m[:, :2].T) if self.is_planar else cloud.range_m
+        if azimuth_deg is not None:
+            within &= np.mod(cloud.azimuth_deg - azimuth_deg[0], _TURN_DEG) <= azimuth_deg[1] - azimuth_deg[0]
+        if elevation_deg is not None and not self.is_planar:
+            within &= (cloud.elevation_deg >= elevation_deg[0]) & (cloud.elevation_deg <= elevation_deg[1])
+        if range_m is not None:
+            within &= (level_m >= range_m[0]) & (level_m <= range_m[1])
+        return cloud.only(within)
 
     def to_xarray(self) -> "xarray.DataArray":
         """Return the image as an `xarray.DataArray`, with the names that energyscape files have.

@@ -125,6 +125,57 @@ class PointCloud(DegreesFromRadians):
         """
         return replaced("a point cloud", self, changes)
 
+    def only(self, chosen: NDArray[Any]) -> Self:
+        """Return some of the points.
+
+        Parameters
+        ----------
+        chosen : (point,) bool, or int indices
+            Points to keep.
+
+        Returns
+        -------
+        PointCloud
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import ertis_numba as ertis
+        >>> cloud = ertis.PointCloud(np.ones((2, 3), np.float32), np.ones(2, np.float32), ertis.Settings())
+        >>> len(cloud.only(np.array([True, False])))
+        1
+        """
+        return self.replace(
+            position_m=self.position_m[chosen],
+            amplitude=self.amplitude[chosen],
+            uncertainty_m=None if self.uncertainty_m is None else self.uncertainty_m[chosen],
+        )
+
+    def strongest(self, top: int | None, min_level_db: float) -> Self:
+        """Return the strongest points, which come first.
+
+        Parameters
+        ----------
+        top : int or None
+            Largest number of points; None for all.
+        min_level_db : float
+            Lowest level relative to the strongest point in dB.
+
+        Returns
+        -------
+        PointCloud
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import ertis_numba as ertis
+        >>> cloud = ertis.PointCloud(np.ones((2, 3), np.float32), np.ones(2, np.float32), ertis.Settings())
+        >>> len(cloud.strongest(1, -20.0))
+        1
+        """
+        lowest = self.amplitude.max(initial=0.0) * 10 ** (min_level_db / 20)
+        return self.only(np.flatnonzero((self.amplitude >= lowest) & (self.amplitude > 0))[:top])
+
     def to_structured(self) -> NDArray[np.void]:
         """Return the points as a NumPy structured array, with the field names of exported files.
 

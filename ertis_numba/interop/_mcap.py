@@ -11,7 +11,7 @@ from typing import IO, Any
 from ertis_numba.extras import extra
 from ertis_numba.frames import BEHAVIOURS, Behaviour, Energyscape, OccupancyMap, Stamp
 from ertis_numba.geometry import self_contained
-from ertis_numba.interop._mountings import Mountings
+from ertis_numba.interop._mountings import PLATFORM, Mountings
 from ertis_numba.interop._points import FindPoints
 from ertis_numba.interop.ros_definitions import encoder, schema
 from ertis_numba.interop.ros_messages import (
@@ -166,10 +166,15 @@ class _McapWriter:
                 if message is not None:
                     name = f"/{self._names[sensor]}/{topic}"
                     self._added.add(name, MESSAGES[topic], message, stamp.timestamp_ns, stamp.sequence)
-        if earliest is not None:
-            transforms = {"transforms": self._transforms(earliest)}
+        transforms = [] if earliest is None else self._transforms(earliest)
+        if earliest is not None and (transforms or self._names.keys() != {PLATFORM}):
             self._added.add(
-                _STATIC, _STATIC_TYPE, transforms, earliest.timestamp_ns, earliest.sequence, is_latched=True
+                _STATIC,
+                _STATIC_TYPE,
+                {"transforms": transforms},
+                earliest.timestamp_ns,
+                earliest.sequence,
+                is_latched=True,
             )
         for sensor, counts in behaviours.items():
             numbers = {f"n_{behaviour}": str(counts[behaviour]) for behaviour in BEHAVIOURS}
@@ -186,7 +191,7 @@ class _McapWriter:
         found = []
         for sensor in self._names:
             own = replace(stamp, sensor=sensor)
-            if sensor in self._mountings:
+            if sensor in self._mountings and sensor != PLATFORM:  # A frame has no transform to itself.
                 found.append(mounting_message(own, self._mountings[sensor]))
             if "sonar_image" in self._topics:
                 found.append(sonar_frame_message(own))

@@ -6,14 +6,11 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ertis_numba import checks
 from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
-from ertis_numba.interop._mountings import Mounting, validated
+from ertis_numba.interop._mountings import PLATFORM, Mounting, validated
 from ertis_numba.interop.ros_messages import (
     MESSAGES,
     ImageMessages,
@@ -238,7 +235,7 @@ class RosPublisher:
         limits_m = self._settings.range_m
         if limits_m is None:
             return cloud
-        return _selected(cloud, (cloud.range_m >= limits_m[0]) & (cloud.range_m <= limits_m[1]))
+        return cloud.only((cloud.range_m >= limits_m[0]) & (cloud.range_m <= limits_m[1]))
 
     def publish_status(self, status: Status) -> None:
         """Publish the status of a central node and its sensors on ``/diagnostics``."""
@@ -290,7 +287,7 @@ class RosPublisher:
         transforms = []
         for sensor, known in self._frames.items():
             own = replace(stamp, sensor=sensor)
-            if known is not None:
+            if known is not None and sensor != PLATFORM:  # A frame has no transform to itself.
                 transforms.append(mounting_message(own, known))
             if "sonar_image" in self._wanted and sensor != LOCAL_FRAME:
                 transforms.append(sonar_frame_message(own))
@@ -301,14 +298,6 @@ class RosPublisher:
         if name not in self.topics:
             self.topics[name] = self._participant.topic(name, message, latched=latched)
         return self.topics[name]
-
-
-def _selected(cloud: PointCloud, within: NDArray[np.bool_]) -> PointCloud:
-    """Return some points of a cloud."""
-    uncertainty_m = None if cloud.uncertainty_m is None else cloud.uncertainty_m[within]
-    return cloud.replace(
-        position_m=cloud.position_m[within], amplitude=cloud.amplitude[within], uncertainty_m=uncertainty_m
-    )
 
 
 def _namespace(given: str) -> str:

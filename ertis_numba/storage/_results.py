@@ -20,7 +20,7 @@ from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import FileWriter
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import FORMAT_VERSION, POSES, Variable, create_variables, set_attributes
+from ertis_numba.storage.schema import FORMAT_VERSION, POINTS, POSES, Variable, create_variables, set_attributes
 from ertis_numba.storage.truth import GroundTruth
 
 __all__ = ["ResultFile", "ResultReader", "ResultWriter"]
@@ -110,7 +110,7 @@ class ResultWriter(ResultFile, FileWriter[Result]):
         axes = {name: getattr(first, field) for name, field in self._axes.items()}
         create_variables(
             group,
-            [variable for variable in self._table if variable not in POSES],
+            [variable for variable in self._table if variable not in (*POINTS, *POSES)],
             sizes=self._sizes_of(axes),
             dtypes={self._data: self._dtype},
             texts={"settings": self_contained(first.settings).to_toml()},

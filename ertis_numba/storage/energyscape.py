@@ -13,23 +13,33 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DamagedError
-from ertis_numba.frames import Energyscape
+from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.storage._points import POINT_SIZES, PointReader, require_uniform, write_points
 from ertis_numba.storage._results import ResultFile, ResultReader, ResultWriter
-from ertis_numba.storage._rows import RowReader
+from ertis_numba.storage._rows import RowReader, RowWriter
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import ENERGYSCAPE, POSES, Variable, set_attributes, to_python
+from ertis_numba.storage.schema import (
+    ENERGYSCAPE,
+    FORMAT_VERSION,
+    POINTS,
+    POSES,
+    Variable,
+    set_attributes,
+    to_python,
+)
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 
 __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write_energyscapes"]
 
 _ERRORS_DB: Final = ("predicted_error_db", "max_error_db", "wavefront_error_db")
+PLATFORM_FRAME: Final = "base_link"  # Sensor of fused images; the fusion lies above this package.
 _TEXTS: Final = ("budget_applies_to", "error_warning", "call_warning", "layout_warning")
 
 
 class _EnergyscapeFile(ResultFile):
     _kind: ClassVar[str] = "energyscape"
     _data: ClassVar[str] = "amplitude"
-    _table: ClassVar[tuple[Variable, ...]] = (*ENERGYSCAPE, *POSES)
+    _table: ClassVar[tuple[Variable, ...]] = (*ENERGYSCAPE, *POINTS, *POSES)
     _type: ClassVar[type[Any]] = Energyscape
     _name: ClassVar[str] = "an energyscape"
     _axes: ClassVar[Mapping[str, str]] = {"azimuth": "azimuth_rad", "elevation": "elevation_rad", "range": "range_m"}
@@ -73,6 +83,7 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
     ) -> None:
         checks.choice("dtype", dtype, ("float32", "float16"))
         super().__init__(path, recording=recording, mounting=mounting, dtype=dtype, overwrite=overwrite, truth=truth)
+        self._points: dict[str, list[PointCloud]] = {}
         self._stated: dict[str, dict[str, float | str]] = {}
         self._recorded = {reader.sensor: (reader.truth, reader.stamps()) for reader in self._readers if reader.truth}
 
@@ -133,6 +144,20 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
     def _begin(self, group: h5py.Group, first: Energyscape) -> None:
         super()._begin(group, first)
         set_attributes(group, self._stated.get(first.stamp.sensor, {}))
+
+    def _row(self, item: Energyscape) -> tuple[NDArray[Any], dict[str, float]]:
+        require_uniform(item, self._first[item.stamp.sensor])
+        row = super()._row(item)
+        if item.points is not None:
+            self._points.setdefault(item.stamp.sensor, []).append(item.points)
+        return row
+
+    def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
+        clouds = self._points.get(group.name.rpartition("/")[2])
+        if clouds is not None:
+            write_points(group, clouds)
+            self._format_version = FORMAT_VERSION
+        super()._complete(group, rows)
 
     def _sensor_truth(self, sensor: str, group: h5py.Group) -> GroundTruth | GroundTruthLog | None:
         given = super()._sensor_truth(sensor, group)
@@ -212,6 +237,30 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
             setattr(self, name, _number(self.path, name, stated[name]) if name in stated else None)
         for name in _TEXTS:
             setattr(self, name, str(to_python(stated.get(name, ""))))
+        has_points = any(variable.name in self._group for variable in POINTS)
+        self._points = PointReader(self._group, self.path, self.settings) if has_points else None
+
+    @property
+    def has_points(self) -> bool:
+        """True if the images have the points of a fusion."""
+        return self._points is not None
+
+    @property
+    def points_note(self) -> str | None:
+        """Note on fused images without points, whose maxima take their place; None for other images."""
+        if self.sensor != PLATFORM_FRAME or self.has_points:
+            return None
+        return (
+            f"{self.path} has fused images without the points of the fusion, so maxima of the images are shown, some "
+            "of which may be ghosts; fuse the recordings again with 'ertis process --fuse'"
+        )
+
+    def _item(self, index: int) -> Energyscape:
+        image = super()._item(index)
+        return image if self._points is None else self._points(image, index)
+
+    def _sizes(self) -> dict[str, int]:
+        return super()._sizes() | POINT_SIZES
 
 
 def _number(path: Path, name: str, value: Any) -> float:

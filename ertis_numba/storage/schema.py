@@ -29,6 +29,7 @@ __all__ = [
     "FORMAT_VERSION",
     "FORMER_NAMES",
     "OCCUPANCY_MAP",
+    "POINTS",
     "POSES",
     "RECORDING",
     "RECORDING_OF_PCM",
@@ -149,6 +150,21 @@ POSES: Final = (
     Variable("pose_source", (), "str", "origin of the poses", optional=True),
 )
 """Variables of files with poses of the platform; they follow all others."""
+
+POINTS: Final = (
+    Variable("point_count", ("time",), "<u4", "number of points of the image", optional=True),
+    Variable("point_position", ("point", "axis"), "<f4", "x, y, z in the frame of the platform", "m", optional=True),
+    Variable("point_amplitude", ("point",), "<f4", "amplitude, as that of images", optional=True),
+    Variable(
+        "point_uncertainty",
+        ("point", "component"),
+        "<f4",
+        "standard deviation of the position along range and across it",
+        "m",
+        optional=True,
+    ),
+)
+"""Points that a fusion has located; those of the first image come first, the strongest of each image first."""
 
 ENERGYSCAPE: Final = (
     *STAMPS,

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from ertis_numba.frames import Energyscape
+from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion import Fuser
 from ertis_numba.fusion.pulses import is_same_pulse
 from ertis_numba.viewer._choices import Choices, colour_table
@@ -37,6 +37,8 @@ class FusedPlan:
         self._width_px = width_px
         self._fuser: tuple[dict[str, Pose], Fuser] | None = None
         self._fused: tuple[list[Energyscape], float, Energyscape] | None = None
+        self.points: PointCloud | None = None
+        """Points of the latest fused image, in the frame of the platform."""
         self._sector: tuple[list[object], Sector] | None = None
         self._polar: tuple[list[object], Polar] | None = None
 
@@ -74,7 +76,8 @@ class FusedPlan:
         # Sensors that are not on one SYNC chain are fused as if they were.
         first = images[0].stamp
         together = [image.replace(stamp=replace(first, sensor=image.stamp.sensor)) for image in images]
-        self._fused = images, now_s, self._fuser[1](together).image
+        fused = self._fuser[1](together)
+        self._fused, self.points = (images, now_s, fused.image), fused.points
         return self._fused[2]
 
     def _polar_of(self, image: Energyscape, choices: Choices) -> Polar:

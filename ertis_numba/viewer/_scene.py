@@ -89,6 +89,8 @@ class ViewedScene:
         self._find = PointFinder(top=_MAX_POINTS, min_level_db=LOWEST_THRESHOLD_DB)
         self._sensors: dict[str, _SensorImages] = {}
         self._plan = FusedPlan(2 * width_px)  # A circle has less room than a sector.
+        self._fused_clouds: deque[_Cloud] = deque(maxlen=_MAX_CLOUDS)
+        self._fused_from: frozenset[str] = frozenset()  # Sensors of the fused image on display.
 
     @property
     def farthest_m(self) -> float:
@@ -96,15 +98,25 @@ class ViewedScene:
         return max((float(kept.latest.image.range_m[-1]) for kept in self._sensors.values()), default=0.0)
 
     def latest(self, choices: Choices) -> list[tuple[Energyscape, PointCloud, Pose | None]]:
-        """Return the shown images with their drawn points and the poses of their sensors."""
-        return [
-            (kept.latest.image, _chosen(kept.clouds[-1].points, kept.clouds[-1].seen(choices)[0]), kept.latest.pose)
-            for _, kept in sorted(self._sensors.items())
-        ]
+        """Return the shown images with their drawn points and the poses of their sensors.
+
+        The points of a fused image are those of the fusion, and belong to the first of its sensors.
+        """
+        found = []
+        for name, kept in sorted(self._sensors.items()):
+            cloud, pose = kept.clouds[-1], kept.latest.pose
+            drawn = cloud.points.only(cloud.seen(choices)[0])
+            if name in self._fused_from:
+                cloud, pose = self._fused_clouds[-1], UNTURNED
+                drawn = cloud.points.only(cloud.seen(choices)[0] & (name == min(self._fused_from)))
+            found.append((kept.latest.image, drawn, pose))
+        return found
 
     def clear(self) -> None:
         """Discard all images, as after a seek."""
         self._sensors.clear()
+        self._fused_clouds.clear()
+        self._fused_from = frozenset()
 
     def take(self, taken: ReceivedImage[Energyscape]) -> None:
         """Add an image to draw next; points of later times are discarded, as after a restart of the playback."""
@@ -118,7 +130,7 @@ class ViewedScene:
         kept.latest = taken
         while kept.clouds and kept.clouds[-1].time_s >= taken.time_s:
             kept.clouds.pop()
-        kept.clouds.append(_cloud_of(self._find(taken.image), taken))
+        kept.clouds.append(_cloud_of(self._find(taken.image), taken.time_s, taken.pose or UNTURNED))
 
     def draw(self, choices: Choices, now_s: float | None = None) -> DrawnFrame:
         """Return the drawn objects of the present images.
@@ -144,15 +156,44 @@ class ViewedScene:
             pose = each.latest.pose or (UNTURNED if len(kept) == 1 else None)
             alone = pose is not None and (overdue or not fused)
             sensors[name] = _drawn(each, choices, now_s, pose, overdue=overdue, alone=alone)
-        frame = DrawnFrame(
+        self._fused_from = frozenset(joined) if fused else frozenset()
+        plan, height_m = None, 0.0
+        if fused:
+            plan = self._plan(joined, choices)
+            height_m = min(taken.pose.translation_m[2] for taken in joined.values() if taken.pose is not None)
+            sensors |= self._with_fused_points({name: sensors[name] for name in joined}, choices, now_s)
+        return DrawnFrame(
             sensors,
             self.farthest_m if choices.range_m is None else min(self.farthest_m, choices.range_m[1]),
+            fused=plan,
+            height_m=height_m,
             until_s=_until_s(timely, sensors, choices, now_s),
         )
-        if not fused:
-            return frame
-        height_m = min(taken.pose.translation_m[2] for taken in joined.values() if taken.pose is not None)
-        return replace(frame, fused=self._plan(joined, choices), height_m=height_m)
+
+    def _with_fused_points(self, joined: dict[str, Drawn], choices: Choices, now_s: float) -> dict[str, Drawn]:
+        """Return the drawn objects of fused sensors with the points of the fusion, all at the first sensor.
+
+        The points of a single sensor contain foreign echoes, where there is no reflector.
+        """
+        cloud, time_s = self._plan.points, max(drawn.time_s for drawn in joined.values())
+        clouds = self._fused_clouds
+        if cloud is not None and not (clouds and clouds[-1].points is cloud):
+            while clouds and clouds[-1].time_s >= time_s:
+                clouds.pop()
+            clouds.append(_cloud_of(cloud, time_s, UNTURNED))
+        position_m, colours, share_left, n_points = _points(clouds, choices, now_s, colour_table(choices.colours))
+        first = min(joined)
+        found = {}
+        for name, drawn in joined.items():
+            count = None if name == first else 0
+            found[name] = replace(
+                drawn,
+                position_m=position_m[:count],
+                colours=colours[:count],
+                share_left=share_left[:count],
+                n_points=n_points if name == first else 0,
+            )
+        return found
 
     def _prepare(self, kept: _SensorImages, choices: Choices) -> None:
         """Update the levels of a sensor's image after a new image or choice."""
@@ -172,20 +213,13 @@ def _same_axes(image: Energyscape, other: Energyscape) -> bool:
     return same_directions(image, other) and np.array_equal(image.range_m, other.range_m)
 
 
-def _chosen(cloud: PointCloud, some: NDArray[np.bool_]) -> PointCloud:
-    uncertainty_m = None if cloud.uncertainty_m is None else cloud.uncertainty_m[some]
-    return cloud.replace(
-        position_m=cloud.position_m[some], amplitude=cloud.amplitude[some], uncertainty_m=uncertainty_m
-    )
-
-
-def _cloud_of(cloud: PointCloud, taken: ReceivedImage[Energyscape]) -> _Cloud:
+def _cloud_of(cloud: PointCloud, time_s: float, pose: Pose) -> _Cloud:
     return _Cloud(
         cloud,
-        (taken.pose or UNTURNED).placed(cloud.position_m),
+        pose.placed(cloud.position_m),
         np.asarray(20 * np.log10(np.maximum(cloud.amplitude, np.float32(1e-30))), dtype=np.float32),
         np.asarray(np.linalg.norm(cloud.position_m, axis=1), dtype=np.float32),
-        taken.time_s,
+        time_s,
     )
 
 
