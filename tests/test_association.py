@@ -14,7 +14,7 @@ from ertis_numba.fusion.rig import Emitters, mounted_sensors
 N_SENSORS = 4
 PATH_SD_M, ANGLE_SD_RAD = 2e-3, math.radians(0.25)
 GRID = PolarGrid.around(2.0, 0.03, 4.0, is_planar=True, height_m=0.0)
-MODEL = Emitters(ertis.Settings(), 0.0)
+MODEL = Emitters(ertis.Settings(), [0.0] * N_SENSORS)
 
 
 def sensors():

@@ -358,7 +358,7 @@ def test_pixels_of_a_reflector_lead_back_to_its_cell(emitter, seed):
     sensors = mounted_sensors(mountings())
     image = images()["front"]
     receiver = Receiver(sensors[0], image, 0.015)
-    emitters = Emitters(image.settings, 0.0)
+    emitters = Emitters(image.settings, [0.0] * 4)
     grid = PolarGrid.around(1.0, 0.015, 2.9, is_planar=True, height_m=0.4)
     draws = np.random.default_rng(seed)
     azimuth_rad = draws.uniform(-1.2, 1.2, 50)
@@ -371,6 +371,39 @@ def test_pixels_of_a_reflector_lead_back_to_its_cell(emitter, seed):
     cells_m = grid.positions_m[back.cell[nearest]]
     assert len(pair.cell) == 50
     assert np.max(np.linalg.norm(cells_m - places_m[pair.cell], axis=1)) < 0.09  # half a direction at 2 m, and a step
+
+
+@pytest.mark.parametrize("diameter_m", [0.0, 0.012])
+def test_fusion_uses_the_emitters_of_the_settings(diameter_m):
+    """Images of scenes carry the diameter of the emitter, and a given one replaces it."""
+    group = [of_emitter(image, diameter_m) for image in images().values()]
+    found, told = ertis.fuse(group, mountings()), ertis.fuse(group, mountings(), emitter_diameter_m=diameter_m)
+    other = ertis.fuse(group, mountings(), emitter_diameter_m=0.012 - diameter_m)
+    np.testing.assert_array_equal(found.image.amplitude, told.image.amplitude)
+    assert not np.array_equal(found.image.amplitude, other.image.amplitude)
+    assert all(image.settings.array.emitter_diameter_m == 0.012 for image in images().values())
+
+
+def test_fuser_follows_a_change_of_emitters():
+    fuser = ertis.Fuser(mountings())
+    for diameter_m in (0.012, 0.0, None):
+        group = [of_emitter(image, diameter_m) for image in images().values()]
+        assert not fuser.has_tables(group) or diameter_m is None
+        wanted = ertis.fuse(group, mountings(), emitter_diameter_m=0.012 if diameter_m is None else diameter_m)
+        np.testing.assert_array_equal(fuser(group).image.amplitude, wanted.image.amplitude)
+        assert fuser.has_tables(group)
+
+
+def test_emitters_of_one_platform_may_differ():
+    """The front sensor does not hear the call of a piston that faces away, but that of an omnidirectional emitter."""
+    emitters = Emitters(images()["front"].settings, [0.012, 0.012, 0.0, 0.012])
+    behind = np.full((1, 4), -1.0)
+    assert emitters.powers(behind)[0].round(3).tolist() == [0.001, 0.001, 1.0, 0.001]
+    assert [float(emitters.power(np.array(-1.0), number)) for number in range(4)] == emitters.powers(behind)[0].tolist()
+
+
+def of_emitter(image, diameter_m):
+    return image.replace(settings=image.settings.replace("array.emitter_diameter_m", diameter_m))
 
 
 def test_cell_of_is_the_inverse_of_positions():

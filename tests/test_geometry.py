@@ -121,6 +121,18 @@ def test_sensitivity_of_a_layout_is_kept_unless_the_settings_state_another(tmp_p
         Array(sensitivity_dbfs=94.0)
 
 
+def test_emitter_of_a_layout_is_kept_unless_the_settings_state_another(tmp_path):
+    path = tmp_path / "wide.toml"
+    path.write_text("emitter_diameter_m = 0.02\npositions_mm = [[0, 0], [4, 2]]")
+    named = Array(layout=str(path))
+    assert load_layout(path).emitter_diameter_m == microphones(named).emitter_diameter_m == 0.02
+    assert microphones(named.replace(emitter_diameter_m=0.0)).emitter_diameter_m == 0.0
+    assert written_out(named).emitter_diameter_m == written_out(written_out(named)).emitter_diameter_m == 0.02
+    assert layout_file(load_layout(path), name="mine").emitter_diameter_m == 0.02
+    with pytest.raises(ArgumentError, match=r"array.emitter_diameter_m is 12; give a number from 0 to 0.2"):
+        Array(emitter_diameter_m=12.0)
+
+
 def test_sound_pressure_level_follows_from_the_sensitivity_of_a_data_sheet():
     """A sine of 1 Pa at −26 dBFS has an amplitude of 10^(−26/20); its RMS in this package is 3 dB lower."""
     sine = 10 ** (-26 / 20) * np.sin(2 * np.pi * np.arange(1000) / 10)

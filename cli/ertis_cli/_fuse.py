@@ -29,7 +29,7 @@ def write_fused(
     changed: "Callable[[Settings], Settings]",
     *,
     mounting: "Path | None",
-    emitter_diameter_m: float,
+    emitter_diameter_m: float | None,
     force: bool,
     quiet: bool,
     as_json: bool,
@@ -47,8 +47,8 @@ def write_fused(
         Function that returns the settings to use from those of the recording.
     mounting : Path or None
         File with the mountings of all sensors, instead of those of the recordings.
-    emitter_diameter_m : float
-        Diameter of the emitters.
+    emitter_diameter_m : float or None
+        Diameter of the emitters instead of that of the recordings.
     force, quiet, as_json : bool
         As for the command.
     **device

@@ -80,7 +80,7 @@ def mapping(
     half_life_s: float | None,
     height_m: tuple[float, float] | None,
     probabilities: bool,
-    emitter_diameter_m: float,
+    emitter_diameter_m: float | None,
     preset: str | None,
     settings_file: Path | None,
     device: str,

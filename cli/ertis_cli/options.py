@@ -258,10 +258,8 @@ def emitter_diameter(text: str) -> Decorator:
         "--emitter-diameter",
         "emitter_diameter_m",
         type=click.FloatRange(0.0, 0.2),
-        default=0.012,
-        show_default=True,
         metavar="M",
-        help=f"{text} in m, which determines their directivity; 0 is omnidirectional.",
+        help=f"{text} in m instead of that of the recordings; 0 is omnidirectional.",
     )
 
 

@@ -148,7 +148,7 @@ def process(
     settings_file: Path | None,
     dtype: Literal["float32", "float16"],
     fuse: bool,
-    emitter_diameter_m: float,
+    emitter_diameter_m: float | None,
     strict: bool,
     device: str,
     threads: int | None,

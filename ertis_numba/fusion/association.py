@@ -178,7 +178,7 @@ class Reflectors:
         cosine = np.einsum("psi,si->ps", away_m, self._ahead) / np.maximum(apart_m, _NEAREST_M)
         gain = np.zeros((len(place_m), len(self._sensors), len(self._sensors)))
         for number, model in self._emitters.items():
-            radiated = model.power(cosine)
+            radiated = model.powers(cosine)
             spreading = model.spreading(apart_m, apart_m[:, number, None])
             gain[:, number] = np.where(radiated > AUDIBLE, radiated, 0) * spreading
         return gain

@@ -12,12 +12,12 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.pulses import is_same_pulse
-from ertis_numba.fusion.rig import Mountings, mounted_sensors
+from ertis_numba.fusion.rig import Mountings, emitter_diameter_m, mounted_sensors
 from ertis_numba.fusion.tables import FusionTables
+from ertis_numba.settings import MAX_EMITTER_M
 
 __all__ = ["Fused", "Fuser", "fuse"]
 
-EMITTER_DIAMETER_M: Final = 0.012
 _SPACING_DEG: Final = 1.0, 4.0  # of planar and of three-dimensional images
 _STEP_M: Final = 0.015, 0.03
 
@@ -73,15 +73,17 @@ class Fuser:
     reflector to another one, so the reflector lies on an ellipse around both. Each pair of emitter and receiver has its
     own range axis, and each part of an image is attributed to the pair whose reflectors explain it. Foreign echoes thus
     do not appear as ghosts, and confirm reflectors instead. The settings of the images contain the delay of each
-    sensor's call. A sensor without an image so far is assumed to emit together with the first one that has an image.
+    sensor's call. A sensor without an image so far is assumed to emit together with the first one that has an image,
+    and by an emitter of the same diameter.
 
     Parameters
     ----------
     mountings : mapping of str to (translation_m, rotation_xyzw)
         Mountings of all sensors: position x, y, z in metres, and the unit quaternion x, y, z, w that rotates the sensor
         frame into the platform frame. Sensors without an image still emit.
-    emitter_diameter_m : float, default 0.012
-        Diameter of the emitters as pistons, which determines their directivity; 0 for omnidirectional ones.
+    emitter_diameter_m : float, optional
+        Diameter of the emitters as pistons, which determines their directivity; 0 for omnidirectional ones. By default,
+        that in the settings of each sensor, ``array.emitter_diameter_m``, or in its layout; 0.012 if neither states it.
     spacing_deg : float, optional
         Spacing of directions; 1° for planar images, and 4° for others by default.
     range_step_m : float, optional
@@ -107,19 +109,22 @@ class Fuser:
         self,
         mountings: Mountings,
         *,
-        emitter_diameter_m: float = EMITTER_DIAMETER_M,
+        emitter_diameter_m: float | None = None,
         spacing_deg: float | None = None,
         range_step_m: float | None = None,
         silent: Collection[str] = (),
     ) -> None:
         self._mountings = mounted_sensors(mountings)
         self._numbers = {sensor.name: number for number, sensor in enumerate(self._mountings)}
-        self._diameter_m = checks.between("emitter_diameter_m", emitter_diameter_m, 0.0, 0.2)
+        if emitter_diameter_m is not None:
+            checks.between("emitter_diameter_m", emitter_diameter_m, 0.0, MAX_EMITTER_M)
+        self._given_m = emitter_diameter_m
         self._spacing_deg, self._step_m = spacing_deg, range_step_m
         for sensor in silent:
             self._number(sensor, "silent")
         self._emitting = [number for number, sensor in enumerate(self._mountings) if sensor.name not in silent]
         self._start_s: dict[int, float] = {}  # of the calls of all sensors so far
+        self._diameter_m: dict[int, float] = {}  # of the emitters of all sensors so far
         self._tables: FusionTables | None = None
 
     @property
@@ -149,7 +154,8 @@ class Fuser:
         """
         group = self._group(images)
         self._start_s |= {number: image.settings.call.start_s for number, image in group.items()}
-        if self._tables is None or not self._tables.fit(group):
+        self._diameter_m |= self._diameters_m(group)
+        if self._tables is None or not self._tables.fit(group, self._diameter_m):
             self._tables = self._new_tables(group)
         tables = self._tables
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
@@ -181,7 +187,7 @@ class Fuser:
             As for a call.
         """
         group = self._group(images)
-        return self._tables is not None and self._tables.cover(group)
+        return self._tables is not None and self._tables.cover(group, self._diameters_m(group))
 
     def _group(self, images: Iterable[Energyscape]) -> dict[int, Energyscape]:
         """Return checked images by number of the sensor, in the order of the mountings."""
@@ -211,6 +217,9 @@ class Fuser:
                 )
         return group
 
+    def _diameters_m(self, group: Mapping[int, Energyscape]) -> dict[int, float]:
+        return {number: emitter_diameter_m(image.settings, self._given_m) for number, image in group.items()}
+
     def _number(self, sensor: str, name: str) -> int:
         if sensor not in self._numbers:
             raise ArgumentError(
@@ -238,14 +247,14 @@ class Fuser:
             is_planar=kind == 0,
             height_m=float(np.mean([sensor.translation_m[2] for sensor in self._mountings])),
         )
-        first = next(iter(group.values())).settings.call.start_s
-        start_s = [self._start_s.get(number, first) for number in range(len(self._mountings))]
-        return FusionTables(grid, self._mountings, self._emitting, start_s, self._diameter_m)
+        numbers, first = range(len(self._mountings)), next(iter(group))
+        start_s, diameters_m = (
+            [known.get(number, known[first]) for number in numbers] for known in (self._start_s, self._diameter_m)
+        )
+        return FusionTables(grid, self._mountings, self._emitting, start_s, diameters_m)
 
 
-def fuse(
-    images: Iterable[Energyscape], mountings: Mountings, *, emitter_diameter_m: float = EMITTER_DIAMETER_M
-) -> Fused:
+def fuse(images: Iterable[Energyscape], mountings: Mountings, *, emitter_diameter_m: float | None = None) -> Fused:
     """Return the fusion of the images of sensors that emitted together; use `Fuser` for several groups.
 
     Parameters
@@ -254,8 +263,8 @@ def fuse(
         Images of one SYNC pulse, at most one of each sensor.
     mountings : mapping of str to (translation_m, rotation_xyzw)
         Mountings of the sensors, as for `Fuser`.
-    emitter_diameter_m : float, default 0.012
-        Diameter of the emitters in metres; 0 for omnidirectional ones.
+    emitter_diameter_m : float, optional
+        Diameter of the emitters in metres, as for `Fuser`.
 
     Returns
     -------

@@ -130,7 +130,7 @@ def pair_of(
     """
     sent, heard = sensors[emitter].local_m(positions_m), sensors[number].local_m(positions_m)
     from_m, to_m = np.linalg.norm(sent, axis=1), np.linalg.norm(heard, axis=1)
-    radiated = emitters.power(sent[:, 0] / np.maximum(from_m, _NEAREST_M))
+    radiated = emitters.power(sent[:, 0] / np.maximum(from_m, _NEAREST_M), emitter)
     cosine = heard[:, 0] / np.maximum(to_m, _NEAREST_M)
     step = np.floor((from_m + to_m + late_m) / 2 / receiver.step_m).astype(np.int64)
     beam = receiver.beam(heard)
@@ -204,7 +204,7 @@ def hypothesis(
     place_m = mounting.translation_m + to_m[..., None] * directions[:, None]
     sent_m = (place_m - sensors[emitter].translation_m) @ sensors[emitter].rotation
     from_m = np.linalg.norm(sent_m, axis=-1)
-    radiated = emitters.power(sent_m[..., 0] / np.maximum(from_m, _NEAREST_M))
+    radiated = emitters.power(sent_m[..., 0] / np.maximum(from_m, _NEAREST_M), emitter)
     cell = np.where((beyond > 0) & (to_m > _NEAREST_M), grid.cell_of(place_m), -1)
     is_audible = (cell >= 0) & (radiated > AUDIBLE)
     gain = np.where(is_audible, radiated * emitters.spreading(from_m, to_m), 0.0).astype(np.float32)

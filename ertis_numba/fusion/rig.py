@@ -1,8 +1,9 @@
 """Sensors of a platform: places, orientations and emissions."""
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
@@ -11,15 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from ertis_numba.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.errors import ArgumentError
-from ertis_numba.geometry import mounting
-from ertis_numba.settings import Settings
+from ertis_numba.geometry import microphones, mounting
+from ertis_numba.settings import Array, Settings
 
-__all__ = ["Emitters", "MountedSensor", "Mountings", "mounted_sensors"]
+__all__ = ["Emitters", "MountedSensor", "Mountings", "emitter_diameter_m", "mounted_sensors"]
 
 Floats = NDArray[np.float64]
 Mountings = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 """Position x, y, z in m, and unit quaternion x, y, z, w from the sensor frame to the platform frame, by sensor."""
 
+_USUAL_DIAMETER_M: Final = 0.012  # of an emitter whose settings and layout state none
 _N_FREQUENCIES = 12  # of the band, over which the power of an emitter is averaged
 _NEAREST_M = 0.05  # Distance below which spreading does not increase.
 _STRAY_DB = -20.0  # Power that an emitter radiates at least to its front, which no piston model predicts.
@@ -72,42 +74,74 @@ def mounted_sensors(mountings: Mountings) -> tuple[MountedSensor, ...]:
     return tuple(sensors)
 
 
+def emitter_diameter_m(settings: Settings, given_m: float | None = None) -> float:
+    """Return the diameter of an emitter: the given one, that of the settings or their layout, or else 0.012.
+
+    Parameters
+    ----------
+    settings : Settings
+        Settings of the sensor.
+    given_m : float, optional
+        Diameter that replaces that of the settings.
+    """
+    stated_m = _stated_diameter_m(settings.array) if given_m is None else given_m
+    return _USUAL_DIAMETER_M if stated_m is None else stated_m
+
+
+@functools.cache
+def _stated_diameter_m(array: Array) -> float | None:
+    return microphones(array).emitter_diameter_m
+
+
 class Emitters:
-    """Model of the sound that emitters radiate: circular pistons in a baffle.
+    """Model of the sound that the emitters of a platform radiate: circular pistons in a baffle.
 
     Parameters
     ----------
     settings : Settings
         Settings with the call and the air.
-    diameter_m : float
+    diameters_m : sequence of float
         Diameter of each piston; 0 radiates equally in all directions.
     """
 
-    def __init__(self, settings: Settings, diameter_m: float) -> None:
+    def __init__(self, settings: Settings, diameters_m: Sequence[float]) -> None:
         call = settings.call
         low_hz, high_hz = sorted((call.start_frequency_hz, call.stop_frequency_hz))
         frequency_hz = np.linspace(low_hz, high_hz, _N_FREQUENCIES)
-        self._diameter_m = diameter_m
         self._absorption_db_m = float(absorption_db_m(settings.air, np.array([(low_hz + high_hz) / 2]))[0])
         # The pattern is tabulated over the cosine, because a Bessel function of each cell takes long.
         self._cosine = np.linspace(-1.0, 1.0, 2049)
         sine = np.sqrt(1 - self._cosine**2)
         speed_m_s = sound_speed_m_s(settings.air)
-        argument = np.maximum(1e-9, math.pi * diameter_m / speed_m_s * sine[:, None] * frequency_hz)
-        power = np.mean((2 * scipy.special.j1(argument) / argument) ** 2, axis=1)
-        if diameter_m:
-            power = np.where(self._cosine > 0, np.maximum(power, 10 ** (_STRAY_DB / 10)), 10 ** (_BEHIND_DB / 10))
-        self._power = power
+        patterns = {}
+        for diameter_m in {*diameters_m}:
+            argument = np.maximum(1e-9, math.pi * diameter_m / speed_m_s * sine[:, None] * frequency_hz)
+            power = np.mean((2 * scipy.special.j1(argument) / argument) ** 2, axis=1)
+            if diameter_m:
+                power = np.where(self._cosine > 0, np.maximum(power, 10 ** (_STRAY_DB / 10)), 10 ** (_BEHIND_DB / 10))
+            patterns[diameter_m] = power
+        self._powers = [patterns[diameter_m] for diameter_m in diameters_m]
 
-    def power(self, cosine: Floats) -> Floats:
-        """Return the radiated power relative to that ahead.
+    def power(self, cosine: Floats, emitter: int) -> Floats:
+        """Return the power that an emitter radiates, relative to that ahead.
 
         Parameters
         ----------
         cosine : ndarray of float64
             Cosine of the angle to the emitter's axis.
+        emitter : int
+            Index of the emitter.
         """
-        return np.asarray(np.interp(cosine, self._cosine, self._power))
+        return np.asarray(np.interp(cosine, self._cosine, self._powers[emitter]))
+
+    def powers(self, cosine: Floats) -> Floats:
+        """Return the powers that all emitters radiate, relative to those ahead: (..., emitter) float64.
+
+        Parameters
+        ----------
+        cosine : (..., emitter) float64
+        """
+        return np.stack([self.power(cosine[..., number], number) for number in range(len(self._powers))], axis=-1)
 
     def spreading(self, to_point_m: Floats, from_point_m: Floats) -> Floats:
         """Return the power of an echo relative to that at 1 m: spherical spreading of both paths, and absorption."""

@@ -37,8 +37,8 @@ class FusionTables:
         Indices of the sensors that emit.
     start_s : sequence of float
         Start of each sensor's call after the start of the record.
-    diameter_m : float
-        Diameter of the emitters.
+    diameters_m : sequence of float
+        Diameter of each sensor's emitter.
     """
 
     def __init__(
@@ -47,10 +47,10 @@ class FusionTables:
         sensors: tuple[MountedSensor, ...],
         emitting: list[int],
         start_s: Sequence[float],
-        diameter_m: float,
+        diameters_m: Sequence[float],
     ) -> None:
         self.grid = grid
-        self._sensors, self._emitting, self._start_s, self._diameter_m = sensors, emitting, start_s, diameter_m
+        self._sensors, self._emitting, self._start_s, self._diameters_m = sensors, emitting, start_s, diameters_m
         self._positions_m = grid.positions_m
         self._receivers: dict[int, Receiver] = {}
         self._deaf: dict[int, NDArray[np.bool_]] = {}
@@ -64,18 +64,25 @@ class FusionTables:
         self._points: dict[int, PointFuser] = {}
         self._converted: dict[str, tuple[Settings, Settings]] = {}  # The checks of settings take long.
 
-    def fit(self, group: Mapping[int, Energyscape]) -> bool:
-        """Return True if images have the same directions, ranges and calls as earlier ones of their sensors."""
-        return all(
+    def fit(self, group: Mapping[int, Energyscape], diameters_m: Mapping[int, float]) -> bool:
+        """Return True if images have the same directions, ranges, calls and emitters as earlier ones of their sensors.
+
+        Parameters
+        ----------
+        group : mapping of int to Energyscape
+        diameters_m : mapping of int to float
+            Diameters of emitters.
+        """
+        return all(self._diameters_m[number] == each for number, each in diameters_m.items()) and all(
             image.settings.call.start_s == self._start_s[number]
             if number not in self._receivers
             else self._receivers[number].fits(image) and image.settings.call == self._settings[number].call
             for number, image in group.items()
         )
 
-    def cover(self, group: Mapping[int, Energyscape]) -> bool:
+    def cover(self, group: Mapping[int, Energyscape], diameters_m: Mapping[int, float]) -> bool:
         """Return True if all tables for a group exist."""
-        return self.fit(group) and group.keys() <= self._receivers.keys() and _key(group) in self._known
+        return self.fit(group, diameters_m) and group.keys() <= self._receivers.keys() and _key(group) in self._known
 
     def coarse(self, number: int, image: Energyscape) -> CoarseImage:
         """Return the powers of an image of a receiver."""
@@ -139,7 +146,7 @@ class FusionTables:
             emitter: (self._start_s[emitter] - self._start_s[number]) * speed_m_s for emitter in self._emitting
         }
         deaf = self._deaf[number] = self._direct_sound(number, receiver, late_m)
-        emitters = self._emitters[number] = Emitters(settings, self._diameter_m)
+        emitters = self._emitters[number] = Emitters(settings, self._diameters_m)
         common = self._sensors, emitters, receiver
         pairs = [
             pair_of(

@@ -52,6 +52,9 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
     sensitivity_dbfs : float, optional
         Sensitivity of the microphones as in their data sheet: level of a sine of 94 dB, 1 Pa RMS, relative to a
         full-scale sine, -120 to 20 dBFS; unknown by default.
+    emitter_diameter_m : float, optional
+        Diameter of the emitter beside the array as a circular piston, 0 to 0.2 m; 0 is omnidirectional, and unknown by
+        default.
     """
 
     positions_mm: list[list[float]] | None = None
@@ -64,6 +67,7 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
     gain: tuple[float, ...] | None = None
     delay_s: tuple[float, ...] | None = None
     sensitivity_dbfs: float | None = None
+    emitter_diameter_m: float | None = None
 
     def to_toml(self) -> str:
         """Return TOML text with one position per line."""
@@ -211,6 +215,7 @@ def _checked(source: str, positions_m: NDArray[np.float64], enabled: NDArray[np.
             delay_s=file.delay_s,
             word_bits=file.word_bits,
             sensitivity_dbfs=file.sensitivity_dbfs,
+            emitter_diameter_m=file.emitter_diameter_m,
         )
     except ArgumentError as error:
         raise ArgumentError(f"{source}: {error}") from error

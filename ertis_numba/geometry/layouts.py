@@ -51,6 +51,8 @@ class Layout:
         Bits of one PDM word.
     sensitivity_dbfs : float, optional
         Level of a sine of 94 dB relative to a full-scale sine; None, the default, if it is unknown.
+    emitter_diameter_m : float, optional
+        Diameter of the emitter beside the array, 0 if it is omnidirectional; None, the default, if it is unknown.
     notes : tuple of str
         Remarks about the file of the layout, such as a unit that it does not state; none by default.
     unit_is_stated : bool
@@ -64,6 +66,7 @@ class Layout:
     delay_s: NDArray[np.float64]
     word_bits: int
     sensitivity_dbfs: float | None = None
+    emitter_diameter_m: float | None = None
     notes: tuple[str, ...] = ()
     unit_is_stated: bool = True
 
@@ -97,6 +100,7 @@ class Layout:
             delay_s=tuple(self.delay_s.tolist()),
             word_bits=self.word_bits,
             sensitivity_dbfs=self.sensitivity_dbfs,
+            emitter_diameter_m=self.emitter_diameter_m,
         )
 
 
@@ -127,6 +131,7 @@ def layout_file(layout: Layout, *, name: str, source: str = "") -> LayoutFile:
         gain=tuple(np.round(layout.gain, 6).tolist()),
         delay_s=tuple(np.round(layout.delay_s, 12).tolist()),
         sensitivity_dbfs=layout.sensitivity_dbfs,
+        emitter_diameter_m=layout.emitter_diameter_m,
     )
 
 
@@ -229,9 +234,8 @@ def _fitted(array: Array) -> Layout:
     """Return all microphones of an array, including the disabled ones."""
     if array.positions_m is None:
         named = load_layout(array.layout)
-        if array.sensitivity_dbfs is None:
-            return named
-        return replace(named, sensitivity_dbfs=array.sensitivity_dbfs)
+        given = {name: getattr(array, name) for name in ("sensitivity_dbfs", "emitter_diameter_m")}
+        return replace(named, **{name: value for name, value in given.items() if value is not None})
     positions_m = np.asarray(array.positions_m, dtype=np.float64)
     enabled = np.ones(len(positions_m), dtype=np.bool_) if array.enabled is None else np.asarray(array.enabled)
     centre_m = positions_m[enabled].mean(axis=0)
@@ -247,6 +251,7 @@ def _fitted(array: Array) -> Layout:
         delay_s=np.zeros(len(enabled)) if array.delay_s is None else np.asarray(array.delay_s, dtype=np.float64),
         word_bits=array.word_bits,
         sensitivity_dbfs=array.sensitivity_dbfs,
+        emitter_diameter_m=array.emitter_diameter_m,
     )
 
 

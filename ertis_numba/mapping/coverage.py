@@ -57,7 +57,7 @@ class Coverage(NamedTuple):
         sensors: Sequence[MountedSensor],
         limits_m: Sequence[tuple[float, float]],
         settings: Settings,
-        diameter_m: float,
+        diameters_m: Sequence[float],
         step_m: float,
         *,
         height_m: float | None = None,
@@ -71,14 +71,14 @@ class Coverage(NamedTuple):
             Ranges of their images.
         settings : Settings
             Settings with the call and the air.
-        diameter_m : float
-            Diameter of the emitters.
+        diameters_m : sequence of float
+            Diameter of each sensor's emitter.
         step_m : float
         height_m : float, optional
             Height on the platform of the centre of the directions in space; by default, directions are those of a plane
             through each sensor.
         """
-        emitters = Emitters(settings, diameter_m)
+        emitters = Emitters(settings, diameters_m)
         reach_m = max(
             float(np.hypot(*sensor.translation_m[:2])) + last
             for sensor, (_, last) in zip(sensors, limits_m, strict=True)
@@ -86,11 +86,11 @@ class Coverage(NamedTuple):
         grid = directions_around(2 if height_m is None else 3, reach_m, step_m)
         place_m = grid.directions[:, None] * grid.range_m[:, None]
         weight = np.zeros(place_m.shape[:2])
-        for sensor, (first_m, last_m) in zip(sensors, limits_m, strict=True):
+        for number, (sensor, (first_m, last_m)) in enumerate(zip(sensors, limits_m, strict=True)):
             centre_m = [0.0, 0.0, sensor.translation_m[2] if height_m is None else height_m]
             local_m = sensor.local_m(place_m + centre_m)
             distance_m = np.linalg.norm(local_m, axis=-1)
-            power_db = 10 * np.log10(emitters.power(local_m[..., 0] / np.maximum(distance_m, 1e-6)))
+            power_db = 10 * np.log10(emitters.power(local_m[..., 0] / np.maximum(distance_m, 1e-6), number))
             heard = np.clip(1 - power_db / _WEAKEST_DB, 0.0, 1.0) * (local_m[..., 0] > 0)
             # Silence means less at long ranges, because spreading and oblique walls make echoes weak.
             heard *= (distance_m >= first_m) * np.clip(1 - distance_m / last_m, 0.0, 1.0)

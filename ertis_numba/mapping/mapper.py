@@ -12,8 +12,7 @@ from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Trajectory
 from ertis_numba.fusion import Fused, Fuser
-from ertis_numba.fusion.fuser import EMITTER_DIAMETER_M
-from ertis_numba.fusion.rig import Mountings, mounted_sensors
+from ertis_numba.fusion.rig import Mountings, emitter_diameter_m, mounted_sensors
 from ertis_numba.geometry import mounting
 from ertis_numba.mapping.attitude_check import AttitudeCheck
 from ertis_numba.mapping.cell_grid import CellGrid
@@ -56,8 +55,9 @@ class Mapper:
     height_m : (float, float), optional
         Lowest and highest height of points in the world frame, in metres, to leave out floor and ceiling; all by
         default. A map of three dimensions has cells at these heights only, which saves memory and time.
-    emitter_diameter_m : float, default 0.012
-        Diameter of the emitters as pistons; 0 for omnidirectional ones.
+    emitter_diameter_m : float, optional
+        Diameter of the emitters as pistons, as for `Fuser`: 0 for omnidirectional ones, and by default, that in the
+        settings of each sensor.
 
     Raises
     ------
@@ -83,12 +83,12 @@ class Mapper:
         cell_m: float = 0.05,
         half_life_s: float | None = None,
         height_m: tuple[float, float] | None = None,
-        emitter_diameter_m: float = EMITTER_DIAMETER_M,
+        emitter_diameter_m: float | None = None,
     ) -> None:
         self._fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
         self._mountings = {sensor.name: sensor for sensor in mounted_sensors(mountings)}
         self._dimensions = checks.integer("dimensions", dimensions, 2, 3)
-        self._diameter_m = emitter_diameter_m
+        self._given_m = emitter_diameter_m
         self._cell_m = checks.between("cell_m", cell_m, 0.005, 1.0)
         self._half_life_s = None if half_life_s is None else checks.positive("half_life_s", half_life_s)
         self._height_m = (-math.inf, math.inf)
@@ -100,7 +100,7 @@ class Mapper:
         self._centre_m = np.array([0.0, 0.0, places_m[:, 2].mean()])  # Origin of directions in space, at the sensors.
         self._grid = CellGrid(self._cell_m, self._dimensions, self._height_m)
         self._usual = UsualAmplitude()
-        self._coverages: dict[tuple[tuple[str, float, float], ...], Coverage] = {}
+        self._coverages: dict[tuple[tuple[str, float, float, float], ...], Coverage] = {}
         self._n_groups, self._time_ns, self._n_points = 0, 0, 0
         self._attitude = AttitudeCheck()
 
@@ -199,13 +199,14 @@ class Mapper:
             raise DataError("no sensor emitted, so the images show no free space; leave out passive measurements")
         limits_m = [(float(image.range_m[0]), float(image.range_m[-1])) for image in emitted]
         names = [image.stamp.sensor for image in emitted]
-        key = tuple((name, *limits) for name, limits in zip(names, limits_m, strict=True))
+        diameters_m = [emitter_diameter_m(image.settings, self._given_m) for image in emitted]
+        key = tuple((name, *limits, each) for name, limits, each in zip(names, limits_m, diameters_m, strict=True))
         if key not in self._coverages:
             self._coverages[key] = Coverage.of(
                 [self._mountings[name] for name in names],
                 limits_m,
                 emitted[0].settings,
-                self._diameter_m,
+                diameters_m,
                 self._cell_m / 2,
                 height_m=float(self._centre_m[2]) if self._dimensions == 3 else None,
             )

@@ -97,7 +97,7 @@ class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
         sensors: Sequence[str] | None = None,
         keys: ClientKeys | None = None,
         on_note: Callable[[str], None] | None = None,
-        emitter_diameter_m: float = 0.012,
+        emitter_diameter_m: float | None = None,
         spacing_deg: float | None = 2.0,
         range_step_m: float | None = 0.02,
     ) -> None:
@@ -115,7 +115,7 @@ class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
     def _result(self, received: ReceivedPulse) -> FusedArrival:
         if self._fuser is None or received.mountings != self._mountings:
             self._mountings = received.mountings
-            self._fuser = Fuser(received.mountings, **self._options)  # type: ignore[arg-type]  # all options are numbers
+            self._fuser = Fuser(received.mountings, **self._options)  # type: ignore[arg-type]  # all options are numbers or None
         images = received.images.values()
         with nullcontext() if self._fuser.has_tables(images) else self._receiver.queue.keeping():
             fused = self._fuser(images)

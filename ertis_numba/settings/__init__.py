@@ -6,7 +6,15 @@ those of a processing preset.
 """
 
 from ertis_numba.settings.accuracy import ERROR_PRESETS_DB, MAX_FOCAL_ZONES, Accuracy
-from ertis_numba.settings.array import LAYOUT_SUFFIXES, LENGTH_UNITS_M, MAX_SPAN_M, MIN_SPAN_M, OWN_ARRAY, Array
+from ertis_numba.settings.array import (
+    LAYOUT_SUFFIXES,
+    LENGTH_UNITS_M,
+    MAX_EMITTER_M,
+    MAX_SPAN_M,
+    MIN_SPAN_M,
+    OWN_ARRAY,
+    Array,
+)
 from ertis_numba.settings.array_windows import ArrayWindow, parse_window
 from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
 from ertis_numba.settings.passive import HIGHEST_SHARE, MAP_METHODS, MAX_BANDS, MapMethod, Passive
@@ -26,6 +34,7 @@ __all__ = [
     "MAP_METHODS",
     "MAX_BANDS",
     "MAX_CALL_SAMPLES",
+    "MAX_EMITTER_M",
     "MAX_FOCAL_ZONES",
     "MAX_SPAN_M",
     "MAX_WAVEFORM_SAMPLES",

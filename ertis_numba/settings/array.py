@@ -11,7 +11,7 @@ from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH, WORD_BITS
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["LAYOUT_SUFFIXES", "LENGTH_UNITS_M", "MAX_SPAN_M", "MIN_SPAN_M", "OWN_ARRAY", "Array"]
+__all__ = ["LAYOUT_SUFFIXES", "LENGTH_UNITS_M", "MAX_EMITTER_M", "MAX_SPAN_M", "MIN_SPAN_M", "OWN_ARRAY", "Array"]
 
 LAYOUT_SUFFIXES: Final = (".toml", ".csv", ".tsv", ".txt", ".npy", ".xml")
 """Endings of layout files."""
@@ -23,6 +23,8 @@ MIN_SPAN_M: Final = 2e-3
 """Smallest extent of an array; single microphones are larger than that."""
 MAX_SPAN_M: Final = 25.0
 """Largest extent of an array. An array of 26 mm has a larger one if its millimetres are taken for metres."""
+MAX_EMITTER_M: Final = 0.2
+"""Largest diameter of an emitter."""
 
 _NAMED: Final = "eRTIS_v3D1"
 _SENSITIVITIES_DBFS = -120.0, 20.0
@@ -54,6 +56,9 @@ class Array(TomlTable, frozen=True, kw_only=True):
     sensitivity_dbfs : float, optional, default None
         Sensitivity of the microphones as in their data sheet: level of a sine of 94 dB, 1 Pa RMS, relative to a
         full-scale sine, -120 to 20 dBFS. That of the layout by default; sound pressures are unknown without it.
+    emitter_diameter_m : float, optional, default None
+        Diameter of the emitter beside the array as a circular piston, 0 to 0.2 m; 0 is omnidirectional. That of the
+        layout by default. Fusion and maps assume 0.012 if it is unknown.
     """
 
     layout: str = ""
@@ -64,6 +69,7 @@ class Array(TomlTable, frozen=True, kw_only=True):
     disabled: tuple[int, ...] | None = None
     word_bits: int = 32
     sensitivity_dbfs: float | None = None
+    emitter_diameter_m: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -71,8 +77,9 @@ class Array(TomlTable, frozen=True, kw_only=True):
             msgspec.structs.force_setattr(self, "layout", _NAMED if self.positions_m is None else OWN_ARRAY)
         checks.length("array.layout", self.layout, MAX_NAME_LENGTH)
         checks.choice("array.word_bits", checks.integer("array.word_bits", self.word_bits, 1), WORD_BITS)
-        if self.sensitivity_dbfs is not None:
-            checks.between("array.sensitivity_dbfs", self.sensitivity_dbfs, *_SENSITIVITIES_DBFS)
+        for name, limits in (("sensitivity_dbfs", _SENSITIVITIES_DBFS), ("emitter_diameter_m", (0.0, MAX_EMITTER_M))):
+            if (given := getattr(self, name)) is not None:
+                checks.between(f"array.{name}", given, *limits)
         for channel in self.disabled or ():
             checks.integer("array.disabled", channel, 0, MAX_MICROPHONES - 1)
         if self.positions_m is None:

@@ -11,14 +11,13 @@ from ertis_numba import checks
 from ertis_numba.documents import TomlTable
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones
-from ertis_numba.settings import Settings
+from ertis_numba.settings import MAX_EMITTER_M, Settings
 from ertis_numba.simulation.trajectory import Placed, Vector, check_vector
 
 __all__ = ["Electronics", "Emitter", "Sensor"]
 
 _LOUDEST_DB = 120.0
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")  # characters that are valid in files
-_LARGEST_M = 0.2  # of an emitter or a microphone
 _MAX_OFFSET_M = 10.0  # size of one housing; an emitter farther away belongs to a separate sensor
 _QUALITY_FACTORS = 1e-6, 200.0  # from a film with a flat response to a bare crystal
 _QUALITY_FACTOR = 5.0
@@ -79,7 +78,7 @@ class Emitter(TomlTable, frozen=True, kw_only=True):
                     "give emitter.resonance_hz, or leave out quality_factor"
                 )
         checks.between("emitter.level_db", self.level_db, -300.0, _LOUDEST_DB)
-        checks.between("emitter.diameter_m", self.diameter_m, 0.0, _LARGEST_M)
+        checks.between("emitter.diameter_m", self.diameter_m, 0.0, MAX_EMITTER_M)
         if self.direct_sound_db is not None:
             checks.between("emitter.direct_sound_db", self.direct_sound_db, -300.0, _LOUDEST_DB)
 
@@ -137,7 +136,7 @@ class Electronics(TomlTable, frozen=True, kw_only=True):
             checks.between("electronics.noise_dbfs", self.noise_dbfs, -300.0, 0.0)
         checks.integer("electronics.modulator_order", self.modulator_order, 1, 4)
         checks.between("electronics.dither", self.dither, 0.0, 2.0)
-        checks.between("electronics.microphone_diameter_m", self.microphone_diameter_m, 0.0, _LARGEST_M)
+        checks.between("electronics.microphone_diameter_m", self.microphone_diameter_m, 0.0, MAX_EMITTER_M)
         checks.between("electronics.gain_spread_db", self.gain_spread_db, 0.0, 20.0)
         checks.between("electronics.delay_spread_s", self.delay_spread_s, 0.0, 1e-4)
         checks.between("electronics.clock_drift_ppm", self.clock_drift_ppm, -_MAX_DRIFT_PPM, _MAX_DRIFT_PPM)
@@ -236,9 +235,9 @@ class Sensor(Settings, frozen=True, kw_only=True):
         return _Pose(position_m=place, velocity_m_s=self.velocity_m_s, waypoints=self.waypoints)
 
     def settings(self) -> Settings:
-        """Return the settings with which its recordings are processed."""
+        """Return the settings with which its recordings are processed; they contain the diameter of the emitter."""
         return Settings(
-            array=self.array,
+            array=self.array.replace(emitter_diameter_m=self.emitter.diameter_m),
             call=self.call,
             recording=self.recording,
             air=self.air,
