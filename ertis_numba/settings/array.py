@@ -83,9 +83,7 @@ class Array(TomlTable, frozen=True, kw_only=True):
         for channel in self.disabled or ():
             checks.integer("array.disabled", channel, 0, MAX_MICROPHONES - 1)
         if self.positions_m is None:
-            for name in ("enabled", "gain", "delay_s"):
-                if getattr(self, name) is not None:
-                    raise ArgumentError(f"array.{name} is given without array.positions_m; give both or neither")
+            self._refuse_per_channel()
             return
         self._check_positions(self.positions_m)
         n_channels = len(self.positions_m)
@@ -97,6 +95,11 @@ class Array(TomlTable, frozen=True, kw_only=True):
         for channel, gain in enumerate(self.gain or ()):
             checks.between(f"magnitude of array.gain[{channel}]", abs(gain), 1e-3, 1e3)
         self._check_per_channel("delay_s", -1e-3, 1e-3)
+
+    def _refuse_per_channel(self) -> None:
+        for name in ("enabled", "gain", "delay_s"):
+            if getattr(self, name) is not None:
+                raise ArgumentError(f"array.{name} is given without array.positions_m; give both or neither")
 
     @property
     def is_file(self) -> bool:
