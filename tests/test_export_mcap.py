@@ -13,7 +13,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.nearest_echo import nearest_echo
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.errors import ArgumentError
-from ertis_numba.frames import Stamp
+from ertis_numba.frames import PointCloud, Stamp
 from ertis_numba.geometry import Grid, direction_grid, unit_vectors
 from ertis_numba.interop import TOPICS, export
 from ertis_numba.interop.ros_definitions import DEFINITIONS, schema
@@ -300,11 +300,51 @@ def test_mcap_metadata_contains_the_settings(tmp_path):
     assert read(path)[0]["/tf_static", TIME_NS].transforms == []
 
 
+def fused_image(places_m, across_m=0.005):
+    """A dark image around a platform, with points at places."""
+    azimuth_deg = np.arange(360) - 179.5
+    made = image(azimuth_deg, np.zeros(360), range_m=np.linspace(0.02, 4.0, 200), seed=3)
+    made = stamped(made, "base_link", 3, TIME_NS)
+    cloud = PointCloud(
+        np.array([[*place, 0.4] for place in places_m], np.float32),
+        np.full(len(places_m), 0.1, np.float32),
+        made.settings,
+        made.stamp,
+        uncertainty_m=np.tile(np.float32([0.002, across_m]), (len(places_m), 1)),
+    )
+    return made.replace(points=cloud)
+
+
+def test_scans_of_fused_images_have_each_reflector_in_one_beam(tmp_path):
+    rng = np.random.default_rng(7)
+    for scene in range(24):
+        range_m, azimuth_rad = rng.uniform(0.4, 3.8, 6), rng.uniform(-np.pi, np.pi, 6)
+        places_m = np.stack([range_m * np.cos(azimuth_rad), range_m * np.sin(azimuth_rad)], axis=1)
+        (path,) = export(tmp_path / f"{scene}.mcap", [fused_image(places_m, 0.001)], topics=["scan"])
+        scan = read(path)[0]["/fused/scan", TIME_NS]
+        angle_rad = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+        wanted = np.full(360, np.inf)
+        for near_m, toward_rad in zip(range_m, azimuth_rad, strict=True):
+            beam = np.argmax(np.cos(angle_rad - toward_rad))
+            wanted[beam] = min(wanted[beam], near_m)
+        np.testing.assert_allclose(scan.ranges, wanted, atol=1e-4)
+        assert scan.header.frame_id == "base_link"
+
+
+@pytest.mark.parametrize(("across_m", "n_beams"), [(0.005, 1), (0.1, 5), (np.nan, 1)])
+def test_scans_show_reflectors_as_wide_as_their_direction_is_uncertain(tmp_path, across_m, n_beams):
+    # 0.1 m at 2 m are 2.86°, so that beams at 0°, ±1° and ±2° from the reflector show it.
+    middle_rad = np.radians(0.5)
+    places_m = [(2 * np.cos(middle_rad), 2 * np.sin(middle_rad))]
+    (path,) = export(tmp_path / "wide.mcap", [fused_image(places_m, across_m)], topics=["scan"])
+    assert np.count_nonzero(np.isfinite(read(path)[0]["/fused/scan", TIME_NS].ranges)) == n_beams
+
+
 def test_mcap_has_no_transform_of_the_platform_to_itself(tmp_path):
     fused = stamped(GIVEN[0], "base_link", 3, TIME_NS)
     mounting = {"base_link": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
     (path,) = export(tmp_path / "points.mcap", [fused], topics=["points"], mounting=mounting)
-    assert set(read(path)[2]) == {"/base_link/points"}
+    assert set(read(path)[2]) == {"/fused/points"}
     (path,) = export(tmp_path / "all.mcap", [fused], mounting=mounting)
     children = [each.child_frame_id for each in read(path)[0]["/tf_static", TIME_NS].transforms]
     assert children == ["base_link_sonar"]

@@ -59,6 +59,7 @@ _PLANAR: Final = np.ix_((0, 1, 5), (0, 1, 5))
 """Rows and columns of x, y and yaw in a covariance of x, y, z, and the rotations about them."""
 _UNKNOWN_TWIST: Final = np.diag([MAX_SPEED_M_S, MAX_SPEED_M_S, MAX_YAW_RATE_RAD_S]) ** 2
 _SONAR_SUFFIX = "_sonar"
+_FUSED = "fused"
 _SQRT_HALF = math.sqrt(0.5)
 _SONAR_TURN = (_SQRT_HALF, 0.0, _SQRT_HALF, 0.0)
 """Frame of marine_acoustic_msgs relative to that of the sensor: z forward, x up, y right.
@@ -73,6 +74,8 @@ _INVALID_CHARACTERS = re.compile(r"[^A-Za-z0-9]+")
 class TopicNames(dict[str, str]):
     """Name of each sensor in topics, by sensor. Characters that ROS does not allow become ``_``.
 
+    The topics of fused images, whose sensor is ``base_link``, lie in ``fused``.
+
     Raises
     ------
     ArgumentError
@@ -82,6 +85,7 @@ class TopicNames(dict[str, str]):
     def __missing__(self, sensor: str) -> str:
         name = _INVALID_CHARACTERS.sub("_", checks.sensor_name(sensor)).strip("_")
         name = f"sensor_{name}" if not name[:1].isalpha() else name
+        name = _FUSED if sensor == PLATFORM else name
         for other, taken in self.items():
             if taken == name:
                 raise ArgumentError(f"sensors {other} and {sensor} would share topics /{name}; choose one (--sensor)")
@@ -136,7 +140,8 @@ def scan_message(
     """Return the nearest echo of each azimuth, as sensor_msgs/msg/LaserScan; None for images that are not planar.
 
     The angles of a scan are evenly spaced. Each has the echo of the nearest direction of the image, or infinity. The
-    intensities are levels in dBFS. `ertis_numba.analysis.nearest_echo` describes both limits.
+    intensities are levels in dBFS. `ertis_numba.analysis.nearest_echo` describes both limits. The scan of an image with
+    `Energyscape.points` has these reflectors only, each as wide as its direction is uncertain.
     """
     if not image.is_planar or len(image.azimuth_rad) < 2 or len(image.range_m) < 3:
         return None
@@ -145,7 +150,11 @@ def scan_message(
     ascending = azimuth_rad[order]
     angle_rad = np.linspace(ascending[0], ascending[-1], len(ascending))
     nearest = order[np.searchsorted((ascending[:-1] + ascending[1:]) / 2, angle_rad)]
-    range_m, level_dbfs = nearest_echo(image, min_level_db=min_level_db, floor_dbfs=floor_dbfs)
+    if image.points is not None:
+        ranges_m, levels_dbfs = _beams_of_points(image, image.points, angle_rad, min_level_db, floor_dbfs)
+    else:
+        range_m, level_dbfs = nearest_echo(image, min_level_db=min_level_db, floor_dbfs=floor_dbfs)
+        ranges_m, levels_dbfs = range_m[nearest], level_dbfs[nearest]
     return {
         "header": header(image.stamp),
         "angle_min": float(angle_rad[0]),
@@ -155,9 +164,33 @@ def scan_message(
         "scan_time": 0.0,
         "range_min": float(image.range_m[0]),
         "range_max": float(image.range_m[-1]),
-        "ranges": range_m[nearest].tolist(),
-        "intensities": level_dbfs[nearest].tolist(),
+        "ranges": ranges_m.tolist(),
+        "intensities": levels_dbfs.tolist(),
     }
+
+
+def _beams_of_points(
+    image: Energyscape, cloud: PointCloud, angle_rad: NDArray[np.float64], min_level_db: float, floor_dbfs: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the range and level of the nearest point in each beam of a scan; infinite without one.
+
+    A point fills the beam nearest to it, and all beams within one standard deviation of its direction.
+    """
+    cloud = cloud.strongest(None, min_level_db)
+    range_m = np.hypot(cloud.position_m[:, 0], cloud.position_m[:, 1], dtype=np.float64)
+    kept = (range_m >= image.range_m[0]) & (range_m <= image.range_m[-1])
+    kept &= cloud.amplitude >= 10 ** (floor_dbfs / 20)
+    cloud, range_m = cloud.only(kept), range_m[kept]
+    ranges_m, levels_dbfs = np.full(len(angle_rad), np.inf), np.full(len(angle_rad), -np.inf)
+    across_m = np.zeros(len(cloud)) if cloud.uncertainty_m is None else np.nan_to_num(cloud.uncertainty_m[:, 1])
+    turn = 2 * math.pi
+    for point in np.argsort(-range_m, kind="stable"):  # Nearer points replace farther ones.
+        away_rad = np.abs((angle_rad - cloud.azimuth_rad[point] + math.pi) % turn - math.pi)
+        beams = away_rad <= max(float(away_rad.min()), across_m[point] / range_m[point])
+        if away_rad.min() > angle_rad[1] - angle_rad[0]:  # Outside the angles of the scan.
+            continue
+        ranges_m[beams], levels_dbfs[beams] = range_m[point], 20 * math.log10(cloud.amplitude[point])
+    return ranges_m, levels_dbfs
 
 
 class ImageMessages:

@@ -112,7 +112,7 @@ class RosPublisher:
         self._participant, self._given, self._top = participant, validated(mounting), top
         self.settings = settings
         self._image = ImageMessages()
-        self._names = TopicNames({_ALL_SENSORS: "fused"})
+        self._names = TopicNames({PLATFORM: "fused"})
         self._frames: dict[str, Mounting | None] = {}
         self._fused = FusedPoints()
         self._due_ns: dict[tuple[str, str], int] = {}  # By sensor and topic.
