@@ -1,9 +1,12 @@
 """Poses in messages of ROS 2 in MCAP."""
 
+import errno
+import io
 import struct
+import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 
@@ -21,7 +24,10 @@ _POSES: Final = (
 _PATH: Final = "nav_msgs/msg/Path"
 _TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 _NS: Final = 10**9
-_OF_DAMAGE: Final = (struct.error, EOFError, UnicodeDecodeError)
+_OF_DAMAGE: Final = (struct.error, EOFError, MemoryError, OSError, UnicodeDecodeError)  # A length may be damaged, too.
+_DAMAGED: Final = "the file is damaged or cut short; record it again, or repair it with 'mcap recover'"
+_FOOTER: Final = struct.Struct("<9xQQI8s")  # Start of the summary, and of its offsets; checksum; after them, the magic.
+_AFTER_CHECKED: Final = 12  # Bytes at the end of a file that the checksum does not cover: itself and the magic.
 _PLATFORM_FRAMES: Final = ("", "base_link", "base_footprint")
 
 
@@ -49,10 +55,12 @@ def read_messages(path: Path, topic: str | None) -> PoseRows:
     with extra("ros", "trajectories in .mcap files need mcap and mcap-ros2-support"):
         from mcap.exceptions import DecoderNotFoundError, McapError, UnsupportedCompressionError  # noqa: PLC0415  an extra
         from mcap.reader import make_reader  # noqa: PLC0415  an extra
+        from mcap.stream_reader import CRCValidationError  # noqa: PLC0415  an extra
         from mcap_ros2.decoder import DecoderFactory  # noqa: PLC0415  an extra
     with path.open("rb") as file:
         try:
-            reader: Any = make_reader(file, decoder_factories=[DecoderFactory()])
+            _check_summary(file)
+            reader: Any = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
             summary = reader.get_summary()
             kinds = {} if summary is None else _kinds(summary)
             wanted, _, edge = (topic or "").partition(":")
@@ -60,16 +68,43 @@ def read_messages(path: Path, topic: str | None) -> PoseRows:
             found = reader.iter_decoded_messages(topics=[chosen], log_time_order=True)
             poses = _poses(kinds[chosen], ((raw.log_time, message) for _, _, raw, message in found), edge)
             return _rows(poses)
-        except (ErtisError, MemoryError, OSError):
+        except ErtisError:
             raise
         except Exception as error:  # The libraries raise errors of any type.
+            if isinstance(error, OSError) and error.errno != errno.EINVAL:  # EINVAL is a wrong place in the file.
+                raise
             is_foreign = isinstance(error, DecoderNotFoundError | UnsupportedCompressionError)
-            if (isinstance(error, (McapError, *_OF_DAMAGE)) and not is_foreign) or _is_of_compression(error):
-                fault = "the file is damaged or cut short; record it again, or repair it with 'mcap recover'"
+            is_of_damage = isinstance(error, (McapError, CRCValidationError, *_OF_DAMAGE)) and not is_foreign
+            if is_of_damage or _is_of_compression(error):
+                fault = _DAMAGED
             else:
                 reason = " ".join(f"{type(error).__name__}: {error}".split())
                 fault = f"its messages cannot be read ({reason}); save the poses as .tum or .csv"
             raise DataError(fault) from error
+
+
+def _check_summary(file: BinaryIO) -> None:
+    """Compare the summary with its checksum, which the library ignores.
+
+    Raises
+    ------
+    DataError
+        They differ.
+    """
+    size = file.seek(0, io.SEEK_END)
+    file.seek(max(0, size - _FOOTER.size))
+    footer = file.read()
+    file.seek(0)
+    if len(footer) < _FOOTER.size:
+        return
+    start, _, checksum, _ = _FOOTER.unpack(footer)
+    if not checksum or start >= size:
+        return
+    file.seek(start)
+    summary = file.read()[:-_AFTER_CHECKED]
+    file.seek(0)
+    if zlib.crc32(summary) != checksum:
+        raise DataError(_DAMAGED)
 
 
 def _is_of_compression(error: Exception) -> bool:
