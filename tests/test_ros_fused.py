@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import PointCloud, Stamp
-from ertis_numba.interop.ros_messages import MESSAGES, points_message
+from ertis_numba.fusion import Fuser
+from ertis_numba.interop.ros_messages import MESSAGES, points_message, scan_message
 from ertis_numba.ros import Participant, PublishingSettings, RosPublisher
-from ertis_numba.ros.fused_points import FusedPoints, joined
+from ertis_numba.ros.fused_points import FusedImages, FusedPoints, joined
 from ertis_numba.settings import Settings
 from tests.ros_topics import DOMAIN, await_subscribers, subscribed
 from tests.test_ros import equal, stamped
@@ -89,15 +89,11 @@ def test_equal_counts_of_different_times_are_different_pulses():
 
 
 def test_fused_points_arrive_in_rclpy():
-    find, images = PointFinder(), {"front": stamped(1, "front"), "left": stamped(2, "left")}
+    images = {"front": stamped(1, "front"), "left": stamped(2, "left")}
     places = {"front": AHEAD, "left": LEFT}
-    kinds = {"/robot1/fused/points": MESSAGES["points"]}
-    clouds = {
-        name: find(each).replace(translation_m=places[name][0], rotation_xyzw=places[name][1])
-        for name, each in images.items()
-    }
+    kinds = {"/robot1/fused/points": MESSAGES["points"], "/robot1/fused/scan": MESSAGES["scan"]}
     with Participant(domain=DOMAIN) as participant:
-        publisher = RosPublisher(participant, topics=["points"], namespace="robot1")
+        publisher = RosPublisher(participant, topics=["points", "scan"], namespace="robot1")
         for sequence in range(2):
             for name, each in images.items():
                 publisher.publish(each.replace(stamp=replace(each.stamp, sync_count=sequence)), places[name])
@@ -105,11 +101,34 @@ def test_fused_points_arrive_in_rclpy():
             await_subscribers([publisher.topics[name] for name in kinds])
             for name, each in images.items():
                 publisher.publish(each.replace(stamp=replace(each.stamp, sync_count=2)), places[name])
-            (received,) = subscriber.take(1)["/robot1/fused/points"]
+            taken = {name: each[0] for name, each in subscriber.take(2).items()}
             with pytest.raises(ArgumentError, match="fused would share topics"):
                 publisher.publish(stamped(3, "fused"))
-    wanted = joined(clouds)
-    assert equal(received, points_message(wanted), MESSAGES["points"])
+    same = [each.replace(stamp=replace(each.stamp, sync_count=2)) for each in images.values()]
+    fuser = Fuser(places)
+    fuser(same[1:])  # The first pulse that is fused has no image of the front, and determines the last range.
+    wanted = fuser(same)
+    cloud = wanted.points.strongest(256, -20.0)
+    assert equal(taken["/robot1/fused/points"], points_message(cloud), MESSAGES["points"])
+    scan = scan_message(wanted.image.replace(points=wanted.points))
+    assert equal(taken["/robot1/fused/scan"], scan, MESSAGES["scan"])
+
+
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), (500_000.0, 4_000_000.0, 0.0)])
+def test_fused_images_have_the_points_of_the_fuser(origin_m):
+    given = {"front": stamped(1, "front"), "left": stamped(2, "left")}
+    x_m, y_m, z_m = origin_m
+    places = {
+        name: ((x + x_m, y + y_m, z + z_m), turn) for name, ((x, y, z), turn) in {"front": AHEAD, "left": LEFT}.items()
+    }
+    fusing, made = FusedImages(), []
+    for sequence in range(2):
+        for each in given.values():
+            made += fusing.add(each.replace(stamp=replace(each.stamp, sync_count=sequence)), places)
+    wanted = Fuser({"front": AHEAD, "left": LEFT})([*given.values()]).points
+    assert made[-1].points.translation_m == origin_m
+    np.testing.assert_allclose(made[-1].points.position_m, wanted.position_m, atol=1e-5)
+    assert made[-1].stamp.sensor == ("base_link_local" if any(origin_m) else "base_link")
 
 
 def test_sensors_without_mounting_are_not_fused():

@@ -171,7 +171,7 @@ def scan_message(
 
 def _beams_of_points(
     image: Energyscape, cloud: PointCloud, angle_rad: NDArray[np.float64], min_level_db: float, floor_dbfs: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return the range and level of the nearest point in each beam of a scan; infinite without one.
 
     A point fills the beam nearest to it, and all beams within one standard deviation of its direction.
@@ -181,7 +181,7 @@ def _beams_of_points(
     kept = (range_m >= image.range_m[0]) & (range_m <= image.range_m[-1])
     kept &= cloud.amplitude >= 10 ** (floor_dbfs / 20)
     cloud, range_m = cloud.only(kept), range_m[kept]
-    ranges_m, levels_dbfs = np.full(len(angle_rad), np.inf), np.full(len(angle_rad), -np.inf)
+    ranges_m, levels_dbfs = np.full(len(angle_rad), np.inf), np.full(len(angle_rad), -np.inf, np.float32)
     across_m = np.zeros(len(cloud)) if cloud.uncertainty_m is None else np.nan_to_num(cloud.uncertainty_m[:, 1])
     turn = 2 * math.pi
     for point in np.argsort(-range_m, kind="stable"):  # Nearer points replace farther ones.

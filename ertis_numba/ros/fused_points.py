@@ -1,15 +1,17 @@
 """Points of all sensors that emitted together, in the frame of their platform."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
-from ertis_numba.frames import PointCloud
+from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.fusion.fuser import Fuser
 from ertis_numba.fusion.pulses import PulseGroups
+from ertis_numba.interop._mountings import Mounting
 
-__all__ = ["LOCAL_FRAME", "FusedPoints", "joined"]
+__all__ = ["LOCAL_FRAME", "FusedImages", "FusedPoints", "joined"]
 
 PLATFORM_FRAME: Final = "base_link"
 LOCAL_FRAME: Final = "base_link_local"
@@ -29,6 +31,42 @@ class FusedPoints:
         Points that come after their group was returned are left out.
         """
         return [joined(group) for group in self._groups.add(cloud)]
+
+
+class FusedImages:
+    """Fuser of the images of each SYNC pulse, whose points are reflectors that all sensors confirm."""
+
+    def __init__(self) -> None:
+        self._groups: PulseGroups[Energyscape] = PulseGroups()
+        self._fuser: tuple[dict[str, Mounting], Fuser] | None = None
+
+    def add(self, image: Energyscape, mountings: Mapping[str, Mounting]) -> list[Energyscape]:
+        """Add an image, and return the fused images that are complete now, with their points.
+
+        Images that are planar, unlike the first one of their pulse, or the reverse, are left out. The frame of the
+        result is that of `joined`.
+
+        Parameters
+        ----------
+        image : Energyscape
+        mountings : mapping of str to (translation_m, rotation_xyzw)
+            Poses of all sensors with a known mounting.
+        """
+        return [self._fused(group, mountings) for group in self._groups.add(image)]
+
+    def _fused(self, group: Mapping[str, Energyscape], mountings: Mapping[str, Mounting]) -> Energyscape:
+        x_m, y_m, z_m = origin_m = _origin_m(mountings[next(iter(group))][0])
+        near = {
+            name: ((place[0][0] - x_m, place[0][1] - y_m, place[0][2] - z_m), place[1])
+            for name, place in mountings.items()
+        }
+        if self._fuser is None or self._fuser[0] != near:
+            self._fuser = near, Fuser(near)
+        images = [*group.values()]
+        fused = self._fuser[1](image for image in images if image.is_planar == images[0].is_planar)
+        stamp = replace(fused.image.stamp, sensor=LOCAL_FRAME if any(origin_m) else PLATFORM_FRAME)
+        points = fused.points.replace(stamp=stamp, translation_m=origin_m)
+        return fused.image.replace(stamp=stamp, points=points)
 
 
 def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:
@@ -60,7 +98,7 @@ def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:
     )
 
 
-def _origin_m(place_m: tuple[float, float, float]) -> tuple[float, float, float]:
+def _origin_m(place_m: Sequence[float]) -> tuple[float, float, float]:
     """Return the origin of the points near a sensor."""
     x_m, y_m, z_m = (_FAR_M * round(each_m / _FAR_M) if abs(each_m) > _FAR_M else 0.0 for each_m in place_m)
     return x_m, y_m, z_m

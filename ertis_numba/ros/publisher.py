@@ -23,7 +23,7 @@ from ertis_numba.interop.ros_messages import (
 )
 from ertis_numba.network.status import Status
 from ertis_numba.ros.diagnostics import diagnostics_message
-from ertis_numba.ros.fused_points import LOCAL_FRAME, FusedPoints
+from ertis_numba.ros.fused_points import LOCAL_FRAME, FusedImages, FusedPoints
 from ertis_numba.ros.odometry_publisher import OdometryPublisher
 from ertis_numba.ros.participant import Participant, Topic
 from ertis_numba.ros.publishing_settings import PublishingSettings
@@ -41,8 +41,10 @@ class RosPublisher:
     """Publisher of the topics of all sensors.
 
     The topics of a sensor lie in ``NAMESPACE/SENSOR/``; their frame is the sensor's name. ``NAMESPACE/fused/points``
-    holds the points of all sensors of a SYNC pulse, if the mounting of two or more is known. ``docs/how-to/ros.md``
-    lists the topics and their messages. With ``odometry``, use the publisher in a ``with`` statement, or close it.
+    holds the reflectors that all sensors of a SYNC pulse have located, and ``NAMESPACE/fused/scan`` their scan, if the
+    mounting of two or more is known. Without images, ``fused/points`` holds the points of each sensor instead.
+    ``docs/how-to/ros.md`` lists the topics and their messages. With ``odometry``, use the publisher in a
+    ``with`` statement, or close it.
 
     Parameters
     ----------
@@ -114,7 +116,7 @@ class RosPublisher:
         self._image = ImageMessages()
         self._names = TopicNames({PLATFORM: "fused"})
         self._frames: dict[str, Mounting | None] = {}
-        self._fused = FusedPoints()
+        self._fused, self._fused_images = FusedPoints(), FusedImages()
         self._due_ns: dict[tuple[str, str], int] = {}  # By sensor and topic.
         self._odometry: OdometryPublisher | None = None
         if odometry:
@@ -192,6 +194,8 @@ class RosPublisher:
         counts = [
             self._publish_points(item) if topic == "points" else self._publish_topic(topic, item) for topic in wanted
         ]
+        if isinstance(item, Energyscape):
+            counts.append(self._publish_fused(item))
         self.published += any(counts)
 
     def _publish_topic(self, topic: str, item: Any) -> int:
@@ -206,30 +210,58 @@ class RosPublisher:
         return 1
 
     def _publish_points(self, item: Energyscape | PointCloud) -> int:
-        """Publish the points of a sensor, and those of all sensors of its pulse, once they are complete.
+        """Publish the points of a sensor; return the number of published messages.
 
-        The rate of fused points is limited after fusing, because messages that are left out of the topics of sensors
-        need not be of the same pulses. The number of published messages is returned.
+        If only points arrive, those of all sensors of a pulse are published once they are complete. Their rate is
+        limited afterwards, because messages that are left out of the topics of sensors need not be of the same pulses.
         """
         stamp, place = item.stamp, self._frames[item.stamp.sensor]
         is_due = self._is_due("points", stamp.sensor, stamp.timestamp_ns)
-        is_fused = place is not None and sum(each is not None for each in self._frames.values()) > 1
-        if not (is_due or is_fused):
+        is_joined = isinstance(item, PointCloud) and len(self._known_mountings) > 1 and place is not None
+        if not (is_due or is_joined):
             return 0
         cloud = self._within_limits(item if isinstance(item, PointCloud) else self._find(item))
         if is_due:
             self._topic(f"{self._base}/{self._names[stamp.sensor]}/points", MESSAGES["points"]).publish(
                 points_message(cloud)
             )
-        n_published = int(is_due)
-        groups = [] if place is None else self._fused.add(cloud.replace(translation_m=place[0], rotation_xyzw=place[1]))
-        for group in groups if is_fused else ():
-            if self._is_due("points", _ALL_SENSORS, group.stamp.timestamp_ns):
-                if group.stamp.sensor == LOCAL_FRAME and group.translation_m and group.rotation_xyzw:
-                    self._announce(group.stamp, (group.translation_m, group.rotation_xyzw))
-                self._topic(f"{self._base}/fused/points", MESSAGES["points"]).publish(points_message(group))
-                n_published += 1
-        return n_published
+        if place is None or not isinstance(item, PointCloud):
+            return int(is_due)
+        groups = self._fused.add(cloud.replace(translation_m=place[0], rotation_xyzw=place[1]))
+        return int(is_due) + sum(self._publish_fused_points(group) for group in groups if is_joined)
+
+    @property
+    def _known_mountings(self) -> dict[str, Mounting]:
+        return {name: place for name, place in self._frames.items() if place is not None and name != LOCAL_FRAME}
+
+    def _publish_fused(self, image: Energyscape) -> int:
+        """Publish the fused points and the scan of each pulse that is complete now; return the number of messages."""
+        mountings, count = self._known_mountings, 0
+        if image.stamp.sensor not in mountings or not {"points", "scan"} & {*self._wanted}:
+            return 0
+        if len(mountings) < 2:
+            return 0
+        for fused in self._fused_images.add(image, mountings):
+            if fused.points is None:
+                continue
+            if "points" in self._wanted:
+                cloud = fused.points.strongest(self._top, self._settings.min_level_db)
+                count += self._publish_fused_points(self._within_limits(cloud))
+            if "scan" in self._wanted and self._is_due("scan", _ALL_SENSORS, fused.stamp.timestamp_ns):
+                message = self._scan(fused)
+                if message is not None:
+                    self._topic(f"{self._base}/fused/scan", MESSAGES["scan"]).publish(message)
+                    count += 1
+        return count
+
+    def _publish_fused_points(self, cloud: PointCloud) -> int:
+        """Publish points of all sensors, if they are due; return the number of published messages."""
+        if not self._is_due("points", _ALL_SENSORS, cloud.stamp.timestamp_ns):
+            return 0
+        if cloud.stamp.sensor == LOCAL_FRAME and cloud.translation_m and cloud.rotation_xyzw:
+            self._announce(cloud.stamp, (cloud.translation_m, cloud.rotation_xyzw))
+        self._topic(f"{self._base}/fused/points", MESSAGES["points"]).publish(points_message(cloud))
+        return 1
 
     def _within_limits(self, cloud: PointCloud) -> PointCloud:
         limits_m = self._settings.range_m
