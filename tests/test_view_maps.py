@@ -19,6 +19,7 @@ from ertis_numba.viewer import Choices, Dome, Live, Playback, Pose, ReceivedImag
 from ertis_numba.viewer._axes import PAGE
 from ertis_numba.viewer._level_plane import LevelPlane
 from ertis_numba.viewer._page import ControlRequest
+from ertis_numba.viewer._result_notes import ResultNotes
 from tests.files import SMALL, noise
 from tests.publishing import Publisher, measurement
 from tests.views import TABLE, Source, acked_through, brightest, spot, stamped, taken, wait_for
@@ -370,3 +371,9 @@ def test_maps_of_a_recording_are_saved_as_a_page(tmp_path):
     done = CliRunner().invoke(cli, command)
     assert done.exit_code == 0, (done.stderr, done.exception)
     assert "latest image: dBFS" in page.read_text()
+
+
+def test_view_notes_directions_that_a_map_cannot_show():
+    notes, found = ResultNotes(), sounds((0, 0, 0, -20.0))
+    assert any("front has directions at one elevation, 0°" in text for text in notes.of(found))
+    assert not list(notes.of(found))

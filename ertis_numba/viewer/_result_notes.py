@@ -1,4 +1,4 @@
-"""Notes on the images and maps of a view: coarse directions, and sound that bands do not show."""
+"""Notes on the images and maps of a view: directions, and sound that directions or bands do not show."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.frames import AcousticMap, Energyscape
 from ertis_numba.fusion import PLATFORM
+from ertis_numba.geometry import direction_note
 from ertis_numba.passive.search_grid import coarse_map_warning
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ class ResultNotes:
         if sensor == PLATFORM or (known is not None and known == settings.replace(air=known.air)):
             return
         self._checked[sensor] = settings
+        if text := direction_note(settings.array, item, is_passive=isinstance(item, AcousticMap)):
+            yield f"sensor {sensor} {text}"
         warning_of = coarse_map_warning if isinstance(item, AcousticMap) else spacing_warning
         if text := warning_of(settings, item):
             yield f"sensor {sensor}: {text}"
