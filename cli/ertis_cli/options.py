@@ -46,6 +46,7 @@ __all__ = [
     "min_level",
     "note",
     "note_layout",
+    "note_open_edges",
     "note_unknown_angles",
     "note_unlisted_directions",
     "note_when_slow",
@@ -464,6 +465,16 @@ def note_unknown_angles(
     text = direction_note(settings.array, grid, is_passive=is_passive)
     if text is not None:
         note(f"sensor {sensor} {text}")
+
+
+def note_open_edges(sensor: str, count: int, *, quiet: bool = False) -> None:
+    """Print a note on listed directions at the edge of the grid whose sources may lie beyond, if there are any."""
+    if count:
+        note(
+            f"sensor {sensor}: at {count} of the listed directions, at an edge of the grid, the source may lie beyond "
+            "it, so grid_error_deg is unknown; to locate it, use ertis process with wider --azimuth or --elevation",
+            quiet=quiet,
+        )
 
 
 def say(text: str, *, quiet: bool) -> None:

@@ -1,5 +1,6 @@
 """``ertis plot``: plots of a measurement, of its image, or of an array."""
 
+import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -225,7 +226,10 @@ def plot(
             image = _image(path, sensor, index, quiet=quiet)
             places = {"height_m": height, "left_m": left, "side_lobes": side_lobes}
             look |= {name: value for name, value in places.items() if value is not None}
-            figure, name = _drawn(kind, image, _reflectors(image, 5 if top is None else top), look), image.stamp.sensor
+            figure, name = (
+                _drawn(kind, image, _reflectors(image, 5 if top is None else top, quiet=quiet), look),
+                image.stamp.sensor,
+            )
         report |= {"sensor": name, row: index}
         reported = f"{row} {index} of {path}"
     with atomic_write(target, overwrite=force) as part:
@@ -271,10 +275,14 @@ def _drawn(kind: str, image: "Energyscape", peaks: "list[Peak] | None", look: di
     return draw[kind](image, peaks=peaks, **look)
 
 
-def _reflectors(image: "Energyscape", top: int) -> "list[Peak] | None":
+def _reflectors(image: "Energyscape", top: int, *, quiet: bool) -> "list[Peak] | None":
     from ertis_numba.analysis.detect import find_peaks
 
-    return find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else None
+    found = find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else None
+    if found and len(image.azimuth_rad) > 1:
+        n_open = sum(math.isinf(peak.grid_error_deg) for peak in found)
+        options.note_open_edges(image.stamp.sensor, n_open, quiet=quiet)
+    return found
 
 
 def _image(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "Energyscape":

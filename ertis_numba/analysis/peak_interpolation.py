@@ -35,7 +35,8 @@ class Tops(NamedTuple):
     range_m, amplitude : (place,) float64
         Range in metres, and amplitude.
     width_rad : (place,) float64
-        Spacing of the grid where the direction, or one of its angles, is that of the bin; 0 if it is interpolated.
+        Spacing of the grid where the direction, or one of its angles, is that of the bin; 0 if it is interpolated. It
+        is infinite at an edge of the grid beyond which the maximum may lie: see `QuadricFits.are_open`.
     """
 
     direction: NDArray[np.float64]
@@ -112,13 +113,15 @@ class PeakInterpolator:
             found = self._corrected(found, directions, measured, (rows, columns), step_m, image)
         shift_m, offset = found[:, 0].clip(-0.5, 0.5) * step_m, found[:, 1:4]
         offset, width_rad = self._fits.within_cells(self._row[directions], offset)
+        rises = _filled(measured)[:, 3:] - measured[:, 1:2]
+        is_open = self._fits.are_open(self._row[directions], rows[:, 3:], rises)
         top = self._directions[directions] + offset
         top /= np.linalg.norm(top, axis=1)[:, None]
         return Tops(
             direction=top,
             range_m=image.range_m[ranges] + shift_m,
             amplitude=np.minimum(np.exp(found[:, 4]), self._highest(image, directions, measured[:, 1], top, shift_m)),
-            width_rad=width_rad,
+            width_rad=np.where(is_open, np.inf, width_rad),
         )
 
     def _highest(
@@ -174,7 +177,7 @@ class PeakInterpolator:
         logarithm of the amplitude. Bins without amplitude, such as those that cleaning removes, count as
         half of the maximum. Results therefore change by about half a bin and 1 dB at most.
         """
-        logs = np.where(logs > _ABSENT, logs, logs[:, 1:2] - math.log(2))
+        logs = _filled(logs)
         before, level, after = logs[:, 0], logs[:, 1], logs[:, 2]
         curvature = before - 2 * level + after
         shift = np.divide(0.5 * (before - after), curvature, out=np.zeros_like(curvature), where=curvature < 0)
@@ -199,6 +202,11 @@ class PeakInterpolator:
         deviation = None if self._deviation is None else self._deviation.of(rows.ravel())
         amplitude = self._spread(away.reshape(-1, 3), away_m.ravel(), image.settings.air, deviation=deviation)
         return np.asarray(np.log(np.maximum(amplitude.reshape(away_m.shape), _DARK)) + found[:, 4:])
+
+
+def _filled(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return logarithms of samples, (place, sample), with half of the maximum in bins without amplitude."""
+    return np.where(logs > _ABSENT, logs, logs[:, 1:2] - math.log(2))
 
 
 def _bins(

@@ -1,5 +1,6 @@
 """Point clouds of images, computed fast enough for every image of a stream."""
 
+import math
 from typing import Final
 
 import numpy as np
@@ -99,7 +100,7 @@ class PointExtractor:
             listed(tops.amplitude, image).astype(np.float32),
         )
         order = np.argsort(-levels, kind="stable")
-        uncertainty_m = self._uncertainty(image, position_m, levels, tops.width_rad)
+        uncertainty_m = self._uncertainty(image, position_m, levels, np.minimum(tops.width_rad, math.pi))
         return PointCloud(
             position_m[order], levels[order], image.settings, image.stamp, uncertainty_m=uncertainty_m[order]
         )

@@ -19,6 +19,11 @@ _MAX_BORDERS = 16  # Each shortens an offset to the border with one other cell; 
 _BESIDE = 0.75  # Share of an offset within its cell, below which the maximum lies elsewhere.
 _WELL_POSED = 0.02  # Least singular value relative to the largest; uniform weights have 0.17 within a grid.
 _SAME = 1e-9  # Distance in radians below which two directions are one.
+_ONE_SIDED = 0.2  # Sum of the neighbours' offsets relative to that of their lengths; within a grid, it is about 0.
+_ONE_SIDED_TERMS = (slice(0, 5), slice(0, 4), slice(0, 2))  # Of x, x², y, y² and xy; the last ones for a line.
+_LEAST_WEIGHT = -7.0  # Logarithm of the weight of neighbours far below the direction.
+_ROOT = 0.6  # A power of this order is another parabola: that of the logarithm is too steep in the skirt of a lobe.
+_OUTSIDE = 0.75  # Distance of a maximum from its direction in spacings, beyond which it may lie outside of the grid.
 _MAX_REACH_RAD = 1.0  # Beyond it, the plane that touches the sphere is no approximation.
 
 Floats = NDArray[np.float64]
@@ -148,6 +153,28 @@ class QuadricFits:
         width_rad = self.width_rad[directions]
         return offset * share[:, None], np.where(is_between, np.minimum(math.sqrt(12) * cut_rad, width_rad), width_rad)
 
+    def are_open(
+        self, directions: NDArray[np.int64], neighbours: NDArray[np.int64], rises: Floats | None = None
+    ) -> NDArray[np.bool_]:
+        """Return True at edges of the grid where the maximum may lie beyond the cell of the direction: (place,) bool.
+
+        Values on one side of a direction show a maximum in its cell only if a quadric through them has it there.
+
+        Parameters
+        ----------
+        directions : (place,) int64
+        neighbours : (place, neighbour) int64
+        rises : (place, neighbour) float64, optional
+            Values at the neighbours minus the value at the direction; if they are unknown, all edges are open.
+        """
+        is_open = np.zeros(len(directions), dtype=np.bool_)
+        for place in np.flatnonzero(self.n_axes[directions] < self.n_axes_of_grid):
+            row = directions[place]
+            offsets = self.grid.data[neighbours[place]] - self.grid.data[self.wanted[row]]
+            values = None if rises is None else rises[place]
+            is_open[place] = _is_open(offsets, values, float(self.width_rad[row]))
+        return is_open
+
 
 def _are_around(x: Floats, y: Floats) -> NDArray[np.bool_]:
     """Return True where neighbours lie all around 0: (place,) bool."""
@@ -186,3 +213,32 @@ def _line_through(offsets: Floats, first: int, second: int) -> tuple[Floats, Flo
     inverse[0, [first, second]] = np.array([b * b, -a * a]) / (a * b * (b - a))
     inverse[2, [first, second]] = np.array([-b, a]) / (a * b * (b - a))
     return axis, inverse
+
+
+def _is_open(offsets: Floats, rises: Floats | None, width_rad: float) -> bool:
+    """Return True unless the maximum of values on one side of a direction lies in the cell of the direction."""
+    distance = np.linalg.norm(offsets, axis=1)
+    is_other = distance > _SAME
+    offsets, inwards = offsets[is_other], offsets.sum(axis=0)
+    size = float(np.linalg.norm(inwards))
+    if size <= _ONE_SIDED * distance.sum():  # Other directions lie on both sides.
+        return False
+    if rises is None:
+        return True
+    x = offsets @ inwards / size
+    beside = offsets - x[:, None] * (inwards / size)
+    y = beside @ np.linalg.svd(beside)[2][0]
+    terms = np.stack([x, x * x, y, y * y, x * y], axis=1) / distance.max() ** np.array([1, 2, 1, 2, 2])
+    used = next((each for each in _ONE_SIDED_TERMS if _is_determined(terms[:, each])), None)
+    if used is None:
+        return True
+    values = np.stack([rises[is_other], np.expm1(_ROOT * rises[is_other])], axis=1)
+    weights = np.exp(0.5 * np.maximum(rises[is_other], _LEAST_WEIGHT))[:, None]  # Skirts are no parabola.
+    slope, curve = np.linalg.lstsq(weights * terms[:, used], weights * values, rcond=None)[0][:2]
+    return bool(((curve >= 0) | (slope < _OUTSIDE * width_rad / distance.max() * 2 * curve)).any())
+
+
+def _is_determined(terms: Floats) -> bool:
+    """Return True if values determine the coefficients of all terms, (neighbour, term)."""
+    sizes = np.linalg.svd(terms, compute_uv=False)
+    return len(terms) >= terms.shape[1] and bool(sizes[-1] > _WELL_POSED * sizes[0])

@@ -38,7 +38,7 @@ _TINY: Final = 1e-300
 class _Top(NamedTuple):
     """Source of a band, with its direction as a unit vector, (axis,) float64, and the width of its cell.
 
-    The width is 0 if the direction is interpolated.
+    The width is 0 if the direction is interpolated, and infinite if the source may lie beyond an edge of the grid.
     """
 
     direction: Floats
@@ -57,8 +57,10 @@ class _Grid(NamedTuple):
         return cls(directions, neighbours_of(directions))
 
     def spacing_rad(self, place: int) -> float:
-        """Return the distance from a direction to its nearest neighbour; infinite if there is none."""
-        return float(QuadricFits.of(self.directions, self.neighbours, np.array([place])).width_rad[0])
+        """Return the distance from a direction to its nearest neighbour; infinite at an edge, or if there is none."""
+        fits = QuadricFits.of(self.directions, self.neighbours, np.array([place]))
+        is_open = fits.are_open(np.zeros(1, np.int64), self.neighbours[[place]])
+        return math.inf if is_open[0] else float(fits.width_rad[0])
 
 
 def find_sound_sources(
@@ -76,8 +78,9 @@ def find_sound_sources(
 
     An interpolated maximum stays within half of the way to each neighbour, and within the main lobe through its
     direction. It exceeds the maximum of the map by less than 1 dB. At the edge of a grid, it is interpolated along the
-    edge only, and in a corner not at all; `SoundDirection.grid_error_rad` states the error. Angles that the array
-    cannot observe are NaN: see `ertis_numba.geometry.observable_angles`.
+    edge only, and in a corner not at all; `SoundDirection.grid_error_rad` states the error, which is infinite if the
+    source may lie beyond the edge. Angles that the array cannot observe are NaN: see
+    `ertis_numba.geometry.observable_angles`.
 
     Errors are small if the main lobe is at least two spacings of the grid wide. The peaks of Capon are often narrower;
     their levels are then too low.
@@ -200,14 +203,16 @@ def _maxima(power: Floats, grid: _Grid, passive: Passive, loss_of: _LossOf) -> I
     order = _order_of(passive)
     floor = _EDGE_OF_LOBE**order
     relative = np.clip(around[places] / np.maximum(power[places, None], _TINY), floor, 1.0)
+    values = 1 - 1 / relative if passive.method in _INVERSE else np.log(relative)
     if passive.method in _INVERSE:
         fits = QuadricFits.of(grid.directions, grid.neighbours, places)
-        offsets, rises = fits.tops(np.arange(len(places)), 1 - 1 / relative)
+        offsets, rises = fits.tops(np.arange(len(places)), values)
         rises = -np.log(np.where(rises < 1, 1 - rises, 1.0))  # A peak may be too narrow for a quadric.
     else:  # Beyond the main lobe, the logarithm falls steeply, so weights are small there.
         fits = QuadricFits.of(grid.directions, grid.neighbours, places, relative ** (1 / order))
-        offsets, rises = fits.tops(np.arange(len(places)), np.log(relative))
+        offsets, rises = fits.tops(np.arange(len(places)), values)
     offsets, widths = fits.within_cells(np.arange(len(places)), offsets)
+    widths = np.where(fits.are_open(np.arange(len(places)), grid.neighbours[places], values), np.inf, widths)
     tops = grid.directions[places] + offsets
     tops /= np.linalg.norm(tops, axis=1)[:, None]
     if passive.method != "music":  # Its numbers have no level, and no main lobe of delay-and-sum.
