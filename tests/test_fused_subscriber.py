@@ -121,15 +121,66 @@ def test_mountings_of_the_central_node_are_used():
     assert (x < 1.0, y < 2.0, round(z, 2)) == (True, True, 3.0)  # Both sensors are at (1, 2, 3) and look back.
 
 
-def test_unknown_mounting_is_an_error():
+@pytest.mark.parametrize(
+    ("mountings", "peak", "reason"),
+    [
+        ({"front": MOUNTINGS["front"]}, 0.1, "its mounting is unknown; pass mountings (--mounting FILE)"),
+        (MOUNTINGS, np.nan, "its images contain NaN or infinity"),
+    ],
+)
+def test_sensor_that_cannot_be_fused_is_left_out_with_one_note(mountings, peak, reason):
+    sent = [
+        image(number, sensor=sensor, reflectors=[(20.0, 1.5, peak if sensor == "back" else 0.1)])
+        for number in range(4)
+        for sensor in ("back", "front")
+    ]
+    notes = []
     with Publisher() as publisher:
         publisher.translation_m = publisher.rotation_xyzw = None
         with (
-            publisher.playing(pulses(count=1)),
-            FusedSubscriber(publisher.address) as subscriber,
-            pytest.raises(DataError, match="the mounting of sensor 'front' is unknown; pass mountings"),
+            publisher.playing(sent),
+            FusedSubscriber(publisher.address, mountings=mountings, on_note=notes.append) as subscriber,
         ):
-            subscriber.receive(PATIENCE_S)
+            found = {}
+            while 3 not in found:
+                fused = subscriber.receive(PATIENCE_S).fused
+                found[fused.image.stamp.sync_count] = fused.sensors
+    assert set(found.values()) == {("front",)}
+    assert [reason in note for note in notes if note.startswith("sensor back is left out")] == [True]
+
+
+def test_pulse_that_cannot_be_fused_is_left_out_and_noted(monkeypatch):
+    fuse = Fuser.has_tables
+
+    def refused(fuser, images):
+        if any(each.stamp.sync_count == 1 for each in images):
+            raise DataError("it is refused")
+        return fuse(fuser, images)
+
+    monkeypatch.setattr(Fuser, "has_tables", refused)
+    notes, used = [], threading.Semaphore(0)
+
+    def one_by_one():
+        for each in pulses():
+            yield each
+            if each.stamp.sensor == "back":
+                assert used.acquire(timeout=PATIENCE_S)
+
+    def note(text):
+        if text.startswith("SYNC pulse"):
+            notes.append(text)
+            used.release()
+
+    counts = []
+    with (
+        Publisher() as publisher,
+        publisher.playing(one_by_one()),
+        FusedSubscriber(publisher.address, mountings=MOUNTINGS, on_note=note) as subscriber,
+    ):
+        while 2 not in counts:
+            counts.append(subscriber.receive(PATIENCE_S).fused.image.stamp.sync_count)
+            used.release()
+    assert (counts, notes) == ([0, 2], ["SYNC pulse 1 is left out: it is refused"])
 
 
 def test_closed_subscriber_ends_the_loop():

@@ -675,3 +675,13 @@ def test_commands_and_code_of_the_page_run(tmp_path):
     assert (tmp_path / "platform.fused.png").stat().st_size > 10_000
     (code,) = python_in(text)
     assert run_code_here(tmp_path, code).strip().endswith("()")
+
+
+def test_image_with_nan_is_refused_by_the_name_of_its_sensor():
+    settings = ertis.Settings().replace(**{"processing.directions": "2d:9", "processing.range_m": (0.5, 1.0)})
+    amplitude = np.full((9, 50), 1e-4, np.float32)
+    amplitude[3, 7] = np.nan
+    azimuth_rad, range_m = np.radians(np.linspace(-80.0, 80.0, 9)), np.arange(50) * 0.01 + 0.5
+    image = ertis.Energyscape(amplitude, azimuth_rad, np.zeros(9), range_m, settings, ertis.Stamp(sensor="left"))
+    with pytest.raises(ertis.DataError, match="the image of sensor 'left' contains NaN or infinity"):
+        ertis.fuse([image], {"left": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})

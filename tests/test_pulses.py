@@ -1,6 +1,7 @@
 """Groups of images of the same SYNC pulse, in whatever order they arrive."""
 
 import itertools
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,28 @@ class StampedItem(NamedTuple):
 
 def item(sensor, count, *, later_ns=0):
     return StampedItem(Stamp(sensor=sensor, sync_count=count, timestamp_ns=10**18 + count * PERIOD_NS + later_ns))
+
+
+HOUR_NS = 3_600_000_000_000
+
+
+def counted(sensor, count, *, session_id=7, later_ns=0):
+    """An item of a session, whose clock may be wrong."""
+    stamp = item(sensor, count, later_ns=later_ns).stamp
+    return StampedItem(replace(stamp, session_id=session_id))
+
+
+class Arrivals:
+    """A collector whose items arrive at times of the test, and its notes."""
+
+    def __init__(self):
+        self.notes, self.at_ns = [], 0
+        self.groups = PulseGroups(self.notes.append, lambda: self.at_ns)
+
+    def add(self, number, *items):
+        """Add items that arrive at the pulse of a number."""
+        self.at_ns = number * PERIOD_NS
+        return [group for each in items for group in self.groups.add(each)]
 
 
 def summary(groups):
@@ -105,3 +128,83 @@ def test_recorded_items_of_another_chain_remove_no_pulse():
     groups = PulseGroups.recorded(slow + fast)
     assert sorted(group["front"].stamp.sync_count for group in groups if "front" in group) == list(range(6))
     assert sorted(group["left"].stamp.sync_count for group in groups if "left" in group) == list(range(10))
+
+
+@pytest.mark.parametrize(
+    "wrong_ns",
+    [
+        lambda sensor, count: HOUR_NS if (sensor, count) == ("left", 10) else 0,
+        lambda sensor, count: -HOUR_NS if (sensor, count) == ("left", 10) else 0,
+        lambda _, count: HOUR_NS if count == 10 else 0,
+        lambda _, count: -HOUR_NS if count >= 10 else 0,
+        lambda _, count: HOUR_NS if count >= 10 else 0,
+        lambda sensor, count: -count * 700_000_000 if sensor == "left" else 0,
+    ],
+    ids=["one ahead", "one behind", "all ahead once", "set back", "set ahead", "too slow"],
+)
+def test_wrong_clock_of_a_session_changes_no_group(wrong_ns):
+    arrivals = Arrivals()
+    found = [
+        group
+        for count in range(30)
+        for group in arrivals.add(
+            count, *(counted(each, count, later_ns=wrong_ns(each, count)) for each in ("front", "left"))
+        )
+    ]
+    assert summary(found)[1:] == [(count, "front", "left") for count in range(1, 30)]
+    assert arrivals.notes == []
+
+
+@pytest.mark.parametrize("ahead_ns", [HOUR_NS, -HOUR_NS])
+def test_session_with_another_clock_stops_no_other(ahead_ns):
+    """Sensors of two nodes, of which one has a wrong clock: each node's pulses are complete."""
+    arrivals = Arrivals()
+    found = [
+        group
+        for count in range(40)
+        for group in arrivals.add(
+            count,
+            *(counted(each, count) for each in ("front", "left")),
+            *(counted(each, count, session_id=8, later_ns=ahead_ns) for each in ("right", "back")),
+        )
+    ]
+    for sensors in (("front", "left"), ("back", "right")):
+        counts = [count for count, *names in summary(found) if tuple(names) == sensors]
+        assert counts[-20:] == [*range(counts[-1] - 19, counts[-1] + 1)]
+        assert counts[-1] >= 37
+
+
+def test_measurement_of_the_future_does_not_end_the_pulses_of_another_session():
+    arrivals = Arrivals()
+    found = []
+    for count in range(20):
+        late_ns = HOUR_NS if count == 5 else 0
+        found += arrivals.add(count, counted("front", count), counted("left", count, session_id=8, later_ns=late_ns))
+    assert [(count, *names) for count, *names in summary(found) if count > 6] == [
+        (count, "front", "left") for count in range(7, 20)
+    ]
+
+
+def test_counter_that_restarts_within_its_session_begins_anew_and_is_noted():
+    arrivals = Arrivals()
+    for count in range(100, 120):
+        arrivals.add(count, counted("front", count))
+    found = [(number, group) for number in range(30) for group in arrivals.add(120 + number, counted("front", number))]
+    first = found[0][0]
+    assert 10 <= first <= 12
+    assert summary(group for _, group in found) == [(count, "front") for count in range(first, 30)]
+    (note,) = arrivals.notes
+    assert note.startswith("images of sensor front were left out for 1.0 s, because their SYNC counts or times went")
+    assert note.endswith(f"its pulses count anew from {first}")
+
+
+def test_restarted_node_with_a_new_session_continues_at_once():
+    arrivals = Arrivals()
+    for count in range(100, 110):
+        arrivals.add(count, counted("front", count))
+    found = [
+        group
+        for number in range(5)
+        for group in arrivals.add(120 + number, counted("front", number, session_id=9, later_ns=120 * PERIOD_NS))
+    ]
+    assert summary(found) == [(number, "front") for number in range(5)]

@@ -261,12 +261,12 @@ def test_publisher_refuses_invalid_arguments(options, message):
         RosPublisher(participant, **options)
 
 
-def test_sensors_with_the_same_topics_are_refused():
+def test_later_sensor_of_the_same_topics_gets_a_number():
     with Participant(domain=DOMAIN) as participant:
-        ros = RosPublisher(participant)
-        ros.publish(stamped(1, "a.b"))
-        with pytest.raises(ArgumentError, match=r"sensors a\.b and a-b would share topics /a_b"):
-            ros.publish(stamped(1, "a-b"))
+        ros = RosPublisher(participant, topics=["points"])
+        for name in ("a.b", "a-b", "a_b", "a.b"):
+            ros.publish(stamped(1, name))
+        assert [name for name in ros.topics if "points" in name] == ["/a_b/points", "/a_b_2/points", "/a_b_3/points"]
 
 
 def test_loopback_is_the_default():

@@ -130,9 +130,14 @@ def _readable(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(map(_readable, value))
     if isinstance(value, dict):
-        return ", ".join(f"{count} {name}" for name, count in value.items())
+        return ", ".join(f"{count} {_printable(str(name))}" for name, count in value.items())
     time = _TIME.fullmatch(value) if isinstance(value, str) else None
-    return f"{time[1]} {time[2]}{(time[3] or '')[:4]} UTC" if time else str(value)
+    return f"{time[1]} {time[2]}{(time[3] or '')[:4]} UTC" if time else _printable(str(value))
+
+
+def _printable(text: str) -> str:
+    """Return a text of a file with escapes for control characters, which a terminal would obey."""
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 def _file(reader: "_Reader") -> dict[str, Any]:

@@ -197,6 +197,11 @@ class Fuser:
             image.settings.processing.require_sensor_frame("fusion needs directions of each sensor")
             if number in found:
                 raise ArgumentError(f"images has two of sensor {image.stamp.sensor!r}; give one image of each sensor")
+            if not np.isfinite(image.amplitude).all():
+                raise DataError(
+                    f"the image of sensor {image.stamp.sensor!r} contains NaN or infinity; leave it out, or check its "
+                    "samples with 'ertis check'"
+                )
             found[number] = image
         if not found:
             raise ArgumentError("images is empty; give the images of one SYNC pulse")

@@ -52,7 +52,7 @@ def write_mcap(
     Raises
     ------
     ArgumentError
-        The packages for MCAP are not installed, two sensors would share a topic, the name of a sensor is invalid, or a
+        The packages for MCAP are not installed, the name of a sensor is invalid, or a
         time is outside the range of ROS 2, or directions are levelled.
     """
     with path.open("wb") as file, _started(file) as writer:

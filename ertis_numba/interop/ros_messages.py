@@ -16,7 +16,6 @@ from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.nearest_echo import nearest_echo
 from ertis_numba.analysis.point_finder import same_directions
-from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Stamp
 from ertis_numba.geometry import unit_vectors, unrolled_rad
 from ertis_numba.interop._grey_image import GreyImage
@@ -74,21 +73,21 @@ _INVALID_CHARACTERS = re.compile(r"[^A-Za-z0-9]+")
 class TopicNames(dict[str, str]):
     """Name of each sensor in topics, by sensor. Characters that ROS does not allow become ``_``.
 
-    The topics of fused images, whose sensor is ``base_link``, lie in ``fused``.
+    The topics of fused images, whose sensor is ``base_link``, lie in ``fused``. If another sensor has the same name in
+    topics, the later one gets a number, such as ``a_b_2``.
 
     Raises
     ------
     ArgumentError
-        The name of a sensor is invalid, or two sensors would share their topics.
+        The name of a sensor is invalid.
     """
 
     def __missing__(self, sensor: str) -> str:
         name = _INVALID_CHARACTERS.sub("_", checks.sensor_name(sensor)).strip("_")
         name = f"sensor_{name}" if not name[:1].isalpha() else name
-        name = _FUSED if sensor == PLATFORM else name
-        for other, taken in self.items():
-            if taken == name:
-                raise ArgumentError(f"sensors {other} and {sensor} would share topics /{name}; choose one (--sensor)")
+        taken = {*self.values(), _FUSED}
+        names = (name, *(f"{name}_{number}" for number in range(2, len(taken) + 3)))
+        name = _FUSED if sensor == PLATFORM else next(each for each in names if each not in taken)
         self[sensor] = name
         return name
 

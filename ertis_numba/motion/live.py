@@ -1,13 +1,17 @@
 """Odometry of groups of images that arrive live: mountings may change, and clocks may be set."""
 
+import time
 from collections.abc import Callable, Mapping
+from typing import Final
 
-from ertis_numba.frames import Trajectory
+from ertis_numba.frames import Stamp, Trajectory
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.motion.odometry import Odometry, PlanarPose
 from ertis_numba.motion.velocity import EgoVelocity, Item, stamp_of
 
 __all__ = ["LiveOdometry"]
+
+_RESTART_S: Final = 1.0
 
 
 class LiveOdometry:
@@ -24,6 +28,7 @@ class LiveOdometry:
         self._mountings: Mountings = {}
         self._first: frozenset[str] = frozenset()  # Sensors of the first group.
         self._odometry: Odometry | None = None
+        self._early_s: float | None = None  # Time of the first of the latest pulses, all of which were left out.
 
     @property
     def trajectory(self) -> Trajectory | None:
@@ -43,13 +48,16 @@ class LiveOdometry:
         mountings : mapping of str to (translation_m, rotation_xyzw)
             Mountings of these and other sensors.
         """
+        stamp = stamp_of(group)
+        if self._has_restarted(stamp):
+            self._odometry = None
         is_second = self._odometry is not None and len(self._odometry.poses) == 1
         if self._odometry is None or (is_second and group.keys() - self._first):
             self._odometry, self._first = Odometry(mountings), frozenset(group)
         elif mountings != self._mountings:
             self._odometry.remount(mountings)
         self._mountings = dict(mountings)
-        stamp, poses = stamp_of(group), self._odometry.poses
+        poses = self._odometry.poses
         if poses and stamp.timestamp_ns <= poses[-1].timestamp_ns:
             early_s = (poses[-1].timestamp_ns - stamp.timestamp_ns) / 1e9
             self._note(
@@ -57,5 +65,19 @@ class LiveOdometry:
                 "set back?"
             )
             return None
+        self._early_s = None
         velocity = self._odometry.add(group.values())
         return self._odometry.poses[-1], velocity
+
+    def _has_restarted(self, stamp: Stamp) -> bool:
+        """Return True if all pulses have been before the last one for a second: their clock was set back."""
+        poses = self._odometry.poses if self._odometry is not None else ()
+        if not poses or stamp.timestamp_ns > poses[-1].timestamp_ns:
+            self._early_s = None
+            return False
+        now_s = time.monotonic()
+        self._early_s = now_s if self._early_s is None else self._early_s
+        if now_s - self._early_s < _RESTART_S:
+            return False
+        self._note("the clock of the sensors was set back; the path begins anew at the origin")
+        return True

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 
+from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.fusion.loading import load_kernels
@@ -68,7 +69,8 @@ class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
     keys : ClientKeys, optional
         None on loopback only.
     on_note : callable, optional
-        Called by a thread with a line for each change of the connection.
+        Called by a thread with a line for each change of the connection, for each sensor that is left out because its
+        mounting is unknown or its images are not finite, and for pulses that cannot be fused.
     emitter_diameter_m, spacing_deg, range_step_m : float
         As for `Fuser`; a planar pulse of four sensors takes some 25 ms with the default spacings.
 
@@ -111,8 +113,18 @@ class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
         super().__init__(self._receiver)
         self._mountings: Mountings = {}
         self._fuser: Fuser | None = None
+        self._note, self._noted = on_note or (lambda _: None), ""
 
-    def _result(self, received: ReceivedPulse) -> FusedArrival:
+    def _result(self, received: ReceivedPulse) -> FusedArrival | None:
+        try:
+            return self._fused(received)
+        except ErtisError as error:  # Others of its pulses may be usable.
+            if str(error) != self._noted:
+                self._noted = str(error)
+                self._note(f"SYNC pulse {next(iter(received.images.values())).stamp.sync_count} is left out: {error}")
+            return None
+
+    def _fused(self, received: ReceivedPulse) -> FusedArrival:
         if self._fuser is None or received.mountings != self._mountings:
             self._mountings = received.mountings
             self._fuser = Fuser(received.mountings, **self._options)  # type: ignore[arg-type]  # all options are numbers or None

@@ -29,7 +29,8 @@ __all__ = [
 Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.@+-]*\Z")]
 MAX_LINE_LENGTH: Final = 512
 Line = Annotated[str, Meta(max_length=MAX_LINE_LENGTH)]
-Reason = Annotated[str, Meta(min_length=1, max_length=64)]
+Reason = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]*\Z")]
+"""Text on one line without control characters, which terminals would obey."""
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 MAX_SEQUENCE = 2**48  # Half a million years at 20 Hz; sums of many still fit into 64 bits.
 Number = Annotated[int, Meta(ge=0, le=MAX_SEQUENCE)]

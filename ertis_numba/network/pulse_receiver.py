@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
-from ertis_numba.errors import DataError
+import numpy as np
+
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.fusion.rig import Mountings
@@ -65,7 +66,7 @@ class PulseReceiver:
 
     A pulse is complete when all sensors of the two pulses before have sent their image. A missing sensor delays it
     until up to three later pulses have begun, or until no image has come for 0.25 s. An application that is too slow
-    gets the latest pulses.
+    gets the latest pulses. A sensor without a mounting, and one that sends images with NaN, is left out with a note.
 
     Parameters
     ----------
@@ -111,9 +112,10 @@ class PulseReceiver:
         )
         self._note = on_note or (lambda _: None)
         self.counts: SubscriberCounts = self._subscriber.counts
-        self._groups: PulseGroups[_Received] = PulseGroups.of(self._given)
+        self._groups: PulseGroups[_Received] = PulseGroups.of(self._given, self._note)
         self.queue: PulseQueue[dict[str, _Received]] = PulseQueue()
         self._mountings: dict[str, _Place] = dict(self._given)
+        self._left_out: set[str] = set()  # Sensors without a mounting, or with numbers that are not finite.
         self._owner = Owner("receiver")
         self._thread = threading.Thread(target=self._run, name="ertis-pulse-receiver", daemon=True)
         self._thread.start()
@@ -140,8 +142,6 @@ class PulseReceiver:
         ------
         RefusedError
             The central node has refused this application from the start.
-        DataError
-            The mounting of a sensor is unknown.
         """
         self._owner.require_this_process()
         group = self.queue.take(timeout_s)
@@ -171,14 +171,16 @@ class PulseReceiver:
                 image = self._subscriber.receive(_POLL_S)
                 if image is not None:
                     latest_s = time.monotonic()
-                    for group in self._groups.add(self._received(image)):
+                    received = self._received(image)
+                    for group in () if received is None else self._groups.add(received):
                         self._put(group)
                 elif time.monotonic() - latest_s > _PATIENCE_S and (group := self._groups.close()):
                     self._put(group)
         except Exception as error:  # noqa: BLE001  whatever it is, who waits must not do so for ever
             self.queue.fail(error)
 
-    def _received(self, image: Energyscape) -> _Received:
+    def _received(self, image: Energyscape) -> _Received | None:
+        """Return an image with its mounting; None, with one note, if that is unknown or the image is not finite."""
         arrival = self._subscriber.latest
         assert arrival is not None  # noqa: S101  it belongs to the image
         sensor = image.stamp.sensor
@@ -188,11 +190,22 @@ class PulseReceiver:
         if mounting is None and arrival.translation_m is not None and arrival.rotation_xyzw is not None:
             mounting = arrival.translation_m, arrival.rotation_xyzw
         if mounting is None:
-            raise DataError(
-                f"the mounting of sensor {sensor!r} is unknown; pass mountings (--mounting FILE), or start 'ertis "
-                "capture' with --mounting"
+            self._leave_out(
+                sensor,
+                "its mounting is unknown; pass mountings (--mounting FILE), or start 'ertis capture' with --mounting",
             )
+            return None
+        if not np.isfinite(image.amplitude).all():
+            self._leave_out(sensor, "its images contain NaN or infinity; check its samples with 'ertis check'")
+            return None
+        self._left_out.discard(sensor)
         return _Received(image, mounting, arrival.header.monotonic_ns)  # type: ignore[union-attr]  # of an image
+
+    def _leave_out(self, sensor: str, reason: str) -> None:
+        """Note once that a sensor is left out, until it is used again."""
+        if sensor not in self._left_out:
+            self._left_out.add(sensor)
+            self._note(f"sensor {sensor} is left out, because {reason}")
 
     def _put(self, group: dict[str, _Received]) -> None:
         self.queue.put(group, sum(each.image.amplitude.nbytes for each in group.values()))

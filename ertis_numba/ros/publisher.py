@@ -178,7 +178,7 @@ class RosPublisher:
         Raises
         ------
         ArgumentError
-            Two sensors would share topics, the time is outside the range of ROS 2, or directions are levelled.
+            The time is outside the range of ROS 2, or directions are levelled.
         """
         item.settings.processing.require_sensor_frame("messages of ROS are in the frame of the sensor")
         if not item.stamp.is_timed:

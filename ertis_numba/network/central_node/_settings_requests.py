@@ -72,7 +72,8 @@ class SettingsRequests:
         Raises
         ------
         Unwanted
-            No node, or several, send the sensor; the settings are missing or too long; or there are too many requests.
+            No node, or several, send the sensor; the settings are missing or too long; or there are too many requests,
+            or an equal one is open.
         """
         self._forget_old()
         if len(payload) != 1 or len(payload[0]) > Settings.max_bytes:
@@ -86,6 +87,12 @@ class SettingsRequests:
             count = f"{len(nodes)} sensor nodes send" if nodes else "no sensor node sends"
             remedy = "end all of them but one" if nodes else "start 'ertis capture --to', or correct the name"
             raise Unwanted("sensor", f"{count} sensor {request.sensor}; {remedy}", "message")
+        if request.request_id in self._open:
+            raise Unwanted(
+                "size",
+                f"request {request.request_id} has no answer yet; wait for it, or use another number",
+                "too many",
+            )
         if len(self._open) >= _MAX_OPEN:
             raise Unwanted("size", f"{_MAX_OPEN} requests for settings have no answer yet; wait for them", "too many")
         self._open[request.request_id] = _OpenRequest(admin_id, nodes[0], request.sensor, time.monotonic())
