@@ -177,7 +177,11 @@ CASES = {
     "picture format": ("plot img.h5 -o out.bmp", 1, "picture format '.bmp' is unknown; known are .pdf, .png, .svg"),
     "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 2, "--dynamic-range is -5; give a number above 0"),
     # sensors and ground truth
-    "which sensor": ("plot two.h5 -o out.png", 1, "two.h5 contains 2 sensors; choose one of left, right (--sensor)"),
+    "which sensor": (
+        "plot two.h5 -o out.png",
+        1,
+        "two.h5 contains 2 sensors; choose one of left, right (sensor, --sensor)",
+    ),
     "no such sensor to process": ("process rec.h5 -o out.h5 --sensor x", 1, "has no sensor 'x'; choose one of eRTIS-7"),
     "no such sensor to plot": ("plot two.h5 -o out.png --sensor x", 1, "no sensor 'x'; choose one of left, right"),
     "no such sensor to list": ("peaks two.h5 --sensor x", 1, "two.h5 has no sensor 'x'; choose one of left, right"),

@@ -147,7 +147,11 @@ CASES = {
     "no such place": ("img.h5 -o a.npz -m 4", 1, "--measurement is 4; give a whole number from 0 to 3"),
     "places backwards": ("img.h5 -o a.npz -m 2:1", 2, "--measurement runs from 2 to 1; give the smaller number first"),
     "no places": ("img.h5 -o a.npz -m 1:x", 2, "'1:x' is not a measurement; give one number, or two as in 2:5"),
-    "unknown mounting": ("both.energy.h5 -o a.ply", 1, "choose one (--sensor), or give their --mounting"),
+    "unknown mounting": (
+        "both.energy.h5 -o a.ply",
+        1,
+        "choose one (sensor, --sensor), or pass their mountings (mountings, --mounting)",
+    ),
     "several sensors": ("both.h5 -o a.npz", 1, "sensors left and right cannot share the axes of one npz"),
     "several signals": ("rec.h5 -o a.h5", 1, "more than one measurement was given; give one (--measurement)"),
     "no signals": ("img.h5 -o a.h5 -m 0", 1, "img.h5 is an energyscape file, wanted a recording; use the recording"),

@@ -157,8 +157,8 @@ def report(
             options.say(f"{sensor}: {count} missing, {reason}", quiet=quiet)
         if each.skipped:
             options.say(
-                f"{sensor}: {each.skipped} commands were skipped, because the sensor was still busy; give a lower "
-                "--rate",
+                f"{sensor}: {options.counted(each.skipped, 'command')} skipped, because the sensor was still busy; set "
+                "a lower --rate",
                 quiet=quiet,
             )
     if as_json:

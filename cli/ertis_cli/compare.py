@@ -41,8 +41,8 @@ def compare(*, path: Path, sensor: str | None, min_level: float, as_json: bool) 
     from ertis_numba.analysis.compare import errors_of
 
     names = options.sensors_of(path, sensor, "an energyscape file")
-    options.note_unlisted_directions(path, names)
     compared = {name: [comparison for _, comparison in options.comparisons(path, name, min_level)] for name in names}
+    options.note_unlisted_directions(path, names)
     sensors = {name: errors_of(given) for name, given in compared.items()}
     whole = errors_of(comparison for given in compared.values() for comparison in given)
     if as_json:

@@ -140,7 +140,7 @@ def _require_equal(ears: VirtualEars, sensor: str, measurement: Measurement) -> 
     if measurement.stamp.sensor != sensor:
         raise ArgumentError(
             f"sensors {sensor} and {measurement.stamp.sensor} are given, but format 'batslam' holds one; choose one "
-            "(--sensor)"
+            "(sensor, --sensor)"
         )
     first, other = ears.settings, measurement.settings
     for name in ("array", "recording", "call"):

@@ -94,7 +94,7 @@ def _require_same(result: Result, first: Result) -> None:
     if result.stamp.sensor != first.stamp.sensor:
         raise ArgumentError(
             f"sensors {first.stamp.sensor} and {result.stamp.sensor} cannot share the axes of one npz; choose one "
-            "(--sensor)"
+            "(sensor, --sensor)"
         )
     for name in _content(first)[1]:
         if not np.array_equal(getattr(result, name), getattr(first, name)):

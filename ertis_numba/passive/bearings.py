@@ -77,7 +77,7 @@ class BearingFinder:
     def __init__(
         self, camera: AcousticCamera, *, false_alarm: float = 1e-3, top: int = 8, min_level_db: float = -20.0
     ) -> None:
-        checks.instance("camera", camera, AcousticCamera, "AcousticCamera returns")
+        checks.instance("camera", camera, AcousticCamera, "AcousticCamera(settings) makes")
         checks.between("false_alarm", false_alarm, 1e-9, 0.5)
         self._camera, self._top = camera, checks.integer("top", top, 1)
         self._least = 10 ** (checks.between("min_level_db", min_level_db, -200.0, 0.0) / 10)
