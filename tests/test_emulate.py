@@ -418,3 +418,20 @@ def test_pulse_preparation_survives_a_rendering_error():
     registers = SimpleNamespace(armed=True, active=True, amplifier=True, n_codes=0)
     device = SimpleNamespace(name="sensor", error=None, registers=registers)
     _get_ready([device], {"sensor": (Unrenderable([0]), None, None)}, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--log", "{recording}"], "is no log of 'ertis emulate'; choose another file"),
+        (["--sensor", ""], "has no sensor ''"),
+    ],
+)
+def test_foolish_options_are_refused_before_a_device_starts(recording, arguments, message):
+    before = recording.read_bytes()
+    done = CliRunner().invoke(
+        cli, ["emulate", str(recording), *(each.format(recording=recording) for each in arguments)]
+    )
+    assert done.exit_code != 0
+    assert message in done.stderr
+    assert recording.read_bytes() == before

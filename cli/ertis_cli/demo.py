@@ -70,8 +70,8 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     """Run four emulated sensors, a central node and an application.
 
     A sensor node sends the measurements of four sensors on one SYNC chain to a central node, which stores them and
-    publishes images to an application. A recording is then processed into an image, a list of reflectors and a
-    picture. The demo prints each command and writes all files to one folder.
+    publishes images to an application. The images of all sensors are then fused into one, with a list of
+    reflectors and a picture. The demo prints each command and writes all files to one folder.
     """
     _make(folder, force=force)
     scene = folder / _SCENE
@@ -96,7 +96,7 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     image = folder / "image.h5"
     recordings = sorted((folder / "recordings").glob("*.h5"))
     run("verify", *recordings, allowed=(_GAPS,))  # a busy machine may miss a pulse
-    run("process", recordings[0], "--sensor", _SENSORS[0], "--output", image, "--directions", "2d:181")
+    run("process", recordings[0], "--fuse", "--output", image, "--directions", "2d:181")
     run("peaks", image, "--measurement", "0")
     run("plot", image, "--output", folder / "image.png")
 

@@ -134,6 +134,7 @@ def emulate(
     from ertis_numba.devices.links import HeldLink, emulated_folder
     from ertis_numba.errors import ArgumentError
 
+    _require_log(log_path)
     kinds = dict(faults)
     try:
         Faults(0, kinds)  # refuse before rendering a scene
@@ -192,6 +193,22 @@ def emulate(
     sys.exit(128 + signals.came[0])
 
 
+def _require_log(path: Path | None) -> None:
+    """Refuse to append lines to a file of another kind, such as a recording.
+
+    Raises
+    ------
+    ArgumentError
+        The file exists and does not contain JSON.
+    """
+    from ertis_numba.errors import ArgumentError
+
+    if path is not None and path.is_file():
+        with path.open("rb") as file:
+            if file.read(1) not in {b"", b"{"}:
+                raise ArgumentError(f"log {path} exists, and is no log of 'ertis emulate'; choose another file (--log)")
+
+
 def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
     """Return the names of the sensors to emulate; raise an error for settings that no device supports."""
     from ertis_numba.devices.setup import Setup
@@ -200,7 +217,9 @@ def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:
 
     if is_scene:
         scene = load_scene(path)
-        settings = {each.name: each.settings() for each in ([scene.sensor(sensor)] if sensor else scene.sensors)}
+        settings = {
+            each.name: each.settings() for each in (scene.sensors if sensor is None else [scene.sensor(sensor)])
+        }
     else:
         settings = {}
         for name in options.sensors_of(path, sensor):

@@ -60,7 +60,7 @@ def of_image(image: Energyscape) -> Heading:
         (
             *_of_sensor(settings, image.stamp),
             directions,
-            *((f"array {seen.note}",) if seen.note else ()),
+            *((f"array {seen.note}",) if seen.note and image.points is None else ()),
             *level,
             f"{span(image.range_m)} m in {len(image.range_m)} range{'s' if len(image.range_m) > 1 else ''}",
             f"method {processing.method}{adaptive}",
