@@ -122,6 +122,8 @@ def edge_map(azimuth_deg, elevation_deg, directions, **limits):
 
 
 LIMITS = {"azimuth_limits_deg": (-30.0, 30.0), "elevation_limits_deg": (-20.0, 20.0)}
+# Sources in cells at an edge for which samples on one side of a narrow lobe show no maximum within the cell.
+UNKNOWN = {(-29.7, -19.6), (0.3, -19.6), (-29.7, 19.9), (0.3, 19.9), (29.2, 19.9)}
 
 
 @pytest.mark.parametrize("azimuth_deg", [-29.7, 0.3, 29.2])
@@ -133,10 +135,8 @@ def test_source_in_the_cell_at_an_edge_is_listed_there(azimuth_deg, elevation_de
     is_inner = abs(azimuth_deg) < 29 and abs(elevation_deg) < 19
     assert np.abs(apart_deg).max() < (0.05 if is_inner else 0.5)
     assert source.level_dbfs == pytest.approx(0, abs=0.05 if is_inner else 1.0)
-    error_deg = np.degrees(source.grid_error_rad)  # Infinite where the narrow lobe shows no maximum within the cell.
-    assert error_deg == pytest.approx(0 if is_inner else 0.9 / np.sqrt(12), abs=0.04) or (
-        not is_inner and error_deg > 9
-    )
+    expected_deg = 0 if is_inner else np.inf if (azimuth_deg, elevation_deg) in UNKNOWN else 0.9 / np.sqrt(12)
+    assert np.degrees(source.grid_error_rad) == pytest.approx(expected_deg, abs=0.04)
 
 
 def test_source_at_an_edge_is_interpolated_along_it():
@@ -278,5 +278,5 @@ def test_error_that_the_grid_causes_covers_the_true_one_at_its_limits():
     assert np.mean(covered) > 0.95
     is_known = np.array([np.isfinite(source.grid_error_rad) for source, *_ in draws])
     is_beyond = np.array([beyond for *_, beyond in draws])
-    assert is_known[~is_beyond].mean() > 0.5  # An error that is always unknown would be no answer.
+    assert is_known[~is_beyond].mean() > 0.6  # An error that is always unknown would be no answer.
     assert is_known[is_beyond].mean() < 0.2

@@ -89,7 +89,9 @@ def test_recording_is_saved_as_a_page(tmp_path):
     page = tmp_path / "page.html"
     done = CliRunner().invoke(cli, ["view", str(path), "--save-html", str(page), "--json"])
     assert done.exit_code == 0, (done.stderr, done.exception)
-    assert done.stderr.splitlines()[-1] == f"{page}: 3 frames of {path}"  # A note on the directions comes first.
+    *notes, last = done.stderr.splitlines()
+    assert last == f"{page}: 3 frames of {path}"
+    assert [note.partition(",")[0] for note in notes] == ["sensor front has directions at one elevation"]
     assert json.loads(done.stdout) == {"event": "recorded", "source": str(path), "output": str(page), "frames": 3}
     text = page.read_text()
     assert "__VISER_EMBED_DATA__" in text

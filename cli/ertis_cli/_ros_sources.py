@@ -110,9 +110,7 @@ def publish_file(
         opened: Any = open_energyscapes if file_kind(path) == "energyscape" else open_recording
         readers = {name: stack.enter_context(opened(path, sensor=name)) for name in (sensors or sensor_names(path))}
         for reader in readers.values():
-            missing = getattr(reader, "points_note", None)
-            if missing is not None:
-                options.note(missing)
+            options.note_missing_points(reader)
         order = _in_order({name: reader.stamps() for name, reader in readers.items()})
         if opened is open_recording:
             order = _with_call(path, readers, order, on_passive)

@@ -193,9 +193,7 @@ def _readers(
     )
     readers = [stack.enter_context(open_file(path, sensor=each)) for each in options.sensors_of(path, sensor)]
     for reader in readers:
-        missing = getattr(reader, "points_note", None)
-        if missing is not None and name != "npz":
-            options.note(missing)
+        options.note_missing_points(reader, quiet=name == "npz")
     return readers, readers
 
 

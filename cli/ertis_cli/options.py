@@ -1,6 +1,7 @@
 """Options, parameter types and output functions shared by several commands."""
 
 import json
+import math
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Array, Settings
     from ertis_numba.stages.costs import PlanCosts
+    from ertis_numba.storage import EnergyscapeReader, RecordingReader
 
 __all__ = [
     "CHANNELS",
@@ -46,6 +48,7 @@ __all__ = [
     "min_level",
     "note",
     "note_layout",
+    "note_missing_points",
     "note_open_edges",
     "note_unknown_angles",
     "note_unlisted_directions",
@@ -450,10 +453,15 @@ def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
 
     for name in sensors:
         with open_energyscapes(path, sensor=name) as images:
-            if images.points_note is not None:
-                note(images.points_note)
-            elif not images.has_points:
+            note_missing_points(images)
+            if images.points_note is None and not images.has_points:
                 note_unknown_angles(name, images.settings, images)
+
+
+def note_missing_points(reader: "EnergyscapeReader | RecordingReader", *, quiet: bool = False) -> None:
+    """Print a note if a file has fused images without the points of the fusion."""
+    if reader.points_note is not None:
+        note(reader.points_note, quiet=quiet)
 
 
 def note_unknown_angles(
@@ -467,12 +475,15 @@ def note_unknown_angles(
         note(f"sensor {sensor} {text}")
 
 
-def note_open_edges(sensor: str, count: int, *, quiet: bool = False) -> None:
-    """Print a note on listed directions at the edge of the grid whose sources may lie beyond, if there are any."""
-    if count:
+def note_open_edges(
+    sensor: str, grid: "DegreesFromRadians", grid_errors: "Iterable[float]", *, quiet: bool = False
+) -> None:
+    """Print a note on listed directions at an edge of the grid whose sources may lie beyond, if there are any."""
+    count = sum(map(math.isinf, grid_errors))
+    if count and len(grid.azimuth_rad) > 1:
         note(
-            f"sensor {sensor}: at {count} of the listed directions, at an edge of the grid, the source may lie beyond "
-            "it, so grid_error_deg is unknown; to locate it, use ertis process with wider --azimuth or --elevation",
+            f"sensor {sensor}: {counted(count, 'listed direction')} at an edge of the grid, whose source may lie "
+            "beyond the edge, so grid_error_deg is unknown; use 'ertis process' with a wider --azimuth or --elevation",
             quiet=quiet,
         )
 

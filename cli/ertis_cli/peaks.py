@@ -93,9 +93,9 @@ def peaks(
     peak, and level_dbfs to a full-scale echo in every microphone. Maxima that noise alone may cause in
     one of 1000 images are omitted unless --all is given. This limit exists only for delay-and-sum. grid_error_deg is
     the standard deviation of directions that cannot be interpolated, as at the edge of the grid; other directions have
-    0. It is -, and null in JSON, where the source may lie beyond the edge. No level is more than 1 dB above its
-    image or map. Angles that the array cannot observe are shown as –, and as
-    null in JSON: both for one microphone, the elevation for microphones on a horizontal line.
+    0. It is -, and null in JSON, where the source may lie beyond the edge. No level is more than 1 dB above its image
+    or map. Angles that the array cannot observe are shown as –, and as null in JSON: both for one microphone, the
+    elevation for microphones on a horizontal line.
 
     With --detector cfar, a reflector exceeds the noise around it in range, at any level, and is at most 10 dB below the
     strongest echo at its range. The noise is estimated from 32 bins of the same direction (OS-CFAR), so that
@@ -114,11 +114,10 @@ def peaks(
     local maxima above the floor of the map, interpolated between directions of the grid; side lobes of delay-and-sum
     are left out. grid_error_deg is the standard deviation of directions that are not interpolated, as at the edge of
     the grid, and - where the source may lie beyond the edge. The loudest direction of each band is always listed,
-    except in silence. Levels are those of the band;
-    level_dbfs is the mean square, where a full-scale
-    tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones. source_level_db, in dB re 20 µPa
-    at 1 m from the source, also needs the distance of the source (process --focus). Maps of the method music have no
-    levels. Maps are counted from 0, regardless of the number of measurements that they average. --measurement chooses a
+    except in silence. Levels are those of the band; level_dbfs is the mean square, where a full-scale tone has -3.
+    level_db, in dB re 20 µPa, needs the sensitivity of the microphones. source_level_db, in dB re 20 µPa at 1 m from
+    the source, also needs the distance of the source (process --focus). Maps of the method music have no levels. Maps
+    are counted from 0, regardless of the number of measurements that they average. --measurement chooses a
     map. Of the other options, --sensor, --top, --min-level and --json apply to maps.
     """
     from ertis_numba.storage import file_kind
@@ -217,13 +216,13 @@ def _list_sources(
         with open_acoustic_maps(path, sensor=name) as maps:
             options.warn_of(name, coarse_map_warning(maps.settings, maps))
             options.warn_of(name, maps.band_note)
-            n_open = 0
+            errors_rad: list[float] = []
             for index in options.places(measurement, len(maps)):
                 found = find_sound_sources(maps[index], top=top, min_level_db=min_level_db)
-                n_open += sum(math.isinf(each.grid_error_rad) for each in found)
+                errors_rad += [each.grid_error_rad for each in found]
                 rows += [{"sensor": name, "map": index, **each.as_dict()} for each in found]
             options.note_unknown_angles(name, maps.settings, maps, is_passive=True)
-            options.note_open_edges(name, n_open if len(maps.azimuth_rad) > 1 else 0)
+            options.note_open_edges(name, maps, errors_rad)
     if as_json:
         options.print_json({"sources": rows})
         return
@@ -277,8 +276,7 @@ def _found(
     with open_energyscapes(path, sensor=sensor) as images:
         options.warn_of_spacing(sensor, images.settings, images)
         found = [(index, peak) for index in options.places(measurement, len(images)) for peak in find(images[index])]
-        n_open = sum(math.isinf(peak.grid_error_deg) for _, peak in found)
-        options.note_open_edges(sensor, n_open if len(images.azimuth_rad) > 1 else 0)
+        options.note_open_edges(sensor, images, (peak.grid_error_deg for _, peak in found))
         return [{"sensor": sensor, "measurement": index, **_rounded(peak)} for index, peak in found]
 
 

@@ -1,6 +1,5 @@
 """``ertis plot``: plots of a measurement, of its image, or of an array."""
 
-import math
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ertis_numba.calibration import Calibration
-    from ertis_numba.frames import Energyscape, Measurement, Peak
+    from ertis_numba.frames import Energyscape, Measurement
     from ertis_numba.settings import Settings
 
 __all__ = ["plot"]
@@ -226,10 +225,7 @@ def plot(
             image = _image(path, sensor, index, quiet=quiet)
             places = {"height_m": height, "left_m": left, "side_lobes": side_lobes}
             look |= {name: value for name, value in places.items() if value is not None}
-            figure, name = (
-                _drawn(kind, image, _reflectors(image, 5 if top is None else top, quiet=quiet), look),
-                image.stamp.sensor,
-            )
+            figure, name = _drawn(kind, image, 5 if top is None else top, look, quiet=quiet), image.stamp.sensor
         report |= {"sensor": name, row: index}
         reported = f"{row} {index} of {path}"
     with atomic_write(target, overwrite=force) as part:
@@ -267,22 +263,17 @@ def _calibrated(path: Path, sensor: str | None) -> "tuple[Calibration, Settings]
         return calibrate(recording), recording.settings
 
 
-def _drawn(kind: str, image: "Energyscape", peaks: "list[Peak] | None", look: dict[str, Any]) -> "Figure":
+def _drawn(kind: str, image: "Energyscape", top: int, look: dict[str, Any], *, quiet: bool) -> "Figure":
+    """Draw an image with rings around its strongest reflectors, if ``top`` is above 0."""
     from ertis_numba import figures
+    from ertis_numba.analysis.detect import find_peaks
 
+    peaks = find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else None
+    errors_deg = (peak.grid_error_deg for peak in peaks or ())
+    options.note_open_edges(image.stamp.sensor, image, errors_deg, quiet=quiet)
     draw: dict[str, Callable[..., Figure]]
     draw = {"image": figures.plot, "polar": figures.polar, "projection": figures.projection, "slices": figures.slices}
     return draw[kind](image, peaks=peaks, **look)
-
-
-def _reflectors(image: "Energyscape", top: int, *, quiet: bool) -> "list[Peak] | None":
-    from ertis_numba.analysis.detect import find_peaks
-
-    found = find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else None
-    if found and len(image.azimuth_rad) > 1:
-        n_open = sum(math.isinf(peak.grid_error_deg) for peak in found)
-        options.note_open_edges(image.stamp.sensor, n_open, quiet=quiet)
-    return found
 
 
 def _image(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "Energyscape":
@@ -292,8 +283,7 @@ def _image(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "Energ
     if file_kind(path) == "energyscape":
         with open_energyscapes(path, sensor=sensor) as images:
             image = images[options.place(index, len(images))]
-            if images.points_note is not None:
-                options.note(images.points_note, quiet=quiet)
+            options.note_missing_points(images, quiet=quiet)
     else:
         measurement = _measurement(path, sensor, index)
         image = options.pipeline(measurement.settings, quiet=quiet).process(measurement)

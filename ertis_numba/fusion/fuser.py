@@ -241,10 +241,9 @@ class Fuser:
             raise ArgumentError(
                 f"range_step_m is {step_m:g}, but ranges are {spacing_m:.3g} m apart; give at least that"
             )
-        last_m = max(
-            float(np.linalg.norm(self._mountings[number].translation_m[:2]) + image.range_m[-1])
-            for number, image in group.items()
-        )
+        # Of all sensors: one without an image now may reach farthest in a later group.
+        farthest_m = max(float(np.linalg.norm(sensor.translation_m[:2])) for sensor in self._mountings)
+        last_m = farthest_m + max(float(image.range_m[-1]) for image in group.values())
         grid = PolarGrid.around(
             _SPACING_DEG[kind] if self._spacing_deg is None else self._spacing_deg,
             step_m,

@@ -55,7 +55,7 @@ class _PulsePlace(NamedTuple):
         if self.shares_session(other) or abs(apart_ns) < _SAME_PULSE_NS:
             return self.stamp.sync_count < other.stamp.sync_count
         came_ns = self.arrived_ns - other.arrived_ns
-        # Nothing arrives before its emission: where clocks contradict the arrivals, one of them is wrong.
+        # Items arrive soon after their emission. If the clocks contradict the arrivals, a clock is wrong.
         return came_ns < 0 if abs(apart_ns - came_ns) > _WRONG_CLOCK_NS and came_ns else apart_ns < 0
 
 

@@ -1,11 +1,12 @@
 """Points of all sensors that emitted together, in the frame of their platform."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
+from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.fuser import Fuser
 from ertis_numba.fusion.pulses import PulseGroups
@@ -22,8 +23,8 @@ _FAR_M: Final = 1000.0  # Distance from which float32 rounds by more than 30 µm
 class FusedPoints:
     """Collector of the points of each SYNC pulse, joined in the frame of the platform."""
 
-    def __init__(self) -> None:
-        self._groups: PulseGroups[PointCloud] = PulseGroups()
+    def __init__(self, on_note: Callable[[str], None] = lambda _: None) -> None:
+        self._groups: PulseGroups[PointCloud] = PulseGroups(on_note)
 
     def add(self, cloud: PointCloud) -> list[PointCloud]:
         """Add the points of a sensor with a known mounting, and return the groups that are complete now, joined.
@@ -36,15 +37,16 @@ class FusedPoints:
 class FusedImages:
     """Fuser of the images of each SYNC pulse, whose points are reflectors that all sensors confirm."""
 
-    def __init__(self) -> None:
-        self._groups: PulseGroups[Energyscape] = PulseGroups()
+    def __init__(self, on_note: Callable[[str], None] = lambda _: None) -> None:
+        self._note, self._noted = on_note, ""
+        self._groups: PulseGroups[Energyscape] = PulseGroups(on_note)
         self._fuser: tuple[dict[str, Mounting], Fuser] | None = None
 
     def add(self, image: Energyscape, mountings: Mapping[str, Mounting]) -> list[Energyscape]:
         """Add an image, and return the fused images that are complete now, with their points.
 
-        Images that are planar, unlike the first one of their pulse, or the reverse, are left out. The frame of the
-        result is that of `joined`.
+        Images that are planar, unlike the first one of their pulse, or the reverse, are left out. A pulse that cannot
+        be fused is left out with a note. The frame of the result is that of `joined`.
 
         Parameters
         ----------
@@ -52,7 +54,15 @@ class FusedImages:
         mountings : mapping of str to (translation_m, rotation_xyzw)
             Poses of all sensors with a known mounting.
         """
-        return [self._fused(group, mountings) for group in self._groups.add(image)]
+        fused = []
+        for group in self._groups.add(image):
+            try:
+                fused.append(self._fused(group, mountings))
+            except ErtisError as error:  # Others of its pulses may be usable.
+                if str(error) != self._noted:
+                    self._noted = str(error)
+                    self._note(f"SYNC pulse {image.stamp.sync_count} is left out: {error}")
+        return fused
 
     def _fused(self, group: Mapping[str, Energyscape], mountings: Mapping[str, Mounting]) -> Energyscape:
         x_m, y_m, z_m = origin_m = _origin_m(mountings[next(iter(group))][0])

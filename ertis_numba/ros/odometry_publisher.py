@@ -37,7 +37,7 @@ class OdometryPublisher:
         self._odometry, self._transforms = odometry, transforms
         self._note, self._is_paused = on_note, is_paused
         self._live = LiveOdometry(on_note)
-        self._groups: PulseGroups[_Item] = PulseGroups()
+        self._groups: PulseGroups[_Item] = PulseGroups(on_note)
         self._mountings: dict[str, Mounting] = {}
         self._left_out: set[str] = set()
         self._queue: PulseQueue[tuple[_Group, dict[str, Mounting]]] = PulseQueue()

@@ -63,7 +63,7 @@ class RosPublisher:
         Publish the pose and velocity of the platform on ``NAMESPACE/odom``, and the transform from ``odom`` to
         ``base_link`` on ``/tf``. A thread computes them from the images of all sensors with a known mounting.
     on_note : callable, optional
-        Called with a line for each sensor or pulse that the odometry leaves out.
+        Called with a line for each sensor or pulse that fusion or odometry leaves out.
 
     Attributes
     ----------
@@ -114,16 +114,17 @@ class RosPublisher:
         self._participant, self._given, self._top = participant, validated(mounting), top
         self.settings = settings
         self._image = ImageMessages()
-        self._names = TopicNames({PLATFORM: "fused"})
+        self._names = TopicNames()
         self._frames: dict[str, Mounting | None] = {}
-        self._fused, self._fused_images = FusedPoints(), FusedImages()
+        on_note = on_note or (lambda _: None)
+        self._fused, self._fused_images = FusedPoints(on_note), FusedImages(on_note)
         self._due_ns: dict[tuple[str, str], int] = {}  # By sensor and topic.
         self._odometry: OdometryPublisher | None = None
         if odometry:
             self._odometry = OdometryPublisher(
                 self._topic(f"{self._base}/odom", _ODOMETRY),
                 self._topic("/tf", _TRANSFORMS[1]),
-                on_note=on_note or (lambda _: None),
+                on_note=on_note,
                 is_paused=lambda: self._settings.paused,
             )
 

@@ -138,6 +138,11 @@ class FileReader(Sequence[Item]):
         with self._reading():
             return self._rows.stamps(self.sensor)
 
+    @property
+    def points_note(self) -> str | None:
+        """Note on fused images without points; None for other files."""
+        return None
+
     def __len__(self) -> int:
         return len(self._rows)
 

@@ -130,8 +130,7 @@ class Playback:
                 self._notes += [
                     masked_note(name) for name, each in stamps.items() if any(one.behaviour == "active" for one in each)
                 ]
-            missing = (getattr(reader, "points_note", None) for reader in self._readers.values())
-            self._notes += [text for text in missing if text is not None]
+            self._notes += [reader.points_note for reader in self._readers.values() if reader.points_note is not None]
             self._stack = self._stack.pop_all()
         self._tracks = {name: SensorTimeline.of(name, self.time_steps) for name in self._readers}
         self._result_notes = ResultNotes()
