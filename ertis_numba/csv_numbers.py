@@ -1,8 +1,14 @@
-"""Tables of numbers in CSV files."""
+"""Tables of numbers in CSV files, and arrays in NPY files."""
+
+import tokenize
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
 
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["csv_rows"]
+__all__ = ["csv_rows", "npy_content"]
 
 
 def csv_rows(source: str, text: str) -> list[list[float]]:
@@ -22,3 +28,19 @@ def csv_rows(source: str, text: str) -> list[list[float]]:
         raise ArgumentError(
             f"{source}: {error}; give rows of numbers separated by commas, and comments after #"
         ) from error
+
+
+def npy_content(file: Path | IO[bytes]) -> Any:
+    """Return the content of an NPY or NPZ file, as ``numpy.load`` does.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    ValueError
+        It is empty or damaged. NumPy raises other errors for some damaged headers.
+    """
+    try:
+        return np.load(file, allow_pickle=False)
+    except (EOFError, SyntaxError, tokenize.TokenError) as error:
+        raise ValueError("it is empty, or its header is damaged") from error

@@ -13,13 +13,14 @@ from ertis_numba.geometry import (
     delay_matrix,
     direction_grid,
     far_field_delays,
+    load_layout,
     microphones,
     received_settings,
     storable,
     unit_vectors,
 )
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Processing, Settings
+from ertis_numba.settings import Call, Processing, Settings
 from ertis_numba.storage import open_energyscapes, write_recording
 from ertis_numba.verification import error_db, exact_image
 from tests.cases import CASES, SHORT, noise
@@ -164,6 +165,19 @@ def test_delays_are_read_from_a_file_beside_the_settings(tmp_path, suffix):
 def test_unusable_matrices_are_refused_by_settings(changes, message):
     with pytest.raises(ArgumentError, match=message):
         Processing(**changes)
+
+
+def test_damaged_header_of_an_npy_file_is_refused(tmp_path):
+    """NumPy raises errors of other types for headers that end too early."""
+    path = tmp_path / "cut.npy"
+    header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000,), ".ljust(117) + b"\n"
+    path.write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(8000))
+    with pytest.raises(ArgumentError, match=r"cut.npy cannot be read \(it is empty, or its header is damaged\)"):
+        delay_matrix(given(str(path)), n_directions=3)
+    with pytest.raises(SettingsError, match=r"cut.npy cannot be read \(it is empty, or its header is damaged\)"):
+        Call.from_file(path, sample_rate_hz=450_000)
+    with pytest.raises(ArgumentError, match=r"cut.npy is no array of NumPy"):
+        load_layout(path)
 
 
 @pytest.mark.parametrize(

@@ -258,6 +258,28 @@ def test_missing_sensor_is_reported_and_still_emits():
     assert 20 * math.log10(highest(result.image, *PLACES_M[0]) / highest(fused().image, *PLACES_M[0])) > -3
 
 
+SCENES = (1000, 1001, 1002, 1003)
+
+
+@functools.cache
+def recorded(seed, diameter_m):
+    """Images of a random platform scene, with the mountings and places of its reflectors."""
+    made, group = platform_scene(seed, random_reflectors(seed), diameter_m), []
+    for sensor in made.sensors:
+        with ertis.Pipeline(sensor.settings(), predict=False) as pipeline:
+            group.append(pipeline.process(ertis.render(made, sensor=sensor.name)))
+    return group, {sensor.name: (sensor.position_m, sensor.quaternion()) for sensor in made.sensors}
+
+
+@pytest.mark.parametrize("diameter_m", [0.0, 0.012])
+@pytest.mark.parametrize("seed", SCENES)
+def test_sensor_without_an_image_is_not_unheard(seed, diameter_m):
+    group, mounted = recorded(seed, diameter_m)
+    for missing in group:
+        heard = [image for image in group if image is not missing]
+        assert ertis.fuse(heard, mounted).unheard == (), missing.stamp.sensor
+
+
 def test_order_of_images_does_not_matter():
     other = ertis.fuse(reversed(list(images().values())), mountings())
     np.testing.assert_array_equal(other.image.amplitude, fused().image.amplitude)

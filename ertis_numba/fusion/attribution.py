@@ -194,13 +194,15 @@ class Attribution:
     def _not_heard(self, evidence: Sequence[_Evidence], reflectivity: Singles) -> frozenset[int]:
         """Return emitters whose calls other sensors do not hear, where the reflectors of all images lead to expect it.
 
-        An emitter may be broken, covered, or not on the same SYNC chain.
+        An emitter may be broken, covered, or not on the same SYNC chain. Without an own image, only foreign echoes show
+        its reflectors, so none are expected.
         """
+        own = {each.pair.emitter for each in evidence if each.pair.emitter == each.pair.receiver}
         shown: dict[int, list[NDArray[np.float64]]] = {}
         strong = np.float32(_STRONG) * reflectivity.max()
         for each in evidence:
             pair = each.pair
-            if pair.emitter == pair.receiver:
+            if pair.emitter == pair.receiver or pair.emitter not in own:
                 continue
             sums = np.zeros(2)
             self._kernels.compare_echoes(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.csv_numbers import csv_rows
+from ertis_numba.csv_numbers import csv_rows, npy_content
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry.delays import far_field_delays, unit_vectors
 from ertis_numba.geometry.grids import Grid
@@ -114,13 +114,13 @@ def _read(name: str, path: Path) -> NDArray[np.float64]:
         raise ArgumentError(f"{name} is not a .csv or .npy file; give one, or a list of rows")
     try:
         if suffix == ".npy":
-            loaded = np.asarray(np.load(path, allow_pickle=False))
+            loaded = np.asarray(npy_content(path))
         else:
             rows = csv_rows(name, path.read_text("utf-8-sig"))
             if len({len(row) for row in rows}) != 1:
                 raise ArgumentError(f"{name} has rows of different lengths; give a delay for each channel in each row")
             loaded = np.array(rows)
-    except (OSError, ValueError, EOFError) as error:  # np.load raises EOFError for an empty file.
+    except (OSError, ValueError) as error:
         if isinstance(error, ArgumentError):
             raise
         reason = checks.reason_unreadable(error) if isinstance(error, OSError | UnicodeDecodeError) else error

@@ -8,6 +8,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from ertis_numba import checks
+from ertis_numba.csv_numbers import npy_content
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry.position_headings import AXES
 from ertis_numba.geometry.position_tables import PositionTable, read_position_table
@@ -95,8 +96,8 @@ def read_position_file(path: str | Path, content: bytes) -> PositionTable:
 
 def _of_numpy(source: str, content: bytes) -> PositionTable:
     try:
-        numbers = np.load(io.BytesIO(content), allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        numbers = npy_content(io.BytesIO(content))
+    except (OSError, ValueError) as error:
         raise ArgumentError(f"{source} is no array of NumPy; save the positions with numpy.save") from error
     if getattr(numbers, "ndim", 0) != 2 or numbers.shape[1] not in {2, 3} or numbers.dtype.kind not in "iuf":
         found = f"{numbers.dtype} of shape {numbers.shape}" if isinstance(numbers, np.ndarray) else "several arrays"

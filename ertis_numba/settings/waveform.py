@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.csv_numbers import csv_rows
+from ertis_numba.csv_numbers import csv_rows, npy_content
 from ertis_numba.errors import ArgumentError, DataError, SettingsError
 from ertis_numba.wav import read_wav
 
@@ -50,7 +50,7 @@ def read_waveform(path: Path, *, key: str = "call.waveform") -> tuple[tuple[floa
         if n_bytes > _MAX_FILE_BYTES:
             raise SettingsError(f"{key} {path} has {n_bytes} bytes; the limit is {_MAX_FILE_BYTES}")
         rate_hz, values = _read_wav(path) if suffix == ".wav" else (None, _read_numbers(path, suffix))
-    except (OSError, ValueError, EOFError, DataError) as error:  # np.load raises EOFError for empty files.
+    except (OSError, ValueError, DataError) as error:
         if isinstance(error, SettingsError):
             raise
         raise SettingsError(f"{key} {path} cannot be read ({error}); save it again") from error
@@ -74,7 +74,7 @@ def _read_wav(path: Path) -> tuple[float, NDArray[Any]]:
 
 def _read_numbers(path: Path, suffix: str) -> NDArray[Any]:
     if suffix == ".npy":
-        return np.asarray(np.load(path, allow_pickle=False))
+        return np.asarray(npy_content(path))
     return np.array(csv_rows(path.name, path.read_text("utf-8-sig")), dtype=np.float64)
 
 
