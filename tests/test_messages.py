@@ -34,7 +34,7 @@ NAMES = st.from_regex(r"\A[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,63}\Z")
 COUNTS, INT64, UINT32 = (st.integers(*limits) for limits in ((0, 2**63 - 1), (-(2**63), 2**63 - 1), (0, 2**32 - 1)))
 NUMBERS = st.integers(0, 2**48)
 FINITE = st.floats(allow_nan=False)
-REASONS = st.text(st.characters(codec="utf-8"), min_size=1, max_size=64)
+REASONS = st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Zl", "Zp"]), min_size=1, max_size=64)
 WHOLE = Data(
     sensor="front",
     session_id=7,

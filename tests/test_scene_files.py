@@ -112,7 +112,7 @@ def test_scenes_survive_toml(scene):
 
 def test_empty_scene_file_is_one_sensor_in_silence():
     assert Scene.from_toml("") == Scene()
-    assert Scene().sensor().settings() == Settings()
+    assert Scene().sensor().settings() == Settings(array=Array(emitter_diameter_m=0.0))  # an omnidirectional emitter
 
 
 def test_positions_are_computed_from_direction_and_range():

@@ -219,7 +219,9 @@ def test_recording_ends_at_its_size_limit(tmp_path, monkeypatch):
         view.record(tmp_path / "page.html")
         assert 2 < view.recorded < 29
         assert view.shown == view.recorded
-    assert notes == [f"{tmp_path / 'page.html'} is full at 0.02 MB: the view up to now is written"]
+    directions, full = notes
+    assert directions.startswith("sensor front has directions at one elevation, 0°, so sound from above or below may")
+    assert full == f"{tmp_path / 'page.html'} is full at 0.02 MB: the view up to now is written"
     assert 15_000 < len(embedded((tmp_path / "page.html").read_text())) < 25_000
 
 

@@ -46,7 +46,8 @@ class FusedImages:
         """Add an image, and return the fused images that are complete now, with their points.
 
         Images that are planar, unlike the first one of their pulse, or the reverse, are left out. A pulse that cannot
-        be fused is left out with a note. The frame of the result is that of `joined`.
+        be fused is left out with a note. The frame of the result is that of `joined`,
+        with an origin in whole metres.
 
         Parameters
         ----------
@@ -65,7 +66,8 @@ class FusedImages:
         return fused
 
     def _fused(self, group: Mapping[str, Energyscape], mountings: Mapping[str, Mounting]) -> Energyscape:
-        x_m, y_m, z_m = origin_m = _origin_m(mountings[next(iter(group))][0])
+        # Whole metres, since the image reaches from the origin to all sensors.
+        x_m, y_m, z_m = origin_m = _origin_m(mountings[min(mountings)][0], step_m=1.0)
         near = {
             name: ((place[0][0] - x_m, place[0][1] - y_m, place[0][2] - z_m), place[1])
             for name, place in mountings.items()
@@ -108,7 +110,7 @@ def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:
     )
 
 
-def _origin_m(place_m: Sequence[float]) -> tuple[float, float, float]:
-    """Return the origin of the points near a sensor."""
-    x_m, y_m, z_m = (_FAR_M * round(each_m / _FAR_M) if abs(each_m) > _FAR_M else 0.0 for each_m in place_m)
+def _origin_m(place_m: Sequence[float], *, step_m: float = _FAR_M) -> tuple[float, float, float]:
+    """Return the origin of the points near a sensor, rounded to a step; 0 near the origin of the platform."""
+    x_m, y_m, z_m = (step_m * round(each_m / step_m) if abs(each_m) > _FAR_M else 0.0 for each_m in place_m)
     return x_m, y_m, z_m
