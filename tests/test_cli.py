@@ -300,6 +300,22 @@ def test_package_import_loads_no_heavy_library():
     assert not {"numba", "numpy", "scipy", "h5py", "matplotlib", "msgspec"} & set(done.stdout.split())
 
 
+@pytest.mark.parametrize(
+    ("time_s", "unused"), [("1e9", {"numba", "h5py", "matplotlib"}), ("1e300000", {"numba", "h5py", "scipy"})]
+)
+def test_reading_a_trajectory_loads_no_unused_library(tmp_path, time_s, unused):
+    (tmp_path / "drive.tum").write_text(f"{time_s} 0 0 0 0 0 0 1\n1000000001 1 0 0 0 0 0 1\n")
+    code = (
+        "import sys, ertis_numba\n"
+        "try: ertis_numba.read_trajectory(sys.argv[1])\n"
+        "except ertis_numba.DataError: pass\n"
+        "print(*sys.modules)"
+    )
+    command = [sys.executable, "-c", code, tmp_path / "drive.tum"]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert not unused & set(done.stdout.split())
+
+
 def test_version_option_prints_the_version():
     done = subprocess.run([*MODULE, "--version"], env=ENVIRONMENT, capture_output=True, text=True, check=True)
     assert done.stdout.startswith("ertis ")
