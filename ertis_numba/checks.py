@@ -4,6 +4,7 @@ import difflib
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from ertis_numba.errors import ArgumentError
 __all__ = [
     "between",
     "choice",
+    "file_ending",
     "finite",
     "finite_array",
     "instance",
@@ -98,6 +100,18 @@ def unknown_choice(name: str, value: str, known: Sequence[str]) -> str:
     return f"{name} {value!r} is unknown{hint}; known are {', '.join(known)}"
 
 
+def file_ending(name: str, path: str | Path, known: Iterable[str]) -> str:
+    """Return the ending of an output file in lower case; refuse folders, and an ending that is not among ``known``."""
+    path, known = Path(path), [*dict.fromkeys(known)]
+    ending = path.suffix.lower()
+    if path.is_dir():
+        raise ArgumentError(f"{name} {path} is a folder; name a file in it that ends in {', '.join(known)}")
+    if ending not in known:
+        found = f"ends in {ending!r}" if ending else "has no ending"
+        raise ArgumentError(f"{name} {path} {found}; choose a name that ends in {', '.join(known)}")
+    return ending
+
+
 def finite_array(name: str, values: NDArray[np.floating]) -> None:
     """Refuse an array that contains NaN or infinities; the error names the first index."""
     bad = np.argwhere(~np.isfinite(values))
@@ -147,5 +161,6 @@ def reason_unreadable(error: OSError | UnicodeDecodeError) -> str:
     'No such file or directory'
     """
     if isinstance(error, UnicodeDecodeError):
-        return f"it is not text in UTF-8 (byte {error.object[error.start]:#04x} at position {error.start})"
+        wrong = f"byte {error.object[error.start]:#04x} at position {error.start}"
+        return f"it is not text in {error.encoding.upper()} ({wrong})"
     return error.strerror or str(error)

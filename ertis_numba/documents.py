@@ -20,6 +20,7 @@ import tomli_w
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.file_kinds import kind_of, problem_of
 
 __all__ = ["MAX_KEY_PARTS", "TomlDocument", "TomlTable"]
 
@@ -37,6 +38,8 @@ _PATH_PART = re.compile(r"\.(\w+)|\[(\d+)\]")
 _EXPECTED = re.compile(r"Expected `([^`]*)`(?: of length (\d+), got (\d+))?")
 _CHOICE = re.compile(r"Invalid enum value '(.*)'")
 _TOML_TYPES: Final = (dt.datetime, dt.date, dt.time)
+_FOREIGN: Final = {"{": "JSON", "<": "XML"}
+"""Formats by their first character, with which no TOML begins."""
 _TYPE_NAMES = {
     "array": "a list",
     "bool": "true or false",
@@ -245,11 +248,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     @classmethod
     def _load(cls, path: Path) -> tuple[Self, dict[str, Any]]:
         """Return the content of a file, and its tables as written but with the present names of keys."""
-        try:
-            text = path.read_text(encoding="utf-8-sig")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = checks.reason_unreadable(error)
-            raise SettingsError(f"{path}: {reason}; give a readable {cls.__name__.lower()} file") from error
+        text = _text_of(path, f"a {cls.__name__.lower()} file (TOML)")
         return cls.from_toml(text, str(path)), cls._tables(text)
 
     @classmethod
@@ -286,6 +285,26 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     def to_toml(self) -> str:
         """Return TOML text that `from_toml` reads back to an equal structure."""
         return tomli_w.dumps(_without_none(msgspec.to_builtins(self)))
+
+
+def _text_of(path: Path, wanted: str) -> str:
+    """Return the text of a file in UTF-8, or in UTF-16 with its byte-order mark, as PowerShell writes it."""
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise SettingsError(f"{path}: {checks.reason_unreadable(error)}; choose {wanted}") from error
+    kind = kind_of(path)
+    if kind is not None and not kind.is_text:
+        raise SettingsError(f"{path} {problem_of(path, wanted)}")
+    try:
+        text = content.decode("utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        remedy = f"choose {wanted}" if kind is None else "save it as UTF-8"
+        raise SettingsError(f"{path}: {checks.reason_unreadable(error)}; {remedy}") from error
+    start = text.lstrip()[:1]
+    if start in _FOREIGN:
+        raise SettingsError(f"{path} is {_FOREIGN[start]}, not TOML; choose {wanted}")
+    return text
 
 
 @cache

@@ -179,7 +179,8 @@ def problem_of(path: str | Path, wanted: str = "a recording") -> str:
     if kind is None:
         return ""
     if "recording" not in wanted:
-        return f"is {kind.name}; choose {wanted}"
+        shown = f"; 'ertis info {quoted(path)}' describes this file" if kind.is_hdf5 else ""
+        return f"is {kind.name}; choose {wanted}{shown}"
     names = {
         "file": quoted(path),
         "path": str(path),

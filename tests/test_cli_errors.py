@@ -24,7 +24,7 @@ RAW = "import {} -o out.h5 --layout eRTIS_v3D1 --preset short_25_50"
 CASES = {
     # raw samples
     "missing raw file": (RAW.format("none.bin"), 1, "none.bin: No such file or directory"),
-    "empty raw file": (RAW.format("empty.bin"), 1, "empty.bin is empty, wanted a multiple of 262144"),
+    "empty raw file": (RAW.format("empty.bin"), 1, "empty.bin is empty; record or copy it again, or leave it out"),
     "odd raw file": (RAW.format("odd.bin"), 1, "odd.bin has 262143 bytes, which is not a multiple of a word"),
     "truncated raw file": (RAW.format("cut.bin"), 1, "cut.bin has 262140 bytes, wanted a multiple of 262144"),
     "one good, one bad": (RAW.format("good.bin odd.bin"), 1, "odd.bin has 262143 bytes"),
@@ -174,7 +174,11 @@ CASES = {
         1,
         "folder is a folder; choose a recording, an energyscape file or a file of acoustic maps",
     ),
-    "picture format": ("plot img.h5 -o out.bmp", 1, "picture format '.bmp' is unknown; known are .pdf, .png, .svg"),
+    "picture format": (
+        "plot img.h5 -o out.bmp",
+        1,
+        "picture out.bmp ends in '.bmp'; choose a name that ends in .pdf",
+    ),
     "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 2, "--dynamic-range is -5; give a number above 0"),
     # sensors and ground truth
     "which sensor": (

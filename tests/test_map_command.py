@@ -326,7 +326,7 @@ def test_map_refuses_poses_at_other_times(folder):
         (
             "both.h5 --poses poses.tum -o place.tif",
             1,
-            "suffix of the map '.tif' is unknown; known are .h5, .mcap, .pgm, .ply",
+            "ends in '.tif'; choose a name that ends in .h5, .mcap, .pgm, .ply",
         ),
         ("both.h5 --poses none.tum", 1, "none.tum"),
         ("both.h5 --time-unit ms", 2, "--time-unit requires --poses; add --poses FILE, or remove --time-unit"),

@@ -624,7 +624,7 @@ def test_ply_holds_the_occupied_cells(tmp_path):
 
 
 def test_unknown_format_of_a_map_is_refused(tmp_path):
-    with pytest.raises(ArgumentError, match=r"suffix of the map '.png' is unknown"):
+    with pytest.raises(ArgumentError, match=r"ends in '.png'; choose a name that ends in .h5"):
         ertis.write_map(tmp_path / "m.png", small())
 
 

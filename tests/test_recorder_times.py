@@ -1,5 +1,6 @@
 """Times and sample rates of recorders' files: metadata, names, options, and contradictions between them."""
 
+import os
 import struct
 from datetime import UTC, datetime
 
@@ -269,7 +270,7 @@ def test_contradicting_times_are_noted(tmp_path):
     assert times_s(reader)[0] == seconds("2024-05-18T03:25:37")
     assert (
         "20240518_042537.WAV (and 1 more): GUANO (2024-05-18 05:25:37 UTC+02:00) and file names (2024-05-18 04:25:37) "
-        "differ; GUANO is used"
+        "differ; that of GUANO is used"
     ) in reader.notes
 
 
@@ -277,6 +278,45 @@ def test_contradicting_times_are_noted(tmp_path):
 def test_names_in_the_zone_or_in_utc_agree(tmp_path, name):
     reader = opened(write(tmp_path / name, guano("Timestamp: 2024-05-18T04:25:37+02:00")))
     assert not any("differ" in note for note in reader.notes)
+
+
+UNSET = "Recorded at 00:00:05 01/01/1970 (UTC) by AudioMoth"
+
+
+def test_clock_that_was_never_set_yields_to_the_name(tmp_path):
+    reader = opened(write(tmp_path / "20240518_042537.WAV", comment(UNSET)))
+    assert times_s(reader) == [seconds("2024-05-18T04:25:37")]
+    assert "differ; that of file names is used, because a clock of 1970 was not set" in reader.notes[0]
+
+
+@pytest.mark.parametrize("name", ["M1.WAV", "19700101_000005.WAV", "20000101_000005.WAV"])
+def test_clock_that_was_never_set_is_noted(tmp_path, name):
+    reader = opened(write(tmp_path / name, *[comment(UNSET)] * (not name.startswith("2000"))))
+    assert "so the clock of the recorder was probably not set; use --start" in reader.notes[0]
+
+
+ORDERS = {  # name: notes, None if the order is clear
+    "180524_042537.wav": "the date may be 2018-05-24 (year first, as assumed) or 2024-05-18 (day first); use --start",
+    "240518_042537.wav": "the date may be 2024-05-18 (year first, as assumed) or 2018-05-24 (day first); use --start",
+    "240538_042537.wav": "contains no time, so its time is unknown",  # no day
+    "240531_042537.wav": None,  # not recorded in 2031
+    "240524_042537.wav": None,
+    "18052024_042537.wav": "contains no time in a known order, so its time is unknown; use --start",
+    "05-06-2024 04.25.37.wav": "contains no time in a known order, so its time is unknown; use --start",
+}
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_order_of_a_date_is_never_guessed_silently(tmp_path, name):
+    path = write(tmp_path / name)
+    os.utime(path, (seconds("2026-01-01T00:00:00"),) * 2)
+    reader = opened(path)
+    assert ORDERS[name] in reader.notes[0] if ORDERS[name] else "date" not in " ".join(reader.notes)
+
+
+def test_order_of_dates_is_noted_for_folders(tmp_path):
+    reader = opened(*(write(tmp_path / f"1805202{year}_042537.wav") for year in "45"))
+    assert "nor names contain times in a known order (18052024_042537.wav), so the files" in reader.notes[0]
 
 
 REFUSED = {

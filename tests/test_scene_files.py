@@ -142,7 +142,7 @@ def test_named_layouts_stay_names(tmp_path):
 
 
 def test_missing_scene_file_is_refused(tmp_path):
-    with pytest.raises(SettingsError, match=r"none\.toml: .*; give a readable scene file"):
+    with pytest.raises(SettingsError, match=r"none\.toml: .*; choose a scene file \(TOML\)"):
         load_scene(tmp_path / "none.toml")
 
 

@@ -134,7 +134,7 @@ def test_tolerance_selects_the_effects(scene_file):
 @pytest.mark.parametrize(
     ("text", "arguments", "code", "message"),
     [
-        (None, (), 1, r"scene\.toml: .*; give a readable scene file"),
+        (None, (), 1, r"scene\.toml: .*; choose a scene file \(TOML\)"),
         (b"\xe9", (), 1, r"not text in UTF-8 \(byte 0xe9 at position 0\)"),
         ("sede = 1", (), 1, r"scene\.toml.*unknown key `sede`; correct it or remove it"),
         ("[[sensors]]\narray.layout = 'eRTIS'", (), 1, "layout 'eRTIS' is unknown"),

@@ -49,7 +49,7 @@ def plot_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option(
             "--photo",
-            type=click.Path(path_type=Path),
+            type=options.FILE,
             metavar="PICTURE",
             help="Draw an acoustic map over a picture, whose camera is at the sensor and looks ahead.",
         ),

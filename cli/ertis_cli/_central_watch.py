@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
+from ertis_cli._config import typed
 from ertis_cli._lines import JsonLines
 from ertis_cli._progress import StatusLine
 from ertis_cli._stop_signals import stopped_by_signals
@@ -26,7 +27,18 @@ if TYPE_CHECKING:
     from ertis_numba.network.metrics import Metrics
     from ertis_numba.network.status import Status
 
-__all__ = ["CentralWatch", "archive", "max_bytes", "name", "report", "rotate_every", "rotate_size", "run", "size"]
+__all__ = [
+    "CentralWatch",
+    "archive",
+    "max_bytes",
+    "name",
+    "report",
+    "require_use",
+    "rotate_every",
+    "rotate_size",
+    "run",
+    "size",
+]
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -60,6 +72,16 @@ max_bytes: Decorator = click.option(
 
 _REFRESH_S = 0.5
 _EXPECTED = {"listening", "joined", "left", "configure", "resumed", "sealed"}
+
+
+def require_use(*, stores: bool, as_json: bool) -> None:
+    """Raise an error for options without effect in a node that stores no measurements, or that prints no JSON."""
+    context = click.get_current_context()
+    for option in ("name", "rotate_size", "rotate_every", "every"):
+        missing = "--record DIR" if not stores else "--json" if option == "every" and not as_json else ""
+        if missing and typed(option):
+            spelling = f"--{option.replace('_', '-')}"
+            raise click.UsageError(f"{spelling} requires {missing}; add {missing}, or leave out {spelling}", context)
 
 
 class CentralWatch:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _poses, _pulses, _results
+from ertis_cli import _poses, _pulses, _results, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["drive_of", "drive_options", "open_ears", "require_fitting"]
 
-_FILE = click.Path(path_type=Path)
 _OPTIONS = {"poses": "poses", "odometry": "odometry", "scene": "scene", "beam_azimuth_deg": "beam-azimuth"}
 _IDENTITY: "Mounting" = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
@@ -37,16 +36,16 @@ def drive_options(command: Any) -> Any:
             metavar="DEG",
             help="Azimuth of the virtual ears for BatSLAM in °, each to its own side; 0 is the front.",
         ),
-        click.option("--scene", type=_FILE, metavar="SCENE.toml", help="Scene with the reflectors for BatSLAM."),
+        click.option("--scene", type=options.FILE, metavar="SCENE.toml", help="Scene with the reflectors for BatSLAM."),
         click.option(
             "--odometry",
-            type=_FILE,
+            type=options.FILE,
             metavar="TRAJ",
             help="Odometry of the platform for BatSLAM; computed from the echoes of all sensors by default.",
         ),
         click.option(
             "--poses",
-            type=_FILE,
+            type=options.FILE,
             metavar="TRAJ",
             help="True poses of the platform for BatSLAM, such as a TUM file; those of the recording by default.",
         ),

@@ -18,7 +18,7 @@ _WANTED: Final = "a scene or mounting file (.toml), or a file of ertis that cont
 
 mounting: "Decorator" = click.option(
     "--mounting",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="FILE",
     help="Mountings of sensors on their platform: a scene, its [[sensors]], or a recording that contains them.",
 )

@@ -51,7 +51,7 @@ def name_options(command: click.Command) -> None:
 def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(callback)
     def call(*arguments: Any, **options: Any) -> Any:
-        _require_finite(click.get_current_context())
+        _require_values(click.get_current_context())
         require_no_pipes(options)
         try:
             return callback(*arguments, **options)
@@ -71,14 +71,23 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _require_finite(ctx: click.Context) -> None:
-    """Raise an error for NaN and infinity, which lie within the ranges of click."""
+def _require_values(ctx: click.Context) -> None:
+    """Raise an error for empty texts, and for NaN and infinity, which lie within the ranges of click."""
     for option in _given(ctx):
-        value = ctx.params.get(str(option.name))
+        value, name = ctx.params.get(str(option.name)), _typed_name(option)
         for each in value if isinstance(value, tuple) else (value,):
             if isinstance(each, float) and not math.isfinite(each):
-                name = long_name(option) if isinstance(option, click.Option) else str(option.name)
-                raise _usage_error(f"--{name} is {each}; give a finite number", option, ctx)
+                raise _usage_error(f"{name} is {each}; give a finite number", option, ctx)
+            if each == "":
+                raise _usage_error(f"{name} is empty; write a value, or leave it out", option, ctx)
+
+
+def _typed_name(option: click.Parameter) -> str:
+    return (
+        f"--{long_name(option)}"
+        if isinstance(option, click.Option)
+        else option.make_metavar(click.get_current_context())
+    )
 
 
 def _usage_error(message: str, option: click.Parameter, ctx: click.Context) -> click.UsageError:

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ertis_cli import options
+
 if TYPE_CHECKING:
     from ertis_numba.network.keys import ClientKeys, ServerKeys
     from ertis_numba.network.metrics import Metrics
@@ -35,7 +37,7 @@ server_key: Decorator = click.option(
 )
 allow: Decorator = click.option(
     "--allow",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="FILE",
     help="List of allowed keys; the list of 'ertis keys allow' by default.",
 )

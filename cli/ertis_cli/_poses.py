@@ -28,9 +28,7 @@ def reading(command: "Callable[..., Any]") -> "Callable[..., Any]":
             "camera-world: as camera, and the world has the axes of the first camera. ned: x forward, z down, in a "
             "world of north, east and down.",
         ),
-        click.option(
-            "--times", type=click.Path(path_type=Path), metavar="FILE", help="Text file with the times of KITTI poses."
-        ),
+        click.option("--times", type=options.FILE, metavar="FILE", help="Text file with the times of KITTI poses."),
         click.option(
             "--time-unit",
             type=click.Choice(("s", "ms", "us", "ns")),

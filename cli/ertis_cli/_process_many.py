@@ -52,6 +52,11 @@ def process_many(
     context = click.get_current_context()
     if target is None:
         raise click.UsageError("several recordings need an output folder; give one with -o", context)
+    if Path(target).suffix and not target.endswith((os.sep, "/")) and not Path(target).is_dir():
+        raise click.UsageError(
+            f"-o {target} names a file, but several recordings need a folder; use -o {Path(target).with_suffix('')}/",
+            context,
+        )
     recordings = find_recordings(paths)
     campaign = Campaign(recordings, target, wanted, workers=workers, scheduler=scheduler)
     report = _Report([found.path for found in recordings], quiet=quiet, as_json=as_json)

@@ -17,7 +17,7 @@ _OPTIONS = (
     click.option(
         "--call",
         "call_file",
-        type=click.Path(path_type=Path),
+        type=options.FILE,
         metavar="FILE",
         help="Waveform of the call: .wav, or .csv or .npy with samples at 450 kHz.",
     ),
@@ -34,9 +34,7 @@ _OPTIONS = (
         shell_complete=options.complete_layouts,
         help="Name of a shipped layout, or a layout file such as .csv or .toml; eRTIS_v3D1 by default.",
     ),
-    click.option(
-        "--settings", "settings_file", type=click.Path(path_type=Path), metavar="FILE", help="Settings file (TOML)."
-    ),
+    click.option("--settings", "settings_file", type=options.FILE, metavar="FILE", help="Settings file (TOML)."),
     click.option("--temperature", type=float, metavar="C", help="Air temperature in °C; 20 by default."),
 )
 

@@ -40,7 +40,7 @@ _PLACE = _Place()
 
 
 @click.command()
-@click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.input_files("REC.h5...")
 @options.output("Layout or mounting file (TOML) to write; without it, the calibration is only printed.")
 @click.option(
     "--target",
@@ -152,7 +152,7 @@ def calibrate(
         _calibrate_poses.write_poses(paths, sensors, target, force=force, quiet=quiet, as_json=as_json)
         return
     if sensors is not None:
-        raise click.UsageError("--sensors is for --poses; add it, or choose one sensor with --sensor", ctx)
+        raise click.UsageError("--sensors requires --poses; add --poses, or choose one sensor with --sensor", ctx)
     if target is not None:
         if target.suffix.lower() != ".toml":
             raise ArgumentError(

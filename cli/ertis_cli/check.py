@@ -19,11 +19,11 @@ _UNFIT = 1
 
 
 @click.command()
-@click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.input_files("REC.h5...")
 @click.option(
     "--settings",
     "settings_file",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="FILE",
     help="Settings to check against, such as another layout or call; keys in FILE replace those in the recording.",
 )
@@ -37,7 +37,7 @@ _UNFIT = 1
     metavar="HZ",
     help="Nominal rate of measurements or pulses; the drift of the clock is measured relative to it.",
 )
-@click.option("--report", "page", type=click.Path(path_type=Path), metavar="FILE.html", help="HTML page to write.")
+@click.option("--report", "page", type=options.FILE, metavar="FILE.html", help="HTML page to write.")
 @options.force
 @options.quiet
 @options.as_json

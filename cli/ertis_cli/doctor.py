@@ -42,7 +42,7 @@ def doctor(
     from ertis_numba.errors import ArgumentError, ErtisError
 
     if not ros and (domain is not None or interface is not None):
-        raise click.UsageError("--domain and --interface are for --ros; add it")
+        raise click.UsageError("--domain and --interface require --ros; add --ros")
     checks = {"ROS": lambda _: ros_findings(domain, interface or "lo")} if ros else CHECKS
 
     if not folder.is_dir():

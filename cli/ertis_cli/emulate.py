@@ -72,7 +72,7 @@ class _Absence(click.ParamType):  # type: ignore[type-arg]  # as above
 )
 @click.option(
     "--link",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="PATH",
     help="Symbolic link to the port of a single device; by default, 'ertis devices' finds it by the sensor's name.",
 )
@@ -95,7 +95,7 @@ class _Absence(click.ParamType):  # type: ignore[type-arg]  # as above
 @click.option(
     "--log",
     "log_path",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="FILE",
     help="Append a line of JSON per measurement to this file.",
 )

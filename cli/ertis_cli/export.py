@@ -39,12 +39,12 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
 
 
 @click.command()
-@click.argument("paths", metavar="REC.h5|IMG.h5...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.input_files("REC.h5|IMG.h5...")
 @click.option(
     "--output",
     "-o",
     "target",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="OUT",
     required=True,
     help="File to write: .mcap, .ply, .pcd, .csv, .npz, .tum, .wav, .mat for BatSLAM, or .h5 and .xml for Acoular.",
@@ -204,7 +204,7 @@ def _format_of(target: Path, file_format: str | None) -> str:
     if file_format is None:
         others = (f".{name}" for name in (*FORMATS_OF_POSES, *FORMATS_OF_SOUND))
         endings = (*(each.suffix for each in interop.FORMATS.values()), *others)
-        checks.choice("ending of the export", target.suffix.lower(), endings)
+        checks.file_ending("export", target, endings)
     return interop.choose_format(target, file_format)
 
 

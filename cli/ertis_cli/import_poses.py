@@ -19,7 +19,7 @@ _MAX_OFFSET_S = 4e9  # Covers clocks that count from another year; times remain 
 
 @click.command("import-poses")
 @options.input_file("REC.h5|FOLDER")
-@click.argument("trajectory_file", metavar="TRAJ", type=click.Path(path_type=Path))
+@click.argument("trajectory_file", metavar="TRAJ", type=options.FILE)
 @click.option(
     "--offset-s",
     "offset_s",
@@ -34,7 +34,7 @@ _MAX_OFFSET_S = 4e9  # Covers clocks that count from another year; times remain 
     "--output",
     "-o",
     "target",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="OUT",
     help="Recording to write, or folder for the recordings of a folder; by default, each recording is replaced.",
 )

@@ -23,7 +23,7 @@ _UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
 
 
 @click.command("import")
-@click.argument("raw", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.input_files("FILE...", name="raw")
 @options.output("Recording to write; FILE.h5 beside the first file or the folder by default.")
 @click.option(
     "--layout",
@@ -41,7 +41,7 @@ _UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
     "--settings",
     "settings_file",
     metavar="FILE.toml",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     help="Settings that differ from those of an eRTIS, such as array and call; --layout and air options override it.",
 )
 @click.option(
@@ -128,6 +128,8 @@ def import_raw(
     check_target(target, overwrite=force, sources=raw)
     are_pcm = [_is_pcm(path, is_raw=is_raw) for path in raw] if folder is None else [is_wav_folder(folder)]
     is_pcm = all(are_pcm)
+    if folder is None:
+        _require_content(raw)
     for name in of_pcm:
         if typed(name) and not is_pcm:
             option = f"--{name.removesuffix('_s').replace('_', '-')}"
@@ -206,6 +208,19 @@ def _is_pcm(path: Path, *, is_raw: bool) -> bool:
     return False
 
 
+def _require_content(paths: tuple[Path, ...]) -> None:
+    """Refuse missing and empty files, before anything is said about options."""
+    from ertis_numba.errors import DataError
+
+    for path in paths:
+        try:
+            n_bytes = path.stat().st_size
+        except OSError as error:
+            raise DataError(f"{path}: {error.strerror}; choose a file with measurements") from error
+        if n_bytes == 0:
+            raise DataError(f"{path} is empty; record or copy it again, or leave it out")
+
+
 def _beside(first: Path) -> Path:
     """Return the default name of the recording."""
     if first.suffix.lower() == ".h5":
@@ -251,6 +266,8 @@ def _opened_pcm(
 
     settings = whole_range = None
     if any(part is not None for part in (layout, preset, settings_file)):
+        if settings_file is None and (layout is None or not (preset or given["passive"])):
+            _require_samples(raw[0])
         if settings_file is None and layout is None:
             _require("--layout")
         if settings_file is None and preset is None and not given["passive"]:
@@ -262,8 +279,17 @@ def _opened_pcm(
         settings = _settings(layout, preset, settings_file, {"processing.range_m": _UNSTATED_M})
         whole_range = settings.processing.range_m == _UNSTATED_M
     elif raw[0].is_dir() or raw[0].suffix.lower() not in _PCM - {".wav"}:
+        _require_samples(raw[0])
         _require("--settings")
     return open_pcm(raw, settings, whole_range=whole_range, **given)
+
+
+def _require_samples(path: Path) -> None:
+    """Refuse a file without usable samples, before anything is said about options."""
+    from ertis_numba.interop.pcm_files import inspect
+
+    if path.is_file():
+        inspect(path).open().channel(0, slice(0, 1))
 
 
 def _since_1970_ns(start: datetime) -> int:

@@ -12,9 +12,12 @@ if TYPE_CHECKING:
 
 __all__ = ["keys"]
 
-_FILE = click.Path(path_type=Path)
 _list_file = click.option(
-    "--list", "listed", type=_FILE, metavar="FILE", help="List of allowed keys; allow.toml beside the keys by default."
+    "--list",
+    "listed",
+    type=options.FILE,
+    metavar="FILE",
+    help="List of allowed keys; allow.toml beside the keys by default.",
 )
 
 
@@ -39,7 +42,7 @@ def keys() -> None:
 @click.option(
     "--dir",
     "folder",
-    type=_FILE,
+    type=options.FILE,
     metavar="DIR",
     help="Folder for the key files; the key folder of this user by default.",
 )

@@ -49,7 +49,7 @@ _POLL_INTERVAL_S = 0.1
 @click.option(
     "--save",
     "target",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="FILE.h5",
     help="Energyscape file or, with --product raw, recording to write.",
 )
@@ -74,7 +74,7 @@ _POLL_INTERVAL_S = 0.1
     "--output",
     "-o",
     "trajectory",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="TRAJ.tum",
     help="With --odometry: trajectory to write in the TUM format at the end.",
 )

@@ -20,11 +20,11 @@ __all__ = ["mapping"]
 
 
 @click.command("map")
-@click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.input_files("REC.h5...")
 @click.option(
     "--poses",
     "poses_file",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="FILE",
     help="Poses of the platform in the world frame, .tum, .csv or .mcap; those of the recordings by default.",
 )

@@ -23,12 +23,12 @@ _NS_PER_S = 1e9
 
 
 @click.command()
-@click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.input_files("REC.h5...")
 @click.option(
     "--output",
     "-o",
     "target",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="TRAJ.tum",
     help="Trajectory to write in the TUM format; REC.odometry.tum beside the first recording by default.",
 )

@@ -1,5 +1,6 @@
 """Options, parameter types and output functions shared by several commands."""
 
+import glob
 import json
 import math
 import sys
@@ -31,9 +32,11 @@ __all__ = [
     "ELEVATION",
     "ERROR_BUDGET",
     "FALSE_ALARM",
+    "FILE",
     "INTERVAL",
     "NAMES",
     "PREPARING",
+    "TEXT_PATH",
     "as_json",
     "as_json_of",
     "cleaning",
@@ -44,6 +47,7 @@ __all__ = [
     "emitter_diameter",
     "force",
     "input_file",
+    "input_files",
     "measurement",
     "min_level",
     "note",
@@ -148,19 +152,29 @@ class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
         )
 
 
+class _File(click.Path):
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return (
+            super().convert(value, param, ctx)
+            if str(value)
+            else self.fail("the path is empty; name a file", param, ctx)
+        )
+
+
 CHANNELS = _Channels()
 DIRECTION = _Direction()
 ELEVATION = _Elevation()
 ERROR_BUDGET = _ErrorBudget()
+FILE = _File(path_type=Path)
 INTERVAL = _Interval()
 NAMES = _Names()
+TEXT_PATH = _File()
 FALSE_ALARM = 1e-3
 """Probability that noise alone causes a reflector in one image."""
 PREPARING = "preparing ..."
 """Message for a slow start."""
 COMPILING = "a first run compiles kernels, which takes longer ..."
 """Message for a start that compiles kernels."""
-_FILE = click.Path(path_type=Path)
 
 
 def as_json_of(objects: str) -> Decorator:
@@ -195,7 +209,7 @@ settings_file: Decorator = click.option(
     "--settings",
     "settings_file",
     metavar="FILE.toml",
-    type=click.Path(path_type=Path),
+    type=FILE,
     help="Settings file (TOML) whose keys override those of the recording.",
 )
 
@@ -269,12 +283,30 @@ def emitter_diameter(text: str) -> Decorator:
 
 def input_file(metavar: str) -> Decorator:
     """Return the argument for the input file."""
-    return click.argument("path", metavar=metavar, type=_FILE)
+    return click.argument("path", metavar=metavar, type=FILE)
+
+
+def input_files(metavar: str, *, name: str = "paths") -> Decorator:
+    """Return the argument for one or more input files; patterns are expanded, as some shells leave them in place."""
+    return click.argument(name, metavar=metavar, nargs=-1, required=True, type=FILE, callback=_expanded)
+
+
+def _expanded(_ctx: click.Context, _param: click.Parameter, paths: tuple[Path, ...]) -> tuple[Path, ...]:
+    return tuple(file for path in paths for file in _matches(path))
+
+
+def _matches(path: Path) -> list[Path]:
+    if path.exists() or not glob.has_magic(str(path)):
+        return [path]
+    found = sorted(Path(each) for each in glob.glob(str(path), recursive=True))  # noqa: PTH207
+    if not found:
+        raise click.BadParameter(f"no file matches {path}; choose another pattern, or name the files")
+    return found
 
 
 def output(text: str) -> Decorator:
     """Return the option for the output file."""
-    return click.option("--output", "-o", "target", type=_FILE, metavar="FILE", help=text)
+    return click.option("--output", "-o", "target", type=FILE, metavar="FILE", help=text)
 
 
 def measurement(text: str) -> Decorator:

@@ -176,7 +176,7 @@ def plot(
     if not path.name:  # "." and "/" give no name for the picture
         raise DataError(f"{path} is a folder; choose a recording, an energyscape file or a file of acoustic maps")
     target = target or path.with_suffix(".png")
-    checks.choice("picture format", target.suffix.lower(), _FORMATS)
+    checks.file_ending("picture", target, _FORMATS)
     check_target(target, overwrite=force)
     look: dict[str, Any] = {
         "dynamic_range_db": dynamic_range,

@@ -23,12 +23,12 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 
 
 @click.command()
-@click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=click.Path())
+@click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=options.TEXT_PATH)
 @click.option(
     "--output",
     "-o",
     "target",
-    type=click.Path(),
+    type=options.TEXT_PATH,
     metavar="FILE|DIR",
     help="File to write, by default REC.energy.h5 beside the recording, or REC.acoustic.h5 for acoustic maps; a folder "
     "for several recordings; FILE.npz for signals or beams.",
@@ -295,7 +295,7 @@ def _require_options_of(*, fuse: bool, target: str | None) -> None:
         if typed(name):
             raise click.UsageError(f"--{name} does not apply to --fuse; leave it out", context)
     if not fuse and typed("emitter_diameter_m"):
-        raise click.UsageError("--emitter-diameter applies to --fuse only; add it", context)
+        raise click.UsageError("--emitter-diameter requires --fuse; add --fuse, or remove it", context)
     if fuse and target is not None and (_results.is_results_file(target) or Path(target).suffix in _PICTURES):
         raise click.UsageError(f"-o {target} is not an energyscape file; give a .h5 file for --fuse", context)
 

@@ -9,12 +9,12 @@ from ertis_cli._saving import withdrawn
 
 __all__ = ["record"]
 
-_FILE = click.Path(path_type=Path)
-
 
 @click.command()
 @click.option("--listen", metavar="ADDRESS", help="Address for sensor nodes; tcp://127.0.0.1:5601 by default.")
-@click.option("--output", "-o", "folder", type=_FILE, required=True, metavar="DIR", help="Folder for recordings.")
+@click.option(
+    "--output", "-o", "folder", type=options.FILE, required=True, metavar="DIR", help="Folder for recordings."
+)
 @_central_watch.name
 @_central_watch.rotate_size
 @_central_watch.rotate_every
@@ -49,6 +49,7 @@ def record(
     crash, the next start or 'ertis recover' seals the journals. Ctrl-C ends the node. With --json, there is one line
     per event.
     """
+    _central_watch.require_use(stores=True, as_json=as_json)
     life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN
     from ertis_numba.network.central_node import CentralNode

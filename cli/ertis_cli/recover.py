@@ -16,7 +16,7 @@ _FAILED, _INCOMPLETE = 1, 3
 
 
 @click.command()
-@click.argument("places", metavar="DIR|JOURNAL...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.input_files("DIR|JOURNAL...", name="places")
 @options.force
 @options.quiet
 @options.as_json

@@ -120,7 +120,7 @@ class _MaxRate(click.ParamType[Any]):
 )
 @click.option(
     "--control",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="FILE",
     help="TOML file that sets levels, ranges, rates and speed, or pauses; read again whenever it changes.",
 )

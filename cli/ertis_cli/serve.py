@@ -10,13 +10,11 @@ from ertis_cli._saving import withdrawn
 
 __all__ = ["serve"]
 
-_FOLDER = click.Path(path_type=Path)
-
 
 @click.command()
 @click.option("--listen", metavar="ADDRESS", help="Address for sensor nodes; tcp://127.0.0.1:5601 by default.")
 @click.option("--publish", metavar="ADDRESS", help="Address for applications; tcp://127.0.0.1:5602 by default.")
-@click.option("--record", "folder", type=_FOLDER, metavar="DIR", help="Also store measurements in this folder.")
+@click.option("--record", "folder", type=options.FILE, metavar="DIR", help="Also store measurements in this folder.")
 @_central_watch.name
 @_central_watch.rotate_size
 @_central_watch.rotate_every
@@ -56,7 +54,10 @@ _FOLDER = click.Path(path_type=Path)
     help="Time limit per measurement; a slower worker is killed.",
 )
 @click.option(
-    "--quarantine", type=_FOLDER, metavar="DIR", help="Dead-letter folder for measurements that made two workers fail."
+    "--quarantine",
+    type=options.FILE,
+    metavar="DIR",
+    help="Dead-letter folder for measurements that made two workers fail.",
 )
 @click.option("--scheduler", metavar="ADDRESS", help="Scheduler of a dask.distributed cluster whose workers to use.")
 @click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
@@ -104,6 +105,7 @@ def serve(
     acknowledges a measurement once it is durable, like 'ertis record'. Ctrl-C ends the node. With --json, there is
     one line per event.
     """
+    _central_watch.require_use(stores=folder is not None, as_json=as_json)
     life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH, at_port
     from ertis_numba.network.central_node import CentralNode

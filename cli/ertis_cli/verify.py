@@ -18,7 +18,7 @@ _FAILED, _INCOMPLETE = 1, 3
 
 
 @click.command()
-@click.argument("paths", metavar="FILE...", nargs=-1, required=True, type=click.Path(path_type=Path))
+@options.input_files("FILE...")
 @options.quiet
 @options.as_json
 @click.pass_context

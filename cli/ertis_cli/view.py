@@ -125,7 +125,7 @@ _ONLY = {
 @click.option(
     "--save-html",
     "html",
-    type=click.Path(path_type=Path),
+    type=options.FILE,
     metavar="FILE",
     help="Write the view as a page that needs no server: a whole file at once, or a live view at its end; "
     "at most 256 MB.",
@@ -182,7 +182,7 @@ def view(
         from ertis_numba.storage import check_target
 
         check_target(html, overwrite=force, sources=[] if live else [Path(location)])
-        checks.choice("page format", html.suffix.lower(), _PAGES)
+        checks.file_ending("page", html, _PAGES)
     if not live:
         from ertis_numba.storage import file_kind
 

@@ -90,8 +90,7 @@ def choose_format(path: str | Path, name: str | None = None) -> str:
     """
     if name is None:
         endings = {each.suffix: known for known, each in FORMATS.items()}
-        checks.choice("ending of the export", Path(path).suffix.lower(), endings)
-        return endings[Path(path).suffix.lower()]
+        return endings[checks.file_ending("export", path, endings)]
     checks.choice("format", name, FORMATS)
     return name
 

@@ -41,7 +41,7 @@ def map_files(path: str | Path, *, n_dimensions: int = 2, probabilities: bool = 
         the packages for MCAP are not installed.
     """
     path = Path(path)
-    checks.choice("suffix of the map", path.suffix.lower(), MAP_SUFFIXES)
+    checks.file_ending("map", path, MAP_SUFFIXES)
     if n_dimensions == 3 and path.suffix.lower() in _PLANAR_SUFFIXES:
         raise ArgumentError(
             f"{path} would hold a map of two dimensions, but the map has three; give a name that ends in .h5 or .ply"

@@ -218,9 +218,10 @@ def natural_order(name: str) -> list[tuple[int, str]]:
 
 
 def first_stated_times(files: Sequence[PcmFile]) -> list[StatedTime | None]:
-    """Return the times of files from their metadata, otherwise from their names."""
+    """Return the times of files from their metadata, otherwise from their names; clocks that were set come first."""
     named = times_in_names([file.path.name for file in files])
-    return [next(iter(file.metadata.stated_times), name) for file, name in zip(files, named, strict=True)]
+    every = [[*file.metadata.stated_times, *([name] if name else [])] for file, name in zip(files, named, strict=True)]
+    return [next((time for time in times if time.was_set), next(iter(times), None)) for times in every]
 
 
 def require_alike(files: Sequence[PcmFile], *, joined: bool = False) -> None:
@@ -320,7 +321,11 @@ def _converted(
         came = numbers[sample, channel]
         raise DataError(
             f"{file.path} contains {came:g} at sample {first_sample + sample} of channel {channel}; "
-            + (f"scale the samples to at most {_MAX_FLOAT32:.4g}" if np.isfinite(came) else "give finite numbers")
+            + (
+                f"scale the samples to at most {_MAX_FLOAT32:.4g}"
+                if np.isfinite(came)
+                else "replace such samples in the file, or add the channel to array.disabled in the settings"
+            )
         )
     return words
 

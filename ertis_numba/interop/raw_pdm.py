@@ -70,11 +70,22 @@ class RawReader:
         if starts[-1] + counts[-1] > _END:
             raise DataError(f"{paths[-1]} is number {starts[-1]}, above the limit of recordings; give it a smaller one")
         self._files = list(zip(paths, counts, starts, strict=True))
+        self._silent: list[int] = []
 
     def __len__(self) -> int:
         return sum(count for _, count, _ in self._files)
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes on the measurements read so far."""
+        if not self._silent:
+            return ()
+        first = f"measurement {self._silent[0]}" + f" (and {len(self._silent) - 1} more)" * (len(self._silent) > 1)
+        problem = f"all words of {first} are equal, so no microphone recorded anything"
+        return (f"{problem}; check the power and the clock of the microphones, or the file",)
+
     def __iter__(self) -> Iterator[Measurement]:
+        self._silent = []
         for path, count, start in self._files:
             with path.open("rb") as file:
                 for sequence in range(start, start + count):
@@ -82,6 +93,8 @@ class RawReader:
                     if len(block) != self._format.n_bytes:
                         raise DataError(f"{path} became shorter while it was read; copy it again")
                     words = self._format.from_bytes(block)
+                    if (words == words[:1]).all():
+                        self._silent.append(sequence)
                     stamp = Stamp(sensor=self._sensor, sequence=sequence, sync_count=sequence)
                     yield Measurement(words, self.settings, stamp)
 

@@ -9,7 +9,14 @@ import numpy as np
 
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.interop.pcm_files import PcmFile, first_stated_times
-from ertis_numba.interop.recorder_names import MAX_DIFFERENCE_S, StatedTime, times_in_names
+from ertis_numba.interop.recorder_names import (
+    MAX_DIFFERENCE_S,
+    NAMES,
+    StatedTime,
+    day_first,
+    has_year_last,
+    times_in_names,
+)
 
 __all__ = ["file_times"]
 
@@ -65,7 +72,12 @@ def file_times(
         earliest = times_ns.index(min(times_ns))
         raise DataError(f"{files[earliest].path} states a time before 1970 ({_stated(known[earliest])}); {_UNKNOWN}")
     _require_order(files, times_ns)
-    notes = [*_contradictions(files), _source(known, is_relative=bool(starts_ns))]
+    notes = [
+        *_contradictions(files),
+        *_unset(files, known),
+        *_ambiguous(files, known),
+        _source(known, is_relative=bool(starts_ns)),
+    ]
     times_ns, overlaps = _without_overlaps(files, times_ns, max(time.resolution_s for time in known))
     shift_ns = starts_ns[0] - firsts_ns[0] - times_ns[0] if starts_ns else 0
     return [sum(pair) + shift_ns for pair in zip(times_ns, firsts_ns, strict=True)], notes + overlaps
@@ -78,13 +90,14 @@ def _back_to_back_ns(files: Sequence[PcmFile], start_ns: int) -> list[int]:
 
 def _unknown(files: Sequence[PcmFile], starts_ns: Sequence[int]) -> list[str]:
     """Return the note on files without any time."""
+    unread = next((f" in a known order ({file.path.name})" for file in files if has_year_last(file.path.name)), "")
     if len(files) == 1:
-        return [f"{files[0].path.name} contains no time, so its time is unknown; {_UNKNOWN.partition(',')[0]}"]
+        first = f"{files[0].path.name} contains no time{unread and ' in a known order'}, so its time is unknown"
+        return [f"{first}; {_UNKNOWN.partition(',')[0]}"]
     relative = ", beginning at --start" if starts_ns else ""
     remedy = "use --start once for each file" if starts_ns else _UNKNOWN
-    assumption = (
-        "neither metadata nor names contain times, so the files are assumed to follow each other without pauses"
-    )
+    missing = f"neither metadata nor names contain times{unread}"
+    assumption = f"{missing}, so the files are assumed to follow each other without pauses"
     return [f"{assumption}{relative}; {remedy}"]
 
 
@@ -152,13 +165,35 @@ def _contradictions(files: Sequence[PcmFile]) -> list[str]:
     if not found:
         return []
     file, other = found[0]
-    used = file.metadata.stated_times[0]
+    first, used = file.metadata.stated_times[0], next(time for time in first_stated_times([file]) if time)
+    why = "" if used == first else f", because a clock of {first.clock.year} was not set"
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
     note = (
-        f"{file.path.name}{more}: {used.source} ({_stated(used)}) and {other.source} ({_stated(other)}) differ; "
-        f"{used.source} is used"
+        f"{file.path.name}{more}: {first.source} ({_stated(first)}) and {other.source} ({_stated(other)}) differ; "
+        f"that of {used.source} is used{why}"
     )
     return [note]
+
+
+def _ambiguous(files: Sequence[PcmFile], known: Sequence[StatedTime]) -> list[str]:
+    """Return a note on the first name whose six digits are a date in two orders, before the file was written."""
+    for file, time in zip(files, known, strict=True):
+        other = day_first(file.path.name) if time.source == NAMES else None
+        written = datetime.fromtimestamp(file.path.stat().st_mtime, UTC).replace(tzinfo=None) + timedelta(days=1)
+        if other is not None and other.date() != time.clock.date() and other < written:
+            dates = f"{time.clock:%Y-%m-%d} (year first, as assumed) or {other:%Y-%m-%d} (day first)"
+            return [f"{file.path.name}: the date may be {dates}; use --start (start_ns) if the day comes first"]
+    return []
+
+
+def _unset(files: Sequence[PcmFile], known: Sequence[StatedTime]) -> list[str]:
+    """Return a note on times of a clock that was not set."""
+    unset = [(file, time) for file, time in zip(files, known, strict=True) if not time.was_set]
+    if not unset:
+        return []
+    file, time = unset[0]
+    problem = f"{file.path.name} begins at {_stated(time)} by {time.source}"
+    return [f"{problem}, so the clock of the recorder was probably not set; use --start (start_ns)"]
 
 
 def _agree(one: StatedTime, other: StatedTime) -> bool:

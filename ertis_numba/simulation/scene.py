@@ -4,14 +4,14 @@ Levels and strengths are relative to full scale. A signal of amplitude 1, or 0 d
 """
 
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import msgspec
 import numpy as np
 
 from ertis_numba import checks
 from ertis_numba.documents import TomlDocument
-from ertis_numba.errors import ArgumentError
+from ertis_numba.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import require_plausible_size, written_out
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.platform import MovingPose, Platform
@@ -83,6 +83,14 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
     noises: tuple[Noise, ...] = ()
     sonars: tuple[Sonar, ...] = ()
     ambient: Ambient | None = None
+
+    @classmethod
+    def _load(cls, path: Path) -> tuple[Self, dict[str, Any]]:
+        """Return the scene and the tables of a file, which sets at least one key."""
+        scene, tables = super()._load(path)
+        if not tables:
+            raise SettingsError(f"{path} sets no key; add reflectors or sound sources, see 'ertis settings scene'")
+        return scene, tables
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,6 +1,7 @@
 """Opening of HDF5 files, and errors that name their cause."""
 
 import errno
+import glob
 import io
 import re
 from collections.abc import Iterator
@@ -64,13 +65,19 @@ def _n_bytes(path: Path, wanted: str) -> int:
     except PermissionError as error:
         raise DataError(f"{path}: {error.strerror}; ask its owner for permission to read it") from error
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror}; choose {wanted}") from error
+        raise DataError(f"{path}: {error.strerror}; choose {wanted}{_such_as(path)}") from error
+
+
+def _such_as(pattern: Path) -> str:
+    """Return the first file that matches a pattern, as an example."""
+    matching = sorted(glob.glob(str(pattern))) if glob.has_magic(str(pattern)) else ()  # noqa: PTH207
+    return f", such as {matching[0]}" if matching else ""
 
 
 def open_file(path: Path, wanted: str = RESULT_OR_RECORDING) -> h5py.File:
     """Open an HDF5 file for reading; errors name the kind of file that is wanted."""
     if path.is_dir():
-        raise DataError(f"{path} is a folder; choose {wanted}")
+        raise DataError(f"{path} is a folder; choose {wanted}{_such_as(path / '*.h5')}")
     n_bytes = _n_bytes(path, wanted)
     if n_bytes == 0:
         raise DataError(f"{path} is empty; choose {wanted}")

@@ -99,6 +99,7 @@ class Viewer:
         )
         self._recordings = Recordings(self._page.serializer, self._completion)
         self._file: ToFile | None = None
+        self._noted_band_hz: float | None = None
         self._pause = Pause()  # of a live view
         self._changed, self._ended = False, False
         self._refused_s = math.inf  # when a number was chosen that cannot be
@@ -230,6 +231,18 @@ class Viewer:
         for note in self._source.notes():
             self._note(note)
 
+    def _note_missing_band(self, frame: "DrawnFrame") -> None:
+        """Note once that no map contains the chosen frequency."""
+        bands, chosen_hz = () if frame.scale is None else frame.scale.bands, self.choices.band_hz
+        if chosen_hz == self._noted_band_hz or any(each.is_shown for each in bands) or not bands:
+            return
+        self._noted_band_hz = chosen_hz
+        edges_khz = [edge_hz / 1e3 for each in bands if each.band_hz is not None for edge_hz in each.band_hz]
+        self._note(
+            f"no map has a band at {(chosen_hz or 0.0) / 1e3:g} kHz, so the page shows none; choose a frequency from "
+            f"{min(edges_khz):.3g} to {max(edges_khz):.3g} kHz (--band)"
+        )
+
     def _completion(self) -> Callable[[str], str]:
         """Return a function that adds a legend of the present view to a saved page."""
         title, frame = self._source.title, self._frame
@@ -286,6 +299,7 @@ class Viewer:
         """Draw images as they are at a given time."""
         self._frame, self._clock_drawn_s = self._scene.draw(self.choices, clock_s), clock_s
         self._page.show(self._frame, place)
+        self._note_missing_band(self._frame)
         self._recordings.add(frames=int(new))
 
     def _taken(self) -> "list[ReceivedImage[Any]]":
