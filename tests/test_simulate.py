@@ -138,10 +138,10 @@ def test_tolerance_selects_the_effects(scene_file):
         (b"\xe9", (), 1, r"not text in UTF-8 \(byte 0xe9 at position 0\)"),
         ("sede = 1", (), 1, r"scene\.toml.*unknown key `sede`; correct it or remove it"),
         ("[[sensors]]\narray.layout = 'eRTIS'", (), 1, "layout 'eRTIS' is unknown"),
-        ("", ("--sensor", "left"), 1, "sensor 'left' is unknown; known are sensor"),
-        ("", ("--tolerance-db", "-1"), 2, "--tolerance-db is -1; give a number from 0 to 60"),
-        ("", ("--count", "0"), 2, "--count"),
-        ("", ("--seed", "-1"), 2, "--seed"),
+        ("seed = 1", ("--sensor", "left"), 1, "sensor 'left' is unknown; known are sensor"),
+        ("seed = 1", ("--tolerance-db", "-1"), 2, "--tolerance-db is -1; give a number from 0 to 60"),
+        ("seed = 1", ("--count", "0"), 2, "--count"),
+        ("seed = 1", ("--seed", "-1"), 2, "--seed"),
     ],
 )
 def test_simulate_refuses_invalid_input(tmp_path, text, arguments, code, message):

@@ -36,7 +36,7 @@ BIND = socket.socket.bind
             ("tcp:127.0.0.1:5602",),
             "'tcp:127.0.0.1:5602' is not a file; for the address of a central node, give tcp://127.0.0.1:5602",
         ),
-        (("IMG", "--save-html", "p.png"), "page p.png ends in '.png'; choose a name that ends in .html, .htm"),
+        (("IMG", "--save-html", "p.png"), "p.png ends in '.png'; choose a name that ends in .html, .htm"),
         (("IMG", "--sensor", "back"), "back"),
         (("IMG", "--decay", "99"), "--decay is 99; give"),
         (("IMG", "--range", "5:1"), "--range runs from 5 to 1"),
