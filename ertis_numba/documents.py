@@ -20,7 +20,7 @@ import tomli_w
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, SettingsError
-from ertis_numba.file_kinds import kind_of, problem_of
+from ertis_numba.file_kinds import kind_of, markup_of, problem_of
 
 __all__ = ["MAX_KEY_PARTS", "TomlDocument", "TomlTable"]
 
@@ -38,8 +38,6 @@ _PATH_PART = re.compile(r"\.(\w+)|\[(\d+)\]")
 _EXPECTED = re.compile(r"Expected `([^`]*)`(?: of length (\d+), got (\d+))?")
 _CHOICE = re.compile(r"Invalid enum value '(.*)'")
 _TOML_TYPES: Final = (dt.datetime, dt.date, dt.time)
-_FOREIGN: Final = {"{": "JSON", "<": "XML"}
-"""Formats by their first character, with which no TOML begins."""
 _TYPE_NAMES = {
     "array": "a list",
     "bool": "true or false",
@@ -301,9 +299,8 @@ def _text_of(path: Path, wanted: str) -> str:
     except UnicodeDecodeError as error:
         remedy = f"choose {wanted}" if kind is None else "save it as UTF-8"
         raise SettingsError(f"{path}: {checks.reason_unreadable(error)}; {remedy}") from error
-    start = text.lstrip()[:1]
-    if start in _FOREIGN:
-        raise SettingsError(f"{path} is {_FOREIGN[start]}, not TOML; choose {wanted}")
+    if markup := markup_of(text):
+        raise SettingsError(f"{path} is {markup}, not TOML; choose {wanted}")
     return text
 
 

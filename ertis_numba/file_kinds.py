@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-__all__ = ["HDF5_PLACES", "HDF5_SIGNATURE", "FileKind", "kind_of", "problem_of", "quoted"]
+__all__ = ["HDF5_PLACES", "HDF5_SIGNATURE", "FileKind", "kind_of", "markup_of", "problem_of", "quoted"]
 
 _HEAD_BYTES = 4096
 HDF5_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
@@ -142,6 +142,14 @@ _MAGICS: Final[tuple[tuple[FileKind, tuple[tuple[int, bytes], ...]], ...]] = (
     (FileKind("a PLY file", _NO_SIGNALS), ((0, b"ply\n"),)),
     (FileKind("a PCD file", _NO_SIGNALS), ((0, b"# .PCD"),)),
     (FileKind("a LAS file", _NO_SIGNALS), ((0, b"LASF"),)),
+    (
+        FileKind("a pointer of Git LFS", "fetch the file itself with 'git lfs pull'", is_text=True),
+        ((0, b"version https://git-lfs"),),
+    ),
+    *(
+        (FileKind("an HTML page", "download the file itself instead of its page", is_text=True), ((0, mark),))
+        for mark in (b"<!DOCTYPE html", b"<!doctype html", b"<html", b"<HTML")
+    ),
     (FileKind("a MIDI file", _NO_SIGNALS), ((0, b"MThd"),)),
     (FileKind("a program (ELF)", _NO_SIGNALS), ((0, b"\x7fELF"),)),
     (FileKind("a DICOM file", _NO_SIGNALS), ((128, b"DICM"),)),
@@ -168,6 +176,18 @@ def kind_of(path: str | Path) -> FileKind | None:
         (_is_text(head), _TEXT),
     )
     return next((kind for fits, kind in checks if fits), None)
+
+
+def markup_of(text: str) -> str | None:
+    """Return the name of a format of text that is neither a table nor TOML, by its first character; None if unknown.
+
+    Examples
+    --------
+    >>> from ertis_numba.file_kinds import markup_of
+    >>> markup_of('{"seed": 1}'), markup_of("seed = 1")
+    ('JSON', None)
+    """
+    return {"{": "JSON", "<": "XML"}.get(text.lstrip()[:1])
 
 
 def problem_of(path: str | Path, wanted: str = "a recording") -> str:

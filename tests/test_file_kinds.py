@@ -107,6 +107,8 @@ MADE = {
     "png": (b"\x89PNG\r\n\x1a\n", "a PNG image"),
     "jpg": (b"\xff\xd8\xff\xe0\0\x10JFIF", "a JPEG image"),
     "tif": (struct.pack("<2sHI", b"II", 42, 8), "a TIFF image"),
+    "pointer.wav": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "a pointer of Git LFS"),
+    "page.wav": (b"<!DOCTYPE html>\n<html></html>\n", "an HTML page"),
     "pdf": (b"%PDF-1.7\n%\xe2\xe3", "a PDF document"),
     "elf": (b"\x7fELF\2\1\1", r"a program \(ELF\)"),
     "csv": (b"time_s,x\n0.0,1.0\n1.0,2.0\n", "a text file"),

@@ -49,6 +49,8 @@ def written(tmp_path, name, text, encoding="utf-8"):
         ("german.csv", "time_s;x_m;y_m;z_m;qx;qy;qz;qw\n1403715524,907143168;1;2;3;0;0;0,6;0,8\n", "utf-8"),
         ("nanoseconds.tum", "1403715524907143168 1 2 3 0 0 0.6 0.8\n", "utf-8"),
         ("microseconds.csv", "time_us,x_m,y_m,z_m,qx,qy,qz,qw\n1403715524907143.168,1,2,3,0,0,0.6,0.8\n", "utf-8"),
+        ("seconds.csv", "t [seconds],x,y,z,qx,qy,qz,qw\n1403715524.907143168,1,2,3,0,0,0.6,0.8\n", "utf-8"),
+        ("comma.tum", "1403715524,907143168 1 2,0 3,0 0 0 0,6 0,8\n", "utf-8"),
         ("ends.tum", "1403715524.907143168,1,2,3,0,0,0.6,0.8,\n", "utf-8"),
         ("spaced.txt", "#timestamp [ns] x [m] y [m] z [m] qw qx qy qz\n1403715524907143168 1 2 3 .8 0 0 .6\n", "utf-8"),
         ("slashes.txt", "// t x y z qw qx qy qz\n// start\n1403715524.907143168 1 2 3 .8 0 0 .6\n", "utf-8"),
@@ -195,6 +197,13 @@ def test_poses_of_kitti_that_do_not_fit_are_refused(tmp_path, text, times, messa
             r"line 2: rotation_xyzw has length 1.06 .* correct or remove 1 line",
         ),
         ("a.tum", rows(START, "2 0 0 0 0 0 0 0"), r"line 2: rotation_xyzw has length 0 \(0 0 0 0\)"),
+        (
+            "a.csv",
+            "1700000000,0,0,0,1,0,0,0\n",
+            r"first line has numbers instead of names of columns; add a line such as",
+        ),
+        ("a.csv", "time [min],x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n", r"'time \[min\]' is not in s, ms, us or ns"),
+        ("a.txt", "0.0\n0.1\n", r"line 1 has one number, as in the times of KITTI; choose the file of the poses"),
         ("a.tum", rows("1 nan 0 0 0 0 0 1"), r"the file contains no complete pose; 1 of 1 line left out"),
         ("a.tum", rows(START, "2 0 inf 0 0 0 0 1"), r"line 2 has position_m 0 inf 0"),
         ("a.tum", rows("50000000000 0 0 0 0 0 0 1"), r"choose their unit \(time_unit, --time-unit\): s, ms, us, ns"),
@@ -207,7 +216,7 @@ def test_poses_of_kitti_that_do_not_fit_are_refused(tmp_path, text, times, messa
         (
             "a.csv",
             "1,2,3,4,5,6,7,8\n",
-            r"the first line names the columns 1, 2, 3, 4, 5, 6, 7, 8; they must be time_ns",
+            r"the first line has numbers instead of names of columns; add a line such as time_s",
         ),
         (
             "a.csv",
@@ -267,6 +276,12 @@ def test_other_formats_are_refused_by_name(tmp_path, start, message):
     path.write_bytes(start + bytes(range(256)))
     with pytest.raises(DataError, match=message):
         read_trajectory(path)
+
+
+@pytest.mark.parametrize(("text", "markup"), [('{"poses": []}\n', "JSON"), ("<gpx/>\n", "XML")])
+def test_markup_is_refused_by_name(tmp_path, text, markup):
+    with pytest.raises(DataError, match=rf"is {markup}, not a table; choose a \.tum"):
+        read_trajectory(written(tmp_path, "a.tum", text))
 
 
 def test_folder_of_a_bag_is_refused_by_name(tmp_path):

@@ -143,6 +143,14 @@ REFUSED = {
         riff(form(), DATA_CHUNK) + b"\x81" * 70_000,
         r"byte 36 states 3840 bytes, but 73840 follow, and no chunk begins at byte 3884; read all of them with 'ffmpeg",
     ),
+    "short length": (
+        riff(form(), chunk(b"data", DATA, 800)),
+        r"byte 36 states 800 bytes, but 3840 follow, and no chunk begins at byte 844; read all of them with 'ffmpeg",
+    ),
+    "two formats": (
+        riff(form(), form(byte_rate=1), DATA_CHUNK),
+        r"has different fmt chunks at bytes 12 and 36; save the file again as WAV",
+    ),
     "half a frame": (
         riff(form(), chunk(b"data", DATA[:-2])),
         r"has 3838 bytes of samples, not a multiple of .* 8 bytes",

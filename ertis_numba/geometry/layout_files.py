@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ertis_numba import checks
 from ertis_numba.constants import MAX_MICROPHONES
 from ertis_numba.documents import TomlDocument
-from ertis_numba.errors import ArgumentError, LayoutUnitWarning
+from ertis_numba.errors import ArgumentError, LayoutUnitWarning, SettingsError
 from ertis_numba.geometry.position_files import FLAT, layout_bytes, layout_file_text, read_position_file
 from ertis_numba.geometry.position_headings import AXES
 from ertis_numba.geometry.position_tables import HEADER_EXAMPLES
@@ -21,6 +21,7 @@ from ertis_numba.settings import LENGTH_UNITS_M, MAX_SPAN_M, MIN_SPAN_M, Array
 __all__ = ["LayoutFile", "ReadLayout", "parse_layout", "read_layout", "unclear_unit"]
 
 _DEFAULT_UNIT: Final = "mm"
+_HAS_SETTINGS: Final = re.compile(r"^\s*\[+(?:air|array|call|passive|processing|recording|sensors)\b", re.MULTILINE)
 _LIKELY_SPAN_M: Final = 15e-3  # Smaller arrays are rare, so that they are questioned if their file states no unit.
 _MIN_SPACING_M: Final = 2e-3  # Microphones are larger; the packages of MEMS microphones have 2.7 mm.
 _SPLIT_ROW = re.compile(r"\[\s+((?:[-\d.e]+,\s+)+)\]")  # numbers of a list on lines of their own
@@ -183,7 +184,15 @@ def parse_layout(path: str, text: str) -> ReadLayout:
         The text is no layout, or a value cannot be used.
     """
     source = f"layout {path}"
-    file = LayoutFile.from_toml(text, source)
+    try:
+        file = LayoutFile.from_toml(text, source)
+    except SettingsError as error:
+        if _HAS_SETTINGS.search(text):
+            raise ArgumentError(
+                f"{source} is a file of settings; use it as such (--settings), or move the keys of its array to a file "
+                "of their own"
+            ) from error
+        raise
     rows, unit = file.rows(source)
     key = "positions_mm" if file.positions is None else "positions"
     if not rows or any(len(row) != len(rows[0]) or len(row) not in {2, 3} for row in rows):

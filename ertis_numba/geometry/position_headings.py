@@ -12,6 +12,11 @@ AXES: Final = "xyz"
 _UNIT_WORDS: Final = {"millimetre": "mm", "centimetre": "cm", "metre": "m", "inch": "in", "inche": "in", '"': "in"}
 """Units by their names without the s of the plural."""
 _OTHER_UNITS: Final = frozenset({"um", "µm", "μm", "micron", "dm", "km", "ft", "feet", "foot", "yd"})
+_PLAIN_WORDS: Final = frozenset(
+    {"x", "y", "z", "in", "of", "axis", "pos", "position", "coord", "coordinate", "mic", "forward", "left", "up"}
+)
+"""Words in headings of axes that are no units, even in brackets or behind the axis."""
+_BRACKET: Final = re.compile(r"[\[(]\s*([^\W\d_]+)\s*[\])]|\b[xyz]_([^\W\d_]+)$")
 _LABELS: Final = frozenset({"index", "unnamed", "name", "id", "label", "point", "row", "nr", "no", "number", "i", "n"})
 _CHANNELS: Final = frozenset(
     {"channel", "channels", "ch", "chan", "mic", "mics", "microphone", "microphones", "sensor"}
@@ -57,6 +62,9 @@ def heading(text: str) -> ColumnHeading:
     if len(found) != 1:
         return ColumnHeading(text)
     units = [_unit(word) or word for word in words if _unit(word) or word in _OTHER_UNITS]
+    bracket = _BRACKET.search(text.lower().strip())
+    if bracket and not units and (word := bracket[1] or bracket[2]) not in _PLAIN_WORDS:
+        units = [word]
     if len(units) > 1 and "in" in units:  # the preposition, as in "x in mm"
         units.remove("in")
     return ColumnHeading(text, found[0][1], found[0][2] or next(iter(units), ""))

@@ -26,6 +26,7 @@ _COLUMNS: Final = (
     "time_ns or time_s (or dates as time), x_m, y_m, z_m (optional), and either qx, qy, qz, qw or yaw_deg or yaw_rad, "
     "with roll and pitch likewise (optional)"
 )
+_EXAMPLE: Final = "such as time_s,x_m,y_m,z_m,qx,qy,qz,qw, in the order of the columns"
 _TIME: Final = re.compile(r"(?:time|timestamp|stamp|t)(?:_(s|ms|us|ns))?")
 _POSITION: Final = re.compile(r"(?:([xyz])_m|t([xyz])|p_([xyz])|p_rs_r_([xyz]))")
 _IN_METRES: Final = re.compile(r"(?:p|pos|position|t)?_?([xyz])")
@@ -37,6 +38,18 @@ _PLACES: Final = re.compile(r"[xyz]_|alt|height", re.IGNORECASE)
 _UNREAD: Final = re.compile(r"[xyz]_[mcd]m|(?:alt|altitude|height)(?:_m)?|(?:roll|pitch|yaw|heading|theta)(?:_\w+)?")
 """Names that change poses, if they are not read otherwise."""
 _MANY_TURNS_RAD: Final = 50.0
+_UNITS: Final = {
+    "sec": "s",
+    "secs": "s",
+    "seconds": "s",
+    "msec": "ms",
+    "usec": "us",
+    "µs": "us",
+    "μs": "us",
+    "nsec": "ns",
+}
+_DECIMAL_COMMAS: Final = re.compile(r"(?:[-+]?\d+(?:,\d+)?(?:e[-+]?\d+)?(?:\s+|$))+", re.IGNORECASE)
+"""Numbers between spaces, whose commas are therefore those of decimals."""
 _NAMED: Final = re.compile(r"([^\[(]+?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?")  # name [unit]
 _SPACED_UNIT: Final = re.compile(r"\s+(?=[\[(])")
 _UNKNOWN: Final = ("", "null", "none", "na", "n/a", "nan(ind)", "-nan(ind)")
@@ -144,6 +157,8 @@ def _header(text: str, *, needs_header: bool) -> tuple[_Columns | None, list[Row
             found = _columns(names, is_stated=is_stated)
             _require_rotations(number, found, names)
             if is_stated and not found.is_complete:
+                if all(map(_is_number, names)):
+                    raise DataError(f"the first line has numbers instead of names of columns; add a line {_EXAMPLE}")
                 raise DataError(f"the first line names the columns {', '.join(names)}; they must be {_COLUMNS}")
             if found.is_complete:
                 columns = found
@@ -157,6 +172,8 @@ def _header(text: str, *, needs_header: bool) -> tuple[_Columns | None, list[Row
 
 def _cells(line: str) -> list[str]:
     """Return the cells of a line, which semicolons, commas or spaces separate."""
+    if "," in line and _DECIMAL_COMMAS.fullmatch(line):
+        return line.replace(",", ".").split()
     separator = next((each for each in ";," if each in line), None)
     cells = [cell.strip().strip('"').strip() for cell in line.split(separator)]
     return [cell.replace(",", ".") for cell in cells] if separator == ";" else cells  # 1,5;2,0 has decimal commas.
@@ -181,7 +198,7 @@ def _columns(names: Sequence[str], *, is_stated: bool) -> _Columns:
         name = name.replace(".", "_")
         if found := _TIME.fullmatch(name):
             repeated += [full] * (time >= 0)
-            time, unit = place, found[1] or (bracket if bracket in {"s", "ms", "us", "ns"} else None)
+            time, unit = place, found[1] or _unit(full, bracket)
         elif found := _POSITION.fullmatch(name) or _IN_METRES.fullmatch(name):
             if bracket not in {"", "m"}:
                 raise DataError(f"column {full!r} is not in metres; convert the column, and name it {name[-1]}_m")
@@ -212,6 +229,14 @@ def _columns(names: Sequence[str], *, is_stated: bool) -> _Columns:
     return _Columns(-1 if repeated else time, unit, axes, quaternion, angles, len(names), is_bare)
 
 
+def _unit(name: str, bracket: str) -> str | None:
+    """Return the unit in the brackets of a column of times; None without any."""
+    unit = _UNITS.get(bracket, bracket)
+    if unit not in {"", "s", "ms", "us", "ns"}:
+        raise DataError(f"column {name!r} is not in s, ms, us or ns; convert the column, and name it time_s")
+    return unit or None
+
+
 def _require_rotations(number: int, columns: _Columns, names: Sequence[str]) -> None:
     """Refuse a header with times and positions, but without rotations."""
     if columns.time >= 0 and {*"xy"} <= columns.axes.keys() and not columns.quaternion and "yaw" not in columns.angles:
@@ -235,6 +260,11 @@ def _require_no_sensor(names: Sequence[str]) -> None:
 def _without_header(first: Row, text: str) -> _Columns:
     """Return the columns of TUM for rows without a header, unless the order of these may be another."""
     number, cells = first
+    if len(cells) == 1:
+        raise DataError(
+            f"line {number} has one number, as in the times of KITTI; choose the file of the poses, and add this file "
+            "with --times (times in Python)"
+        )
     if len(cells) > len(TUM):
         raise DataError(
             f"line {number} has {len(cells)} fields; write {len(TUM)}: {' '.join(TUM)}, or name all columns in the "

@@ -9,7 +9,7 @@ from typing import Final
 from ertis_numba import checks
 from ertis_numba.atomic_files import atomic_write, check_target
 from ertis_numba.errors import ArgumentError, DataError, PoseWarning
-from ertis_numba.file_kinds import kind_of, quoted
+from ertis_numba.file_kinds import kind_of, markup_of, quoted
 from ertis_numba.frames import PoseAxes, Trajectory
 from ertis_numba.interop._pose_messages import read_messages
 from ertis_numba.interop._pose_rows import trajectory_of
@@ -152,6 +152,8 @@ def _text(path: Path) -> str:
         raise DataError(f"{path} cannot be read ({error.strerror or error}); choose an existing file") from error
     if "\0" in text:
         raise DataError(f"trajectory {path} is not a text file; choose {_KINDS}")
+    if markup := markup_of(text):
+        raise DataError(f"trajectory {path} is {markup}, not a table; choose {_KINDS}")
     return text
 
 

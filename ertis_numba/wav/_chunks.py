@@ -129,6 +129,14 @@ def _wide_lengths(body: bytes, order: str) -> dict[bytes, int]:
 def _require_single(content: Content, chunks: Chunks, name: bytes, place: int) -> None:
     """Refuse samples in several places."""
     path = content.path
+    if name == b"fmt " and name in chunks.places:
+        first = chunks.places[name]
+        length = HEADER_BYTES + content.header(first)[1]
+        if content.read(first, length) != content.read(place, length):
+            raise DataError(
+                f"{path} has different fmt chunks at bytes {first} and {place}; save the file again as WAV with the "
+                "program that wrote it"
+            )
     if name == b"data" and name in chunks.places:
         first = quoted(path.with_name(f"{path.stem}_first.wav"))
         raise DataError(

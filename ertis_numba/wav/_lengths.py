@@ -162,7 +162,7 @@ def _of_misfit(content: Content, start: int, stated: int, room: int, where: str)
             f"left of it with {_read_on(content.path)}"
         )
     left = room - stated
-    if stated + WRAP <= room or not (left <= _MAX_LEFT_BYTES or _is_zero(content, start + stated)):
+    if stated + WRAP <= room or not (left <= min(_MAX_LEFT_BYTES, stated) or _is_zero(content, start + stated)):
         raise DataError(
             f"{content.path}: {where}, but {room} follow, and no chunk begins at byte {start + stated}; "
             f"read all of them with {_read_on(content.path)}"
