@@ -24,6 +24,11 @@ _FINER: Final = 8  # Samples of the correlation per sample of the signals.
 _MIN_BLOCK: Final = 8
 _MAX_BLOCK: Final = 1e15  # More than any record has.
 _TINY: Final = 1e-30
+_BY_CHANCE: Final = 1e-3  # Probability that one frequency looks coherent in noise.
+_MANY_BY_CHANCE: Final = 0.01
+_LEAKED_SHARES: Final = (0.3, 0.05, *(1e-3 * (3 / apart) ** 6 for apart in range(3, 13)))  # by distance, about
+_N_STEPS: Final = 4
+_WIDENED: Final = 3.0
 _MAX_COHERENCE: Final = 1 - 1e-9
 _INDEPENDENT: Final = 0.947  # Share of independent blocks: neighbours have a correlation of 1/6 under Hann windows.
 
@@ -38,8 +43,8 @@ class TimeDifference(NamedTuple):
     delay_s : float
         Time by which the sound arrives later at the second, in seconds.
     uncertainty_s : float
-        Standard deviation in seconds: the Cramér-Rao bound at the measured coherence. Infinite without coherence, and
-        with fewer than three blocks, which cannot show it.
+        Standard deviation in seconds. Infinite without coherence, with fewer than three blocks, which cannot show it,
+        and at the largest delay, beyond which the right one may lie.
     peak : float
         Correlation at the delay, relative to that of equal signals.
     """
@@ -64,10 +69,14 @@ def time_differences(
 
     The cross-spectrum G of two signals is averaged over blocks under Hann windows that overlap by half. The correlation
     of ``G / |G|`` (``phat``), ``G / √(G₁₁ G₂₂)`` (``scot``) or G (``none``) has its largest maximum at the delay (C.
-    Knapp and G. Carter, The generalized correlation method for estimation of time delay, 1976). A parabola interpolates
-    it between samples. The uncertainty is that of the same work: ``1 / √(2 T ∫ ω² γ² / (1 − γ²) df)`` for the time T
-    and the measured coherence γ², corrected for its bias. It holds if the largest maximum is the right one; in weak or
-    narrow-band sound, another may be larger.
+    Knapp and G. Carter, The generalized correlation method for estimation of time delay, 1976). Frequencies without
+    coherence, and those whose sound may be that of neighbours under the window, are left out. Blocks of the later
+    signal are taken later by the delay in whole samples.
+
+    The uncertainty is that of the same work for the weighting W: ``∫ W² ω² G₁₁ G₂₂ (1 − γ²) df / 2 T (∫ W ω² |G| df)²``
+    is the variance for the time T and the measured coherence γ², corrected for its bias. Each further maximum at a
+    delay Δ from the first one adds ``p Δ²`` for its probability p to be the right one. In weak or narrow-band sound,
+    the uncertainty is therefore about that of whole periods.
 
     Parameters
     ----------
@@ -80,8 +89,8 @@ def time_differences(
     band_hz : (low, high), optional
         Band in hertz; that of all bands of ``settings.passive`` for a measurement, else all frequencies.
     max_delay_s : float, optional
-        Largest delay in seconds; that of sound along the distance of the microphones for a measurement, else half of a
-        block.
+        Largest delay in seconds, half of a block at most; that of sound along the distance of the microphones, and one
+        sample, for a measurement, else half of a block.
     resolution_hz : float
         Spacing of frequencies in hertz; 1000 by default. A block lasts one period of it.
 
@@ -179,56 +188,163 @@ class _Correlator:
     def __init__(self, signals: _Signals, n_block: int, band_hz: tuple[float, float], weighting: Weighting) -> None:
         rate_hz = signals.rate_hz
         checks.interval("band_hz", band_hz, 0.0, rate_hz / 2)
-        self._frequency_hz = np.fft.rfftfreq(n_block, 1 / rate_hz)
-        self._chosen = (self._frequency_hz >= band_hz[0]) & (self._frequency_hz <= band_hz[1])
-        self._chosen &= (self._frequency_hz > 0) & (self._frequency_hz < rate_hz / 2)
+        frequency_hz = np.fft.rfftfreq(n_block, 1 / rate_hz)
+        self._chosen = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
+        self._chosen &= (frequency_hz > 0) & (frequency_hz < rate_hz / 2)
         if not self._chosen.any():
             raise ArgumentError(
-                f"band_hz {band_hz[0]:g} to {band_hz[1]:g} contains none of the frequencies {self._frequency_hz[1]:g} "
+                f"band_hz {band_hz[0]:g} to {band_hz[1]:g} contains none of the frequencies {frequency_hz[1]:g} "
                 "Hz apart; give a wider band, or a smaller resolution_hz"
             )
-        pieces = np.lib.stride_tricks.sliding_window_view(signals.rows, n_block, axis=1)[:, :: n_block // 2]
-        window = scipy.signal.get_window("hann", n_block)
-        self._spectra = scipy.fft.rfft(pieces * window, axis=2)
-        self._power = (np.abs(self._spectra) ** 2).mean(axis=1)
+        self._omega = 2 * np.pi * frequency_hz
         self._signals, self._n_block, self._weighting = signals, n_block, weighting
-        self._rate_hz, self._duration_s = rate_hz, signals.rows.shape[1] / rate_hz
+        self._spectra = [self._spectra_of(row) for row in signals.rows]
+
+    def _spectra_of(self, row: NDArray[np.float32]) -> NDArray[np.complex64]:
+        """Return the spectra of the blocks of a signal, (block, frequency)."""
+        blocks = np.lib.stride_tricks.sliding_window_view(row, self._n_block)[:: self._n_block // 2]
+        window = scipy.signal.get_window("hann", self._n_block).astype(np.float32)
+        spectra: NDArray[np.complex64] = scipy.fft.rfft(blocks * window, axis=1)
+        return spectra
 
     def pair(self, first: int, second: int, *, most_s: float | None) -> TimeDifference:
         """Return the time difference of two signals, up to a largest one."""
-        cross = (self._spectra[second] * self._spectra[first].conj()).mean(axis=0)
-        delay_s, positions_s = self._signals.delay_s, self._signals.positions_s
-        if delay_s is not None:
-            cross = cross * np.exp(2j * np.pi * self._frequency_hz * (delay_s[second] - delay_s[first]))
-        if most_s is None and positions_s is not None:
-            most_s = float(np.linalg.norm(positions_s[second] - positions_s[first])) + 1 / self._rate_hz
-        if most_s is None:
-            most_s = self._n_block / self._rate_hz / 2
-        scale = np.sqrt(self._power[first] * self._power[second])
-        size = np.maximum({"phat": np.abs(cross), "scot": scale, "none": np.ones_like(scale)}[self._weighting], _TINY)
-        weighted = np.where(self._chosen, cross / size, 0)
-        most = self._chosen.sum() if self._weighting == "phat" else (scale / size)[self._chosen].sum()
-        n_fine = _FINER * self._n_block
-        correlation = scipy.fft.irfft(weighted, n_fine) * n_fine / 2
-        reach = max(1, int(min(most_s * self._rate_hz * _FINER, n_fine // 2 - 2)))
-        lags = np.arange(-reach, reach + 1)
-        top = int(lags[np.argmax(correlation[lags])])
-        before, here, after = correlation[[top - 1, top, top + 1]]
-        curvature = before - 2 * here + after
-        shift = float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0
-        found_s = (top + shift) / (_FINER * self._rate_hz)
-        return TimeDifference(first, second, found_s, self._uncertainty_s(cross, scale), float(here / max(most, _TINY)))
+        signals, rate_hz = self._signals, self._signals.rate_hz
+        own_s = 0.0 if signals.delay_s is None else float(signals.delay_s[second] - signals.delay_s[first])
+        if most_s is None and signals.positions_s is not None:
+            most_s = float(np.linalg.norm(signals.positions_s[second] - signals.positions_s[first])) + 1 / rate_hz
+        limit_s = self._n_block / rate_hz / 2
+        most_s = limit_s if most_s is None else min(most_s, limit_s)
+        rough = self._cross(self._spectra[first], self._spectra[second], 0.0, own_s)
+        n_late = round((rough.delay_s(most_s) + own_s) * rate_hz)
+        if n_late == 0:
+            return rough.result(first, second, most_s)
+        # Blocks of the same sound have no error of windows that cut it at different times.
+        late = signals.rows[second][max(n_late, 0) :], signals.rows[first][max(-n_late, 0) :]
+        n_common = min(each.size for each in late)
+        if n_common < 4 * self._n_block:
+            return rough.result(first, second, most_s)
+        spectra = [self._spectra_of(each[:n_common]) for each in late]
+        return self._cross(spectra[1], spectra[0], n_late / rate_hz, own_s).result(first, second, most_s)
 
-    def _uncertainty_s(self, cross: NDArray[np.complex128], scale: NDArray[np.float64]) -> float:
-        """Return the Cramér-Rao bound at the coherence of the chosen frequencies."""
-        n_blocks = _INDEPENDENT * self._spectra.shape[1]
-        if n_blocks <= 2:
-            return math.inf
-        coherence = (np.abs(cross) / np.maximum(scale, _TINY))[self._chosen] ** 2
-        coherence = np.minimum(coherence, _MAX_COHERENCE)
+    def _cross(
+        self, first: NDArray[np.complex64], second: NDArray[np.complex64], late_s: float, own_s: float
+    ) -> "_CrossSpectrum":
+        """Return the cross-spectrum of blocks, the second of which are late by a time."""
+        cross = (second * first.conj()).mean(axis=0, dtype=np.complex128)
+        power = [(np.abs(each) ** 2).mean(axis=0, dtype=np.float64) for each in (first, second)]
+        return _CrossSpectrum(
+            cross * np.exp(-1j * self._omega * (late_s - own_s)),
+            np.sqrt(power[0] * power[1], dtype=np.float64),
+            self._omega,
+            self._chosen,
+            len(first),
+            self._weighting,
+        )
+
+
+class _CrossSpectrum:
+    """Cross-spectrum of two signals, weighted at the frequencies where they are coherent."""
+
+    def __init__(
+        self,
+        cross: NDArray[np.complex128],
+        scale: NDArray[np.float64],
+        omega: NDArray[np.float64],
+        chosen: NDArray[np.bool_],
+        n_blocks: int,
+        weighting: Weighting,
+    ) -> None:
+        self._n_blocks, self._omega = _INDEPENDENT * n_blocks, omega
+        self._n_fine = _FINER * 2 * (omega.size - 1)
+        size, scale = np.abs(cross), np.maximum(scale, _TINY)
+        coherence = np.minimum((size / scale) ** 2, _MAX_COHERENCE)
+        coherent = chosen & (size > _leaked(size)) & (coherence > self._by_chance(_BY_CHANCE))
+        n_chosen = float(chosen.sum())
+        self._is_coherent = bool(
+            scipy.stats.poisson.sf(coherent.sum() - 1, _BY_CHANCE * n_chosen) < _MANY_BY_CHANCE
+            or (coherence[coherent] > self._by_chance(_BY_CHANCE / n_chosen)).any()
+        )
+        used = coherent if self._is_coherent else chosen
+        divisor = np.maximum({"phat": size, "scot": scale, "none": np.ones_like(scale)}[weighting], _TINY)
+        self._weighted = np.where(used, cross / divisor, 0)
+        self._most = n_chosen if weighting == "phat" else float((scale / divisor)[chosen].sum())
         # The mean of γ² / (1 − γ²) as measured in n blocks is (1 + n γ² / (1 − γ²)) / (n − 2).
-        ratio = ((n_blocks - 2) * coherence / (1 - coherence) - 1) / n_blocks
-        omega = 2 * np.pi * self._frequency_hz[self._chosen]
-        spacing_hz = self._rate_hz / self._n_block
-        information = 2 * self._duration_s * spacing_hz * float((omega**2 * ratio).sum())
-        return 1 / math.sqrt(information) if information > 0 else math.inf
+        ratio = ((self._n_blocks - 2) * coherence / (1 - coherence) - 1) / self._n_blocks
+        # What is hardly above chance is no evidence for one of several maxima.
+        chance = self._by_chance(_BY_CHANCE) / np.maximum(coherence, _TINY)
+        self._evidence = np.abs(self._weighted) * np.maximum(1 - chance, 0)
+        # Variance of a component of the weighted spectrum; doubled, as windows correlate it with its neighbours.
+        self._noise = np.where(used, np.abs(self._weighted) ** 2 / np.maximum(ratio, _TINY), 0.0) / self._n_blocks
+
+    def _by_chance(self, probability: float) -> float:
+        """Return the coherence that noise exceeds with a probability: (1 − γ²)^(n − 1) for n blocks."""
+        return 1 - probability ** (1 / (self._n_blocks - 1)) if self._n_blocks > 1 else 1.0
+
+    def _correlation(self, delay_s: float) -> float:
+        """Return the correlation at a delay."""
+        return float((self._weighted * np.exp(1j * self._omega * delay_s)).real.sum())
+
+    def _maxima_s(self, most_s: float) -> NDArray[np.float64]:
+        """Return the delays of the maxima up to a largest delay, to a fraction of a sample, the largest first."""
+        step_s = 2 * np.pi / (self._omega[1] * self._n_fine)
+        reach = min(int(most_s / step_s), self._n_fine // 2 - 1)
+        lags = np.arange(-reach, reach + 1)
+        values = (scipy.fft.irfft(self._weighted, self._n_fine) * self._n_fine / 2)[lags]
+        beside = np.pad(values, 1, constant_values=-np.inf)
+        tops = np.flatnonzero((values >= beside[:-2]) & (values >= beside[2:]))
+        found_s: NDArray[np.float64] = lags[tops[np.argsort(-values[tops], kind="stable")]] * step_s
+        return found_s
+
+    def delay_s(self, most_s: float) -> float:
+        """Return the delay of the largest maximum."""
+        return self._refined_s(float(self._maxima_s(most_s)[0]), most_s)
+
+    def _refined_s(self, delay_s: float, most_s: float) -> float:
+        """Return the maximum next to a delay by Newton's method, within the limits."""
+        for _ in range(_N_STEPS):
+            turned = self._weighted * np.exp(1j * self._omega * delay_s)
+            curvature = float((self._omega**2 * turned.real).sum())
+            if curvature <= 0:
+                break
+            delay_s -= float((self._omega * turned.imag).sum()) / curvature
+        return min(max(delay_s, -most_s), most_s)
+
+    def result(self, first: int, second: int, most_s: float) -> TimeDifference:
+        """Return the time difference up to a largest one, and its uncertainty."""
+        maxima_s = self._maxima_s(most_s)
+        found_s = self._refined_s(float(maxima_s[0]), most_s)
+        here = self._correlation(found_s)
+        uncertainty_s = self._uncertainty_s(found_s, here, maxima_s[1:]) if abs(found_s) < most_s else math.inf
+        return TimeDifference(first, second, found_s, uncertainty_s, here / max(self._most, _TINY))
+
+    def _uncertainty_s(self, found_s: float, here: float, others_s: NDArray[np.float64]) -> float:
+        """Return the uncertainty of a maximum beside others."""
+        if not self._is_coherent or self._n_blocks <= 2:
+            return math.inf
+        turned = self._weighted * np.exp(1j * self._omega * found_s)
+        curvature = float((self._omega**2 * turned.real).sum())
+        if curvature <= 0:
+            return math.inf
+        variance = float((self._omega**2 * self._noise).sum()) / curvature**2
+        # A window widens the band of a sound by up to three frequencies.
+        width = self._evidence.sum() ** 2 / (self._evidence**2).sum()
+        offset = (self._omega - np.average(self._omega, weights=self._evidence)) * max(0.0, 1 - _WIDENED / width)
+        odds, squares = 1.0, 0.0
+        for other_s in others_s.tolist():
+            apart = np.abs(1 - np.exp(1j * offset * (other_s - found_s))) ** 2
+            spread = math.sqrt(float((apart * self._noise).sum()))
+            lead = min(here - self._correlation(other_s), float((self._evidence * apart).sum()) / 2)
+            wrong = float(scipy.special.ndtr(-lead / max(spread, _TINY)))
+            odds += wrong / (1 - wrong)
+            squares += wrong / (1 - wrong) * (other_s - found_s) ** 2
+        return math.sqrt(variance + squares / odds)
+
+
+def _leaked(size: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how much each frequency may contain of the sound of others, through a Hann window."""
+    leaked = np.zeros_like(size)
+    for apart, share in enumerate(_LEAKED_SHARES, start=1):
+        np.maximum(leaked[apart:], share * size[:-apart], out=leaked[apart:])
+        np.maximum(leaked[:-apart], share * size[apart:], out=leaked[:-apart])
+    return leaked
