@@ -312,7 +312,7 @@ ORIGIN = View(np.zeros(3), np.eye(3), np.zeros((6, 6)))
 def everywhere(n_dimensions=2, reach_m=3.0, step_m=0.05):
     """Coverage of sensors that hear everything."""
     grid = directions_around(n_dimensions, reach_m, step_m)
-    return Coverage(grid, np.ones((grid.n_directions, grid.n_ranges)))
+    return Coverage(grid, *np.ones((2, grid.n_directions, grid.n_ranges)))
 
 
 def limit_nothing(monkeypatch, **trust):
@@ -443,7 +443,7 @@ def test_strength_of_points_grows_with_their_amplitude_relative_to_the_usual_one
 
 
 def test_coverage_is_that_of_the_emitters_beam_and_of_the_ranges():
-    coverage = Coverage.of(mounted_sensors(AHEAD), [(0.4, 4.0)], ertis.Settings(), [0.012], 0.05)
+    coverage = Coverage.of(mounted_sensors(AHEAD), [(0.4, 4.0)], ertis.Settings(), [0.012], 0.05, heard_m=[9.0])
     ahead, beside, behind = (coverage.weight[180 + azimuth_deg] for azimuth_deg in (0, 80, -180))
     assert ahead[4] == 0  # at 0.2 m, before the first range
     assert ahead[12] > 0.8 > ahead[40] > ahead[70] > 0

@@ -70,7 +70,7 @@ def write_fused(
         clocks = _clock_check(mountings, groups, by_name)
         for text in clocks.warnings():
             options.warn(text)
-        incomplete = 0
+        incomplete = empty = 0
         writer = stack.enter_context(
             EnergyscapeWriter(target, overwrite=force, mounting={PLATFORM: ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})
         )
@@ -80,7 +80,9 @@ def write_fused(
                 incomplete += bool(fused.missing)
                 if fused.missing:
                     options.note(f"pulse {number} has no image of {', '.join(fused.missing)}", quiet=quiet)
+                empty += fused.is_empty
                 writer.write(_numbered(fused, number))
+    _pulses.note_empty(empty, len(groups), quiet=quiet)
     pulses = options.counted(len(groups), "pulse")
     options.say(f"{target}: {pulses} of {', '.join(by_name)}, fused", quiet=quiet)
     if as_json:
@@ -89,6 +91,7 @@ def write_fused(
             "sensors": list(by_name),
             "pulses": len(groups),
             "incomplete": incomplete,
+            "empty": empty,
             "left_out": active.n_passive,
         }
         warnings = [*clocks.warnings(), *pipelines.warnings]

@@ -69,10 +69,11 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
                 "sensors": list(fused.sensors),
                 "missing": list(fused.missing),
                 "unheard": list(fused.unheard),
+                "without_echo": list(fused.without_echo),
             }
         )
         return
-    place = "no reflector"
+    place = "no echo above noise" if fused.is_empty else "no reflector"
     if nearest is not None:
         x, y, _ = fused.points.position_m[nearest].tolist()
         place = f"{range_m[nearest]:.3f} m at {math.degrees(math.atan2(y, x)):+.1f}°"

@@ -25,6 +25,7 @@ __all__ = [
     "StampedIndex",
     "image_settings",
     "mountings_of",
+    "note_empty",
     "open_sensors",
     "processing",
     "pulse_groups",
@@ -43,6 +44,13 @@ def processing(command: "Callable[..., Any]") -> "Callable[..., Any]":
     ):
         command = option(command)
     return command
+
+
+def note_empty(n_empty: int, n_pulses: int, *, quiet: bool) -> None:
+    """State the number of pulses whose images hold nothing but noise."""
+    if n_empty:
+        pulses = options.counted(n_pulses, "pulse")
+        options.note(f"{n_empty} of {pulses} carried no echo above the noise", quiet=quiet)
 
 
 def open_sensors(paths: "Sequence[Path]", stack: ExitStack, *, images: bool = False) -> "list[Any]":

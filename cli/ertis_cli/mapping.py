@@ -132,7 +132,8 @@ def mapping(
             for group in shown:
                 mapper.add([pipelines.image(by_name[name][place.index]) for name, place in group.items()], trajectory)
     occupancy = mapper.map
-    if height_m is not None and not mapper.n_points:
+    _pulses.note_empty(mapper.n_empty, len(located), quiet=quiet)
+    if height_m is not None and not mapper.n_points and mapper.n_empty < len(located):
         _report_heights(occupancy, height_m, quiet=quiet)
     written = write_map(target, occupancy, overwrite=force, probabilities=probabilities)
     if len(located) < len(groups):
@@ -140,6 +141,7 @@ def mapping(
         options.note(f"{left_out} of {len(groups)} outside of the time of the poses left out", quiet=quiet)
     report = _report(written, readers, occupancy) | {
         "left_out": active.n_passive + len(groups) - len(located),
+        "empty": mapper.n_empty,
         "notes": list(trajectory.notes),
     }
     size = " × ".join(f"{side_m:.2f}" for side_m in report["size_m"])

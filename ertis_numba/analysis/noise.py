@@ -7,12 +7,16 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.frames import Energyscape
+from ertis_numba.settings import Processing
 
-__all__ = ["medians_of", "noise_of", "threshold_of"]
+__all__ = ["echo_floor", "medians_of", "noise_of", "threshold_of"]
 
 _ROUNDING = 10 ** (-140 / 20)  # For one-bit microphones: their noise is at least 40 dB above, arithmetic 10 dB below.
 _SAMPLE = 32_768  # Number of bins from which the noise is estimated, with an accuracy of 1 %.
 _BLOCKS = 16  # Number of blocks of ranges with separate estimates of the noise.
+_LONG_BLOCKS = 4  # The same for the noise of single directions.
+_DENSE = 131_072  # Number of bins from which the noise of all directions is estimated.
+_CAPON = 1.5  # Exponent of the amplitude of noise.
 _QUIET = 1 / 3  # Quantile of these estimates: side lobes raise those near echoes, and chance lowers the lowest.
 
 
@@ -83,3 +87,47 @@ def threshold_of(image: Energyscape, false_alarm: float) -> float:
     checks.between("false_alarm", false_alarm, 1e-12, 1.0)
     smallest = _ROUNDING if image.settings.recording.is_pdm else 0.0
     return max(smallest, noise_of(image) * math.sqrt(math.log(max(1, image.amplitude.size) / false_alarm)))
+
+
+def echo_floor(image: Energyscape, false_alarm: float) -> NDArray[np.float32]:
+    """Return the amplitude that noise reaches anywhere in an image with a given probability: (direction,) float32.
+
+    Unlike `threshold_of`, it follows noise that differs between directions, such as that of a machine, and it holds for
+    all beamformers and for cleaned images. The amplitude of others is about a power of that of delay-and-sum. Cleaned
+    images keep the strongest direction of each range, which has the distribution of a single one at the worst.
+
+    Parameters
+    ----------
+    image : Energyscape
+    false_alarm : float
+        Probability that at least one bin of the image exceeds the floor, approximately.
+    """
+    settings, amplitude = image.settings, image.amplitude
+    n_directions, n_ranges = amplitude.shape
+    exponent = _exponent(settings.processing)
+    if settings.processing.is_cleaned:
+        strongest = amplitude.max(axis=0, keepdims=True)
+        median = _quiet(_medians_of_blocks(strongest, min(_BLOCKS, n_ranges))[None])
+    else:
+        some = amplitude[:, :: max(1, amplitude.size // _DENSE)]
+        width = max(1, some.shape[1] // _LONG_BLOCKS)
+        medians = medians_of(some[:, : some.shape[1] // width * width].reshape(-1, width)).reshape(n_directions, -1)
+        median = np.maximum(_quiet(medians), _quiet(medians_of(np.ascontiguousarray(medians.T))[None]))
+    ratio = (math.log(amplitude.size / false_alarm) / math.log(2)) ** (exponent / 2)
+    smallest = 0.0 if settings.recording.encoding == "float32" else _ROUNDING**exponent
+    return np.broadcast_to(np.maximum(smallest, ratio * median).astype(np.float32), n_directions)
+
+
+def _quiet(medians: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the lower tercile of the medians of blocks: (row,) float64, from (row, block)."""
+    return np.asarray(np.quantile(medians.astype(np.float64), _QUIET, axis=1))
+
+
+def _exponent(processing: Processing) -> float:
+    """Return the power of the amplitude of delay-and-sum that the amplitude of noise is proportional to, about.
+
+    The coherence factor multiplies it by its square, relative to the power of all microphones. That of ``capon`` also
+    holds for noise of a narrow band.
+    """
+    own = {"dmas": float(processing.dmas_order), "capon": _CAPON}.get(processing.beamformer, 1.0)
+    return own + (2.0 if processing.weighting == "coherence_factor" else 0.0)

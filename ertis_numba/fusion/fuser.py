@@ -13,7 +13,7 @@ from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.pulses import is_same_pulse
 from ertis_numba.fusion.rig import Mountings, emitter_diameter_m, mounted_sensors
-from ertis_numba.fusion.tables import FusionTables
+from ertis_numba.fusion.tables import FusionTables, Located
 from ertis_numba.settings import MAX_EMITTER_M
 
 __all__ = ["Fused", "Fuser", "fuse"]
@@ -33,7 +33,7 @@ class Fused:
         is that of the earliest image, with the sensor ``base_link``.
     points : PointCloud
         Reflectors in the frame of the platform, with uncertainties. They are computed at the first access, which takes
-        about as long as the image.
+        about as long as the image. Echoes that do not exceed the noise of their image yield none.
     sensors : tuple of str
         Sensors whose images were fused.
     missing : tuple of str
@@ -41,6 +41,11 @@ class Fused:
     unheard : tuple of str
         Sensors whose calls no other sensor hears, although it should. Their emitters may be broken, or they are not on
         the same SYNC chain. They are fused without foreign echoes.
+    without_echo : tuple of str
+        Fused sensors whose images hold no echo above their noise. If it names all, the pulse carried nothing. Computed
+        with the points.
+    noise : dict of str to float
+        Amplitude that noise hardly reaches in the image of each fused sensor; infinite if the image consists of zeros.
 
     Examples
     --------
@@ -58,12 +63,32 @@ class Fused:
     sensors: tuple[str, ...]
     missing: tuple[str, ...]
     unheard: tuple[str, ...]
-    _locate: Callable[[], PointCloud] = field(repr=False)
+    _locate: Callable[[], Located] = field(repr=False)
+    _names: tuple[str, ...] = field(repr=False)
 
     @functools.cached_property
+    def _located(self) -> Located:
+        return self._locate()
+
+    @property
     def points(self) -> PointCloud:
         """Reflectors in the frame of the platform."""
-        return self._locate()
+        return self._located.points
+
+    @property
+    def without_echo(self) -> tuple[str, ...]:
+        """Fused sensors whose images hold no echo above their noise."""
+        return tuple(self._names[number] for number in self._located.without_echo)
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Amplitude that noise hardly reaches in the image of each fused sensor."""
+        return {self._names[number]: floor for number, floor in self._located.floor.items()}
+
+    @property
+    def is_empty(self) -> bool:
+        """True if no image holds an echo above its noise, so that the pulse carried nothing."""
+        return len(self._located.without_echo) == len(self.sensors)
 
 
 class Fuser:
@@ -166,7 +191,8 @@ class Fuser:
             sensors=tuple(self._mountings[number].name for number in group),
             missing=tuple(sensor.name for number, sensor in enumerate(self._mountings) if number not in group),
             unheard=tuple(self._mountings[number].name for number in sorted(found.unheard)),
-            _locate=lambda: tables.points(group, found, image),
+            _locate=lambda: tables.located(group, found, image),
+            _names=self.sensors,
         )
 
     def has_tables(self, images: Iterable[Energyscape]) -> bool:

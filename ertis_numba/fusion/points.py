@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.noise import echo_floor
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.association import Reflectors, SensorEchoes, tangents
@@ -22,6 +23,7 @@ __all__ = ["PointFuser", "joined"]
 Floats = NDArray[np.float64]
 
 _TOP: Final = 128  # Points per image.
+_FALSE_ALARM: Final = 1e-5  # Probability that noise alone yields a point of an image.
 _RANGE_SD_M: Final = 1e-3  # Errors that noise does not explain, such as those of mountings and of the air.
 _ANGLE_SD_RAD: Final = math.radians(0.25)
 _UNKNOWN_RANGE_SD_M: Final = 5e-3
@@ -56,12 +58,24 @@ class PointFuser:
         self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
         self._extract = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP)
 
-    def echoes(self, image: Energyscape, shares: Shares, late_m: Mapping[int, float]) -> SensorEchoes:
-        """Return the echoes of an image, strongest first.
+    def floor(self, image: Energyscape) -> NDArray[np.float32]:
+        """Return the amplitude that noise hardly reaches: (direction,) float32, infinite in an image of zeros."""
+        return (
+            echo_floor(image, _FALSE_ALARM)
+            if image.amplitude.any()
+            else np.full(len(image.amplitude), np.inf, np.float32)
+        )
+
+    def echoes(
+        self, image: Energyscape, floor: NDArray[np.float32], shares: Shares, late_m: Mapping[int, float]
+    ) -> SensorEchoes:
+        """Return the echoes of an image above its noise, strongest first.
 
         Parameters
         ----------
         image : Energyscape
+        floor : (direction,) float32
+            Amplitude that noise hardly reaches.
         shares : Shares
         late_m : mapping of int to float
             Path of sound between the emission of this sensor and that of each emitter.
@@ -69,7 +83,10 @@ class PointFuser:
         if self._is_deaf.any():  # Points are found relative to the strongest one, which direct sound would be.
             image = image.replace(amplitude=np.where(self._is_deaf, np.float32(0), image.amplitude))
         cloud = self._extract(image)
-        place_m, uncertainty_m = cloud.position_m.astype(np.float64), _uncertainties(cloud)
+        place_m = cloud.position_m.astype(np.float64)
+        row = np.argmax(place_m @ self._receiver.directions.T, axis=1)
+        is_heard = cloud.amplitude > floor[row]
+        place_m, uncertainty_m, row = place_m[is_heard], _uncertainties(cloud)[is_heard], row[is_heard]
         range_m = np.linalg.norm(place_m, axis=1)
         emitters = [emitter for emitter, number in shares if number == self._number]
         direction = place_m / range_m[:, None]
@@ -80,16 +97,15 @@ class PointFuser:
             path_m=2 * range_m[:, None] - np.array([late_m[emitter] for emitter in emitters]),
             path_sd_m=2 * np.hypot(uncertainty_m[:, 0], _RANGE_SD_M),
             angle_sd_rad=np.hypot(uncertainty_m[:, 1] / range_m, _ANGLE_SD_RAD),
-            power=cloud.amplitude.astype(np.float64) ** 2,
-            share=self._shares(direction, range_m, [shares[emitter, self._number] for emitter in emitters]),
+            power=cloud.amplitude[is_heard].astype(np.float64) ** 2,
+            share=self._shares(row, range_m, [shares[emitter, self._number] for emitter in emitters]),
         )
 
-    def _shares(self, direction: Floats, range_m: Floats, shares: Sequence[NDArray[np.float32]]) -> Floats:
+    def _shares(self, row: NDArray[np.int64], range_m: Floats, shares: Sequence[NDArray[np.float32]]) -> Floats:
         """Return the highest share of each emitter within one step of each echo: (echo, emitter)."""
         receiver = self._receiver
-        row = np.argmax(direction @ receiver.directions.T, axis=1)[:, None] * receiver.n_steps
         step = (range_m / receiver.step_m).astype(np.int64)[:, None] + np.arange(-1, 2)
-        near = row + step.clip(0, receiver.n_steps - 1)
+        near = row[:, None] * receiver.n_steps + step.clip(0, receiver.n_steps - 1)
         found = np.zeros((len(range_m), len(shares)))
         for column, share in enumerate(shares):
             found[:, column] = share[near].max(axis=1, initial=0.0)

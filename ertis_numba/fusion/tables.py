@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,29 @@ from ertis_numba.fusion.receivers import CoarseImage, Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
 from ertis_numba.settings import Settings
 
-__all__ = ["PLATFORM", "FusionTables"]
+__all__ = ["PLATFORM", "FusionTables", "Located"]
 
 PLATFORM: Final = "base_link"
 """Name of the platform's frame in REP 105, and of the sensor of fused images."""
 
 _DIRECT_SOUND_M: Final = 0.1  # Range before and after direct sound in which it hides echoes.
+
+
+class Located(NamedTuple):
+    """Points of a group of images.
+
+    Attributes
+    ----------
+    points : PointCloud
+    floor : dict of int to float
+        Amplitude that noise hardly reaches in the image of each sensor.
+    without_echo : list of int
+        Sensors whose images have no echo above it.
+    """
+
+    points: PointCloud
+    floor: dict[int, float]
+    without_echo: list[int]
 
 
 class FusionTables:
@@ -126,12 +143,16 @@ class FusionTables:
             stamp=replace(first.stamp, sensor=PLATFORM),
         )
 
-    def points(self, group: Mapping[int, Energyscape], attributed: Attributed, image: Energyscape) -> PointCloud:
+    def located(self, group: Mapping[int, Energyscape], attributed: Attributed, image: Energyscape) -> Located:
         """Return the points of a group."""
+        floor = {number: self._points[number].floor(each) for number, each in group.items()}
         found = [
-            self._points[number].echoes(each, attributed.shares, self._late_m[number]) for number, each in group.items()
+            self._points[number].echoes(each, floor[number], attributed.shares, self._late_m[number])
+            for number, each in group.items()
         ]
-        return joined(found, self._sensors, self._receivers, self._emitters, image, self.grid, attributed.bound)
+        points = joined(found, self._sensors, self._receivers, self._emitters, image, self.grid, attributed.bound)
+        without_echo = [each.receiver for each in found if not len(each.power)]
+        return Located(points, {number: float(each.max()) for number, each in floor.items()}, without_echo)
 
     def _same_call(self, emitter: int, number: int) -> bool:
         """Return True unless the calls are known to differ, so that the matched filter suppresses the foreign one."""

@@ -11,11 +11,13 @@ from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.rig import Emitters, MountedSensor
 from ertis_numba.settings import Settings
 
-__all__ = ["Coverage", "directions_around"]
+__all__ = ["Coverage", "directions_around", "heard_m"]
 
 Floats = NDArray[np.float64]
 
 _N_AZIMUTHS: Final = {2: 360, 3: 120}  # Directions of 1° in a plane and of 3° in space, by number of dimensions.
+_HEARD_STEP: Final = 0.9  # Ratio of the distances that `heard_m` distinguishes, so that few coverages are computed.
+_HEARD_STEPS: Final = 40
 _WEAKEST_DB: Final = -15.0  # Emitted power, relative to ahead, below which silence shows nothing.
 
 
@@ -27,6 +29,24 @@ def directions_around(n_dimensions: int, reach_m: float, step_m: float) -> Polar
     return PolarGrid(n_azimuths, rows, math.ceil(reach_m / step_m), step_m)
 
 
+def heard_m(emitters: Emitters, clear: float, floor: float, last_m: float) -> float:
+    """Return the distance from a sensor up to which a clear echo ahead exceeds the noise, at most that of its image.
+
+    Parameters
+    ----------
+    emitters : Emitters
+    clear : float
+        Amplitude of a clear echo at 1 m.
+    floor : float
+        Amplitude that noise hardly reaches in the image of the sensor.
+    last_m : float
+        Last range of the image.
+    """
+    distance_m = np.asarray(last_m * _HEARD_STEP ** np.arange(_HEARD_STEPS), np.float64)
+    is_heard = clear**2 * emitters.spreading(distance_m, distance_m) > floor**2
+    return float(distance_m[is_heard.argmax()]) if is_heard.any() else 0.0
+
+
 class Coverage(NamedTuple):
     """Part of the surroundings in which a clear echo would be heard.
 
@@ -36,10 +56,13 @@ class Coverage(NamedTuple):
         Directions and ranges.
     weight : (direction, range) float64
         0 where no sensor emits or listens, up to 1 ahead of a sensor.
+    silence : (direction, range) float64
+        The same where a clear echo would exceed the noise, and 0 elsewhere: silence shows nothing there.
     """
 
     grid: PolarGrid
     weight: Floats
+    silence: Floats
 
     @property
     def reach_m(self) -> float:
@@ -60,6 +83,7 @@ class Coverage(NamedTuple):
         diameters_m: Sequence[float],
         step_m: float,
         *,
+        heard_m: Sequence[float],
         height_m: float | None = None,
     ) -> Self:
         """Return the coverage of sensors that emit.
@@ -74,6 +98,8 @@ class Coverage(NamedTuple):
         diameters_m : sequence of float
             Diameter of each sensor's emitter.
         step_m : float
+        heard_m : sequence of float
+            Distance from each sensor up to which a clear echo exceeds the noise of its image.
         height_m : float, optional
             Height on the platform of the centre of the directions in space; by default, directions are those of a plane
             through each sensor.
@@ -85,8 +111,8 @@ class Coverage(NamedTuple):
         )
         grid = directions_around(2 if height_m is None else 3, reach_m, step_m)
         place_m = grid.directions[:, None] * grid.range_m[:, None]
-        weight = np.zeros(place_m.shape[:2])
-        for number, (sensor, (first_m, last_m)) in enumerate(zip(sensors, limits_m, strict=True)):
+        weight, silence = np.zeros((2, *place_m.shape[:2]))
+        for number, (sensor, (first_m, last_m), end_m) in enumerate(zip(sensors, limits_m, heard_m, strict=True)):
             centre_m = [0.0, 0.0, sensor.translation_m[2] if height_m is None else height_m]
             local_m = sensor.local_m(place_m + centre_m)
             distance_m = np.linalg.norm(local_m, axis=-1)
@@ -95,4 +121,5 @@ class Coverage(NamedTuple):
             # Silence means less at long ranges, because spreading and oblique walls make echoes weak.
             heard *= (distance_m >= first_m) * np.clip(1 - distance_m / last_m, 0.0, 1.0)
             np.maximum(weight, heard, out=weight)
-        return cls(grid, weight)
+            np.maximum(silence, heard * (distance_m <= end_m), out=silence)
+        return cls(grid, weight, silence)

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["LocatedEchoes", "UsualAmplitude", "View", "displaced_covariance", "echoes_of"]
+__all__ = ["CLEAR", "LocatedEchoes", "UsualAmplitude", "View", "displaced_covariance", "echoes_of"]
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -15,6 +15,9 @@ _USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that defines the
 # Amplitude at which half of the points are ghosts, relative to the usual amplitude. It comes from a logistic regression
 # of points in simulated places, without obstacles in front of them.
 _GHOST: Final = 0.08
+CLEAR: Final = 0.9
+"""Probability of a clear echo."""
+_CLEAR_AMPLITUDE: Final = _GHOST * math.sqrt(CLEAR / (1 - CLEAR))  # The same relative to the usual amplitude.
 _SMOOTHING: Final = 0.1  # Weight of a new pulse in the usual amplitude.
 # Errors of positions that noise does not explain: overlapping echoes of rough walls, mountings and poses.
 _RANGE_SD_M: Final = 0.01
@@ -112,6 +115,11 @@ class UsualAmplitude:
 
     def __init__(self) -> None:
         self._usual: float | None = None
+
+    @property
+    def clear(self) -> float:
+        """Amplitude from which an echo is clear; 0 without any echo so far."""
+        return 0.0 if self._usual is None else _CLEAR_AMPLITUDE * self._usual
 
     def strength(self, amplitude: Singles) -> Floats:
         """Return the probability that the points of a pulse are reflectors: (point,) float64.

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,17 @@ from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Trajectory
 from ertis_numba.fusion import Fused, Fuser
-from ertis_numba.fusion.rig import Mountings, emitter_diameter_m, mounted_sensors
+from ertis_numba.fusion.rig import Emitters, Mountings, emitter_diameter_m, mounted_sensors
 from ertis_numba.geometry import mounting
 from ertis_numba.mapping.attitude_check import AttitudeCheck
 from ertis_numba.mapping.cell_grid import CellGrid
-from ertis_numba.mapping.coverage import Coverage
+from ertis_numba.mapping.coverage import Coverage, heard_m
 from ertis_numba.mapping.echoes import LocatedEchoes, UsualAmplitude, View, displaced_covariance, echoes_of
 from ertis_numba.mapping.sensor_model import add_evidence
 from ertis_numba.motion import compensate_motion
+
+if TYPE_CHECKING:
+    from ertis_numba.settings import Air, Call
 
 __all__ = ["Mapper", "Pose"]
 
@@ -38,8 +41,9 @@ class Mapper:
     Echoes are fused (`Fuser`) and located. Each point adds evidence to the cells of its uncertainty ellipse, or in a
     map of three dimensions, of its ellipsoid. Occupied cells lose evidence in pulses that do not return their echo.
     Cells in front of the first clear echo of a direction become free, but less so at larger distances. A smooth wall
-    that the sound meets obliquely returns no echo, so silence alone shows free space near the platform only. Uncertain
-    poses spread the evidence of echoes, and shorten free space.
+    that the sound meets obliquely returns no echo, so silence alone shows free space near the platform only, and only
+    as far as a clear echo would exceed the noise. Noise is no echo: without any echo so far, only the place of the
+    platform is free. Uncertain poses spread the evidence of echoes, and shorten free space.
 
     Parameters
     ----------
@@ -99,9 +103,10 @@ class Mapper:
         self._near_m = float(np.hypot(*places_m.T[:2]).max())
         self._centre_m = np.array([0.0, 0.0, places_m[:, 2].mean()])  # Origin of directions in space, at the sensors.
         self._grid = CellGrid(self._cell_m, self._dimensions, self._height_m)
-        self._usual = UsualAmplitude()
-        self._coverages: dict[tuple[tuple[str, float, float, float], ...], Coverage] = {}
-        self._n_groups, self._time_ns, self._n_points = 0, 0, 0
+        self._usual, self._heard = UsualAmplitude(), UsualAmplitude()  # within the limits of height, and anywhere
+        self._coverages: dict[tuple[tuple[str, float, float, float, float], ...], Coverage] = {}
+        self._emitters: dict[tuple[Call, Air], Emitters] = {}
+        self._n_groups, self._time_ns, self._n_points, self._n_empty = 0, 0, 0, 0
         self._attitude = AttitudeCheck()
 
     @property
@@ -114,6 +119,11 @@ class Mapper:
     def n_points(self) -> int:
         """Number of points of all groups so far that lie within the heights."""
         return self._n_points
+
+    @property
+    def n_empty(self) -> int:
+        """Number of groups so far whose images hold no echo above their noise."""
+        return self._n_empty
 
     def add(self, images: Iterable[Energyscape], pose: Pose, *, fused: Fused | None = None) -> None:
         """Add the images of one SYNC pulse.
@@ -154,14 +164,15 @@ class Mapper:
         time_ns = fused.image.stamp.timestamp_ns
         translation_m, rotation, covariance = _pose(pose, time_ns)
         self._attitude(pose, translation_m, rotation)
-        coverage = self._coverage(group)
         view = self._view(translation_m, rotation, covariance)
-        window = self._grid.window(view.place_m, coverage.reach_m)
-        self._decay(time_ns)
         points = _at_rest(fused.points, pose, rotation) if isinstance(pose, Trajectory) else fused.points
         echoes = self._echoes(points, translation_m, rotation, view)
+        coverage = self._coverage(group, fused)
+        window = self._grid.window(view.place_m, coverage.reach_m)
+        self._decay(time_ns)
         add_evidence(window, view, echoes, coverage, near_m=self._near_m)
         self._n_groups += 1
+        self._n_empty += fused.is_empty
         self._time_ns = max(time_ns, self._time_ns)
 
     def _view(self, translation_m: Floats, rotation: Floats, covariance: Floats) -> View:
@@ -192,7 +203,7 @@ class Mapper:
             )
         self._grid.log_odds *= np.float32(0.5 ** (after_s / self._half_life_s))
 
-    def _coverage(self, group: Sequence[Energyscape]) -> Coverage:
+    def _coverage(self, group: Sequence[Energyscape], fused: Fused) -> Coverage:
         """Return the coverage of the sensors of a group that emitted."""
         emitted = [image for image in group if image.stamp.behaviour != "passive"]
         if not emitted:
@@ -200,7 +211,9 @@ class Mapper:
         limits_m = [(float(image.range_m[0]), float(image.range_m[-1])) for image in emitted]
         names = [image.stamp.sensor for image in emitted]
         diameters_m = [emitter_diameter_m(image.settings, self._given_m) for image in emitted]
-        key = tuple((name, *limits, each) for name, limits, each in zip(names, limits_m, diameters_m, strict=True))
+        ends_m = [self._heard_m(image, fused) for image in emitted]
+        each = zip(names, limits_m, diameters_m, ends_m, strict=True)
+        key = tuple((name, *limits, diameter_m, end_m) for name, limits, diameter_m, end_m in each)
         if key not in self._coverages:
             self._coverages[key] = Coverage.of(
                 [self._mountings[name] for name in names],
@@ -208,9 +221,20 @@ class Mapper:
                 emitted[0].settings,
                 diameters_m,
                 self._cell_m / 2,
+                heard_m=ends_m,
                 height_m=float(self._centre_m[2]) if self._dimensions == 3 else None,
             )
         return self._coverages[key]
+
+    def _heard_m(self, image: Energyscape, fused: Fused) -> float:
+        """Return the distance up to which a clear echo of a sensor's call exceeds the noise of its image."""
+        sensor, settings = image.stamp.sensor, image.settings
+        if sensor in fused.unheard:
+            return 0.0
+        key = settings.call, settings.air
+        if key not in self._emitters:
+            self._emitters[key] = Emitters(settings, [0.0])
+        return heard_m(self._emitters[key], self._heard.clear, fused.noise[sensor], float(image.range_m[-1]))
 
     def _echoes(self, points: PointCloud, translation_m: Floats, rotation: Floats, view: View) -> LocatedEchoes:
         """Return the points within the limits of height, in the frame of a view."""
@@ -222,6 +246,7 @@ class Mapper:
             offset_m[:, 2] = 0.0
         uncertainty_m = np.zeros((len(points), 2)) if points.uncertainty_m is None else points.uncertainty_m
         strength = self._usual.strength(points.amplitude[kept])
+        self._heard.strength(points.amplitude)
         return echoes_of(offset_m, np.asarray(uncertainty_m, np.float64)[kept], strength, self._dimensions)
 
 

@@ -13,7 +13,7 @@ from scipy.special import expit, logit
 from ertis_numba import kernels
 from ertis_numba.mapping.cell_grid import Window
 from ertis_numba.mapping.coverage import Coverage
-from ertis_numba.mapping.echoes import LocatedEchoes, View
+from ertis_numba.mapping.echoes import CLEAR, LocatedEchoes, View
 
 __all__ = ["MAX_LOG_ODDS", "TRUST", "Trust", "add_evidence"]
 
@@ -30,7 +30,6 @@ _BEHIND_M: Final = 0.3  # Distance behind an obstacle within the beam from which
 _DEPTH_M: Final = 0.05  # The same for a wall of the map in the direction of the echo: the thickness of its cells.
 _WALL: Final = 1.5  # Log-odds from which a cell hides those behind it.
 _OPEN: Final = -0.5  # Log-odds below which a cell lets sound pass.
-_CLEAR: Final = 0.9  # Probability of a clear echo.
 _CERTAIN: Final = 0.9975  # Highest probability, which is the share of reflectors among the strongest points.
 # Angles between the middles of directions; the quarters of a degree make room for rounding.
 _HALF_BEAM_RAD: Final = math.radians(5.25)  # Directions beside an echo in which it may hide others.
@@ -123,7 +122,7 @@ def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Co
     is_ahead = grid.range_m < (hiding_m + _BEHIND_M)[:, None]
     # If the pose is uncertain, the echo of a cell may appear in another cell.
     missed = trust.missed / (1 + (position_sd_m**2 + (rotation_sd_rad * grid.range_m) ** 2) / window.cell_m**2)
-    free = (coverage.weight * np.where(is_free, _FREE, np.where(is_ahead, -missed, 0.0))).astype(np.float32)
+    free = (coverage.silence * np.where(is_free, _FREE, np.where(is_ahead, -missed, 0.0))).astype(np.float32)
     kernel.add_evidence(
         _occupied(window, view, echoes, log_odds, trust),
         np.float32(_TOUCHED),
@@ -147,7 +146,7 @@ def _direction(coverage: Coverage, echoes: LocatedEchoes) -> Places:
 
 def _first_clear_m(echoes: LocatedEchoes, cosine: Floats) -> Floats:
     """Return the range of the first clear echo in each direction, infinite without one: (direction,) float64."""
-    is_clear = echoes.strength > _CLEAR
+    is_clear = echoes.strength > CLEAR
     is_near = cosine[is_clear] > math.cos(_HALF_BEAM_RAD)
     return np.asarray(np.where(is_near, echoes.range_m[is_clear, None], np.inf).min(axis=0, initial=np.inf))
 
@@ -163,7 +162,7 @@ def _end_m(
     if not position_sd_m and not rotation_sd_rad:
         return np.asarray(end_m)
     end_m -= _POSE_SD * position_sd_m
-    is_clear = echoes.strength > _CLEAR
+    is_clear = echoes.strength > CLEAR
     range_m = echoes.range_m[is_clear]
     across_rad = _POSE_SD * (position_sd_m / np.maximum(range_m, _IN_FRONT_M) + rotation_sd_rad)
     is_near = cosine[is_clear] > np.cos(np.minimum(_HALF_BEAM_RAD + across_rad, math.pi))[:, None]

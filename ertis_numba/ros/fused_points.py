@@ -8,7 +8,7 @@ import numpy as np
 
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.fusion.fuser import Fuser
+from ertis_numba.fusion.fuser import Fused, Fuser
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.interop._mountings import Mounting
 
@@ -41,6 +41,7 @@ class FusedImages:
         self._note, self._noted = on_note, ""
         self._groups: PulseGroups[Energyscape] = PulseGroups(on_note)
         self._fuser: tuple[dict[str, Mounting], Fuser] | None = None
+        self._n_empty = 0
 
     def add(self, image: Energyscape, mountings: Mapping[str, Mounting]) -> list[Energyscape]:
         """Add an image, and return the fused images that are complete now, with their points.
@@ -76,9 +77,22 @@ class FusedImages:
             self._fuser = near, Fuser(near)
         images = [*group.values()]
         fused = self._fuser[1](image for image in images if image.is_planar == images[0].is_planar)
+        self._note_empty(fused)
         stamp = replace(fused.image.stamp, sensor=LOCAL_FRAME if any(origin_m) else PLATFORM_FRAME)
         points = fused.points.replace(stamp=stamp, translation_m=origin_m)
         return fused.image.replace(stamp=stamp, points=points)
+
+    def _note_empty(self, fused: Fused) -> None:
+        """State when pulses begin to carry nothing but noise, and when they end."""
+        count = fused.image.stamp.sync_count
+        if not fused.is_empty:
+            if self._n_empty:
+                self._note(f"SYNC pulse {count} has echoes again, after {self._n_empty} without any above the noise")
+            self._n_empty = 0
+            return
+        if not self._n_empty:
+            self._note(f"SYNC pulse {count} carried no echo above the noise")
+        self._n_empty += 1
 
 
 def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:
