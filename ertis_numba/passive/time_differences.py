@@ -232,10 +232,12 @@ class _Correlator:
     ) -> "_CrossSpectrum":
         """Return the cross-spectrum of blocks, the second of which are late by a time."""
         cross = (second * first.conj()).mean(axis=0, dtype=np.complex128)
-        power = [(np.abs(each) ** 2).mean(axis=0, dtype=np.float64) for each in (first, second)]
+        power: list[NDArray[np.float64]] = [
+            (np.abs(each) ** 2).mean(axis=0, dtype=np.float64) for each in (first, second)
+        ]
         return _CrossSpectrum(
             cross * np.exp(-1j * self._omega * (late_s - own_s)),
-            np.sqrt(power[0] * power[1], dtype=np.float64),
+            np.asarray(np.sqrt(power[0] * power[1]), np.float64),
             self._omega,
             self._chosen,
             len(first),
