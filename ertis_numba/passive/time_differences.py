@@ -196,7 +196,7 @@ class _Correlator:
                 f"band_hz {band_hz[0]:g} to {band_hz[1]:g} contains none of the frequencies {frequency_hz[1]:g} "
                 "Hz apart; give a wider band, or a smaller resolution_hz"
             )
-        self._omega = 2 * np.pi * frequency_hz
+        self._omega = 2 * np.pi * np.asarray(frequency_hz, np.float64)
         self._signals, self._n_block, self._weighting = signals, n_block, weighting
         self._spectra = [self._spectra_of(row) for row in signals.rows]
 
@@ -237,7 +237,7 @@ class _Correlator:
         ]
         return _CrossSpectrum(
             cross * np.exp(-1j * self._omega * (late_s - own_s)),
-            np.asarray(np.sqrt(power[0] * power[1]), np.float64),
+            np.sqrt(power[0] * power[1]),
             self._omega,
             self._chosen,
             len(first),

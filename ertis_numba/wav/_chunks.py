@@ -138,10 +138,10 @@ def _require_single(content: Content, chunks: Chunks, name: bytes, place: int) -
                 "program that wrote it"
             )
     if name == b"data" and name in chunks.places:
-        first = quoted(path.with_name(f"{path.stem}_first.wav"))
+        copy = quoted(path.with_name(f"{path.stem}_first.wav"))
         raise DataError(
             f"{path} has data chunks at bytes {chunks.places[name]} and {place}; keep the samples of the first with "
-            f"'sox {quoted(path)} {first}'"
+            f"'sox {quoted(path)} {copy}'"
         )
     if name in _FILES:
         raise DataError(
