@@ -19,7 +19,7 @@ _FOLDERS: Final = (("ertis_examples", ()), (_RECORDINGS, ()), (_RECORDINGS, ("sc
 """Packages, and folders in them, with examples."""
 
 _SUFFIXES: Final = {".toml", ".py", ".rviz"}
-_TOOLS: Final = {"__init__.py", "build.py", "gallery.py"}
+_TOOLS: Final = {"__init__.py", "build.py", "gallery.py", "hall.py"}
 """Files of these packages that are not examples."""
 
 
