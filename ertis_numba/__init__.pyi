@@ -32,6 +32,7 @@ from .errors import (
     SettingsError as SettingsError,
     SonarDisconnectedError as SonarDisconnectedError,
     SonarError as SonarError,
+    StartMismatchWarning as StartMismatchWarning,
 )
 from .figures import plot as plot
 from .frames import (

@@ -17,9 +17,10 @@
     └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
         └── RefusedError                 it denies access or rejects a request
 
-Each class also inherits the built-in exception in brackets. Seven warnings, all ``UserWarning``, complete them:
+Each class also inherits the built-in exception in brackets. Eight warnings, all ``UserWarning``, complete them:
 ``ErrorBudgetWarning`` for images that may exceed their error budget, ``CallMismatchWarning`` for echoes that do not
-match the call, ``LayoutMismatchWarning`` for echoes that do not match the layout, ``LayoutUnitWarning`` for files of
+match the call, ``StartMismatchWarning`` for records that do not begin with the emission,
+``LayoutMismatchWarning`` for echoes that do not match the layout, ``LayoutUnitWarning`` for files of
 positions that state no unit, ``CoarseGridWarning`` for directions that miss sources between them,
 ``OutsideBandsWarning`` for sound that the bands of acoustic maps leave out, and ``PoseWarning`` for files of poses
 with doubtful rows, and poses that are hardly those of a platform.
@@ -47,6 +48,7 @@ __all__ = [
     "SettingsError",
     "SonarDisconnectedError",
     "SonarError",
+    "StartMismatchWarning",
 ]
 
 
@@ -112,6 +114,10 @@ class ErrorBudgetWarning(UserWarning):
 
 class CallMismatchWarning(UserWarning):
     """Echoes do not match the call in the settings, so that ranges in images are wrong."""
+
+
+class StartMismatchWarning(UserWarning):
+    """Direct sound arrives at another time than from the emitter, so that ranges in images are wrong."""
 
 
 class LayoutMismatchWarning(UserWarning):

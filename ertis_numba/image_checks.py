@@ -1,18 +1,18 @@
-"""Checks of the images of a pipeline: coarse directions, echoes of another call or layout, and errors."""
+"""Checks of the images of a pipeline: coarse directions, sound that contradicts the settings, and errors."""
 
 import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from ertis_numba.analysis.call_match import call_match
 from ertis_numba.analysis.direction_spacing import spacing_warning
-from ertis_numba.analysis.layout_match import layout_match
+from ertis_numba.analysis.sound_checks import SoundChecks, Subject
 from ertis_numba.errors import (
     CallMismatchWarning,
     CoarseGridWarning,
     DeviceError,
     ErrorBudgetWarning,
     LayoutMismatchWarning,
+    StartMismatchWarning,
 )
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.kernels import KernelSet
@@ -24,8 +24,11 @@ if TYPE_CHECKING:
 
 __all__ = ["ImageChecks"]
 
-_MATCHES: Final = ((call_match, CallMismatchWarning), (layout_match, LayoutMismatchWarning))
-_MAX_CHECKS: Final = 8  # Measurements that are compared with the settings, if they contain no sound.
+_CATEGORIES: Final[dict[Subject, type[UserWarning]]] = {
+    "call": CallMismatchWarning,
+    "start": StartMismatchWarning,
+    "layout": LayoutMismatchWarning,
+}
 _CALLER: Final = 5  # Frames from a warning to the caller of `Pipeline.process`.
 
 
@@ -49,7 +52,7 @@ class ImageChecks:
         self._monitor = BudgetMonitor(kernel_set, threads) if has_budget else None
         self._warned = False
         self._is_grid_checked = kernel_set.simulated
-        self._remaining = {} if kernel_set.simulated else dict.fromkeys(_MATCHES, _MAX_CHECKS)
+        self._sound = None if kernel_set.simulated else SoundChecks()
 
     @property
     def prediction(self) -> "Prediction | None":
@@ -72,17 +75,11 @@ class ImageChecks:
             warnings.warn(text, CoarseGridWarning, stacklevel=_CALLER)
 
     def _check_sound(self, measurement: Measurement) -> None:
-        """Compare echoes with call and layout in the first measurements, until one has sound above the noise."""
-        for check in [*self._remaining]:
-            compare, category = check
-            match = compare(replace(measurement, settings=self._settings))
-            self._remaining[check] -= 1
-            if match is not None or not self._remaining[check]:
-                del self._remaining[check]
-            if match is not None and match.warning:
-                warnings.warn(match.warning, category, stacklevel=_CALLER)
-                self._remaining.clear()  # The filter of another call does not find the times of arrival.
-                return
+        """Compare the sound of a measurement with the settings."""
+        if self._sound is None:
+            return
+        for subject, text in self._sound.check(replace(measurement, settings=self._settings)):
+            warnings.warn(text, _CATEGORIES[subject], stacklevel=_CALLER)
 
     def _check_budget(self, image: Energyscape, measurement: Measurement) -> None:
         """Predict the error of an image if it needs a prediction, and issue the warning once."""

@@ -1,18 +1,20 @@
 """Call match: recordings made with another call are reported, healthy ones are not."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_bench import budgets
 from ertis_cli.main import cli
+from scipy.signal import chirp
 
 from ertis_numba.analysis.call_match import call_match, first_call_match
 from ertis_numba.errors import CallMismatchWarning
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Processing, Recording, Settings
+from ertis_numba.settings import Array, Call, Processing, Recording, Settings
 from ertis_numba.storage import open_energyscapes, write_recording
 from ertis_numba.waveform import call_at
 
@@ -41,8 +43,10 @@ def test_call_match_finds_sweeps_of_the_opposite_direction(modulation, noise):
     settings = SETTINGS.replace(call=CALL.replace(modulation=modulation))
     found = call_match(heard(REVERSED.replace(modulation=modulation), noise=noise, settings=settings))
     assert not found.matches
-    assert found.slope == pytest.approx(-1, abs=0.1)
-    assert f"{modulation} sweep in the opposite direction" in found.warning
+    assert (found.sweep.modulation, found.sweep.start_hz < found.sweep.stop_hz) == (modulation, True)
+    assert found.sweep.duration_s == pytest.approx(CALL.duration_s, rel=0.2)
+    assert re.search(rf"{modulation} sweep from about 2\d to", found.warning)
+    assert "in the opposite direction" in found.warning
 
 
 @pytest.mark.parametrize(
@@ -51,7 +55,101 @@ def test_call_match_finds_sweeps_of_the_opposite_direction(modulation, noise):
 def test_call_match_finds_other_presets(emitted):
     found = call_match(heard(emitted, noise=0.5))
     assert not found.matches
-    assert "in the same direction" in found.warning
+    assert found.sweep.duration_s == pytest.approx(emitted.duration_s, rel=0.2)
+    assert "opposite" not in found.warning
+
+
+def chirps(start_khz, stop_khz, duration_ms, method, *, echoes=((8e-3, 1.0),), noise=0.01, rate_hz=450e3):
+    """Echoes of a chirp of SciPy at 6 microphones of an array, as 32-bit floats."""
+    time_s = np.arange(round(0.025 * rate_hz)) / rate_hz
+    signals = noise * np.random.default_rng(2).standard_normal((len(time_s), 6))
+    for delay_s, amplitude in echoes:
+        for mic in range(6):
+            since_s = time_s - delay_s - 11e-6 * mic
+            inside = (since_s >= 0) & (since_s <= 1e-3 * duration_ms)
+            edge_s = np.minimum(since_s, 1e-3 * duration_ms - since_s)[inside]
+            ramp = np.sin(np.pi / 2 * np.minimum(1, edge_s / (1e-4 * duration_ms))) ** 2
+            sound = chirp(since_s[inside], 1e3 * start_khz, 1e-3 * duration_ms, 1e3 * stop_khz, method)
+            signals[inside, mic] += amplitude * ramp * sound
+    places_m = tuple((0.0, 0.01 * mic, 0.003 * (mic % 3)) for mic in range(6))
+    recording = Recording(sample_rate_hz=rate_hz, n_samples=len(time_s), encoding="float32")
+    return Measurement(
+        (0.1 * signals).astype("f4"), SETTINGS.replace(array=Array(positions_m=places_m), recording=recording)
+    )
+
+
+def compared(given, start_khz, stop_khz, duration_ms, modulation="hyperbolic"):
+    call = Call(
+        start_frequency_hz=1e3 * start_khz,
+        stop_frequency_hz=1e3 * stop_khz,
+        duration_s=1e-3 * duration_ms,
+        modulation=modulation,
+    )
+    return call_match(Measurement(given.data, given.settings.replace(call=call)))
+
+
+EMITTED = {
+    "80 to 20 kHz": (80, 20, 2.5, "hyperbolic"),
+    "60 to 30 kHz": (60, 30, 1.0, "hyperbolic"),
+    "110 to 30 kHz": (110, 30, 3.0, "linear"),
+    "25 to 50 kHz": (25, 50, 2.5, "logarithmic"),
+}
+STATED = [(45, 30, 2.5), (48, 38, 0.5, "linear"), (100, 40, 10), (30, 60, 5, "linear"), (70, 35, 1.0)]
+SCENES = {
+    "one echo": {},
+    "weak echo": {"noise": 0.35},
+    "six echoes": {"echoes": [(4e-3 + 1.7e-3 * place, (-0.8) ** place) for place in range(6)]},
+    "direct sound": {"echoes": [(0.1e-3, 3.0), (8e-3, 0.1)]},
+}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("emitted", EMITTED)
+def test_call_match_names_the_emitted_sweep(emitted, scene):
+    start_khz, stop_khz, duration_ms, method = EMITTED[emitted]
+    given = chirps(*EMITTED[emitted], **SCENES[scene])
+    stated = STATED[(2 * [*EMITTED].index(emitted) + [*SCENES].index(scene)) % len(STATED)]
+    found = compared(given, *stated)
+    assert not found.matches, stated
+    assert found.sweep.modulation == {"logarithmic": "exponential"}.get(method, method)
+    assert found.sweep.duration_s == pytest.approx(1e-3 * duration_ms, rel=0.2)
+    assert found.sweep.start_hz == pytest.approx(1e3 * start_khz, rel=0.15)
+    assert found.sweep.stop_hz == pytest.approx(1e3 * stop_khz, rel=0.12)
+
+
+@pytest.mark.parametrize("modulation", ["linear", "hyperbolic"])
+def test_call_match_distinguishes_exponential_sweeps(modulation):
+    found = compared(chirps(80, 20, 2.5, "logarithmic"), 80, 20, 2.5, modulation)
+    assert "they look like an exponential sweep from about" in found.warning
+
+
+def test_call_match_finds_calls_outside_of_the_band():
+    found = compared(chirps(100, 60, 2.0, "hyperbolic"), 50, 25, 2.5)
+    assert "hyperbolic sweep from about 98 to 61 kHz" in found.warning
+
+
+def test_call_match_finds_pulses_of_a_tone():
+    found = compared(chirps(40, 40, 1.0, "linear"), 50, 25, 2.5)
+    assert "they look like pulses of a tone of about 40 kHz" in found.warning
+
+
+def test_call_match_states_that_a_narrow_band_permits_no_judgement():
+    found = compared(chirps(48, 38, 0.5, "linear"), 80, 20, 2.5)
+    assert found.matches
+    assert "echoes contain only about 38 to 4" in found.note
+    assert "if its emitter has no such band, another call was emitted" in found.note
+
+
+def test_call_match_accepts_linear_calls_in_motion():
+    """At 2 m/s, echoes are 1.2 % shorter, and their frequencies as much higher."""
+    factor = 1 + 2 * 2.0 / 343
+    moving = chirps(80 * factor, 20 * factor, 2.5 / factor, "linear")
+    assert compared(moving, 80, 20, 2.5, "linear").matches
+
+
+def test_call_match_does_not_judge_direct_sound_that_began_before_the_record():
+    """The start of the call is missing, as if its band ended earlier."""
+    assert compared(chirps(50, 25, 2.5, "hyperbolic", echoes=[(-0.5e-3, 3.0), (9e-3, 0.05)]), 50, 25, 2.5).matches
 
 
 def test_call_match_accepts_the_call_beside_a_louder_reversed_one():

@@ -288,7 +288,7 @@ def test_echoes_of_another_call_are_a_fault(tmp_path):
     path = stored(tmp_path / "a.h5", real(), real())
     last = run(path, "--settings", tmp_path / "s.toml", code=1).stdout.splitlines()[-1]
     assert "echoes do not match the call of the settings" in last
-    assert last.endswith("give the emitted call as [call] in a settings file")
+    assert last.endswith("set the emitted call as [call] in a settings file")
 
 
 @pytest.mark.parametrize("is_reported", [False, True])

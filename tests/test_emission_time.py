@@ -12,10 +12,15 @@ import ertis_numba as ertis
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.emission_time import emission_time_s, emission_times_s
 from ertis_numba.analysis.health.emission import describe_shift, fit_emission
+from ertis_numba.analysis.sound_checks import SoundChecks
+from ertis_numba.errors import StartMismatchWarning
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.network.processing._predictions import Predictions
+from ertis_numba.pipeline import Pipeline
 from ertis_numba.sensor_check import check_recording
 from ertis_numba.settings import Array, Recording, Settings
+from ertis_numba.viewer import Playback
 from tests.test_sync_channel import call
 
 RATE_HZ = 192_000
@@ -120,6 +125,68 @@ def test_shift_is_described(name):
 @pytest.mark.parametrize("late_s", [[], [0.0], [5e-5, 4e-5], [-9e-5]])
 def test_small_shifts_are_not_described(late_s):
     assert describe_shift(late_s, SPEED_M_S) is None
+
+
+@pytest.mark.parametrize(
+    ("late_s", "delay_s", "remedy"),
+    [
+        ([1.37e-3], 0.0, "set call.delay_s = 0.00137 in the settings"),
+        ([-0.5e-3], 2e-3, "set call.delay_s = 0.0015 in the settings"),
+        ([-0.5e-3], 0.0, "start recording 0.5 ms earlier"),
+        ([0.0, 5e-4], 0.0, "trigger each record by its emission"),
+    ],
+)
+def test_remedy_of_records_that_are_not_imported(late_s, delay_s, remedy):
+    assert describe_shift(late_s, SPEED_M_S, delay_s=delay_s)[1] == remedy
+
+
+@pytest.mark.parametrize("late_s", [1.37e-3, -0.5e-3])
+def test_pipelines_warn_once_of_a_shifted_start(late_s):
+    given = measured(ARRAYS["grid of 9"], late_s)
+    with Pipeline(given.settings, "cpu", 1) as pipeline:
+        with pytest.warns(StartMismatchWarning, match="the direct sound arrives") as caught:
+            pipeline.process(given)
+        pipeline.process(given)
+        assert [each.filename for each in caught if each.category is StartMismatchWarning] == [__file__]
+
+
+def test_remedy_of_a_pipeline_removes_the_shift():
+    given = measured(ARRAYS["grid of 9"], 1.37e-3)
+    repaired = Measurement(given.data, given.settings.replace("call.delay_s", 0.00137))
+    assert emission_time_s(repaired) == pytest.approx(0.0, abs=6e-6)
+    assert SoundChecks().check(repaired) == []
+
+
+def test_sound_checks_report_a_start_that_drifts():
+    checks, found = SoundChecks(), []
+    for number in range(16):
+        found += [(number, *each) for each in checks.check(measured(ARRAYS["grid of 9"], 2e-5 * number))]
+    ((number, subject, warning),) = found
+    assert (number, subject) == (3, "start")
+    assert "drifts from 0 ms later to 0.06 ms later" in warning
+
+
+def test_sound_checks_name_the_start_but_not_the_layout():
+    found = SoundChecks().check(measured(ARRAYS["eRTIS"], 1.37e-3))
+    assert [each.subject for each in found] == ["start"]
+
+
+def test_workers_and_views_report_a_shifted_start(tmp_path):
+    given = [measured(ARRAYS["grid of 9"], 1.37e-3, number=number) for number in range(2)]
+    predictions, found = Predictions("cpu"), []
+    predictions.add("front", None, given[0])
+    while predictions.busy:
+        found += predictions.drain()
+    assert [(each.sensor, each.event) for each in found] == [("front", "start_mismatch")]
+    path, images = tmp_path / "rec.h5", tmp_path / "rec.energy.h5"
+    ertis.write_recording(path, given)
+    assert CliRunner().invoke(cli, ["process", str(path), "-o", str(images)]).exit_code == 0
+    assert "1.37 ms later" in CliRunner().invoke(cli, ["info", str(images)]).stdout
+    for shown in (path, images):
+        with Playback(shown, device="cpu") as playback:
+            playback.at(0)
+            playback.at(1)
+            assert sum("1.37 ms later" in note for note in playback.notes()) == 1
 
 
 @pytest.mark.parametrize("name", ["late", "drifting around 0"])

@@ -153,7 +153,7 @@ def test_process_with_the_settings_of_another_array_warns(tmp_path, more):
 def test_workers_report_another_layout():
     _, loud = wrong()
     predictions = Predictions("cpu")
-    predictions._report_matches(  # noqa: SLF001  the thread needs an image
+    predictions._report_sound(  # noqa: SLF001  the thread needs an image
         "left", loud
     )
     (found,) = predictions.drain()

@@ -218,6 +218,7 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
         **_placement(reader),
         **_error(reader),
         **({"call_warning": reader.call_warning} if reader.call_warning else {}),
+        **({"start_warning": reader.start_warning} if reader.start_warning else {}),
         **({"layout_warning": reader.layout_warning} if reader.layout_warning else {}),
     }
 

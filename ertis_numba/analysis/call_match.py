@@ -1,80 +1,95 @@
-"""Pulse compression of recorded echoes: a check that the recorded call is the call of the settings."""
+"""Comparison of the sweep in a record with the call of the settings."""
 
 import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba import kernels
+from ertis_numba.analysis.sound_spectra import SoundSpectra, some_signals, sound_spectra
+from ertis_numba.analysis.sweep_search import (
+    FoundSweep,
+    arrival_of,
+    find_sweep,
+    power_after,
+    refined,
+    sub_band_hz,
+)
+from ertis_numba.analysis.sweeps import Curve, Sweep, curve_of
 from ertis_numba.frames import Measurement
-from ertis_numba.geometry import microphones
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Call
 from ertis_numba.waveform import call_samples
 
-__all__ = ["CallMatch", "call_match", "first_call_match"]
+__all__ = ["UNKNOWN_CALL", "CallMatch", "call_match", "first_call_match"]
 
-MIN_LOSS: Final = 2.8
-"""Ratio of the peak power of another sweep to that of the call, above which the call does not match."""
-_MIN_LOSS_OF_MODULATION: Final = 1.25
-"""The same ratio for a sweep of equal duration and other modulation, whose peak after the call's filter is sharper."""
-_EQUAL_SLOPE: Final = 0.1  # Deviation of the duration of a sweep of equal duration.
-_MAX_CREST: Final = 12.0  # Peak to mean power around the call's own strongest peak; higher values indicate the call.
+UNKNOWN_CALL: Final = "no sound above the noise is a sweep, so that echoes were not compared with the call"
+"""Note on measurements that `call_match` cannot compare."""
+_WRONG: Final = "another call was emitted, and ranges in the image are wrong"
+_MIN_RATIO: Final = 1.3
+"""Ratio of the peak powers of another sweep and the call, above which the call does not match."""
+_MAX_DOPPLER: Final = 0.03  # Change of the slope of linear sweeps by motion at 2.5 m/s.
+_MIN_CREST: Final = 12.0  # Peak to mean power around the call's own strongest peak; higher values indicate the call.
 _MIN_SNR: Final = 40.0  # Peak to median power after the best filter; noise reaches about 20.
-_MIN_SMEAR: Final = 0.2  # Minimum extent of the peak of another sweep, relative to the call's duration.
-_TAPERED_S: Final = 0.3e-3  # Length of the taper at each end of the record.
+_SMEAR: Final = 0.2  # Extent of the peak after the filter of another call, relative to the call's duration.
+_MIN_BINS: Final = 8  # Fewer are too few for pulse compression.
 _MAX_MICS: Final = 6
-_FEW_MICS: Final = 2  # Number of microphones that select the sweeps to compare in all microphones.
-_MAX_LIKELY: Final = 16
-_BLOCK: Final = 32  # Number of slopes in a block, whose arrays fit into a cache.
-_MAX_SAMPLES: Final = 2**17  # Limit on the memory of long records.
+_PADDING_S: Final = 5e-3
 _MAX_MEASUREMENTS: Final = 8
-_MAX_SLOPE: Final = 4.0
-_MIN_SLOPE: Final = 0.3  # Shorter sweeps cannot be distinguished from clicks.
-_MAX_SLOPES: Final = 400
+_WIDER: Final = 1.5  # Ratio of the band in which sound of the same sweep is searched to the band of the call.
+_GATE_S: Final = 0.4e-3
+_MAX_OUTSIDE: Final = 0.15  # Share of the power of an arrival outside of the call's band.
+_MIN_OUTSIDE: Final = 0.3  # That power relative to the background.
+_MARGIN: Final = 2.0  # Skirts of the call's spectrum, in units of its inverse duration.
+_LEVELS: Final = (10**-0.6, 10**-1.2)
+_MAX_NOISE: Final = 10**-1.4
+_SHARP: Final = 1.3  # Ratio of bandwidths at these levels; that of transducers is above 1.4.
+_MAX_SHARE: Final = 0.75  # Bandwidth of the echoes of another call relative to that of the call.
+_MIN_SHARE: Final = 0.5  # Bandwidth without sharp edges, below which the call is not known.
+_MIN_BANDWIDTH_HZ: Final = 12e3  # Bandwidth of a call that is no tone.
 
 
 @dataclass(frozen=True, slots=True)
 class CallMatch:
-    """Comparison of the call's matched filter with those of other sweeps, for the strongest sound of a measurement.
+    """Comparison of the call with the sweep of the strongest sound of a measurement.
 
     Attributes
     ----------
-    loss_db : float
-        Peak level after the best filter, relative to the peak after the call's own.
-    slope : float
-        Sweep duration of the best filter in units of the call's; negative for the opposite direction.
-    modulation : {"hyperbolic", "linear"}
-        Modulation of the best filter.
     matches : bool
         False if the sound is a sweep other than the call.
+    loss_db : float
+        Peak level after the matched filter of that sweep, relative to the peak after the call's own; 0 by default.
+    sweep : Sweep, optional
+        Sweep of the sound; None if the sound is the call.
+    call : Call, optional
+        Call with which it was compared.
+    note : str
+        Reason why the match is not certain; empty by default.
     """
 
-    loss_db: float
-    slope: float
-    modulation: Literal["hyperbolic", "linear"]
     matches: bool
+    loss_db: float = 0.0
+    sweep: Sweep | None = None
+    call: Call | None = None
+    note: str = ""
 
     @property
     def warning(self) -> str:
         """One-line warning; empty if the echoes match the call."""
-        if self.matches:
+        if self.matches or self.sweep is None or self.call is None:
             return ""
-        direction = "in the opposite direction" if self.slope < 0 else "in the same direction"
-        length = abs(self.slope)
-        sweep = f"a {self.modulation} sweep {direction}"
-        if not 0.9 < length < 1.1:
-            sweep += f" with {length:.2g} times the call's duration over the same band"
-        return (
-            f"echoes do not match the call of the settings: they look like {sweep}, whose matched filter has a peak "
-            f"{self.loss_db:.0f} dB higher. Ranges in the image are wrong; give the emitted call as [call] in a "
-            "settings file"
+        text = f"echoes do not match the call of the settings: they look like {self.sweep}"
+        opposite = self.call.waveform is None and (self.sweep.stop_hz > self.sweep.start_hz) != (
+            self.call.stop_frequency_hz > self.call.start_frequency_hz
         )
+        if opposite and self.sweep.is_compressible:
+            text += ", in the opposite direction"
+        if self.loss_db >= 1:
+            text += f", whose matched filter has a peak {self.loss_db:.0f} dB higher"
+        return f"{text}. Ranges in the image are wrong; set the emitted call as [call] in a settings file"
 
 
 def first_call_match(measurements: Iterable[Measurement]) -> CallMatch | None:
@@ -87,11 +102,10 @@ def first_call_match(measurements: Iterable[Measurement]) -> CallMatch | None:
 
 
 def call_match(measurement: Measurement) -> CallMatch | None:
-    """Compare the call's matched filter with those of sweeps of other slopes.
+    """Compare the call with the sweep that the strongest sound contains, over the whole band of the record.
 
-    All filters have the magnitude of the call's spectrum, so a single echo of the call has its highest peak after the
-    call's own filter. If the call's filter compresses part of the sound, the call matches, because another sensor may
-    be louder.
+    If the call's filter compresses part of the sound, and no similar sweep compresses that part better, the call
+    matches, because another sensor may be louder.
 
     Parameters
     ----------
@@ -100,112 +114,110 @@ def call_match(measurement: Measurement) -> CallMatch | None:
     Returns
     -------
     CallMatch or None
-        None if no sound is above the noise, or the band is too narrow for pulse compression.
+        None if the sound does not permit a comparison: it is not above the noise, or is not a sweep.
 
     Raises
     ------
     DataError
         The samples do not match the settings.
     """
-    settings = measurement.settings
-    spectra, magnitude, own, frequency_hz = _spectra(measurement)
-    if len(frequency_hz) < 8:  # The band is too narrow, or the record too short, for pulse compression.
+    call = measurement.settings.call
+    signals, rate_hz = some_signals(measurement, _MAX_MICS)
+    low_hz = min(sub_band_hz(rate_hz) / 2, call.low_frequency_hz / _WIDER)
+    sound = sound_spectra(signals, rate_hz, low_hz=low_hz, padding_s=call.end_s + _PADDING_S)
+    if len(sound.frequency_hz) < _MIN_BINS:
         return None
-    call = settings.call
-    bandwidth_hz = call.high_frequency_hz - call.low_frequency_hz
-    n_fft = scipy.fft.next_fast_len(2 * len(frequency_hz))
-    plain = (spectra * magnitude).astype(np.complex64)  # Single precision takes half the time of double precision.
-    before = _power((spectra * own).astype(np.complex64), n_fft)
-    spacing_s = 1 / (n_fft * (frequency_hz[1] - frequency_hz[0]))
-    min_half = max(2, round(_MIN_SMEAR * call.duration_s / spacing_s))
-    if _snr(before) >= _MIN_SNR and _crest(before, min_half) >= _MAX_CREST:
-        return CallMatch(0.0, 1.0, call.modulation, matches=True)  # No other sweep can change this result.
-    step = max(1 / (bandwidth_hz * call.duration_s), 2 * _MAX_SLOPE / _MAX_SLOPES)
-    count = math.ceil(_MAX_SLOPE / step)
-    slopes = np.arange(-count, count + 1) * (_MAX_SLOPE / count)
-    highest = np.maximum(before.max(axis=1).astype(np.float64), 1e-300)
-    likely = []
-    for linear in (False, True):
-        curve_rad = _phase_of_sweep(call, frequency_hz, linear=linear)
-        for some in np.array_split(slopes, math.ceil(len(slopes) / _BLOCK)):
-            peaks = _turned(plain[:_FEW_MICS], some, curve_rad, n_fft).max(axis=2)
-            ratios = np.median(peaks / highest[:_FEW_MICS], axis=1)
-            likely += [(ratio, linear, slope) for ratio, slope in zip(ratios.tolist(), some.tolist(), strict=True)]
-    best_ratio, best_slope, best_linear, best = 0.0, 0.0, False, before
-    for _, linear, slope in sorted(likely, reverse=True)[:_MAX_LIKELY]:
-        curve_rad = _phase_of_sweep(call, frequency_hz, linear=linear)
-        (power,) = _turned(plain, np.array([slope]), curve_rad, n_fft)
-        ratio = float(np.median(power.max(axis=1) / highest))
-        if ratio > best_ratio:
-            best_ratio, best_slope, best_linear, best = ratio, slope, linear, power
-    if best_ratio == 0 or _snr(best) < _MIN_SNR:
-        return None
-    smear_s = max(abs(best_slope - 1), _MIN_SMEAR) * call.duration_s
-    crest = _crest(before, max(2, round(smear_s / spacing_s)))
-    is_of_same_duration = abs(best_slope - 1) < _EQUAL_SLOPE and best_linear != (call.modulation == "linear")
-    least = _MIN_LOSS_OF_MODULATION if is_of_same_duration else MIN_LOSS
-    wrong = best_ratio > least and abs(best_slope) >= _MIN_SLOPE and crest < _MAX_CREST
-    return CallMatch(
-        10 * math.log10(best_ratio), best_slope, "linear" if best_linear else "hyperbolic", matches=not wrong
+    if _is_heard(sound, call) and _is_alone(sound, call):
+        return CallMatch(matches=True)
+    found = find_sweep(sound)
+    return None if found is None else _compared(sound, found, call)
+
+
+def _filter_rad(call: Call, sound: SoundSpectra, part: slice) -> NDArray[np.float64]:
+    """Return the phases of the call's matched filter, which continues beyond its band if the call is a sweep."""
+    curve = curve_of(call)
+    if curve is not None:
+        return curve.phase_rad(sound.frequency_hz[part])
+    spectrum = scipy.fft.rfft(call_samples(call, rate_hz=sound.rate_hz), sound.n_fft)
+    first = round(float(sound.frequency_hz[0]) * sound.n_fft / sound.rate_hz)
+    return np.asarray(-np.angle(spectrum[first:][part]))
+
+
+def _is_heard(sound: SoundSpectra, call: Call) -> bool:
+    """Return True if the call's filter compresses part of the sound."""
+    part = sound.band(call.low_frequency_hz, call.high_frequency_hz)
+    if part.stop - part.start < _MIN_BINS:
+        return False
+    power = power_after(sound, _filter_rad(call, sound, part), part)
+    half = max(2, round(_SMEAR * call.duration_s * sound.rate_hz))
+    return _snr(power) >= _MIN_SNR and _crest(power, half) >= _MIN_CREST
+
+
+def _is_alone(sound: SoundSpectra, call: Call) -> bool:
+    """Return True if no similar sweep compresses the strongest arrival better, and it fills the call's band."""
+    curve = curve_of(call)
+    if curve is None:
+        return True
+    arrival = arrival_of(sound, curve, call.low_frequency_hz, call.high_frequency_hz)
+    better, gain = refined(arrival, curve)
+    is_similar = gain < _MIN_RATIO or _differs_by_motion(better, curve)
+    return is_similar and _band_of(sound, FoundSweep(curve, Sweep.of_call(call)), call) == "same"
+
+
+def _differs_by_motion(curve: Curve, own: Curve | None) -> bool:
+    """Return True if motion may cause the difference of two curves; hyperbolic sweeps tolerate motion."""
+    return (
+        own is not None
+        and curve.modulation == own.modulation != "hyperbolic"
+        and abs(float(curve.slopes_s_hz(np.array(own.pivot_hz))) / own.slope_s_hz - 1) < _MAX_DOPPLER
     )
 
 
-def _spectra(
-    measurement: Measurement,
-) -> tuple[NDArray[Any], NDArray[np.float64], NDArray[np.complex128], NDArray[np.float64]]:
-    """Return spectra of some microphones in the call's band, the call's magnitude, its filter, and frequencies."""
-    settings = measurement.settings
-    form = sample_format(settings)
-    words, _ = form.normalised(form.validated(measurement.data))
-    words = words[:_MAX_SAMPLES]
-    channels = np.flatnonzero(microphones(settings.array).enabled).astype(np.int32)
-    channels = np.ascontiguousarray(channels[:: max(1, -(-len(channels) // _MAX_MICS))])
-    signals = np.empty((len(channels), len(words)), dtype=np.float32)
-    plain = kernels.load("numpy")  # These kernels need no compilation.
-    if settings.recording.is_pdm:
-        plain.unpack_bits(words, channels, signals)
-    else:
-        scale = np.float32(1 / settings.recording.full_scale)
-        plain.unpack_pcm(words, channels, scale, np.float32(0), 0, signals)
-    call = settings.call
-    rate_hz = settings.recording.sample_rate_hz
-    emitted = call_samples(call, rate_hz=rate_hz)
-    # Without a taper, a hum below the band would cause clicks at both ends.
-    edge = np.arange(len(words)) / (_TAPERED_S * rate_hz)
-    signals *= np.sin(np.pi / 2 * np.minimum(1.0, np.minimum(edge, edge[::-1]))).astype(np.float32) ** 2
-    n_fft = scipy.fft.next_fast_len(len(words) + len(emitted), real=True)
-    low, high = (round(edge * n_fft / rate_hz) for edge in (call.low_frequency_hz, call.high_frequency_hz))
-    bins = np.arange(max(1, low), min(high, n_fft // 2) + 1)
-    spectra = scipy.fft.rfft(signals, n_fft, axis=1)[:, bins]
-    own = np.conj(scipy.fft.rfft(emitted, n_fft)[bins])
-    return spectra, np.abs(own), own, bins * rate_hz / n_fft
+def _band_of(sound: SoundSpectra, found: FoundSweep, call: Call) -> Literal["same", "other", "narrow"]:
+    """Compare the band of the strongest arrival with that of the call; transducers have bands without sharp edges."""
+    low_hz = min(found.sweep.low_hz, call.low_frequency_hz / _WIDER)
+    high_hz = max(found.sweep.high_hz, call.high_frequency_hz * _WIDER)
+    whole_hz = (call.low_frequency_hz, call.high_frequency_hz)
+    arrival = arrival_of(sound, found.curve, low_hz, high_hz, gate_s=_GATE_S, whole_hz=whole_hz)
+    if not arrival.peak.any():
+        return "same"
+    at_hz, power, background = arrival.frequency_hz, arrival.power, arrival.background
+    margin_hz = _MARGIN / call.duration_s
+    outside = (at_hz < call.low_frequency_hz - margin_hz) | (at_hz > call.high_frequency_hz + margin_hz)
+    beyond = float(power[outside].sum())
+    if beyond > _MAX_OUTSIDE * power.sum() and beyond > _MIN_OUTSIDE * background[outside].sum():
+        return "other"
+    inside = (at_hz >= call.low_frequency_hz) & (at_hz <= call.high_frequency_hz)
+    expected = np.abs(found.curve.slopes_s_hz(at_hz[inside])) + 1e-30  # A sweep stays there for this time.
+    power, background = power[inside] / expected, background[inside] / expected
+    if len(power) < _MIN_BINS or background.max() > _MAX_NOISE * power.max():
+        bandwidth_hz = call.high_frequency_hz - call.low_frequency_hz
+        return "narrow" if found.sweep.high_hz - found.sweep.low_hz < _MAX_SHARE * bandwidth_hz else "same"
+    inner, outer = (int(np.ptp(np.flatnonzero(power > level * power.max()))) for level in _LEVELS)
+    if outer < _MAX_SHARE * len(power) and outer < _SHARP * inner:
+        return "other"
+    return "narrow" if outer < _MIN_SHARE * len(power) else "same"
 
 
-def _phase_of_sweep(call: Call, frequency_hz: NDArray[np.float64], *, linear: bool) -> NDArray[np.float64]:
-    """Return the phase of a sweep's matched filter over the call's band.
-
-    Group delays are relative to the delay at the lowest frequency. This shifts peaks but does not widen them.
-    """
-    span = frequency_hz - frequency_hz[0]
-    if linear:
-        return np.asarray(math.pi * span**2 * call.duration_s / (call.stop_frequency_hz - call.start_frequency_hz))
-    slowness = call.duration_s / (1 / call.stop_frequency_hz - 1 / call.start_frequency_hz)
-    at_first = slowness / frequency_hz[0]
-    return np.asarray(2 * math.pi * (slowness * np.log(frequency_hz / frequency_hz[0]) - span * at_first))
-
-
-def _turned(
-    spectra: NDArray[np.complex64], slopes: NDArray[np.float64], curve_rad: NDArray[np.float64], n_fft: int
-) -> NDArray[np.float32]:
-    """Return the power after the matched filters of some sweeps: (slope, mic, sample) float32."""
-    angles_rad = np.outer(slopes, curve_rad).astype(np.float32)
-    filters = np.cos(angles_rad) + np.complex64(1j) * np.sin(angles_rad)
-    return _power(filters[:, None] * spectra, n_fft)
-
-
-def _power(spectra: NDArray[np.complex64], n_fft: int) -> NDArray[np.float32]:
-    made = scipy.fft.ifft(spectra, n_fft, axis=-1)
-    return np.asarray(made.real**2 + made.imag**2)
+def _compared(sound: SoundSpectra, found: FoundSweep, call: Call) -> CallMatch | None:
+    """Return the match of the call with the sweep of the sound; None if that is no sweep."""
+    sweep, bandwidth_hz = found.sweep, call.high_frequency_hz - call.low_frequency_hz
+    if not sweep.is_compressible and not (sweep.is_tone and bandwidth_hz > _MIN_BANDWIDTH_HZ):
+        return None
+    part = sound.band(min(sweep.low_hz, call.low_frequency_hz), max(sweep.high_hz, call.high_frequency_hz))
+    best = power_after(sound, found.curve.phase_rad(sound.frequency_hz[part]), part)
+    if _snr(best) < _MIN_SNR:
+        return None
+    own = power_after(sound, _filter_rad(call, sound, part), part)
+    ratio = float(np.median(best.max(axis=1) / np.maximum(own.max(axis=1), 1e-30)))
+    loss_db, band = max(0.0, 10 * math.log10(ratio)), _band_of(sound, found, call)
+    is_other = ratio > _MIN_RATIO and not _differs_by_motion(found.curve, curve_of(call))
+    if sweep.is_tone or is_other or band == "other":
+        return CallMatch(matches=False, loss_db=loss_db, sweep=sweep, call=call)
+    if band == "narrow":
+        note = f"echoes contain only about {sweep.band} of the call; if its emitter has no such band, {_WRONG}"
+        return CallMatch(matches=True, loss_db=loss_db, call=call, note=note)
+    return CallMatch(matches=True, loss_db=loss_db, call=call)
 
 
 def _snr(power: NDArray[np.float32]) -> float:

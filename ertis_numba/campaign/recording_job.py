@@ -11,7 +11,7 @@ from typing import Any
 
 from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.call_match import CallMatch, first_call_match
+from ertis_numba.analysis.call_match import UNKNOWN_CALL, CallMatch, first_call_match
 from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.analysis.emission_time import emission_times_s
 from ertis_numba.analysis.health import health
@@ -158,6 +158,7 @@ def prepare_recording(
             if run.prediction is not None:
                 writer.note_error(recording.sensor, **run.prediction.as_dict())
             writer.note_call(recording.sensor, run.call_warning)
+            writer.note_start(recording.sensor, run.start_warning)
             writer.note_layout(recording.sensor, run.layout_warning)
             writer.note_wavefront(recording.sensor, run.reported.get("wavefront_error_db"))
         yield RecordingJob(recordings, runs, writer)
@@ -243,8 +244,6 @@ def _begin_checks(
 def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
     """Return the faults of a sensor's microphones, the shift of its records, and the match of its call and layout."""
     first = recording[0]
-    some = (replace(recording[index], settings=settings) for index in {0, len(recording) // 2, len(recording) - 1})
-    shift = describe_shift(emission_times_s(some), sound_speed_m_s(settings.air))
     report = health(replace(first, settings=settings))
     faults = describe_faults(f"{recording.path}: sensor {recording.sensor}", report)
 
@@ -252,10 +251,13 @@ def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
         others = (recording[index] for index in range(1, len(recording)))
         return (replace(each, settings=settings) for each in itertools.chain([first], others))
 
-    call, layout = first_call_match(heard()), None
-    if call is None or not call.warning:  # The filter of another call does not find the times of arrival.
-        of_report = LayoutMatch.of(report.findings)
-        layout = of_report if of_report.warning else first_layout_match(heard())
+    call = first_call_match(heard())
+    if call is not None and call.warning:  # The filter of another call does not find the times of arrival.
+        return faults, "", call, None
+    some = (replace(recording[index], settings=settings) for index in {0, len(recording) // 2, len(recording) - 1})
+    shift = describe_shift(emission_times_s(some), sound_speed_m_s(settings.air))
+    of_report = LayoutMatch.of(report.findings)
+    layout = of_report if of_report.warning else first_layout_match(heard())
     return faults, "; ".join(shift or ()), call, layout
 
 
@@ -283,17 +285,16 @@ def _check_sensor(
     show: _Show,
 ) -> None:
     first = run.with_pipeline_settings(recording[0])
-    faults, shift, match, layout = checks
+    faults, run.start_warning, match, layout = checks
     place = f"{recording.path}: sensor {recording.sensor}"
-    shift = shift and f"{place}: {shift}"
+    shift = run.start_warning and f"{place}: {run.start_warning}"
     run.layout_warning = layout.warning if layout is not None else ""
     other_layout = run.layout_warning and f"{place}: {run.layout_warning}"
     for text in filter(None, (faults, shift, other_layout)):
         if options.strict:
             raise DataError(text)
         warn(text)
-    if match is not None:
-        run.call_warning = match.warning
+    run.call_warning = UNKNOWN_CALL if match is None else match.warning or match.note
     for text in (*_call_notes(run, recording), *_grid_notes(run.pipeline)):
         warn(f"{place}{text}")
     heard = None

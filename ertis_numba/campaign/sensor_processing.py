@@ -70,8 +70,8 @@ class SensorProcessing:
         Results about the plan.
     prediction : Prediction or None
         Predicted error of the first measurement's image; None before it is computed, and for the paper's method.
-    call_warning, layout_warning : str
-        Warnings that echoes do not match the call or the layout; empty if they do.
+    call_warning, start_warning, layout_warning : str
+        Warnings that the sound does not match the call, the start of the record or the layout; empty if it does.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class SensorProcessing:
         self.times_ms: list[float] = []
         self.reported: dict[str, Any] = {}
         self.prediction: Prediction | None = None
-        self.call_warning = self.layout_warning = ""
+        self.call_warning = self.start_warning = self.layout_warning = ""
         image_bytes = 4 * len(pipeline.grid) * len(pipeline.range_m)
         self._size = max(1, min(batch, int((max_bytes or MAX_WAITING_BYTES) / image_bytes)))
 
@@ -141,6 +141,7 @@ class SensorProcessing:
             "median_ms": round(statistics.median(self.times_ms), 3),
             **(self.prediction.as_dict() if self.prediction else {}),
             **({"call_warning": self.call_warning} if self.call_warning else {}),
+            **({"start_warning": self.start_warning} if self.start_warning else {}),
             **({"layout_warning": self.layout_warning} if self.layout_warning else {}),
             **self.reported,
         }

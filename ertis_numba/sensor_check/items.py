@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
-from ertis_numba.analysis.call_match import CallMatch
+from ertis_numba.analysis.call_match import UNKNOWN_CALL, CallMatch
 from ertis_numba.analysis.health import Health
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_GAIN_DB, MAX_WHITE_DB
 from ertis_numba.sensor_check.clock import ClockCheck
@@ -199,7 +199,9 @@ def of_call(match: CallMatch | None, *, has_call: bool) -> CheckResult:
     if not has_call:
         return CheckResult("not known", NO_CALL)
     if match is None:
-        return CheckResult("not known", "no sound is above the noise")
+        return CheckResult("not known", UNKNOWN_CALL)
+    if match.note:
+        return CheckResult("not known", match.note)
     if match.matches:
         return _result_of((), "echoes match the call of the settings")
     text, _, rest = match.warning.partition(". ")

@@ -33,7 +33,7 @@ __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write
 
 _ERRORS_DB: Final = ("predicted_error_db", "max_error_db", "wavefront_error_db")
 PLATFORM_FRAME: Final = "base_link"  # Sensor of fused images; the fusion lies above this package.
-_TEXTS: Final = ("budget_applies_to", "error_warning", "call_warning", "layout_warning")
+_TEXTS: Final = ("budget_applies_to", "error_warning", "call_warning", "start_warning", "layout_warning")
 
 
 class _EnergyscapeFile(ResultFile):
@@ -122,6 +122,13 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         Call this before the sensor's first energyscape is written.
         """
         self._state(sensor, call_warning=call_warning)
+
+    def note_start(self, sensor: str, start_warning: str) -> None:
+        """Store a warning that a sensor's records do not begin with the emission; empty if they may.
+
+        Call this before the sensor's first energyscape is written.
+        """
+        self._state(sensor, start_warning=start_warning)
 
     def note_layout(self, sensor: str, layout_warning: str) -> None:
         """Store a warning that a sensor's echoes do not match the layout of its settings; empty if they do.
@@ -217,6 +224,8 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
     call_warning : str
         Warning that echoes of the recording do not match the call of its settings; empty if they do, or if it was not
         examined.
+    start_warning : str
+        Warning that records do not begin with the emission; empty if they may, or if it was not examined.
     layout_warning : str
         Warning that echoes do not match the layout; empty if they may, or if it was not examined.
     """
@@ -227,6 +236,7 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
     budget_applies_to: str
     error_warning: str
     call_warning: str
+    start_warning: str
     layout_warning: str
     wavefront_error_db: float | None
 

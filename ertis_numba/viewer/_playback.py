@@ -302,6 +302,10 @@ class Playback:
         else:
             item = reader[number]
             image = self._processed(name, item) if isinstance(item, Measurement) else item
+            if isinstance(item, Measurement):
+                self._notes += self._result_notes.of_sound(item)
+            elif isinstance(reader, EnergyscapeReader):
+                self._notes += self._result_notes.of_file(name, reader)
         self._notes += self._result_notes.of(image, self._band_note(name, reader))
         pose = self._given.get(name) or Pose.of(reader.translation_m, reader.rotation_xyzw)
         if image.settings.processing.level_directions:

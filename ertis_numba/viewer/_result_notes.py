@@ -4,10 +4,12 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from ertis_numba.analysis.direction_spacing import spacing_warning
-from ertis_numba.frames import AcousticMap, Energyscape
+from ertis_numba.analysis.sound_checks import SoundChecks
+from ertis_numba.frames import AcousticMap, Energyscape, Measurement
 from ertis_numba.fusion import PLATFORM
 from ertis_numba.geometry import direction_note
 from ertis_numba.passive.search_grid import coarse_map_warning
+from ertis_numba.storage import EnergyscapeReader
 
 if TYPE_CHECKING:
     from ertis_numba.settings import Settings
@@ -21,6 +23,21 @@ class ResultNotes:
     def __init__(self) -> None:
         self._checked: dict[str, Settings] = {}
         self._with_band_note: set[str] = set()
+        self._sound: dict[str, SoundChecks] = {}
+        self._files: set[str] = set()
+
+    def of_sound(self, measurement: Measurement) -> Iterator[str]:
+        """Yield the new notes on sound that contradicts the settings of a measurement."""
+        sensor = measurement.stamp.sensor
+        for _, text in self._sound.setdefault(sensor, SoundChecks()).check(measurement):
+            yield f"sensor {sensor}: {text}"
+
+    def of_file(self, sensor: str, images: EnergyscapeReader) -> Iterator[str]:
+        """Yield the warnings that a file of images stores about the sound of a sensor, once."""
+        if sensor not in self._files:
+            self._files.add(sensor)
+            for text in filter(None, (images.call_warning, images.start_warning, images.layout_warning)):
+                yield f"sensor {sensor}: {text}"
 
     def of(self, item: Energyscape | AcousticMap, band_note: str | None = None) -> Iterator[str]:
         """Yield the new notes on an image or a map.

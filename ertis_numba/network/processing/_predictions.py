@@ -1,21 +1,26 @@
-"""Predicted errors of images in a worker: one thread computes them while the worker makes further images."""
+"""Checks of measurements and images in a worker: one thread runs them while the worker makes further images."""
 
 import threading
 from collections import deque
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from ertis_numba.network.processing.pipe_messages import Predicted
 
 if TYPE_CHECKING:
-    from ertis_numba.analysis.call_match import CallMatch
-    from ertis_numba.analysis.layout_match import LayoutMatch
+    from ertis_numba.analysis.sound_checks import Subject
     from ertis_numba.frames import Energyscape, Measurement
 
 __all__ = ["Predictions"]
 
+_EVENTS: Final[dict["Subject", Literal["call_mismatch", "start_mismatch", "layout_mismatch"]]] = {
+    "call": "call_mismatch",
+    "start": "start_mismatch",
+    "layout": "layout_mismatch",
+}
+
 
 class Predictions:
-    """Predictions for the first images of sensors, one at a time.
+    """Checks of some measurements of sensors, one at a time.
 
     Attributes
     ----------
@@ -25,7 +30,7 @@ class Predictions:
 
     def __init__(self, device: str) -> None:
         self._device = device
-        self._waiting: deque[tuple[str, Energyscape, Measurement]] = deque()
+        self._waiting: deque[tuple[str, Energyscape | None, Measurement]] = deque()
         self._found: deque[Predicted] = deque()
         self._thread: threading.Thread | None = None
 
@@ -34,8 +39,8 @@ class Predictions:
         """True while a prediction is not finished, or not yet drained."""
         return bool(self._waiting or self._found or self._thread)
 
-    def add(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
-        """Predict the error of an image of a sensor; the arrays must not change."""
+    def add(self, sensor: str, image: "Energyscape | None", measurement: "Measurement") -> None:
+        """Check a measurement of a sensor, and predict the error of its image, if any; the arrays must not change."""
         self._waiting.append((sensor, image, measurement))
 
     def drain(self) -> list[Predicted]:
@@ -50,23 +55,16 @@ class Predictions:
             found.append(self._found.popleft())
         return found
 
-    def _report_matches(self, sensor: str, measurement: "Measurement") -> None:
-        """Report echoes that do not match the call or the layout."""
-        from ertis_numba.analysis.call_match import call_match  # noqa: PLC0415
-        from ertis_numba.analysis.layout_match import layout_match  # noqa: PLC0415
+    def _report_sound(self, sensor: str, measurement: "Measurement") -> None:
+        """Report sound that contradicts the settings."""
+        from ertis_numba.analysis.sound_checks import SoundChecks  # noqa: PLC0415
 
-        event: Literal["call_mismatch", "layout_mismatch"]
-        for event, compare in (("call_mismatch", call_match), ("layout_mismatch", layout_match)):
-            try:
-                match: CallMatch | LayoutMatch | None = compare(measurement)
-            except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images
-                name = event.removesuffix("_mismatch")
-                text = f"echoes were not compared with the {name}: {type(error).__name__}: {error}"
-            else:
-                text = match.warning if match else ""
-            if text:
-                self._found.append(Predicted(sensor=sensor, event=event, warning=text))
-                return  # The filter of another call does not find the times of arrival.
+        try:
+            for subject, text in SoundChecks().check(measurement):
+                self._found.append(Predicted(sensor=sensor, event=_EVENTS[subject], warning=text))
+        except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images
+            text = f"the sound was not compared with the settings: {type(error).__name__}: {error}"
+            self._found.append(Predicted(sensor=sensor, event="call_mismatch", warning=text))
 
     def _report_grid(self, sensor: str, image: "Energyscape") -> None:
         """Report directions that are too far apart for the array."""
@@ -79,9 +77,15 @@ class Predictions:
         if text:
             self._found.append(Predicted(sensor=sensor, event="coarse_grid", warning=text))
 
-    def _predict(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
-        self._report_grid(sensor, image)
-        self._report_matches(sensor, measurement)
+    def _predict(self, sensor: str, image: "Energyscape | None", measurement: "Measurement") -> None:
+        if image is not None:
+            self._report_grid(sensor, image)
+        self._report_sound(sensor, measurement)
+        if image is not None:
+            self._report_error(sensor, image, measurement)
+
+    def _report_error(self, sensor: str, image: "Energyscape", measurement: "Measurement") -> None:
+        """Report an image that may exceed its error budget."""
         if image.settings.processing.method == "paper" or not image.amplitude.any():
             return  # The paper's method has no plan, and silence no relative error.
         from ertis_numba import kernels  # noqa: PLC0415  in a process that has loaded them

@@ -75,8 +75,11 @@ class ProcessJob(_Note, frozen=True, kw_only=True):
     words_bytes: int
     threads: int
     points: bool
-    predict_for: str = ""
-    """Sensor whose images need a predicted error, if any."""
+    sensor: str = ""
+    predict: bool = False
+    """Predict the error of the image."""
+    check_sound: bool = False
+    """Compare the sound with the settings."""
 
 
 class Release(_Note, frozen=True, kw_only=True):
@@ -138,7 +141,7 @@ class Predicted(_Note, frozen=True, kw_only=True):
     """Warning about a sensor's images, and the log event that reports it."""
 
     sensor: str
-    event: Literal["error_budget", "call_mismatch", "layout_mismatch", "coarse_grid"]
+    event: Literal["error_budget", "call_mismatch", "start_mismatch", "layout_mismatch", "coarse_grid"]
     warning: str
 
 

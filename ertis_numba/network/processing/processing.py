@@ -81,7 +81,7 @@ class ImageProcessing:
         self._dead_letter_queue: DeadLetterQueue | None = None
         self._sensors = Sensors(options, log, describe=self._publisher.describe, prepare=self._prepare)
         self._n_jobs = 0
-        self._predicted: dict[str, int] = {}  # Number of the kind whose error was predicted, by sensor.
+        self._images: dict[tuple[str, int], int] = {}  # Number of images, by sensor and number of the latest kind.
         self._order = ReorderBuffer()
         self._passive_slots = SlotPool(_PASSIVE_SLOTS)
         self._passive: set[str] = set()  # Sensors that have sent measurements without a call.
@@ -290,12 +290,19 @@ class ImageProcessing:
             return False
         self._queues.take(job)
         job.points = self._publisher.wants_points(job.data.sensor)
-        sensor, kind = job.data.sensor, job.kind.number
-        job.predict = self._predicted.get(sensor) != kind
-        self._predicted[sensor] = kind
+        self._choose_checks(job)
         self._order.add(job)
         runner.submit(job)
         return True
+
+    def _choose_checks(self, job: Job) -> None:
+        """Check the sound of images 1, 2, 4, 8 and so on of a sensor's settings, and the error of the first one."""
+        sensor, kind = job.data.sensor, job.kind.number
+        count = self._images.get((sensor, kind), 0) + 1
+        if count == 1:
+            self._images = {key: number for key, number in self._images.items() if key[0] != sensor}
+        self._images[sensor, kind] = count
+        job.predict, job.check_sound = count == 1, count & (count - 1) == 0
 
     def _forward(self, job: Job) -> bool:
         """Pass a measurement without a call to the publisher, after the images before it; return False if full."""

@@ -53,6 +53,8 @@ class Job:
         Number of failed tries.
     predict : bool
         Predict the error of the image, and log a warning if images may exceed the budget.
+    check_sound : bool
+        Compare the sound with the settings, and log a warning if it contradicts them.
     slot : Slot, optional
         Slot of samples and image, once it is `FinishedJob`; release it afterwards.
     """
@@ -67,6 +69,7 @@ class Job:
     slot: Slot | None = None
     n_points: int = 0
     predict: bool = False
+    check_sound: bool = False
 
 
 @dataclass(frozen=True, slots=True)

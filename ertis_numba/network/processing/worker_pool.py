@@ -63,6 +63,7 @@ class LocalWorkerPool:
 
     def __init__(self, options: ProcessingOptions, log: EventLog) -> None:
         self._options, self._log = options, log
+        self._reported: set[tuple[str, str]] = set()  # Sensors and events, which are logged once for their settings.
         self._threads = options.threads or usable_cores()
         count = options.workers or (1 if options.device in {"cuda", "numpy"} else self._threads)
         self._chosen = Choice(count, self._threads)
@@ -113,6 +114,8 @@ class LocalWorkerPool:
         worker = self._idle(job.kind)
         if worker is None or worker.child is None:
             raise AssertionError("a job was submitted that no worker can accept; call takes() first")
+        if job.predict:  # The first measurement with these settings.
+            self._reported = {each for each in self._reported if each[0] != job.data.sensor}
         worker.job, worker.mode = job, self._chosen.mode
         worker.slot = slot = worker.free.pop(0)
         slot.view.words(job.words.nbytes)[:] = bytes_of(job.words)
@@ -125,7 +128,9 @@ class LocalWorkerPool:
                 words_bytes=job.words.nbytes,
                 threads=worker.mode.threads,
                 points=job.points,
-                predict_for=job.data.sensor if job.predict else "",
+                sensor=job.data.sensor,
+                predict=job.predict,
+                check_sound=job.check_sound,
             )
         )
         mark("submitted", job.data.sensor, job.data.sequence)
@@ -223,7 +228,9 @@ class LocalWorkerPool:
                 if self._kinds.pop(kind, None) is not None:
                     return [KindFailed(kind, text)]
             case Predicted(sensor=sensor, event=event, warning=warning):
-                self._log.warning(event, sensor=sensor, text=warning)
+                if (sensor, event) not in self._reported:
+                    self._reported.add((sensor, event))
+                    self._log.warning(event, sensor=sensor, text=warning)
             case JobFinished() | JobFailed():
                 return self._finished(worker, note)
         return []

@@ -110,13 +110,13 @@ class _ImageWorker:
         place = view.image_as(chain.shape, self._given.dtype)
         words = view.words(order.words_bytes)
         image = chain.image(words, place if self._given.dtype == "float32" else None, threads=order.threads)
-        if order.predict_for:
-            measurement = Measurement(chain.format.from_bytes(bytes(words)), image.settings)
-            if image.settings.processing.is_cleaned:  # A prediction needs all amplitudes.
+        if order.check_sound:
+            measurement, whole = Measurement(chain.format.from_bytes(bytes(words)), image.settings), None
+            if order.predict and image.settings.processing.is_cleaned:  # A prediction needs all amplitudes.
                 whole = chain.pipeline.process(measurement, clean=False, threads=order.threads)
-            else:
+            elif order.predict:
                 whole = image.replace(amplitude=image.amplitude.copy())
-            self._predictions.add(order.predict_for, whole, measurement)
+            self._predictions.add(order.sensor, whole, measurement)
         if self._given.dtype != "float32":
             np.copyto(place, image.amplitude, casting="same_kind")
         if not order.points:

@@ -1,0 +1,267 @@
+"""Search for the sweep in a record, without knowledge of the emitted call.
+
+Sub-bands find the slope of the group delay at each frequency, because few slopes differ within a narrow band. One curve
+through these slopes compresses the sound over its whole band, and is then refined around the strongest arrival.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import scipy.fft
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from ertis_numba.analysis.sound_spectra import SoundSpectra
+from ertis_numba.analysis.sweeps import MODULATIONS, Curve, Modulation, Sweep
+
+__all__ = ["FoundSweep", "GatedArrival", "arrival_of", "find_sweep", "power_after", "refined", "sub_band_hz"]
+
+_SUB_BAND_HZ: Final = 10e3
+_SUB_BAND: Final = 0.045  # Largest sub-band relative to the sample rate.
+_MAX_TURNS: Final = 80.0  # Steepest slope times the square of a sub-band.
+_N_SLOPES: Final = 161
+_N_CURVES: Final = 120  # of either direction
+_MIN_RATIO: Final = 17.0  # Peak to mean power in a sub-band; noise reaches about 13.
+_MIN_SCORE: Final = 10.0  # Sum of the excess over sub-bands.
+_MIN_POWER: Final = 10**-2.5  # Power of a sub-band relative to the strongest; others contain side lobes of its sound.
+_OCCUPIED: Final = 0.1  # Excess of an occupied sub-band relative to the highest.
+_ALTERNATIVE: Final = 0.3  # Score of another modulation relative to the best, with which it is also refined.
+_GATE_S: Final = 2e-3  # Half the length of the sound around the strongest arrival.
+_COARSE: Final = 1.5  # Steps of the slope in units of the inverse of the squared bandwidth.
+_FINE: Final = 0.25
+_MAX_STEPS: Final = 60
+_ROUNDS: Final = 4
+_GAIN: Final = 1.03  # A refinement that gains less is the last one.
+_SMOOTHED_HZ: Final = 1e3
+_EDGE: Final = 0.1  # Power at the edges of a band relative to its middle.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GatedArrival:
+    """Sound around the strongest arrival of each microphone after the filter of a curve.
+
+    Attributes
+    ----------
+    spectra : (mic, bin) complex128
+    frequency_hz : (bin,) float64
+    peak : (mic,) float64
+        Power at the peaks.
+    elsewhere : (bin,) float64
+        Median of the power spectrum of equally long parts of the record, averaged over the microphones.
+    noise : (bin,) float64
+        Magnitude by which the spectra were divided.
+    """
+
+    spectra: NDArray[np.complex128]
+    frequency_hz: NDArray[np.float64]
+    peak: NDArray[np.float64]
+    elsewhere: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+    @property
+    def power(self) -> NDArray[np.float64]:
+        """Recorded power spectrum without that of other parts of the record: (bin,) float64."""
+        return self._smoothed(np.mean(np.abs(self.spectra) ** 2, axis=0) - self.elsewhere)
+
+    @property
+    def background(self) -> NDArray[np.float64]:
+        """Recorded power spectrum of other parts of the record: (bin,) float64."""
+        return self._smoothed(self.elsewhere)
+
+    def _smoothed(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
+        step_hz = self.frequency_hz[1] - self.frequency_hz[0]
+        size = max(1, round(_SMOOTHED_HZ / step_hz))
+        return np.asarray(scipy.ndimage.uniform_filter1d(power * self.noise**2, size))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundSweep:
+    """Sweep that the strongest sound of a record contains.
+
+    Attributes
+    ----------
+    curve : Curve
+    sweep : Sweep
+    """
+
+    curve: Curve
+    sweep: Sweep
+
+
+def sub_band_hz(rate_hz: float) -> float:
+    """Return the width of sub-bands in hertz."""
+    return min(_SUB_BAND_HZ, _SUB_BAND * rate_hz)
+
+
+def find_sweep(found: SoundSpectra) -> FoundSweep | None:
+    """Return the sweep of the strongest sound; None if no sound exceeds the noise."""
+    width_hz = sub_band_hz(found.rate_hz)
+    slopes_s_hz = np.linspace(-1, 1, _N_SLOPES) * _MAX_TURNS / width_hz**2
+    centres_hz, ratios, power = _sub_bands(found, slopes_s_hz, width_hz)
+    if not len(centres_hz) or power.max() <= 0:
+        return None
+    weights = np.clip(power / power.max() / _MIN_POWER, 0, 1)
+    excess = weights[:, None] * np.maximum(ratios - _MIN_RATIO, 0)
+    loud_hz = centres_hz[weights >= 1]
+    pivot_hz = float(np.sqrt(loud_hz[0] * loud_hz[-1]))
+    coarse = [_best_curve(excess, centres_hz, slopes_s_hz, name, pivot_hz) for name in MODULATIONS]
+    best_score = max(score for score, *_ in coarse)
+    if best_score < _MIN_SCORE:
+        return None
+    found_at = []
+    for score, curve, occupied in coarse:
+        if score >= _ALTERNATIVE * best_score:
+            low_hz, high_hz = centres_hz[occupied][0] - width_hz / 2, centres_hz[occupied][-1] + width_hz / 2
+            found_at.append(_focused(found, curve, low_hz, high_hz))
+    best, arrival = max(found_at, key=lambda each: float(np.median(each[1].peak)))
+    return FoundSweep(best, Sweep.of_curve(best, *_edges_hz(arrival, best)))
+
+
+def _sub_bands(
+    found: SoundSpectra, slopes_s_hz: NDArray[np.float64], width_hz: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the centres of sub-bands, the peak to mean power for each slope, and the power of the sound."""
+    first_hz, last_hz = found.frequency_hz[0] + width_hz / 2, found.frequency_hz[-1] - width_hz / 2
+    centres_hz = np.arange(first_hz, last_hz, width_hz / 2)
+    ratios, power = np.zeros((len(centres_hz), len(slopes_s_hz))), np.zeros(len(centres_hz))
+    for place, centre_hz in enumerate(centres_hz):
+        part = found.band(centre_hz - width_hz / 2, centre_hz + width_hz / 2)
+        offset_hz = found.frequency_hz[part] - centre_hz
+        window = np.cos(np.pi * offset_hz / width_hz) ** 2
+        filters = (window * np.exp(1j * np.pi * slopes_s_hz[:, None] * offset_hz**2)).astype(np.complex64)
+        n_fft = scipy.fft.next_fast_len(2 * len(offset_hz))
+        after = scipy.fft.ifft(filters[:, None] * found.bins[:, part], n_fft, axis=2)
+        powers = after.real**2 + after.imag**2
+        mean = np.maximum(powers.mean(axis=2), 1e-30)
+        ratios[place] = np.median(powers.max(axis=2) / mean, axis=1)
+        power[place] = float(np.mean(np.abs(found.bins[:, part]) ** 2))
+    return centres_hz, ratios, power
+
+
+def _best_curve(
+    excess: NDArray[np.float64],
+    centres_hz: NDArray[np.float64],
+    slopes_s_hz: NDArray[np.float64],
+    modulation: Modulation,
+    pivot_hz: float,
+) -> tuple[float, Curve, NDArray[np.bool_]]:
+    """Return the score of the curve that follows the sound through most sub-bands, the curve, and these sub-bands."""
+    steepest, step = slopes_s_hz[-1], slopes_s_hz[1] - slopes_s_hz[0]
+    rising = np.geomspace(steepest / 1e3, steepest, _N_CURVES)
+    found = []
+    for slope in [*-rising, 0.0, *rising]:
+        curve = Curve(modulation, float(slope), pivot_hz)
+        places = np.rint((curve.slopes_s_hz(centres_hz) + steepest) / step)
+        inside = (places >= 0) & (places < len(slopes_s_hz))
+        along = np.where(inside, excess[np.arange(len(places)), places.clip(0, len(slopes_s_hz) - 1).astype(int)], 0.0)
+        found.append((float(along.sum()), curve, along))
+    score, curve, along = max(found, key=lambda each: each[0])
+    return score, curve, _run_around_highest(along)
+
+
+def _run_around_highest(along: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return the occupied sub-bands around the strongest one, with gaps of at most one sub-band: (sub-band,) bool."""
+    is_occupied = along > _OCCUPIED * along.max()
+    groups, _ = scipy.ndimage.label(scipy.ndimage.binary_closing(np.pad(is_occupied, 1))[1:-1])
+    return np.asarray(is_occupied & (groups == groups[int(along.argmax())]))
+
+
+def _focused(found: SoundSpectra, curve: Curve, low_hz: float, high_hz: float) -> tuple[Curve, GatedArrival]:
+    """Return the curve near a given one with the highest peak, and the arrival after its filter."""
+    arrival = arrival_of(found, curve, low_hz, high_hz)
+    for _ in range(_ROUNDS):
+        better, gain = refined(arrival, curve)
+        if gain < _GAIN:
+            break
+        curve, arrival = better, arrival_of(found, better, low_hz, high_hz)
+    return curve, arrival
+
+
+def power_after(found: SoundSpectra, filter_rad: NDArray[np.float64], part: slice) -> NDArray[np.float32]:
+    """Return the power over time after a filter with given phases in a band: (mic, sample) float32."""
+    after = scipy.fft.ifft(found.bins[:, part] * np.exp(1j * filter_rad).astype(np.complex64), found.n_fft, axis=1)
+    return np.asarray(after.real**2 + after.imag**2)
+
+
+def arrival_of(
+    found: SoundSpectra,
+    curve: Curve,
+    low_hz: float,
+    high_hz: float,
+    *,
+    gate_s: float = _GATE_S,
+    whole_hz: Sequence[float] = (),
+) -> GatedArrival:
+    """Return the strongest arrival of each microphone after the filter of a curve in a band.
+
+    With ``whole_hz``, the record contains these frequencies of the arrival, which neither began before the record nor
+    ends after it.
+    """
+    part = found.band(low_hz, high_hz)
+    frequency_hz = found.frequency_hz[part]
+    turned = found.bins[:, part] * np.exp(1j * curve.phase_rad(frequency_hz)).astype(np.complex64)
+    after = scipy.fft.ifft(turned, found.n_fft, axis=1)
+    power = after.real**2 + after.imag**2
+    half = min(round(gate_s * found.rate_hz), found.n_fft // 4)
+    window = np.hanning(2 * half) ** 0.25
+    n_fft = scipy.fft.next_fast_len(2 * len(window))
+    step_hz = found.rate_hz / n_fft
+    n_bins = int((frequency_hz[-1] - frequency_hz[0]) / step_hz) + 1
+    at_hz = frequency_hz[0] + np.arange(n_bins) * step_hz
+    noise = np.interp(at_hz, found.frequency_hz, found.noise)  # For the spectrum as it was recorded.
+
+    def around(middle: NDArray[np.intp]) -> NDArray[np.complex128]:
+        places = (middle[:, None] + np.arange(-half, half)) % found.n_fft
+        parts = np.take_along_axis(after, places, axis=1) * window
+        return np.asarray(scipy.fft.fft(parts, n_fft, axis=1)[:, :n_bins])
+
+    seconds = np.arange(found.n_fft)[:, None] / found.rate_hz + curve.delay_s(np.array(whole_hz))
+    seconds %= found.n_fft / found.rate_hz
+    is_whole = ((seconds >= found.whole_s[0]) & (seconds <= found.whole_s[1])).all(axis=1)
+    power = np.where(is_whole, power, 0)
+    peaks = power.argmax(axis=1)
+    shifts = np.arange(2 * half, found.n_fft - 2 * half + 1, 2 * half)
+    others = [np.mean(np.abs(around(peaks + shift)) ** 2, axis=0) for shift in shifts] or [np.zeros(n_bins)]
+    return GatedArrival(around(peaks), at_hz, power.max(axis=1), np.median(others, axis=0), noise)
+
+
+def refined(arrival: GatedArrival, curve: Curve) -> tuple[Curve, float]:
+    """Return the curve of any modulation with the highest peak at an arrival, and the ratio of both peak powers."""
+    at_hz = arrival.frequency_hz
+    before_rad = curve.phase_rad(at_hz)
+    n_fft = scipy.fft.next_fast_len(2 * len(at_hz))
+    given = _peaks(arrival, np.zeros((1, len(at_hz))), n_fft)[0]
+    best = (1.0, curve)
+    bandwidth_hz = at_hz[-1] - at_hz[0]
+    for modulation in MODULATIONS:
+        unit = Curve(modulation, 1.0, curve.pivot_hz)
+        unit_rad, extent = unit.phase_rad(at_hz), float(unit.delay_s(at_hz[-1]) - unit.delay_s(at_hz[0]))
+        middle = float(curve.delay_s(at_hz[-1]) - curve.delay_s(at_hz[0])) / extent
+        step = 1 / (extent * bandwidth_hz)
+        count = min(_MAX_STEPS, int(_GATE_S / extent / (_COARSE * step)) + 1)
+        of_modulation = middle, 0.0
+        for size, number in ((_COARSE * step, count), (_FINE * step, round(_COARSE / _FINE))):
+            slopes = of_modulation[0] + size * np.arange(-number, number + 1)
+            gains = np.median(_peaks(arrival, slopes[:, None] * unit_rad - before_rad, n_fft) / given, axis=1)
+            of_modulation = float(slopes[gains.argmax()]), float(gains.max())
+        if of_modulation[1] > best[0]:
+            best = of_modulation[1], Curve(modulation, of_modulation[0], curve.pivot_hz)
+    return best[1], best[0]
+
+
+def _peaks(arrival: GatedArrival, phases_rad: NDArray[np.float64], n_fft: int) -> NDArray[np.float64]:
+    """Return the peak power after filters with given phases: (filter, mic) float64."""
+    filters = np.exp(1j * phases_rad).astype(np.complex64)
+    after = scipy.fft.ifft(filters[:, None] * arrival.spectra.astype(np.complex64), n_fft, axis=2)
+    return np.asarray((after.real**2 + after.imag**2).max(axis=2), dtype=np.float64)
+
+
+def _edges_hz(arrival: GatedArrival, curve: Curve) -> tuple[float, float]:
+    """Return the edges of the band of an arrival; its power at a frequency is relative to the time spent there."""
+    slopes_s_hz = np.abs(curve.slopes_s_hz(arrival.frequency_hz))
+    is_sound = (arrival.power > arrival.background) & (arrival.power > _MIN_POWER * arrival.power.max())
+    power = np.where(is_sound, arrival.power, 0) / np.maximum(slopes_s_hz, 1e-30)
+    loud = np.flatnonzero(power >= _EDGE * power.max())
+    return float(arrival.frequency_hz[loud[0]]), float(arrival.frequency_hz[loud[-1]])
