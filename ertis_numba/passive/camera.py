@@ -211,7 +211,8 @@ class AcousticCamera:
             powers = self.powers()
             power = (self._shares @ powers).T
         if self.settings.passive.method != "music":  # It has no levels.
-            self._edge_tones.add(powers, power, self.n_measurements)
+            heard = np.einsum("bmm->b", self._sums.real) / (self._shape[1] * self._n_blocks)
+            self._edge_tones.add(powers, power, heard, self.n_measurements)
         if self._check and (note := self.band_note) is not None:
             self._check = False
             warnings.warn(note, OutsideBandsWarning, stacklevel=3)

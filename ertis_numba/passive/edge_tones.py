@@ -38,7 +38,10 @@ class _Tone(NamedTuple):
 
 
 class EdgeTones:
-    """Spectra at the edges of bands, in the loudest directions of the bands, over all maps so far.
+    """Spectra at the edges of bands, at the microphones and in the loudest directions of the bands, over all maps.
+
+    Directions show a tone that is weaker than noise at the microphones. Beams of grids coarser than the main lobe
+    distort its spectrum, so that of the microphones has priority if it shows the tone.
 
     Parameters
     ----------
@@ -48,8 +51,8 @@ class EdgeTones:
     highest_hz : float
         Highest frequency of bands.
     method : MapMethod
-        Powers of ``capon``, ``clean_sc`` and ``hr_clean_sc`` do not follow the window, so that tones at edges without a
-        neighbouring band are left out.
+        Powers of methods other than ``delay_and_sum`` and ``functional`` do not follow the window. Tones are then
+        found at the microphones only.
     """
 
     def __init__(self, band_hz: Floats, frequency_hz: Floats, highest_hz: float, method: MapMethod) -> None:
@@ -60,6 +63,7 @@ class EdgeTones:
         self._edges = [self._edge(edge_hz) for edge_hz in sorted(set(band_hz.ravel().tolist()))]
         self._lines = np.zeros((len(self._edges), len(band_hz), 2 * _REACH + 1))
         self._bands, self._count = np.zeros(len(band_hz)), 0
+        self._heard = np.zeros(len(frequency_hz))
 
     def _edge(self, edge_hz: float) -> _Edge:
         near = np.abs(self._band_hz - edge_hz) <= _ROUNDING * edge_hz
@@ -67,7 +71,7 @@ class EdgeTones:
         known = (places >= 0) & (places < len(self._frequency_hz))
         return _Edge(edge_hz, tuple(np.flatnonzero(near.any(axis=1)).tolist()), np.where(known, places, -1))
 
-    def add(self, powers: NDArray[np.float32], power: NDArray[np.float32], count: int) -> None:
+    def add(self, powers: NDArray[np.float32], power: NDArray[np.float32], heard: Floats, count: int) -> None:
         """Add a map.
 
         Parameters
@@ -75,6 +79,8 @@ class EdgeTones:
         powers : (bin, direction) float32
         power : (direction, band) float32
             Map of these powers.
+        heard : (bin,) float64
+            Mean power of the microphones.
         count : int
             Number of its measurements.
         """
@@ -84,6 +90,7 @@ class EdgeTones:
             for band in edge.bands:
                 line = np.where(edge.bins >= 0, powers[edge.bins, loudest[band]], 0.0)
                 self._lines[number, band] += count * line
+        self._heard += count * heard
         self._count += count
 
     def note(self, *, within: bool = False) -> str | None:
@@ -98,8 +105,7 @@ class EdgeTones:
             (edge, tone)
             for number, edge in enumerate(self._edges)
             for band in edge.bands
-            if (len(edge.bands) > 1 or (self._is_linear and not within))
-            and (tone := self._tone(edge, band, self._lines[number, band])) is not None
+            if (len(edge.bands) > 1 or not within) and (tone := self._found(number, band)) is not None
         ]
         if not tones:
             return None
@@ -117,23 +123,40 @@ class EdgeTones:
             return f"for its level, record at a higher rate: bands end at {self._highest_hz / 1e3:.4g} kHz"
         return f"for its level, use --bands {typed_hz(low_hz)}:{typed_hz(high_hz)} (passive.bands_hz)"
 
-    def _tone(self, edge: _Edge, band: int, line: Floats) -> _Tone | None:
-        """Return the tone at an edge in the loudest direction of a band, if it dominates this band."""
-        middle = _REACH - 1 + int(line[_REACH - 1 : _REACH + 2].argmax())
+    def _found(self, number: int, band: int) -> _Tone | None:
+        """Return the tone at an edge that dominates a band at the microphones, or else in its loudest direction."""
+        edge = self._edges[number]
+        heard = np.where(edge.bins >= 0, self._heard[edge.bins], 0.0)
+        if self._is_line(edge, heard):
+            return self._tone(edge, band, heard, float(self._shares[band] @ self._heard))
+        line = self._lines[number, band]
+        is_shown = self._is_linear and self._is_line(edge, line)
+        return self._tone(edge, band, line, self._bands[band]) if is_shown else None
+
+    @staticmethod
+    def _middle(line: Floats) -> int:
+        """Return the place of the strongest of the three bins around an edge."""
+        return _REACH - 1 + int(line[_REACH - 1 : _REACH + 2].argmax())
+
+    def _is_line(self, edge: _Edge, line: Floats) -> bool:
+        """Return True if a spectrum shows a tone at an edge."""
+        middle = self._middle(line)
+        ends = line[[middle - _LINE, middle + _LINE]].max()
+        is_top = line[middle] >= line[[middle - 1, middle + 1]].max()
+        return bool(edge.bins[middle] >= 0 and is_top and line[middle] > _TINY and ends <= _TAIL * line[middle])
+
+    def _tone(self, edge: _Edge, band: int, line: Floats, all_power: float) -> _Tone | None:
+        """Return the tone of a spectrum at an edge, if it dominates the power of a band."""
+        middle = self._middle(line)
         part = slice(middle - _LINE, middle + _LINE + 1)
         bins, tone = edge.bins[part], line[part]
         known = bins >= 0
-        ends = tone[[0, -1]].max()
-        if not known[_LINE] or tone[_LINE] <= _TINY or ends > _TAIL * tone[_LINE]:
-            return None
         inside = float(np.where(known, self._shares[band, bins], 0.0) @ tone)
         power = float(tone.sum())
         places = float(np.where(known, bins, 0) @ tone) / power
-        if not known.all() and not self._is_linear:
-            return None
         if not known.all():
             places, power = _of_part(bins, tone)
-        if inside < _MOST * self._bands[band] or power - inside < _LOSS * power:
+        if inside < _MOST * all_power or power - inside < _LOSS * power:
             return None
         return _Tone(float(self._frequency_hz[0]) + self._spacing_hz * places, power)
 
