@@ -2,11 +2,15 @@
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
 
 import ertis_numba as ertis
+from ertis_numba.analysis.detect import left_out_at_edges
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.geometry import Grid
 from ertis_numba.settings import Array
+from ertis_numba.storage import write_energyscapes
 from tests.test_detect import image_of
 
 RESOLUTION_M = 343.87 / 2 / 25e3
@@ -47,3 +51,18 @@ def test_echo_one_resolution_within_the_first_range_is_listed():
     image, true_m = slid(0, 4)
     (peak,) = ertis.find_peaks(image, top=1)
     assert are_the_echo(peak.azimuth_deg, peak.range_m, true_m)
+
+
+@pytest.mark.parametrize("edge", [0, 1])
+def test_maxima_left_out_at_an_edge_are_counted(tmp_path, monkeypatch, edge):
+    monkeypatch.chdir(tmp_path)
+    noted = {}
+    for quarters in (-4, 12):
+        image, _ = slid(edge, quarters)
+        peaks = ertis.find_peaks(image, false_alarm=1e-3)
+        count = left_out_at_edges(image, peaks, false_alarm=1e-3)
+        assert (count > 0) == (quarters < 0)
+        write_energyscapes("img.h5", [image], overwrite=True)
+        noted[quarters] = CliRunner().invoke(cli, ["peaks", "img.h5"]).stderr
+        assert (f"{count} maxima near the first or last range left out" in noted[quarters]) == (quarters < 0)
+    assert "use 'ertis process' with a wider --range to tell them apart" in noted[-4]

@@ -275,9 +275,32 @@ def _found(
 
     with open_energyscapes(path, sensor=sensor) as images:
         options.warn_of_spacing(sensor, images.settings, images)
-        found = [(index, peak) for index in options.places(measurement, len(images)) for peak in find(images[index])]
+        places = options.places(measurement, len(images))
+        by_place = {index: find(images[index]) for index in places}
+        found = [(index, peak) for index, peaks in by_place.items() for peak in peaks]
+        _note_left_out(sensor, sum(_n_left_out(images[index], peaks, find) for index, peaks in by_place.items()))
         options.note_open_edges(sensor, images, (peak.grid_error_deg for _, peak in found))
         return [{"sensor": sensor, "measurement": index, **_rounded(peak)} for index, peak in found]
+
+
+def _n_left_out(image: "Energyscape", peaks: "list[Peak]", find: "Callable[[Energyscape], list[Peak]]") -> int:
+    """Return the number of maxima near the first and last range that the finder of `find_peaks` left out."""
+    from ertis_numba.analysis.detect import find_peaks, left_out_at_edges
+
+    if not isinstance(find, partial) or find.func is not find_peaks:
+        return 0
+    limits = {name: find.keywords[name] for name in ("min_level_db", "false_alarm")}
+    return left_out_at_edges(image, peaks, **limits)
+
+
+def _note_left_out(sensor: str, count: int) -> None:
+    """Print a note on maxima that were left out near the edges of the range axis."""
+    if count:
+        maxima = "1 maximum" if count == 1 else f"{count} maxima"
+        options.note(
+            f"sensor {sensor}: {maxima} near the first or last range left out, "
+            "which side lobes of an echo beyond may cause; use 'ertis process' with a wider --range to tell them apart"
+        )
 
 
 def _compared(place: dict[str, Any], comparison: "Comparison") -> Iterator[dict[str, Any]]:

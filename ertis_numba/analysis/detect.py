@@ -1,6 +1,7 @@
 """Detection of reflectors in images."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak, PointCloud
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
 
-__all__ = ["find_peaks", "neighbours_of", "peaks_of_grid"]
+__all__ = ["find_peaks", "left_out_at_edges", "neighbours_of", "peaks_of_grid"]
 
 _SAME_DIGITS = 9  # Decimals in which the unit vectors of equal directions agree.
 _NEIGHBOURS = 8  # Number of directions around each direction of a dense grid.
@@ -116,10 +117,7 @@ def peaks_of_grid(
         return _fused_peaks(image.points.strongest(top, min_level_db), is_planar=image.is_planar)
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     neighbours = neighbours_of(directions)
-    highest = float(np.max(image.amplitude, initial=0.0))
-    floor = checks.finite("the maximum of the image", highest) * 10 ** (min_level_db / 20)
-    if false_alarm is not None:
-        floor = max(floor, threshold_of(image, false_alarm))
+    floor = _floor(image, min_level_db, false_alarm)
     if where is not None:
         where = np.asarray(where)
         checks.shape("where", where.shape, image.amplitude.shape)
@@ -157,6 +155,44 @@ def peaks_of_grid(
         for k in sorted(range(len(found)), key=lambda k: -levels[k])
         for direction, range_m, _ in found[k : k + 1]
     ]
+
+
+def left_out_at_edges(
+    image: Energyscape, peaks: Sequence[Peak], *, min_level_db: float = -30.0, false_alarm: float | None = None
+) -> int:
+    """Return the number of maxima that `find_peaks` left out because an echo beyond an edge may have caused them.
+
+    Side lobes of the listed reflectors do not count.
+
+    Parameters
+    ----------
+    image : Energyscape
+    peaks : sequence of Peak
+        Reflectors of the image, from `find_peaks` with the same arguments.
+    min_level_db, false_alarm
+        As for `find_peaks`.
+    """
+    if image.points is not None:
+        return 0
+    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    edges = EdgeFloor(directions, PointSpread(image.settings))(image)
+    floor = _floor(image, min_level_db, false_alarm)
+    places = _local_maxima(image.amplitude, neighbours_of(directions), np.full(len(edges), floor), edges[None] > 0)
+    levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
+    is_left = levels < edges[places[:, 1]]
+    side_lobes = SideLobes(image, directions, places[is_left])
+    for peak in peaks:
+        azimuth_rad, elevation_rad = np.nan_to_num(np.radians([[peak.azimuth_deg], [peak.elevation_deg]]))
+        side_lobes.add(unit_vectors(azimuth_rad, elevation_rad)[0], peak.range_m, 10 ** (peak.level_dbfs / 20))
+    doubtful = zip(places[is_left], levels[is_left], strict=True)
+    return sum(not side_lobes.explain(directions[place[0]], int(place[1]), level) for place, level in doubtful)
+
+
+def _floor(image: Energyscape, min_level_db: float, false_alarm: float | None) -> float:
+    """Return the amplitude that reflectors must have."""
+    highest = checks.finite("the maximum of the image", float(np.max(image.amplitude, initial=0.0)))
+    floor = highest * 10 ** (min_level_db / 20)
+    return floor if false_alarm is None else max(floor, threshold_of(image, false_alarm))
 
 
 def _fused_peaks(cloud: PointCloud, *, is_planar: bool) -> list[Peak]:
