@@ -1,13 +1,16 @@
 """Grids of directions in which bearings are found."""
 
 import math
+import re
 
 import numpy as np
 import pytest
 
 import ertis_numba as ertis
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
-from ertis_numba.passive.search_grid import search_changes, search_warning
+from ertis_numba.passive.search_grid import coarse_map_warning, search_changes, search_warning
+from ertis_numba.settings import Array, Recording
 
 LINE_M = [[0.0, y, 0.0] for y in (0, 0.004, 0.011, 0.02, 0.031, 0.04)]
 COLUMN_M = [[0.0, 0.0, y] for _, y, _ in LINE_M]
@@ -95,3 +98,49 @@ def test_horizontal_line_needs_one_elevation_only():
     assert search_changes(settings_with("2d:5", **line))["processing.directions"].startswith("2d:")
     column = settings_with("2d:181", **{"array.positions_m": COLUMN_M})
     assert search_changes(column)["processing.directions"].startswith("3d:")
+
+
+def spread(span_m, n_samples=16_000, **changes):
+    """Settings of 16 microphones on a spiral, at 16 kHz."""
+    turn, radius_m = np.arange(16) * 2.399963, span_m / 2 * np.sqrt((np.arange(16) + 0.5) / 16)
+    places_m = np.stack([0 * turn, radius_m * np.cos(turn), radius_m * np.sin(turn)], axis=1)
+    return ertis.Settings().replace(
+        array=Array(positions_m=tuple(map(tuple, places_m.tolist()))),
+        recording=Recording(sample_rate_hz=16e3, n_samples=n_samples, encoding="float32"),
+        **{"processing.mode": "passive", "passive.bands_hz": ((1e3, 1.5e3),), **changes},
+    )
+
+
+@pytest.mark.parametrize("span_m", [0.5, 3.0])
+def test_blocks_are_long_enough_for_large_arrays(span_m):
+    settings = spread(span_m, **{"processing.directions": "3d:2500"})
+    places_m = np.array(settings.array.positions_m)
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        azimuth_rad, elevation_rad = np.radians(random.uniform((-60, -40), (60, 40)))
+        (towards,) = unit_vectors(np.array([azimuth_rad]), np.array([elevation_rad]))
+        spectrum, frequency_hz = np.fft.rfft(random.normal(0, 0.05, 20_000)), np.fft.rfftfreq(20_000, 1 / 16e3)
+        early_s = places_m @ towards / sound_speed_m_s(settings.air)
+        sound = [np.fft.irfft(spectrum * np.exp(2j * np.pi * frequency_hz * each)) for each in early_s]
+        data = np.stack(sound, axis=1)[2000:18_000] + random.normal(0, 0.005, (16_000, 16))
+        with ertis.AcousticCamera(settings, "cpu", 1) as camera:
+            assert camera.warning is None
+            camera.add(ertis.Measurement(data.astype("f4"), settings, ertis.Stamp(behaviour="passive")))
+            (found,) = ertis.find_bearings(camera)
+        (direction,) = unit_vectors(np.radians([found.azimuth_deg]), np.radians([found.elevation_deg]))
+        assert math.degrees(np.linalg.norm(direction - towards)) < 5 * math.hypot(found.sideways_deg, found.upwards_deg)
+
+
+@pytest.mark.parametrize(
+    ("changes", "remedy"),
+    [
+        ({"passive.resolution_hz": 200.0}, "use passive.resolution_hz up to 41"),
+        ({"n_samples": 320}, "use measurements of at least 24 ms"),
+    ],
+)
+def test_blocks_that_are_too_short_for_an_array_are_warned_of(changes, remedy):
+    settings = spread(3.0, **changes)
+    for warning in (coarse_map_warning(settings), search_warning(settings)):
+        assert re.match(r"blocks last [56] ms, but sound takes up to 8 ms to cross the array", warning)
+        assert remedy in warning
+    assert "blocks" not in (coarse_map_warning(spread(0.1)) or "")

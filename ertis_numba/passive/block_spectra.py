@@ -1,7 +1,6 @@
 """Spectra of blocks of a measurement: demodulation, window, and Fourier transform."""
 
 import math
-from typing import Final
 
 import numpy as np
 import scipy
@@ -11,14 +10,11 @@ from ertis_numba import fft
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.kernels import KernelSet
+from ertis_numba.passive.block_lengths import BINS_OF_A_BAND, block_length, spacing_of
 from ertis_numba.passive.heard_signals import HeardSignals, heard_bands
 from ertis_numba.settings import Settings
 
 __all__ = ["BlockSpectra"]
-
-_MAX_SPACING_HZ: Final = 1e3
-_BINS_OF_A_BAND: Final = 3
-_LEAST_BLOCKS: Final = 4.0  # in a short record, unless bands are narrow
 
 
 class BlockSpectra:
@@ -125,28 +121,16 @@ class BlockSpectra:
 
 def _spacing(settings: Settings, bands_hz: NDArray[np.float64], rate_hz: float) -> tuple[float, int]:
     """Return the spacing of the bins, and the number of samples of a block."""
-    widest_hz = settings.passive.resolution_hz
-    if widest_hz is None:
-        widest_hz = min(
-            float(np.diff(bands_hz).min()) / _BINS_OF_A_BAND,
-            max(_MAX_SPACING_HZ, _LEAST_BLOCKS / settings.recording.duration_s),
-        )
-    n_block = _block_length(max(8, math.ceil(rate_hz / widest_hz)))
+    n_block = block_length(max(8, math.ceil(rate_hz / spacing_of(settings, bands_hz))))
     return rate_hz / n_block, n_block
-
-
-def _block_length(n_samples: int) -> int:
-    """Return the length of the shortest block with an even, fast transform that has at least so many samples."""
-    n_block = int(scipy.fft.next_fast_len(n_samples, real=True))
-    return n_block + n_block % 2
 
 
 def _too_narrow(settings: Settings, n_block: int, n_samples: int, rate_hz: float) -> str:
     """Return the message for a block that is longer than the record, with a width that suffices."""
-    n_longest = next(n for n in range(n_samples, 0, -1) if n == 1 or _block_length(n) <= n_samples)
+    n_longest = next(n for n in range(n_samples, 0, -1) if n == 1 or block_length(n) <= n_samples)
     n_bins, key, what = 1, "passive.resolution_hz", "one"
     if settings.passive.resolution_hz is None:
-        n_bins, key, what = _BINS_OF_A_BAND, "passive.bands_hz", "bands"
+        n_bins, key, what = BINS_OF_A_BAND, "passive.bands_hz", "bands"
     least_hz = math.ceil(n_bins * rate_hz / n_longest)
     return (
         f"{key} needs blocks of {n_block / rate_hz:.3g} s, longer than the record with {n_samples / rate_hz:.3g} s; "

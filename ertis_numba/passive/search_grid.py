@@ -12,6 +12,7 @@ from ertis_numba.analysis.array_response import ToneResponse
 from ertis_numba.analysis.direction_spacing import LARGEST_GRID, MAX_LOSS_DB, GridCheck, Lobe, Peak, rounded_down
 from ertis_numba.angles import DegreesFromRadians
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.passive.block_lengths import block_warning
 from ertis_numba.passive.heard_signals import heard_bands
 from ertis_numba.passive.scan_extent import is_level
 from ertis_numba.passive.wave_delays import WaveDelays
@@ -61,8 +62,12 @@ def coarse_map_warning(settings: Settings, grid: DegreesFromRadians | None = Non
     True
     """
     check = GridCheck(direction_grid(settings.processing) if grid is None else grid, settings.processing)
-    if check.is_single:
-        return None
+    found = (block_warning(settings, heard_bands(settings)), None if check.is_single else _map_warning(settings, check))
+    return "; also, ".join(filter(None, found)) or None
+
+
+def _map_warning(settings: Settings, check: GridCheck) -> str | None:
+    """Return the warning of a grid that is too coarse for maps, or of an ambiguous array."""
     bands_hz, lobe_at = _bands_hz(settings), _lobes(settings, _map_peak(settings))
     coarse_hz = _lowest(bands_hz, lambda high_hz: check.suffices(lobe_at(high_hz)))
     ambiguous_hz = _lowest(bands_hz, lambda high_hz: not check.is_ambiguous(lobe_at(high_hz)))
@@ -128,7 +133,7 @@ def search_changes(settings: Settings) -> dict[str, object]:
     >>> search_changes(ertis.Settings())["processing.directions"].startswith("3d:")
     True
     """
-    if search_warning(settings) is None:
+    if _search_warning(settings) is None:
         return {}
     wide = settings.replace(**_HALF_SPACE)
     fine = _search_check(wide).finer(_search_lobe(wide))
@@ -166,6 +171,12 @@ def search_warning(settings: Settings) -> str | None:
     >>> search_warning(settings.replace("processing.directions", "3d:230")) is None
     True
     """
+    found = (block_warning(settings, heard_bands(settings)), _search_warning(settings))
+    return "; also, ".join(filter(None, found)) or None
+
+
+def _search_warning(settings: Settings) -> str | None:
+    """Return the warning of directions that do not suit the search."""
     grid = direction_grid(settings.processing)
     if is_level(unit_vectors(grid.azimuth_rad, grid.elevation_rad)) and not _is_line(settings):
         elevation_deg = math.degrees(grid.elevation_rad[0])

@@ -53,6 +53,7 @@ class Passive(TomlTable, frozen=True, kw_only=True):
         Diagonal loading of ``capon`` relative to the mean power of a microphone, 1e-6 to 1e6.
     resolution_hz : float, optional, default None
         Largest spacing of frequencies in hertz; by default a third of the narrowest band, and at most 1 kHz.
+        Arrays above 11 cm have longer blocks by default: three times as long as sound takes to cross them.
     averages : int, default 1
         Number of measurements in a map, 1 to 100000, over which powers are averaged.
     focus_m : float, optional, default None
