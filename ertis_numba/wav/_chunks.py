@@ -130,11 +130,11 @@ def _require_single(content: Content, chunks: Chunks, name: bytes, place: int) -
     """Refuse samples in several places."""
     path = content.path
     if name == b"fmt " and name in chunks.places:
-        first = chunks.places[name]
-        length = HEADER_BYTES + content.header(first)[1]
-        if content.read(first, length) != content.read(place, length):
+        known = chunks.places[name]
+        length = HEADER_BYTES + content.header(known)[1]
+        if content.read(known, length) != content.read(place, length):
             raise DataError(
-                f"{path} has different fmt chunks at bytes {first} and {place}; save the file again as WAV with the "
+                f"{path} has different fmt chunks at bytes {known} and {place}; save the file again as WAV with the "
                 "program that wrote it"
             )
     if name == b"data" and name in chunks.places:
