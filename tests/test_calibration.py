@@ -244,7 +244,7 @@ def test_fixed_positions_need_no_other_direction():
 
 
 def test_wrong_layout_is_refused_and_the_right_one_is_named():
-    with pytest.raises(DataError, match="eRTIS_v3D1 does; give it with --layout eRTIS_v3D1"):
+    with pytest.raises(DataError, match="eRTIS_v3D1 does; use it with --layout eRTIS_v3D1"):
         calibrate(plain(), "eRTIS_v2")
     strange = reordered(plain(), np.random.default_rng(1).permutation(32))
     with pytest.raises(DataError, match=r"does not fit the recordings.*give the layout of this sensor"):

@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba.analysis.health import Finding, health, limits
+from ertis_numba.calibration import OtherLayoutError
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import load_layout
@@ -299,9 +300,16 @@ def test_other_order_in_the_calibration_alone_is_no_fault(is_reported):
     )
     report = health(plane_array())
     finding = Finding(fault="order of channels", channels=tuple(range(32)), measured=30.0, limit=15.0)
-    result = of_calibration(residuals, "", dataclasses.replace(report, findings=(finding,) * is_reported))
+    result = of_calibration(residuals, dataclasses.replace(report, findings=(finding,) * is_reported))
     assert result.result == ("ok" if is_reported else "not known")
     assert result.faults == ()
+
+
+def test_layout_that_fits_instead_is_a_fault():
+    result = of_calibration(OtherLayoutError("own", 0.4, "eRTIS_v2"), None)
+    ((text, remedy),) = [(fault.text, fault.remedy) for fault in result.faults]
+    assert text == "layout own does not fit the recordings (40% of the microphones), but layout eRTIS_v2 does"
+    assert remedy == 'set array.layout = "eRTIS_v2" in a settings file (--settings)'
 
 
 def test_another_layout_deviates(tmp_path):

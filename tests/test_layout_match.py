@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
+from ertis_numba.analysis.health.array_match import unobservable
 from ertis_numba.analysis.layout_match import first_layout_match, layout_match
 from ertis_numba.errors import LayoutMismatchWarning
 from ertis_numba.frames import Measurement, Stamp
@@ -97,8 +98,55 @@ def test_silence_and_few_microphones_are_not_judged():
     assert layout_match(silent) is None
     assert first_layout_match([silent, silent, heard(disc(0.1))]).finding is None
     assert first_layout_match([silent]) is None
-    few = disc(0.1, 8)
+    few = disc(0.1, 4)
     assert layout_match(heard(few, array=Array(positions_m=few[::-1]))).finding is None
+
+
+@pytest.mark.parametrize("count", [8, 10, 11])
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (lambda places_m: {"positions_m": places_m[::-1]}, "order of channels"),
+        (lambda places_m: {"positions_m": 10 * places_m}, "size of the array"),
+        (lambda places_m: {"positions_m": places_m / 10}, "size of the array"),
+        (lambda places_m: {"positions_m": 2.54 * places_m}, "size of the array"),
+        (lambda places_m: {"delay_s": np.where(np.arange(len(places_m)) < len(places_m) // 2, 0, 2e-5)}, "half late"),
+    ],
+    ids=["reversed", "cm as mm", "mm as cm", "inches", "half late"],
+)
+def test_arrays_of_few_microphones_are_judged(count, change, fault):
+    places_m = disc(0.1, count)
+    assert layout_match(read_as(heard(places_m), **change(places_m))).finding.fault == fault
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("count", [5, 6, 8, 11])
+def test_arrays_of_few_inexact_microphones_are_not_accused(count, seed):
+    """Delays deviate by 3 µs, and two echoes may overlap."""
+    rng = np.random.default_rng([count, seed])
+    places_m = np.column_stack([np.zeros(count), rng.uniform(-0.1, 0.1, (count, 2))])
+    places_m -= places_m.mean(axis=0)
+    given, other = (heard(places_m, source_m=(0.9, rng.uniform(-0.5, 0.5), 0.1), seed=seed) for _ in range(2))
+    both = dataclasses.replace(given, data=(given.data + other.data * rng.integers(0, 2)).astype(np.int16))
+    assert not layout_match(read_as(both, delay_s=rng.normal(0, 3e-6, count))).warning
+
+
+@pytest.mark.parametrize("factor", [10, 0.1, 1 / 2.54])
+def test_scaled_layouts_are_named_by_their_unit(factor):
+    array = load_layout("eRTIS_v3D1")
+    found = layout_match(heard(array.positions_m, array=Array(positions_m=factor * array.positions_m))).finding
+    assert found.fault == "size of the array"
+    assert found.detail == f"the positions are those of layout eRTIS_v3D1 times {factor:.3g}"
+
+
+@pytest.mark.parametrize(
+    ("count", "named"), [(16, ""), (7, "a wrong unit of the positions"), (5, "order, unit and timing of the channels")]
+)
+def test_health_states_what_no_echo_reveals(count, named):
+    found = unobservable(disc(0.1, count))
+    assert found[-1].startswith("mirrored or turned positions: ")
+    assert not named or found[0] == f"{named}: {count} microphones are too few"
+    assert len(found) == 1 + bool(named)
 
 
 def test_large_arrays_are_judged_by_some_microphones():

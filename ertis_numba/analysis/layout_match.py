@@ -34,12 +34,9 @@ class LayoutMatch:
     ----------
     finding : Finding, optional
         Another order, size or timing of the channels, which fits far better; None if the layout may be right.
-    note : str
-        Reason why the layout cannot be judged; empty by default.
     """
 
     finding: Finding | None
-    note: str = ""
 
     @classmethod
     def of(cls, findings: Iterable[Finding]) -> "LayoutMatch":

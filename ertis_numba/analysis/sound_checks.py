@@ -63,10 +63,13 @@ class SoundChecks:
         if subject == "start":
             return self._start(measurement)
         self._remaining[subject] -= 1
-        match = call_match(measurement) if subject == "call" else layout_match(measurement)
-        if match is not None:
-            return match.warning or match.note
-        return None if self._remaining[subject] else ""
+        if subject == "call":
+            call = call_match(measurement)
+            known = None if call is None else call.warning or call.note
+        else:
+            layout = layout_match(measurement)
+            known = None if layout is None else layout.warning
+        return "" if known is None and not self._remaining[subject] else known
 
     def _start(self, measurement: Measurement) -> str | None:
         """Compare the direct sound with the distance of the emitter, in ever fewer measurements."""

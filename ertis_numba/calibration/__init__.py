@@ -2,6 +2,7 @@
 
 from ertis_numba.calibration.array_calibration import calibrate
 from ertis_numba.calibration.result import Calibration, Residuals
+from ertis_numba.calibration.usable_sounds import OtherLayoutError
 from ertis_numba.calibration.wavefronts import Target
 
-__all__ = ["Calibration", "Residuals", "Target", "calibrate"]
+__all__ = ["Calibration", "OtherLayoutError", "Residuals", "Target", "calibrate"]

@@ -26,6 +26,25 @@ _MIN_SHARE: Final = 0.6  # Share of the microphones that one wavefront must fit.
 _MAX_SILENT_POWER: Final = 0.1  # Power of a silent channel around the sound, relative to the median channel.
 
 
+class OtherLayoutError(DataError):
+    """Another shipped layout than that of the settings fits the recordings.
+
+    Attributes
+    ----------
+    finding : str
+        Both layouts, as a clause.
+    layout : str
+        Name of the layout that fits.
+    """
+
+    def __init__(self, given: str, share: float, layout: str) -> None:
+        self.finding = (
+            f"layout {given} does not fit the recordings ({share:.0%} of the microphones), but layout {layout} does"
+        )
+        self.layout = layout
+        super().__init__(f"{self.finding}; use it with --layout {layout}")
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Microphones:
     """Microphones that take part, with the calibration and the places in use."""
@@ -155,10 +174,7 @@ def ordered(
             )
         order, positions_m = found
         if order.startswith("layout "):
-            raise DataError(
-                f"layout {heard.former.name} does not fit the recordings ({usual:.0%} of the microphones), but "
-                f"{order} does; give it with --layout {order.removeprefix('layout ')}"
-            )
+            raise OtherLayoutError(heard.former.name, usual, order.removeprefix("layout "))
         every = replace(every, positions_m=positions_m[every.channels])
         sources = _sources(heard, every, used, target)
     for number, source in sources.items():

@@ -14,6 +14,7 @@ from ertis_numba.analysis.emission_time import emission_times_s
 from ertis_numba.analysis.health import Health, health, merge
 from ertis_numba.analysis.health.emission import describe_shift
 from ertis_numba.atomic_files import remedy
+from ertis_numba.calibration import OtherLayoutError
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
@@ -168,7 +169,7 @@ def _check_sensor(
     report = merge([health(measurement) for measurement in heard]) if heard else None
     has_call = report is None or report.has_call
     match = _best_call_match(heard) if has_call else None
-    residuals, why = _calibration_residuals(heard, report) if has_call else (None, items.NO_CALL)
+    residuals = _calibration_residuals(heard, report) if has_call else items.NO_CALL
     shift = describe_shift(emission_times_s(heard), sound_speed_m_s(used.air)) if has_call else None
     layout = microphones(used.array)
     found: dict[str, items.CheckResult] = {
@@ -179,7 +180,7 @@ def _check_sensor(
         items.TIMING: items.of_timing(clock),
         items.DRIFT: items.of_drift(clock),
         items.CALL: items.of_call(match, has_call=has_call),
-        items.CALIBRATION: items.of_calibration(residuals, why, report),
+        items.CALIBRATION: items.of_calibration(residuals, report),
     }
     return SensorCheck(
         sensor=stored.sensor,
@@ -194,7 +195,7 @@ def _check_sensor(
         words=words,
         clock=clock,
         call=match,
-        calibration=residuals,
+        calibration=residuals if isinstance(residuals, CalibrationResiduals) else None,
     )
 
 
@@ -235,18 +236,20 @@ def _best_call_match(heard: Sequence[Measurement]) -> CallMatch | None:
 
 def _calibration_residuals(
     heard: Sequence[Measurement], report: Health | None
-) -> tuple[CalibrationResiduals | None, str]:
-    """Return the deviations from the layout, or the reason why they are not known."""
-    if report is None:
-        return None, "no measurement is intact"
-    if report.unknown:  # Noise can look like faults of channels.
-        return None, report.unknown[0]
+) -> CalibrationResiduals | OtherLayoutError | str:
+    """Return the deviations from the layout, the layout that fits instead, or the reason why neither is known."""
+    if report is None or report.unknown:  # Noise can look like faults of channels.
+        return "no measurement is intact" if report is None else report.unknown[0]
     faulty = [channel.channel for channel in report.channels if not _CALIBRATED.issuperset(channel.faults)]
     if len(faulty) == len(report.channels):
-        return None, "every channel is faulty"
+        return "every channel is faulty"
+    found: CalibrationResiduals | OtherLayoutError | str
     try:
-        return calibration_residuals(heard, faulty), ""
+        found = calibration_residuals(heard, faulty)
     except np.linalg.LinAlgError:  # Sounds from several places at once can leave the fit without a solution.
-        return None, "no single echo fits the layout"
+        found = "no single echo fits the layout"
+    except OtherLayoutError as error:
+        found = error
     except (ArgumentError, DataError) as error:
-        return None, str(error)
+        found = str(error)
+    return found

@@ -1,13 +1,13 @@
 """Results of single checks: measured values, faults and remedies."""
 
 import math
-import re
 from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
 from ertis_numba.analysis.call_match import UNKNOWN_CALL, CallMatch
 from ertis_numba.analysis.health import Health
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_GAIN_DB, MAX_WHITE_DB
+from ertis_numba.calibration import OtherLayoutError
 from ertis_numba.sensor_check.clock import ClockCheck
 from ertis_numba.sensor_check.lost_words import LostWords
 from ertis_numba.sensor_check.microphone_faults import (
@@ -62,10 +62,8 @@ COPY: Final = "copy the file again, or record again"
 _NO_NOISE: Final = "no microphone without a fault has a measurable noise"
 NO_CALL: Final = "no call was emitted"
 
-_FITS_ANOTHER: Final = re.compile(r"does not fit the recordings .*, but layout \S+ does; ")
 _DEVIATIONS: Final = 4.0
 _WORTH_S: Final = 1e-6  # 18 degrees of a period at 50 kHz.
-_OTHER_LAYOUT: Final = "name that layout as array.layout in a settings file (--settings)"
 _CALIBRATE: Final = "calibrate the array (ertis calibrate), or give its own layout (--settings)"
 
 
@@ -100,7 +98,8 @@ def of_microphones(report: Health | None) -> CheckResult:
     if report.unknown:
         detail += f"; not known: {report.unknown[0]}"
     if report.not_observable:
-        detail += f"; not observable: {report.not_observable[0].partition(':')[0]}"
+        faults_left = "; ".join(text.partition(":")[0] for text in report.not_observable)
+        detail += f"; not observable: {faults_left}"
     return _result_of(faults, detail)
 
 
@@ -208,13 +207,13 @@ def of_call(match: CallMatch | None, *, has_call: bool) -> CheckResult:
     return _result_of([CheckFault(check=CALL, text=text, remedy=rest.partition("; ")[2])], "")
 
 
-def of_calibration(residuals: CalibrationResiduals | None, why: str, report: Health | None) -> CheckResult:
+def of_calibration(residuals: CalibrationResiduals | OtherLayoutError | str, report: Health | None) -> CheckResult:
     """Return the deviations from the layout; faults that the health of the microphones names are left out."""
-    if residuals is None and _FITS_ANOTHER.search(why):
-        text = why.rpartition("; ")[0]
-        return _result_of([CheckFault(check=CALIBRATION, text=text, remedy=_OTHER_LAYOUT)], "")
-    if residuals is None:
-        return CheckResult("not known", why)
+    if isinstance(residuals, OtherLayoutError):
+        remedy = f'set array.layout = "{residuals.layout}" in a settings file (--settings)'
+        return _result_of([CheckFault(check=CALIBRATION, text=residuals.finding, remedy=remedy)], "")
+    if isinstance(residuals, str):
+        return CheckResult("not known", residuals)
     faulty = report.faults if report else {}
     reported = {channel for channels in faulty.values() for channel in channels}
     order = next((finding for finding in residuals.findings if not finding.channels), None)

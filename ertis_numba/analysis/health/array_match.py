@@ -5,6 +5,7 @@ arrival over all candidates alike, so that the ratio of their residuals decides,
 holds for arrays of any size.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -16,7 +17,7 @@ from ertis_numba.analysis.health.arrival import Compressed, strongest
 from ertis_numba.analysis.health.report import Finding
 from ertis_numba.geometry import Layout, layout_names, load_layout
 
-__all__ = ["ARRAY_FAULTS", "SIZE", "find_other_array"]
+__all__ = ["ARRAY_FAULTS", "SIZE", "find_other_array", "unobservable"]
 
 _ORDER: Final = "order of channels"
 _HALF: Final = "half late"
@@ -24,10 +25,14 @@ SIZE: Final = "size of the array"
 ARRAY_FAULTS: Final = frozenset({_ORDER, _HALF, SIZE})
 """Faults that `find_other_array` finds."""
 
-_MIN_CHANNELS: Final = 12  # Fewer channels fit another order by chance.
+_MIN_SPARE: Final = 2  # Channels beyond the unknowns of a fit.
+_CHANCE: Final = 1e-3  # Probability that one of the alternatives fits the errors of few channels.
+_MIN_SPARE_OF_SIZE: Final = 4  # The curvature is one more unknown, whose error must be known, too.
+_EQUAL: Final = 1e-3  # Deviation of a layout from a multiple of another one, relative to its size.
 _MIN_CURVED: Final = 3.0  # Residuals with the curvature of an echo relative to those with the best curvature.
 _MIN_RATIO: Final = 5.0  # Residuals of the array in use relative to those of another one.
 _MIN_SPREAD_S: Final = 0.3e-6  # Residuals below it are errors of the times.
+_MIN_RESIDUAL_S: Final = 0.02e-6  # Errors of times are never smaller.
 _KEPT: Final = 0.9  # Share of the microphones whose residuals count, so that a single one does not decide.
 _WIDE_S: Final = 0.4e-3  # Delay across the largest shipped layout, on either side.
 _WIDER: Final = 12.0  # Centimetres in place of millimetres delay sound ten times as much.
@@ -55,11 +60,29 @@ class _Match:
         Slowness across the array relative to that of sound.
     delay_s : float
         Delay of some channels relative to the others, if it is fitted.
+    n_spare : int
+        Number of microphones beyond the unknowns.
     """
 
     spread_s: float
     slowness: float
     delay_s: float = 0.0
+    n_spare: int = 0
+
+
+def unobservable(positions_m: NDArray[np.float64]) -> tuple[str, ...]:
+    """Return the faults of an array that no echo can reveal, with the reasons: positions (mic, 3) float64."""
+    n_mics, n_unknowns = len(positions_m), 1 + _places(positions_m).shape[1]
+    n_spare = _kept(n_mics, n_unknowns) - n_unknowns
+    if n_mics < 2:
+        return ()
+    few = f"{n_mics} microphones are too few"
+    found = ["mirrored or turned positions: they fit every echo as well"]
+    if n_spare < _MIN_SPARE:
+        return f"order, unit and timing of the channels: {few}", *found
+    if n_spare < _MIN_SPARE_OF_SIZE:
+        return f"a wrong unit of the positions: {few}", *found
+    return tuple(found)
 
 
 def find_other_array(
@@ -90,8 +113,6 @@ def find_other_array(
         True for sound so soon after the emission that its curvature is unknown; False by default.
     """
     picked = list(channels)
-    if len(picked) < _MIN_CHANNELS:
-        return None
     own = _best(times_s, layout.positions_m[picked], path_m, speed_m_s)
     every = [times_s]
     if own is None or own.spread_s >= _MIN_SPREAD_S or own.slowness > _MAX_SLOWNESS:
@@ -112,28 +133,44 @@ def find_other_array(
 def _other_order(
     times_s: NDArray[np.float64], channels: list[int], layout: Layout, path_m: float, speed_m_s: float
 ) -> Finding | None:
-    """Return the finding of another order or layout, or of a late half, if it fits much better."""
-    positions_m = layout.positions_m[channels]
-    own = _best(times_s, positions_m, path_m, speed_m_s)
+    """Return the finding of another order, layout or size, or of a late half, if it fits much better."""
+    own = _best(times_s, layout.positions_m[channels], path_m, speed_m_s)
     if own is None or own.spread_s < _MIN_SPREAD_S:
         return None
-    found: list[tuple[_Match, str, float, str]] = []
+    found = list(_alternatives(times_s, channels, layout, path_m, speed_m_s))
+    better, count = [], len(channels)
+    for fault, name, match in found:
+        # Residuals of n spare channels are r times as small in one of r^n cases. Channels left out are more cases.
+        cases = len(found) * math.comb(count, count - _kept(count, 1)) / _CHANCE
+        limit_s = own.spread_s / max(_MIN_RATIO, cases ** (1 / max(1, match.n_spare)))
+        if match.slowness <= _MAX_SLOWNESS and max(match.spread_s, _MIN_RESIDUAL_S) < limit_s:
+            better.append((match.spread_s, fault, name, match, limit_s))
+    if not better:
+        return None
+    spread_s, fault, name, match, limit_s = min(better, key=lambda each: each[0])
+    if fault == SIZE:
+        return _of_size(channels, 1 / (_multiple(layout)[1] or 1.0), layout)
+    measured_s, detail = match.delay_s, f"{name} by {1e6 * match.delay_s:.1f} µs"
+    if fault == _ORDER:
+        residuals = f"{1e6 * spread_s:.2g} instead of {1e6 * own.spread_s:.2g} µs"
+        measured_s = own.spread_s
+        detail = f"{name} fits far better than that of the settings, with residuals of {residuals}"
+    return Finding(fault=fault, channels=tuple(channels), measured=1e6 * measured_s, limit=1e6 * limit_s, detail=detail)
+
+
+def _alternatives(
+    times_s: NDArray[np.float64], channels: list[int], layout: Layout, path_m: float, speed_m_s: float
+) -> Iterator[tuple[str, str, _Match]]:
+    """Yield the faults of arrays that may fit, their names, and their fits."""
+    multiple_of, _ = _multiple(layout)
     for name, other_m in _orders(layout):
         match = _best(times_s, other_m[channels], path_m, speed_m_s)
         if match is not None:
-            residuals = f"{1e6 * match.spread_s:.2g} instead of {1e6 * own.spread_s:.2g} µs"
-            detail = f"{name} fits far better than that of the settings, with residuals of {residuals}"
-            found.append((match, _ORDER, own.spread_s, detail))
+            yield SIZE if name == multiple_of else _ORDER, name, match
     for name, late in _halves(len(layout.enabled)):
-        match = _best(times_s, positions_m, path_m, speed_m_s, late=late[channels])
+        match = _best(times_s, layout.positions_m[channels], path_m, speed_m_s, late=late[channels])
         if match is not None:
-            found.append((match, _HALF, match.delay_s, f"{name} by {1e6 * match.delay_s:.1f} µs"))
-    limit_s = own.spread_s / _MIN_RATIO
-    better = [each for each in found if each[0].slowness <= _MAX_SLOWNESS and each[0].spread_s < limit_s]
-    if not better:
-        return None
-    _, fault, measured_s, detail = min(better, key=lambda each: each[0].spread_s)
-    return Finding(fault=fault, channels=tuple(channels), measured=1e6 * measured_s, limit=1e6 * limit_s, detail=detail)
+            yield _HALF, name, match
 
 
 def _other_size(
@@ -144,6 +181,8 @@ def _other_size(
     own = _best(times_s, positions_m, path_m, speed_m_s)
     if own is None:
         return None
+    if own.n_spare < _MIN_SPARE_OF_SIZE:
+        return None
     low, high, spread_s = _scales(times_s, positions_m, path_m, speed_m_s)
     is_possible = own.slowness <= _MAX_SLOWNESS
     if spread_s > _CLEAR * float(np.ptp(times_s)) or (is_possible and own.spread_s < _MIN_CURVED * spread_s):
@@ -153,7 +192,7 @@ def _other_size(
     if is_possible and low <= _MAX_GROWTH and (is_plane or high >= _MIN_SHRINKAGE):
         return None
     factor, about = (low, "at least ") if low > 1 else (high, "at most ")
-    return _of_size(channels, factor, about)
+    return _of_size(channels, factor, layout, about)
 
 
 def _other_size_of_direct_sound(
@@ -169,16 +208,21 @@ def _other_size_of_direct_sound(
     is_clear = spread_s < min(own.spread_s / _MIN_RATIO, _CLEAR * float(np.ptp(times_s)))
     if not is_clear or _MIN_SHRINKAGE < factor < 1 / _MIN_SHRINKAGE or factor <= 0:
         return None
-    return _of_size(channels, factor, "")
+    return _of_size(channels, factor, layout)
 
 
-def _of_size(channels: list[int], factor: float, about: str) -> Finding:
+def _of_size(channels: list[int], factor: float, layout: Layout, about: str = "") -> Finding:
+    """Return the finding of an array of another size, which may be that of a shipped layout."""
+    name, given = _multiple(layout)
+    detail = f"the wavefront fits an array {about}{factor:.2g} times as large"
+    if given is not None:
+        detail = f"the positions are those of {name} times {given:.3g}"
     return Finding(
         fault=SIZE,
         channels=tuple(channels),
         measured=factor,
         limit=_MAX_SLOWNESS if factor > 1 else _MIN_SHRINKAGE,
-        detail=f"the wavefront fits an array {about}{factor:.2g} times as large",
+        detail=detail,
     )
 
 
@@ -199,8 +243,10 @@ def _best(
     """Return the best fit of a reflector, a wall or the direct sound; None if the array has too few microphones."""
     places_m = _places(positions_m)
     n_axes = places_m.shape[1]
-    if n_axes == 0 or len(positions_m) < 2 * (n_axes + 2):
+    n_unknowns = 1 + n_axes + (late is not None)
+    if n_axes == 0 or _kept(len(positions_m), n_unknowns) < n_unknowns + _MIN_SPARE:
         return None
+    n_spare = _kept(len(positions_m), n_unknowns) - n_unknowns
     columns = [np.ones(len(places_m)), *places_m.T] + ([] if late is None else [late.astype(np.float64)])
     matrix, matches = np.column_stack(columns), []
     for curvature in _CURVATURES:
@@ -211,17 +257,22 @@ def _best(
             curved_s = _curved_m(positions_m, slope_m, curvature / path_m) / speed_m_s
         solution, spread_s = _solve(times_s - curved_s, matrix)
         slowness = float(np.linalg.norm(solution[1 : 1 + n_axes])) * speed_m_s
-        matches.append(_Match(spread_s, slowness, 0.0 if late is None else float(solution[-1])))
+        matches.append(_Match(spread_s, slowness, 0.0 if late is None else float(solution[-1]), n_spare))
     travel_s = np.linalg.norm(positions_m, axis=1) / speed_m_s
     of_emitter = matrix[:, [0] if late is None else [0, -1]]
     solution, spread_s = _solve(times_s - travel_s, of_emitter)
-    matches.append(_Match(spread_s, 0.0, 0.0 if late is None else float(solution[-1])))
+    matches.append(_Match(spread_s, 0.0, 0.0 if late is None else float(solution[-1]), n_spare + n_axes))
     return min(matches, key=lambda match: match.spread_s)
+
+
+def _kept(n_mics: int, n_unknowns: int) -> int:
+    """Return the number of microphones whose residuals count."""
+    return min(n_mics, max(n_unknowns + 1, round(_KEPT * n_mics)))
 
 
 def _solve(times_s: NDArray[np.float64], matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     """Return the solution by least squares without the largest residuals, and the root mean square of the others."""
-    count = max(matrix.shape[1] + 1, round(_KEPT * len(times_s)))
+    count = _kept(len(times_s), matrix.shape[1])
     kept = np.arange(len(times_s))
     for _ in range(3):
         solution = np.linalg.lstsq(matrix[kept], times_s[kept], rcond=None)[0]
@@ -281,6 +332,20 @@ def _orders(layout: Layout) -> Iterator[tuple[str, NDArray[np.float64]]]:
         same = len(other.enabled) == count and np.allclose(other.positions_m, layout.positions_m, atol=1e-6)
         if len(other.enabled) == count and not same:
             yield f"layout {name}", other.positions_m
+
+
+def _multiple(layout: Layout) -> tuple[str, float | None]:
+    """Return the shipped layout whose multiple the positions are, and the factor; no name and None without one."""
+    positions_m = layout.positions_m
+    for name in layout_names():
+        other_m = load_layout(name).positions_m
+        if other_m.shape != positions_m.shape:
+            continue
+        factor = float(np.sum(positions_m * other_m) / np.sum(other_m**2))
+        is_multiple = np.abs(positions_m - factor * other_m).max() < _EQUAL * np.abs(positions_m).max()
+        if is_multiple and factor > 0 and abs(factor - 1) > _EQUAL:
+            return f"layout {name}", factor
+    return "", None
 
 
 def _halves(count: int) -> Iterator[tuple[str, NDArray[np.bool_]]]:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.health.array_match import SIZE, find_other_array
+from ertis_numba.analysis.health.array_match import SIZE, find_other_array, unobservable
 from ertis_numba.analysis.health.arrival import Compressed, Fit, compress, fit_delays, fit_emitter, strongest
 from ertis_numba.analysis.health.coherence import aligned, correlate, half_bands, mean_of
 from ertis_numba.analysis.health.emission import describe_shift, fit_emission
@@ -150,7 +150,8 @@ def by_wavefront(
     if fit.share < _COMPACT_SHARE:
         return shifts, (f"{DESCRIPTIONS}: no single wavefront fits the strongest arrival",)
     findings = [*shifts, *_of_channels(arrival.found, times_s, fit, channels, layout)]
-    return findings, () if is_direct else ("a shift of the record: the strongest arrival is not the direct sound",)
+    shift = () if is_direct else ("a shift of the record: the strongest arrival is not the direct sound",)
+    return findings, (*shift, *unobservable(positions_m))
 
 
 def _shifts(emission_s: float, channels: Sequence[int], speed_m_s: float) -> list[Finding]:
