@@ -20,6 +20,11 @@ __all__ = ["listen_odometry"]
 
 _HEAD = f"{'SYNC':>8}  {'age':>8}  {'x':>8}  {'y':>8}  {'yaw':>7}  {'speed':>8}  {'yaw rate':>9}  sensors"
 _DIGITS = 6
+_REMARKS = {
+    "pause": "last velocity assumed",
+    "few echoes": "last velocity assumed",
+    "other motion": "another motion fits as well",
+}
 
 
 def listen_odometry(
@@ -83,7 +88,7 @@ def _show(arrival: "OdometryArrival", *, as_json: bool) -> None:
         turn = f"{math.degrees(velocity.yaw_rate_rad_s):+.1f} °/s"
     remarks = [f"without {' '.join(arrival.missing)}"] if arrival.missing else []
     remarks += [f"{options.counted(arrival.n_lost, 'pulse')} lost"] if arrival.n_lost else []
-    remarks += [] if pose.is_measured else ["last velocity assumed"]
+    remarks += [_REMARKS[pose.doubt]] if pose.doubt else []
     click.echo(
         f"{arrival.sync_count:8d}  {age:>8}  {pose.x_m:+6.3f} m  {pose.y_m:+6.3f} m  "
         f"{math.degrees(pose.yaw_rad):+6.1f}°  {speed:>8}  {turn:>9}  "
@@ -103,6 +108,7 @@ def _event(arrival: "OdometryArrival") -> dict[str, object]:
         "yaw_deg": round(math.degrees(pose.yaw_rad), _DIGITS),
         "covariance": pose.covariance.tolist(),
         "measured": pose.is_measured,
+        "doubt": pose.doubt or None,
         "velocity_m_s": None,
         "yaw_rate_deg_s": None,
         "n_matches": None,

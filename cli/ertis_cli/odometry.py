@@ -1,5 +1,6 @@
 """``ertis odometry``: compute the trajectory of a platform from recordings."""
 
+from collections import Counter
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +21,19 @@ if TYPE_CHECKING:
 __all__ = ["odometry", "odometry_of"]
 
 _NS_PER_S = 1e9
+_NOTES = {
+    "pause": "follow a pause of more than a second and assume that the last velocity continued",
+    "few echoes": "have too few echoes in common and assume that the last velocity continued",
+    "other motion": "are uncertain because standing still, mirrored motion or the motion of objects explains the "
+    "echoes about as well; the more likely motion is assumed",
+}
+_REFUSALS = {
+    "few echoes": "no two successive pulses have enough echoes in common, at most a second apart; record more pulses "
+    "per second, or a place with more reflectors",
+    "other motion": "no step determines the motion, because standing still, mirrored motion or the motion of objects "
+    "explains the echoes about as well; add the recordings of sensors that face other ways, or record a place with "
+    "more reflectors at rest",
+}
 
 
 @click.command()
@@ -54,7 +68,9 @@ def odometry(
 
     All sensors of the recordings belong to one platform. Their measurements are grouped by SYNC pulse, and each group
     is compared with the one before. The trajectory starts at the origin and lies in the plane. Where too few echoes
-    match, the last velocity is assumed to continue. Pulses may be at most a second apart.
+    match, the last velocity is assumed to continue for at most a second. Where two motions explain the echoes about
+    equally well, the more likely one is assumed. Notes and --json state how many steps are affected. Pulses may be at
+    most a second apart.
     """
     from ertis_numba import write_tum
     from ertis_numba.interop import check_tum_target
@@ -83,6 +99,7 @@ def odometry(
             "length_m": round(found.length_m, 6),
             "duration_s": round(duration_s, 6),
             "measured": round(measured, 6),
+            "uncertain": sum(pose.doubt == "other motion" for pose in found.poses),
         }
         options.print_json(report)
 
@@ -127,15 +144,12 @@ def odometry_of(
         for group in shown:
             emitted = {name: place for name, place in group.items() if not is_passive(settings[name], place.stamp)}
             found.add([pipelines.image(by_name[name][place.index]) for name, place in emitted.items()])
-    unmeasured = sum(not pose.is_measured for pose in found.poses)
-    if unmeasured == len(groups) - 1:
-        raise DataError(
-            f"{readers[0].path}: no two successive pulses have enough echoes in common, at most a second apart; record "
-            "more pulses per second, or a place with more reflectors"
-        )
-    if unmeasured:
+    doubts = Counter(pose.doubt for pose in found.poses if pose.doubt)
+    if doubts.total() == len(groups) - 1:
+        raise DataError(f"{readers[0].path}: {_REFUSALS['other motion' if doubts['other motion'] else 'few echoes']}")
+    for doubt, number in doubts.items():
         steps = options.counted(len(groups) - 1, "step")
-        options.note(f"{unmeasured} of {steps} assume that the last velocity continued", quiet=quiet)
+        options.note(f"{number} of {steps} {_NOTES[doubt]}", quiet=quiet)
     return found
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,12 +11,14 @@ from ertis_numba.errors import DataError
 from ertis_numba.frames import Trajectory
 from ertis_numba.fusion.rig import MountedSensor, Mountings, mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor, GroupEchoes
-from ertis_numba.motion.flow import FlowFit, fit_flow, twist_of
+from ertis_numba.motion.flow import FlowFit, fit_flow
+from ertis_numba.motion.residuals import twist_of
 from ertis_numba.motion.velocity import MAX_TIME_S, EgoVelocity, Item, grouped, stamp_of, velocity_of
 
 __all__ = ["Odometry", "PlanarPose"]
 
 Floats = NDArray[np.float64]
+Doubt: TypeAlias = Literal["", "pause", "few echoes", "other motion"]
 
 # Changes of speed and yaw rate between two groups that the search covers.
 _MAX_CHANGE: Final = np.array([0.6, 0.6, math.radians(60.0)])
@@ -46,8 +48,12 @@ class PlanarPose(NamedTuple):
     covariance : (3, 3) float64
         Covariance of x, y and yaw since the start, in metres and radians.
     is_measured : bool
-        False if no more echoes matched than those of noise, so that the last velocity is assumed to have continued, or
-        if echoes fit another motion almost as well, so that the more likely one is assumed.
+        False if the motion since the last group is unknown.
+    doubt : {"", "pause", "few echoes", "other motion"}
+        Reason why the motion is unknown; empty if it was measured. After a pause of more than a second, or if no more
+        echoes match than those of noise or of one moving object (``few echoes``), the last velocity is assumed to have
+        continued, for at most a second. If another motion explains about as much (``other motion``), the more likely
+        one is assumed. Others are standing still, mirrored motion, and the motion of objects.
 
     Examples
     --------
@@ -65,8 +71,11 @@ class PlanarPose(NamedTuple):
     yaw_rad: float
     covariance: Floats
     is_measured: bool = True
+    doubt: Doubt = ""
 
-    def moved(self, displacement: Floats, covariance: Floats, timestamp_ns: int, *, is_measured: bool) -> "PlanarPose":
+    def moved(
+        self, displacement: Floats, covariance: Floats, timestamp_ns: int, *, is_measured: bool, doubt: Doubt = ""
+    ) -> "PlanarPose":
         """Return the pose after a displacement in the frame of this pose."""
         carried, turned = _propagation(self.yaw_rad, displacement)
         x_m, y_m, turn_rad = (turned @ displacement).tolist()
@@ -77,6 +86,7 @@ class PlanarPose(NamedTuple):
             math.remainder(self.yaw_rad + turn_rad, 2 * math.pi),
             carried @ self.covariance @ carried.T + turned @ covariance @ turned.T,
             is_measured,
+            doubt,
         )
 
 
@@ -126,6 +136,8 @@ class Odometry:
         self._keyframe: _View | None = None
         self._twist = np.zeros(3)
         self._twist_ns: int | None = None  # Time of the last measured twist.
+        self._unknown = np.zeros(3)  # Standard deviations of the way since the last measured group.
+        self._suspects: tuple[Floats, ...] = ()  # Twists of the last groups with several possible motions.
         self._path: list[PlanarPose] = []
 
     @property
@@ -201,9 +213,7 @@ class Odometry:
         Returns
         -------
         EgoVelocity or None
-            None for the first group, after more than a second without images, if no more echoes match than those of
-            noise, and if another motion explains almost as many. The pose then assumes that the last velocity continued
-            for at most a second, or in the last case, the more likely motion.
+            None for the first group, and if the motion is unknown; `PlanarPose.doubt` states the reason.
 
         Raises
         ------
@@ -226,17 +236,32 @@ class Odometry:
             return None
         time_s = (timestamp_ns - self._path[-1].timestamp_ns) / 1e9
         found = self._since_last(echoes, time_s) if time_s <= MAX_TIME_S else None
-        if found is None:
-            age_s = math.inf if self._twist_ns is None else (timestamp_ns - self._twist_ns) / 1e9
-            unknown = np.diag(np.minimum(_UNKNOWN_SD, _ACCELERATION_SD * age_s) * time_s) ** 2
-            assumed = _displacement(self._twist, min(time_s, MAX_TIME_S))
-            self._path.append(self._path[-1].moved(assumed, unknown, timestamp_ns, is_measured=False))
+        if found is None or not found.is_certain:
+            self._guess(found, time_s, timestamp_ns)
             self._begin(echoes)
             return None
         self._twist, self._twist_ns = twist_of(found.displacement, time_s), timestamp_ns
+        self._unknown, self._suspects = np.zeros(3), ()
         self._locate(echoes, found, self._twist, timestamp_ns)
         self._last = _View(echoes, self._path[-1], self._twist)
-        return velocity_of(found, timestamp_ns, time_s) if found.is_certain else None
+        return velocity_of(found, timestamp_ns, time_s)
+
+    def _guess(self, found: FlowFit | None, time_s: float, timestamp_ns: int) -> None:
+        """Add the pose by the more likely of several motions, or else by the last velocity, for at most a second.
+
+        Errors of successive guesses have one cause, such as a person who walks by, so their deviations add up.
+        """
+        age_s = math.inf if self._twist_ns is None else (timestamp_ns - self._twist_ns) / 1e9
+        if found is None:
+            doubt: Doubt = "pause" if time_s > MAX_TIME_S else "few echoes"
+            way = _displacement(self._twist, max(0.0, min(time_s, MAX_TIME_S, MAX_TIME_S + time_s - age_s)))
+            deviation = np.minimum(_UNKNOWN_SD, _ACCELERATION_SD * age_s) * time_s
+        else:
+            doubt, way, deviation = "other motion", found.displacement, np.sqrt(np.diag(found.covariance))
+            self._suspects = twist_of(found.displacement, time_s), twist_of(found.other, time_s)
+        before, self._unknown = self._unknown, self._unknown + deviation
+        covariance = np.diag(self._unknown**2 - before**2)
+        self._path.append(self._path[-1].moved(way, covariance, timestamp_ns, is_measured=False, doubt=doubt))
 
     def _begin(self, echoes: GroupEchoes | None) -> None:
         self._last = None if echoes is None else _View(echoes, self._path[-1], None)
@@ -247,7 +272,8 @@ class Odometry:
         if last is None:
             return None
         if last.twist is None:
-            return _significant(fit_flow(last.echoes, echoes, self._sensors, time_s))
+            suspects = [_displacement(twist, time_s) for twist in self._suspects]
+            return _significant(fit_flow(last.echoes, echoes, self._sensors, time_s, suspects=suspects))
         start = _displacement(last.twist, time_s)
         near = fit_flow(
             last.echoes,
@@ -268,7 +294,7 @@ class Odometry:
 
     def _locate(self, echoes: GroupEchoes, found: FlowFit, twist: Floats, timestamp_ns: int) -> None:
         """Add the pose relative to the keyframe, or to the last group if the keyframe is out of reach."""
-        step = self._path[-1].moved(found.displacement, found.covariance, timestamp_ns, is_measured=found.is_certain)
+        step = self._path[-1].moved(found.displacement, found.covariance, timestamp_ns, is_measured=True)
         keyframe = self._keyframe
         if keyframe is not None:
             expected = _relative(keyframe.pose, step)
@@ -285,9 +311,8 @@ class Odometry:
                     second_twist=twist,
                 )
                 if fit is not None and _confirms(fit, found, expected):
-                    covariance = fit.covariance if found.is_certain else fit.covariance + found.covariance
                     self._path.append(
-                        keyframe.pose.moved(fit.displacement, covariance, timestamp_ns, is_measured=found.is_certain)
+                        keyframe.pose.moved(fit.displacement, fit.covariance, timestamp_ns, is_measured=True)
                     )
                     return
         self._keyframe = self._last

@@ -12,7 +12,8 @@ from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.fusion.pulses import is_same_pulse
 from ertis_numba.fusion.rig import Mountings, mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor
-from ertis_numba.motion.flow import FlowFit, fit_flow, twist_of
+from ertis_numba.motion.flow import FlowFit, fit_flow
+from ertis_numba.motion.residuals import twist_of
 
 __all__ = ["EgoVelocity", "Item", "ego_velocity", "grouped", "stamp_of", "velocity_of"]
 
@@ -68,8 +69,9 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
     """Return the velocity of a platform from the images of two SYNC pulses; use `Odometry` for several.
 
     Echoes of reflectors at rest shift in range and azimuth as the platform moves. The velocity is that which explains
-    the shifts of most echoes. Other echoes, such as those of moving people, are ignored. If another velocity explains
-    almost as many, the covariance includes it.
+    the shifts of echoes in most places. Other echoes, such as those of moving people, are ignored. If another velocity
+    explains about as much, the covariance includes it. Such velocities are 0, that of moving objects, and, if all flat
+    arrays face along one line, the mirrored one: they show echoes from behind as if they came from ahead.
 
     Parameters
     ----------
@@ -87,7 +89,8 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
     ArgumentError
         A group is empty or has two images of a sensor, or a mounting is missing or invalid.
     DataError
-        Times do not increase, the groups share no sensor, or no more echoes match than those of noise.
+        Times do not increase, the groups share no sensor, or no more echoes match than those of noise or of one
+        moving object.
 
     Examples
     --------
@@ -130,9 +133,10 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
             "too few echoes of before and after match; give images that show more reflectors, or images closer in time"
         )
     if not found.is_significant:
+        places = f"{found.n_places} place{'' if found.n_places == 1 else 's'}"
         raise DataError(
-            f"only {found.n_matches} echoes of before and after match, as many as echoes of noise; give images that "
-            "show more reflectors, or images closer in time"
+            f"only {found.n_matches} echoes of before and after match, in {places}, as many as echoes "
+            "of noise or of one moving object; give images that show more reflectors, or images closer in time"
         )
     return velocity_of(found, second.timestamp_ns, time_s)
 

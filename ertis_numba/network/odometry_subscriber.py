@@ -24,8 +24,8 @@ class OdometryArrival:
     pose : PlanarPose
         Pose relative to the first pulse.
     velocity : EgoVelocity or None
-        Mean velocity since the pulse before; None at the first pulse, after more than a second without
-        images, and if too few echoes match.
+        Mean velocity since the pulse before; None at the first pulse, and if the motion is unknown, for the reason
+        that ``pose.doubt`` states.
     sync_count : int
     sensors, missing : tuple of str
         Sensors whose images were used, and other mounted sensors, which sent no image of this pulse.

@@ -1,0 +1,94 @@
+"""Hypotheses of the motion of a platform, and the echoes and places that they explain."""
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.motion.residuals import EchoFlow, EchoPairs
+
+__all__ = ["FAR_SCALES", "NEAR_SCALES", "MotionHypothesis", "hypothesis", "pair_weights", "refined"]
+
+Floats = NDArray[np.float64]
+
+FAR_SCALES: Final = 8.0, 5.0, 3.0, 2.0, 1.4, 1.0
+"""Tolerances of fits that begin at a point of the search, in standard deviations."""
+NEAR_SCALES: Final = 3.0, 2.0, 1.4, 1.0
+"""Tolerances of fits that begin at a motion that may be the right one."""
+_ROUNDS: Final = 8
+_OUTLIER: Final = math.exp(-0.5 * 9.0)  # Likelihood of an echo without a partner: three standard deviations.
+# All echoes of a person are within this distance, so they are evidence of one place only.
+_PLACE_M: Final = 0.7
+
+
+class MotionHypothesis(NamedTuple):
+    """Displacement, and the echoes that it explains.
+
+    Attributes
+    ----------
+    displacement : (3,) float64
+    weight : (pair,) float64
+        Probability of each pair.
+    n_matches, n_places : int
+        Number of echoes, and of places at least 0.7 m apart, that the displacement explains.
+    support : float
+        Sum of the strengths of the strongest echoes of all places.
+    """
+
+    displacement: Floats
+    weight: Floats
+    n_matches: int
+    n_places: int
+    support: float
+
+    def without(self, explained: NDArray[np.bool_], flow: EchoFlow, pairs: EchoPairs) -> "MotionHypothesis":
+        """Return the hypothesis with its other pairs only."""
+        return _described(flow, pairs, self.displacement, np.where(explained, 0.0, self.weight))
+
+
+def hypothesis(
+    flow: EchoFlow, pairs: EchoPairs, start: Floats, scales: tuple[float, ...] = FAR_SCALES
+) -> MotionHypothesis:
+    """Return the hypothesis to which a fit from a displacement leads."""
+    return _described(flow, pairs, *refined(flow, pairs, start, scales))
+
+
+def _described(flow: EchoFlow, pairs: EchoPairs, displacement: Floats, weight: Floats) -> MotionHypothesis:
+    is_match = weight > 0.5
+    strength = flow.strengths(pairs)[is_match]
+    order = np.argsort(-strength, kind="stable")
+    place_m, strength = flow.before.position_m[pairs.before[is_match], :2][order], strength[order]
+    n_matches, n_places, support = len(order), 0, 0.0
+    while len(place_m):
+        n_places, support = n_places + 1, support + float(strength[0])
+        is_far = np.hypot(*(place_m - place_m[0]).T) > _PLACE_M
+        place_m, strength = place_m[is_far], strength[is_far]
+    return MotionHypothesis(displacement, weight, n_matches, n_places, support)
+
+
+def refined(flow: EchoFlow, pairs: EchoPairs, displacement: Floats, scales: tuple[float, ...]) -> tuple[Floats, Floats]:
+    """Return the displacement after a fit with decreasing tolerance, and the probabilities of pairs."""
+    sd = flow.deviations(pairs)
+    weight = np.zeros(len(pairs.before))
+    for scale in (*scales, *([1.0] * _ROUNDS)):
+        residual, slopes = flow.linear(displacement, pairs)
+        residual, slopes = residual / sd, slopes / sd[:, :, None]
+        weight = pair_weights(np.sum(residual**2, axis=0) / scale**2, flow, pairs)
+        displacement = displacement + _solved(slopes, residual, weight)
+    return displacement, weight
+
+
+def pair_weights(square: Floats, flow: EchoFlow, pairs: EchoPairs) -> Floats:
+    """Return the probability of each pair, in which each echo has at most one partner."""
+    likelihood = np.exp(-0.5 * np.minimum(square, 200.0))
+    of_before = np.bincount(pairs.before, likelihood, len(flow.before.level))[pairs.before]
+    of_after = np.bincount(pairs.after, likelihood, len(flow.after.level))[pairs.after]
+    return np.asarray(likelihood / (np.maximum(of_before, of_after) + _OUTLIER))
+
+
+def _solved(slopes: Floats, residual: Floats, weight: Floats) -> Floats:
+    normal = np.einsum("apx,p,apy->xy", slopes, weight, slopes)
+    right = np.einsum("apx,p,ap->x", slopes, weight, residual)
+    ridge = 1e-9 * np.trace(normal) * np.eye(3) + 1e-12 * np.eye(3)
+    return np.asarray(np.linalg.solve(normal + ridge, right))

@@ -1,0 +1,137 @@
+"""Rivals of a motion: standing still, mirrored motion, the motion of objects, and that by the spacing of posts."""
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import scipy.special
+from numpy.typing import NDArray
+
+from ertis_numba.fusion.rig import MountedSensor
+from ertis_numba.motion.hypotheses import NEAR_SCALES, MotionHypothesis, hypothesis
+from ertis_numba.motion.residuals import EchoFlow, EchoPairs
+
+__all__ = ["MAX_AMBIGUITY", "worst_rival"]
+
+Floats = NDArray[np.float64]
+
+# In simulated rooms, correct displacements had ambiguities of at most 0.65. Wrong ones, by the spacing of equal posts,
+# had at least 0.75, as one post of four without a partner.
+MAX_AMBIGUITY: Final = 0.7
+_ELSEWHERE: Final = np.array([0.02, 0.02, math.radians(2.0)])  # Differences of displacements that are not the same.
+# Share of the echoes that a rival must explain otherwise, to be compared by all of its echoes.
+_SHARED: Final = 0.2
+# Rivals of other echoes are compared by the places of these echoes. The reflectors at rest are unknown if another
+# motion explains more than the first share of what the best one explains, and more than the second share of its
+# echoes. If all arrays face along one line, echoes from behind agree with one motion, which needs lower limits.
+_MAX_SUPPORT: Final = 0.5
+_MAX_SUPPORT_ONE_LINE: Final = 0.3
+_MIN_MATCHES: Final = 0.3
+_MIN_MATCHES_MIRRORED: Final = 0.15
+_MAX_ACCIDENTAL: Final = 0.02  # Expected number of rivals by accident
+# Displacements that a fit tells apart near its start, and near a mirrored motion, whose echoes do not move exactly so.
+_N_NEAR: Final = 33.0
+_N_MIRRORED: Final = 8 * _N_NEAR
+_PARALLEL: Final = 0.98  # Cosine of arrays that face along one line
+
+
+def worst_rival(
+    flow: EchoFlow,
+    pairs: EchoPairs,
+    best: MotionHypothesis,
+    found: Sequence[MotionHypothesis],
+    sensors: tuple[MountedSensor, ...],
+    by_accident: float,
+) -> tuple[Floats, float]:
+    """Return the displacement that rivals the best one most, and its ambiguity.
+
+    A flat array shows echoes from behind ahead, mirrored at its plane. They move as if the platform moved backwards and
+    turned the other way. If all arrays face along one line, all such echoes agree, and nothing tells them from others,
+    so the mirrored motion is a rival as soon as it explains more echoes than by accident.
+
+    Parameters
+    ----------
+    flow : EchoFlow
+    pairs : EchoPairs
+    best : MotionHypothesis
+    found : sequence of MotionHypothesis
+        Other hypotheses.
+    sensors : tuple of MountedSensor
+    by_accident : float
+        Expected number of matches of one displacement by accident.
+
+    Returns
+    -------
+    displacement : (3,) float64
+    ambiguity : float
+        Score relative to that of the best displacement; at least `MAX_AMBIGUITY` if the rival cannot be excluded.
+    """
+    facing = _facing(flow, pairs, sensors)
+    mirrored = [_mirrored(best.displacement, sensor) for sensor in facing]
+    rivals = [*found, *(hypothesis(flow, pairs, each, NEAR_SCALES) for each in mirrored)]
+    only = mirrored[0] if len(mirrored) == 1 else None
+    judged = [(each.displacement, _ambiguity(flow, pairs, best, each, by_accident, only)) for each in rivals]
+    return max(judged, key=lambda each: each[1])
+
+
+def _facing(flow: EchoFlow, pairs: EchoPairs, sensors: tuple[MountedSensor, ...]) -> list[MountedSensor]:
+    """Return one sensor with echoes for each line along which arrays face."""
+    found: list[MountedSensor] = []
+    for number in np.unique(flow.before.sensor[pairs.before]):
+        axis = sensors[number].rotation[:, 0]
+        if all(abs(axis @ other.rotation[:, 0]) < _PARALLEL for other in found):
+            found.append(sensors[number])
+    return found
+
+
+def _ambiguity(
+    flow: EchoFlow,
+    pairs: EchoPairs,
+    best: MotionHypothesis,
+    rival: MotionHypothesis,
+    by_accident: float,
+    mirrored: Floats | None,
+) -> float:
+    apart = np.abs(rival.displacement - best.displacement)
+    if np.all(apart < _ELSEWHERE / 3):
+        return 0.0
+    strengths = flow.strengths(pairs)
+    score = float(best.weight @ strengths)
+    explained = np.bincount(pairs.before, best.weight, len(flow.before.level))[pairs.before]
+    shared = 0.0
+    if np.any(apart > _ELSEWHERE) and (rival.weight * explained) @ strengths > _SHARED * score:
+        shared = float(rival.weight @ strengths) / max(score, 1e-30)
+    return max(shared, _ambiguity_of_others(best, rival.without(explained > 0.5, flow, pairs), by_accident, mirrored))
+
+
+def _ambiguity_of_others(
+    best: MotionHypothesis, rival: MotionHypothesis, by_accident: float, mirrored: Floats | None
+) -> float:
+    """Return the ambiguity by a rival that explains other echoes."""
+    if rival.n_matches <= _MIN_MATCHES_MIRRORED * best.n_matches:
+        return 0.0
+    n_accidental = float(scipy.special.gammainc(rival.n_matches, by_accident))
+    if mirrored is not None and _is_near(rival.displacement, mirrored, best.displacement):
+        return float(_N_MIRRORED * n_accidental < _MAX_ACCIDENTAL)
+    if rival.n_matches <= _MIN_MATCHES * best.n_matches or _N_NEAR * n_accidental > _MAX_ACCIDENTAL:
+        return 0.0
+    relative = max(rival.support / best.support, rival.n_places / best.n_places)
+    return MAX_AMBIGUITY * relative / (_MAX_SUPPORT if mirrored is None else _MAX_SUPPORT_ONE_LINE)
+
+
+def _is_near(displacement: Floats, mirrored: Floats, best: Floats) -> bool:
+    """Return True if a displacement is the mirrored one, rather than the best or any other."""
+    away, apart = (float(np.max(np.abs(each - mirrored) / _ELSEWHERE)) for each in (displacement, best))
+    return away < min(2.0, max(0.5, 0.4 * apart))
+
+
+def _mirrored(displacement: Floats, sensor: MountedSensor) -> Floats:
+    """Return a displacement as it appears to a flat array if all reflectors are behind it: (3,) float64."""
+    normal = sensor.rotation[:2, 0] / max(float(np.hypot(*sensor.rotation[:2, 0])), 1e-9)
+    x_m, y_m = sensor.translation_m[:2].tolist()
+    yaw = float(displacement[2])
+    c, s = math.cos(yaw), math.sin(yaw)
+    way_m = displacement[:2] + np.array([c * x_m - s * y_m - x_m, s * x_m + c * y_m - y_m])  # of the sensor
+    way_m = way_m - 2 * (way_m @ normal) * normal
+    return np.array([*(way_m - [c * x_m + s * y_m - x_m, -s * x_m + c * y_m - y_m]), -yaw])
