@@ -57,7 +57,10 @@ class FileKind:
 
 
 _WAV = FileKind("a WAV file", _IMPORT, is_wav=True)
-_MATLAB = FileKind("a MATLAB file", "save its signals with audiowrite('{stem}.wav', signals, rate_hz), and import that")
+_MATLAB = FileKind(
+    "a MATLAB file",
+    "save its signals with audiowrite('{stem}.wav', single(signals), rate_hz, 'BitsPerSample', 32), and import that",
+)
 _HDF5 = FileKind("an HDF5 file", _IMPORT, is_hdf5=True)
 _TEXT = FileKind("a text file", f"choose a recording, or {_SAVE}", is_text=True)
 

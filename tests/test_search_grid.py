@@ -8,6 +8,7 @@ import pytest
 
 import ertis_numba as ertis
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.passive.search_grid import coarse_map_warning, search_changes, search_warning
 from ertis_numba.settings import Array, Recording
@@ -144,3 +145,10 @@ def test_blocks_that_are_too_short_for_an_array_are_warned_of(changes, remedy):
         assert re.match(r"blocks last [56] ms, but sound takes up to 8 ms to cross the array", warning)
         assert remedy in warning
     assert "blocks" not in (coarse_map_warning(spread(0.1)) or "")
+
+
+def test_warnings_of_irregular_lists_state_the_largest_gap():
+    listed = settings_with([[0.0, 0.0], [2.0, 0.0], [60.0, 0.0]])
+    maps = listed.replace(**{"passive.bands_hz": ((20e3, 40e3),)})
+    for warning in (spacing_warning(listed, direction_grid(listed.processing)), coarse_map_warning(maps)):
+        assert warning.startswith("directions are up to 58.0° apart")

@@ -30,6 +30,7 @@ _MARGIN_DB: Final = 0.03  # The weakest source is searched, and the search may m
 _NEAREST: Final = 6
 _ABOVE: Final = 1.03  # Least amplitude of the weakest source relative to the highest side lobe …
 _AS_STRONG: Final = 0.94  # … up to this one, -0.5 dB, which no grid tells from a source.
+_GAP: Final = 3.0  # Gap between directions relative to their spacing, above which a list is irregular.
 _STEP: Final = 1.12
 _NARROWEST_RAD: Final = 1e-5
 _ANGLES: Final = 1200
@@ -111,6 +112,14 @@ class GridCheck:
     def spacing_rad(self) -> float:
         """Spacing of the directions in radians."""
         return spacing_rad(self._directions)
+
+    def apart(self, lobe: Lobe) -> str:
+        """Return the distance of the directions in words: the usual one, or the largest gap of an irregular list."""
+        sources, near, _ = self.farthest_of(lobe.response.axes)
+        chords = np.linalg.norm(sources - self._directions[near[:, 0]], axis=1)
+        gap_rad = 4 * math.asin(min(1.0, float(chords.max(initial=0.0)) / 2))
+        is_irregular = gap_rad > _GAP * self.spacing_rad
+        return f"{'up to ' if is_irregular else ''}{math.degrees(gap_rad if is_irregular else self.spacing_rad):.1f}°"
 
     def weakest(self, lobe: Lobe) -> float:
         """Return the amplitude of delay-and-sum in the direction nearest to the weakest source."""
@@ -289,7 +298,7 @@ def spacing_warning(settings: Settings, grid: DegreesFromRadians) -> str | None:
     narrower = f" in images with {' and '.join(methods)}" if methods else ""
     remedy = check.remedy(lobe, "process with")
     return (
-        f"directions are {math.degrees(check.spacing_rad):.1f}° apart, so a reflector between them appears up to "
+        f"directions are {check.apart(lobe)} apart, so a reflector between them appears up to "
         f"{check.loss_db(lobe)} dB too weak{narrower}; "
         + (
             remedy

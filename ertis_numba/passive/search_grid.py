@@ -90,7 +90,7 @@ def _coarse(
     wide = lobe._replace(peak=np.asarray)
     is_narrow = method in _NARROWER and check.suffices(wide)
     text = (
-        f"directions are {math.degrees(check.spacing_rad):.1f}° apart; above {above_hz / 1e3:.3g} kHz, a source "
+        f"directions are {check.apart(lobe)} apart; above {above_hz / 1e3:.3g} kHz, a source "
         f"between them appears up to {check.loss_db(lobe)} dB too weak"
         + (f" in maps of {method}, whose peaks are narrow" if method in _NARROWER else "")
         + ("" if check.exceeds_side_lobes(lobe) else ", or in the direction of a side lobe")
@@ -189,7 +189,7 @@ def _search_warning(settings: Settings) -> str | None:
     if above_hz is None:
         return None
     return (
-        f"directions are {math.degrees(check.spacing_rad):.1f}° apart; above {above_hz / 1e3:.1f} kHz, sources between "
+        f"directions are {check.apart(lobe_at(above_hz))} apart; above {above_hz / 1e3:.1f} kHz, sources between "
         f"them may have wrong bearings; {_sufficient(settings)}"
     )
 
