@@ -76,6 +76,10 @@ CASES = {  # command: exit code and message
     "import nan.wav --layout lay.csv": (1, "channel 0 of nan.wav contains NaN or infinity"),
     "import nan.wav": (1, "channel 0 of nan.wav contains NaN or infinity"),
     "import gone.wav --layout lay.csv": (1, "gone.wav: No such file or directory; choose a file with measurements"),
+    "import a.wav --passive --layout lay.csv --start 18/05/2024T04:25": (
+        2,
+        "'18/05/2024T04:25' is not a date with a time; write year, month and day first, as in 2026-05-04T12:30",
+    ),
     "import a.wav --layout lay.csv": (2, "the call in a.wav is unknown; use --passive"),
     "serve --every --json": (2, "--every requires --record DIR; add --record DIR, or leave out --every"),
     "serve --every --record d": (2, "--every requires --json; add --json"),
@@ -106,6 +110,16 @@ def test_patterns_are_expanded(folder, monkeypatch):
     done = run(folder, monkeypatch, "verify '*.h5' 'recs/*.h5' --quiet --json")
     assert done.exit_code == 0, done.output
     assert [name in done.stdout for name in ("rec.h5", "first.h5")] == [True, True]
+
+
+def test_patterns_are_expanded_in_the_order_of_numbers(tmp_path, monkeypatch):
+    for number in (1, 2, 10):
+        wavfile.write(tmp_path / f"mic{number}.wav", 96_000, np.full(960, number, "<i2"))
+    (tmp_path / "three.csv").write_text("y_mm,z_mm\n0,0\n20,0\n0,20\n")
+    done = run(tmp_path, monkeypatch, "import 'mic*.wav' --join --passive --layout three.csv -o o.h5")
+    assert done.exit_code == 0, done.output
+    with ertis.open_recording(tmp_path / "o.h5") as recording:
+        assert recording[0].data[0].tolist() == [1, 2, 10]
 
 
 def test_words_without_sound_are_noted(tmp_path, monkeypatch):

@@ -233,3 +233,12 @@ def test_missing_temporary_folder_is_refused(monkeypatch, tmp_path):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
     with pytest.raises(DeviceError, match=r"no folder for compiled kernels is writable .*; set NUMBA_CACHE_DIR to a"):
         _numba_setup.prepare()
+
+
+def test_codec_that_cannot_encode_lines_is_replaced(monkeypatch):
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="idna")
+    monkeypatch.setattr(sys, "stdout", stream)
+    _output.replace_unencodable()
+    stream.write("µ" * 80 + "\n")
+    stream.flush()
+    assert stream.buffer.getvalue().decode() == "µ" * 80 + "\n"

@@ -73,7 +73,15 @@ def replace_unencodable() -> None:
     codecs.register_error("ertis", _replaced)
     for stream in (sys.stdout, sys.stderr):
         if getattr(stream, "errors", None) in {"strict", "surrogateescape"} and hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="ertis")
+            stream.reconfigure(errors="ertis", encoding=None if _can_encode_lines(stream.encoding) else "utf-8")
+
+
+def _can_encode_lines(encoding: str) -> bool:
+    """Return False for codecs that are not for lines of text, such as ``idna``."""
+    try:
+        return bool((100 * "x" + "\n").encode(encoding))
+    except (UnicodeError, LookupError):
+        return False
 
 
 def _replaced(error: UnicodeError) -> tuple[str | bytes, int]:

@@ -22,6 +22,15 @@ _WAV = {".wav", ".wave"}
 _UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
 
 
+class _Time(click.DateTime):
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            return super().convert(str(value).strip().replace(" ", "T", 1), param, ctx)
+        except click.BadParameter:
+            example = "year, month and day first, as in 2026-05-04T12:30 or 2026-05-04T12:30:00.5+02:00"
+            self.fail(f"{value!r} is not a date with a time; write {example}", param, ctx)
+
+
 @click.command("import")
 @options.input_files("FILE...", name="raw")
 @options.output("Recording to write; FILE.h5 beside the first file or the folder by default.")
@@ -58,7 +67,7 @@ _UNSTATED_M = (0.0, 0.0)  # range_m before a settings file is read
     "--start",
     metavar="TIME",
     multiple=True,
-    type=click.DateTime([f"%Y-%m-%dT%H:%M{rest}{zone}" for rest in ("", ":%S", ":%S.%f") for zone in ("", "%z")]),
+    type=_Time([f"%Y-%m-%dT%H:%M{rest}{zone}" for rest in ("", ":%S", ":%S.%f") for zone in ("", "%z")]),
     help="PCM: time of the first emission, such as 2026-05-04T12:30 or 2026-05-04T12:30:00.5+02:00; UTC unless it has "
     "an offset. Use it once for the first file, or once per file. By default, from the metadata or names of the files.",
 )
