@@ -324,9 +324,10 @@ def test_scans_of_fused_images_have_each_reflector_in_one_beam(tmp_path):
         scan = read(path)[0]["/fused/scan", TIME_NS]
         angle_rad = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
         wanted = np.full(360, np.inf)
-        for near_m, toward_rad in zip(range_m, azimuth_rad, strict=True):
-            beam = np.argmax(np.cos(angle_rad - toward_rad))
-            wanted[beam] = min(wanted[beam], near_m)
+        for near_m, toward_rad in sorted(zip(range_m, azimuth_rad, strict=True), reverse=True):
+            off = np.cos(angle_rad - toward_rad)
+            wanted[off >= np.cos(np.radians(3.5))] = np.inf  # Farther echoes may be those of several reflections.
+            wanted[np.argmax(off)] = near_m
         np.testing.assert_allclose(scan.ranges, wanted, atol=1e-4)
         assert scan.header.frame_id == "base_link"
 
@@ -338,6 +339,21 @@ def test_scans_show_reflectors_as_wide_as_their_direction_is_uncertain(tmp_path,
     places_m = [(2 * np.cos(middle_rad), 2 * np.sin(middle_rad))]
     (path,) = export(tmp_path / "wide.mcap", [fused_image(places_m, across_m)], topics=["scan"])
     assert np.count_nonzero(np.isfinite(read(path)[0]["/fused/scan", TIME_NS].ranges)) == n_beams
+
+
+def test_scans_omit_reflectors_that_are_not_confirmed_unless_they_are_nearest(tmp_path):
+    given = fused_image([(2.0, 0.0), (-1.5, 0.0), (0.0, 3.0), (0.0, -1.0)], 0.001)
+    for confirmed, ranges_m in (
+        ([True, False, True, True], [1.0, 2.0, 3.0]),
+        ([True, False, False, False], [1.0, 2.0]),
+        ([False, False, False, False], [1.0]),
+        (None, [1.0, 1.5, 2.0, 3.0]),
+    ):
+        flags = None if confirmed is None else np.array(confirmed)
+        cloud = given.points.replace(confirmed=flags)
+        (path,) = export(tmp_path / "sure.mcap", [given.replace(points=cloud)], topics=["scan"], overwrite=True)
+        found_m = np.array(read(path)[0]["/fused/scan", TIME_NS].ranges)
+        np.testing.assert_allclose(np.sort(found_m[np.isfinite(found_m)]), ranges_m, atol=1e-4)
 
 
 def test_mcap_has_no_transform_of_the_platform_to_itself(tmp_path):

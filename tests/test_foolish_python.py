@@ -123,6 +123,7 @@ CALLS = {
     "cloud.replace energy": lambda given: given.cloud.replace(amplitude=given.cloud.amplitude[:-1]),
     "cloud.replace typo": lambda given: given.cloud.replace(levels=1),
     "cloud.replace uncertainty": lambda given: given.cloud.replace(uncertainty_m=np.zeros((1, 1))),
+    "cloud.replace confirmed": lambda given: given.cloud.replace(confirmed=np.zeros(1, bool)),
     "PointCloud wrong": lambda given: ertis.PointCloud(np.zeros((3, 2)), np.zeros(3), given.settings, ertis.Stamp()),
     "PointCloud lists": lambda given: ertis.PointCloud([[0, 0, 0]], [1], given.settings, ertis.Stamp()),
     "find_peaks(None)": lambda given: ertis.find_peaks(None),

@@ -552,8 +552,9 @@ def test_fused_files_keep_the_points_of_the_fusion(fused_file):
         image = stored[0]
         assert stored.has_points
         assert stored.points_note is None
-    for name in ("position_m", "amplitude", "uncertainty_m"):
+    for name in ("position_m", "amplitude", "uncertainty_m", "confirmed"):
         np.testing.assert_array_equal(getattr(image.points, name), getattr(located, name))
+    assert located.confirmed.all()
     assert image.points.stamp == image.stamp
 
 

@@ -46,6 +46,9 @@ class PointCloud(DegreesFromRadians):
     uncertainty_m : (point, 2) float32, optional
         Standard deviations of the position along range and across it, in metres, from `PointExtractor`. None if they
         are unknown: the network does not transmit them.
+    confirmed : (point,) bool, optional
+        True for reflectors whose echoes of several calls or at several sensors agree. The others may be ghosts of sound
+        that two surfaces reflected. None for points that are not fused.
 
     Raises
     ------
@@ -69,6 +72,7 @@ class PointCloud(DegreesFromRadians):
     translation_m: tuple[float, float, float] | None = None
     rotation_xyzw: tuple[float, float, float, float] | None = None
     uncertainty_m: NDArray[np.float32] | None = None
+    confirmed: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         for name in ("position_m", "amplitude"):
@@ -78,6 +82,8 @@ class PointCloud(DegreesFromRadians):
         checks.shape("position_m", self.position_m.shape, (n_points, 3))
         if self.uncertainty_m is not None:
             checks.shape("uncertainty_m", np.shape(self.uncertainty_m), (n_points, 2))
+        if self.confirmed is not None:
+            checks.shape("confirmed", np.shape(self.confirmed), (n_points,))
 
     def __len__(self) -> int:
         return len(self.amplitude)
@@ -149,6 +155,7 @@ class PointCloud(DegreesFromRadians):
             position_m=self.position_m[chosen],
             amplitude=self.amplitude[chosen],
             uncertainty_m=None if self.uncertainty_m is None else self.uncertainty_m[chosen],
+            confirmed=None if self.confirmed is None else self.confirmed[chosen],
         )
 
     def strongest(self, top: int | None, min_level_db: float) -> Self:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.fusion.confirmation import Heard, confirmed
 from ertis_numba.fusion.pairs import AUDIBLE
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
@@ -116,6 +117,8 @@ class Reflectors:
     ----------
     position_m : (reflector, axis) float64
     covariance_m2 : (reflector, axis, axis) float64
+    confirmed : (reflector,) bool
+        Reflectors that echoes at enough pairs confirm, as in `ertis_numba.fusion.confirmation`.
     """
 
     def __init__(
@@ -149,6 +152,10 @@ class Reflectors:
         self._add_lone(found)
         self.position_m = np.array([each[0] for each in found]).reshape(-1, 3)
         self.covariance_m2 = np.array([each[1] for each in found]).reshape(-1, 3, 3)
+        flat = {number for number, receiver in receivers.items() if receiver.is_flat}
+        rows = {each.receiver: self._rows[each.receiver] for each in echoes}
+        heard = Heard(self._sensor_m, self._ahead, rows, flat, self._direction, self._path_m)
+        self.confirmed = confirmed(heard, self.position_m, self._gains(self.position_m))
 
     def _candidates(self) -> _Candidates:
         """Return the candidates of all echoes, where their emitter is audible."""

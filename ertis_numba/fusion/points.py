@@ -146,6 +146,7 @@ def joined(
         translation_m=(0.0, 0.0, 0.0),
         rotation_xyzw=(0.0, 0.0, 0.0, 1.0),
         uncertainty_m=uncertainty_m[order].astype(np.float32),
+        confirmed=reflectors.confirmed[order],
     )
 
 

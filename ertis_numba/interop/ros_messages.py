@@ -59,6 +59,8 @@ _PLANAR: Final = np.ix_((0, 1, 5), (0, 1, 5))
 _UNKNOWN_TWIST: Final = np.diag([MAX_SPEED_M_S, MAX_SPEED_M_S, MAX_YAW_RATE_RAD_S]) ** 2
 _SONAR_SUFFIX = "_sonar"
 _FUSED = "fused"
+_HIDDEN_RAD: Final = math.radians(3.5)
+"""Angle from a reflector within which farther echoes may be those of sound that it reflected to another surface."""
 _SQRT_HALF = math.sqrt(0.5)
 _SONAR_TURN = (_SQRT_HALF, 0.0, _SQRT_HALF, 0.0)
 """Frame of marine_acoustic_msgs relative to that of the sensor: z forward, x up, y right.
@@ -139,8 +141,11 @@ def scan_message(
     """Return the nearest echo of each azimuth, as sensor_msgs/msg/LaserScan; None for images that are not planar.
 
     The angles of a scan are evenly spaced. Each has the echo of the nearest direction of the image, or infinity. The
-    intensities are levels in dBFS. `ertis_numba.analysis.nearest_echo` describes both limits. The scan of an image with
-    `Energyscape.points` has these reflectors only, each as wide as its direction is uncertain.
+    intensities are levels in dBFS. `ertis_numba.analysis.nearest_echo` describes both limits.
+
+    The scan of an image with `Energyscape.points` has these reflectors only, if they are confirmed or nearest to the
+    sensors. A reflector fills the beam nearest to it, and all beams within one standard deviation of its direction. In
+    other beams within 3.5°, half of the main lobe of an eRTIS array, the range beyond it is unknown, and infinite.
     """
     if not image.is_planar or len(image.azimuth_rad) < 2 or len(image.range_m) < 3:
         return None
@@ -171,25 +176,31 @@ def scan_message(
 def _beams_of_points(
     image: Energyscape, cloud: PointCloud, angle_rad: NDArray[np.float64], min_level_db: float, floor_dbfs: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return the range and level of the nearest point in each beam of a scan; infinite without one.
-
-    A point fills the beam nearest to it, and all beams within one standard deviation of its direction.
-    """
+    """Return the range and level of the nearest reflector in each beam of a scan; infinite without one."""
     cloud = cloud.strongest(None, min_level_db)
     range_m = np.hypot(cloud.position_m[:, 0], cloud.position_m[:, 1], dtype=np.float64)
     kept = (range_m >= image.range_m[0]) & (range_m <= image.range_m[-1])
-    kept &= cloud.amplitude >= 10 ** (floor_dbfs / 20)
+    kept &= (cloud.amplitude >= 10 ** (floor_dbfs / 20)) & _certain(cloud, range_m)
     cloud, range_m = cloud.only(kept), range_m[kept]
     ranges_m, levels_dbfs = np.full(len(angle_rad), np.inf), np.full(len(angle_rad), -np.inf, np.float32)
     across_m = np.zeros(len(cloud)) if cloud.uncertainty_m is None else np.nan_to_num(cloud.uncertainty_m[:, 1])
-    turn = 2 * math.pi
+    turn, spacing_rad = 2 * math.pi, angle_rad[1] - angle_rad[0]
     for point in np.argsort(-range_m, kind="stable"):  # Nearer points replace farther ones.
         away_rad = np.abs((angle_rad - cloud.azimuth_rad[point] + math.pi) % turn - math.pi)
-        beams = away_rad <= max(float(away_rad.min()), across_m[point] / range_m[point])
-        if away_rad.min() > angle_rad[1] - angle_rad[0]:  # Outside the angles of the scan.
+        if away_rad.min() > spacing_rad:  # Outside the angles of the scan.
             continue
+        hidden = away_rad <= _HIDDEN_RAD
+        ranges_m[hidden], levels_dbfs[hidden] = np.inf, -np.inf
+        beams = away_rad <= max(float(away_rad.min()), across_m[point] / range_m[point])
         ranges_m[beams], levels_dbfs[beams] = range_m[point], 20 * math.log10(cloud.amplitude[point])
     return ranges_m, levels_dbfs
+
+
+def _certain(cloud: PointCloud, range_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return True for confirmed reflectors and the nearest one, whose echo no other surface can have reflected."""
+    if cloud.confirmed is None:
+        return np.ones(len(cloud), np.bool_)
+    return np.asarray(cloud.confirmed | (range_m <= range_m.min(initial=np.inf)))
 
 
 class ImageMessages:

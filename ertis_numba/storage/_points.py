@@ -16,6 +16,7 @@ __all__ = ["POINT_SIZES", "PointReader", "require_uniform", "write_points"]
 
 POINT_SIZES: Final = {"axis": 3, "component": 2}
 """Lengths of the axes of points."""
+_UNKNOWN: Final = -1
 
 
 def require_uniform(image: Energyscape, first: Energyscape) -> None:
@@ -45,6 +46,9 @@ def write_points(group: h5py.Group, clouds: Sequence[PointCloud]) -> None:
                 unknown if cloud.uncertainty_m is None else cloud.uncertainty_m
                 for cloud, unknown in zip(clouds, unknown_m, strict=True)
             ]
+        ),
+        "point_confirmed": np.concatenate(
+            [np.full(len(cloud), _UNKNOWN) if cloud.confirmed is None else cloud.confirmed for cloud in clouds]
         ),
     }
     create_variables(group, POINTS, sizes={"point": len(columns["point_amplitude"]), **POINT_SIZES})
@@ -82,13 +86,16 @@ class PointReader:
         self._position_m, self._amplitude, self._uncertainty_m = (
             np.asarray(group[f"point_{name}"][:], np.float32) for name in ("position", "amplitude", "uncertainty")
         )
-        lengths = {len(self._position_m), len(self._amplitude), len(self._uncertainty_m), int(self._bounds[-1])}
+        self._confirmed = np.asarray(group["point_confirmed"][:], np.int8)
+        columns = self._position_m, self._amplitude, self._uncertainty_m, self._confirmed
+        lengths = {*map(len, columns), int(self._bounds[-1])}
         if len(lengths) != 1:
             raise DamagedError(f"{path}: point_count does not match the number of points; copy the file again")
 
     def __call__(self, image: Energyscape, index: int) -> Energyscape:
         """Return an image with its points."""
         own = slice(self._bounds[index], self._bounds[index + 1])
+        confirmed = self._confirmed[own]
         cloud = PointCloud(
             self._position_m[own],
             self._amplitude[own],
@@ -97,5 +104,6 @@ class PointReader:
             translation_m=(0.0, 0.0, 0.0),
             rotation_xyzw=(0.0, 0.0, 0.0, 1.0),
             uncertainty_m=self._uncertainty_m[own],
+            confirmed=None if (confirmed == _UNKNOWN).any() else confirmed.astype(np.bool_),
         )
         return image.replace(points=cloud)

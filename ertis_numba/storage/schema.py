@@ -163,6 +163,7 @@ POINTS: Final = (
         "m",
         optional=True,
     ),
+    Variable("point_confirmed", ("point",), "|i1", "1 if enough echoes agree, 0 if not, -1 if unknown", optional=True),
 )
 """Points that a fusion has located; those of the first image come first, the strongest of each image first."""
 

@@ -1,0 +1,107 @@
+"""Confirmation of reflectors: points and mirror-like walls, and ghosts of sound that a wall reflects as well."""
+
+import numpy as np
+import pytest
+
+from ertis_numba.fusion.confirmation import Heard, confirmed
+
+YAW_RAD = np.radians([0.0, 90.0, 180.0, -90.0])
+AHEAD = np.stack([np.cos(YAW_RAD), np.sin(YAW_RAD), np.zeros(4)], axis=1)
+HEIGHT_M = 0.4
+SENSOR_M = 0.2 * AHEAD + [0.0, 0.0, HEIGHT_M]
+GAIN = np.ones((1, 4, 4))
+POST_M = np.array([1.2, 0.9, HEIGHT_M])
+WALL_M = np.array([-1.6, 0.0, HEIGHT_M])  # A wall across x.
+
+
+def echo(receiver, from_m, path_m):
+    """An echo of a flat array: a direction in front of it, and the path for each emitter."""
+    toward = (from_m - SENSOR_M[receiver]) / np.linalg.norm(from_m - SENSOR_M[receiver])
+    depth = toward @ AHEAD[receiver]
+    return receiver, toward - 2 * min(depth, 0.0) * AHEAD[receiver], path_m
+
+
+def mirrored(place_m):
+    return place_m * [-1.0, 1.0, 1.0] + [2 * WALL_M[0], 0.0, 0.0]
+
+
+def echoes_of_post(place_m):
+    for receiver, heard_m in enumerate(SENSOR_M):
+        for sent_m in SENSOR_M:
+            yield echo(receiver, place_m, np.linalg.norm(place_m - sent_m) + np.linalg.norm(place_m - heard_m))
+
+
+def echoes_of_wall():
+    for receiver, heard_m in enumerate(SENSOR_M):
+        for sent_m in SENSOR_M:
+            yield echo(receiver, mirrored(sent_m), np.linalg.norm(mirrored(sent_m) - heard_m))
+
+
+def echoes_over_wall(place_m):
+    """Sound that meets the post first and the wall then."""
+    for receiver, heard_m in enumerate(SENSOR_M):
+        for sent_m in SENSOR_M:
+            path_m = np.linalg.norm(place_m - sent_m) + np.linalg.norm(mirrored(place_m) - heard_m)
+            yield echo(receiver, mirrored(place_m), path_m)
+
+
+def found(echoes, *places_m, flat=range(4), with_image=range(4)):
+    receiver, direction, path_m = zip(*echoes, strict=True)
+    rows = {number: np.flatnonzero(np.array(receiver) == number) for number in with_image}
+    heard = Heard(SENSOR_M, AHEAD, rows, flat, np.array(direction), np.repeat(np.array(path_m)[:, None], 4, axis=1))
+    return confirmed(heard, np.array(places_m), np.repeat(GAIN, len(places_m), axis=0)).tolist()
+
+
+def test_reflectors_are_confirmed_by_echoes_of_all_sensors():
+    assert found(echoes_of_post(POST_M), POST_M, POST_M + 0.1) == [True, False]
+
+
+def test_a_reflector_that_few_sensors_hear_is_not_confirmed():
+    most = [each for each in echoes_of_post(POST_M) if each[0] in (0, 1)]
+    assert found(most, POST_M) == [False]
+    assert found([*most, *(each for each in echoes_of_post(POST_M) if each[0] == 2)], POST_M) == [True]
+    assert found(most, POST_M, with_image=(0, 1)) == [True]
+
+
+def test_arrays_that_are_not_flat_need_no_echo_from_behind():
+    ahead = [each for each in echoes_of_post(POST_M) if each[0] in (0, 1)]
+    assert found(ahead, POST_M, flat=()) == [True]
+
+
+def test_a_mirror_like_wall_is_confirmed_by_the_images_of_all_emitters():
+    assert found(echoes_of_wall(), WALL_M) == [True]
+    assert found(echoes_of_wall(), WALL_M - [0.13, 0.0, 0.0]) == [False]
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_sound_over_a_wall_confirms_no_reflector(seed):
+    rng = np.random.default_rng(seed)
+    place_m = np.array([rng.uniform(0.5, 2.0), rng.uniform(-2.0, 2.0), HEIGHT_M])
+    # The place that the sensor behind derives from its own call.
+    path_m = np.linalg.norm(place_m - SENSOR_M[2]) + np.linalg.norm(mirrored(place_m) - SENSOR_M[2])
+    toward = (mirrored(place_m) - SENSOR_M[2]) / np.linalg.norm(mirrored(place_m) - SENSOR_M[2])
+    ghost_m = SENSOR_M[2] + path_m / 2 * toward
+    echoes = [*echoes_of_post(place_m), *echoes_of_wall(), *echoes_over_wall(place_m)]
+    assert found(echoes, place_m, WALL_M, ghost_m) == [True, True, False]
+
+
+def test_mirror_images_behind_a_wall_are_not_confirmed():
+    """Sound that the wall reflects on both ways fits the mirror image at all sensors."""
+    echoes = [*echoes_of_post(POST_M), *echoes_of_wall(), *echoes_of_post(mirrored(POST_M))]
+    assert found(echoes, POST_M, WALL_M, mirrored(POST_M)) == [True, True, False]
+
+
+def test_a_lone_echo_confirms_nothing_on_a_platform_with_several_sensors():
+    own = echo(0, np.array([2.0, 0.0, HEIGHT_M]), 3.6)
+    rows = {0: np.array([0])}
+    heard = Heard(SENSOR_M, AHEAD, rows, range(4), own[1][None], np.array([[3.6, np.nan, np.nan, np.nan]]))
+    gain = np.zeros((1, 4, 4))
+    gain[0, 0, 0] = 1.0
+    assert confirmed(heard, np.array([[2.0, 0.0, HEIGHT_M]]), gain).tolist() == [False]
+    alone = Heard(SENSOR_M[:1], AHEAD[:1], rows, range(1), own[1][None], np.array([[3.6]]))
+    assert confirmed(alone, np.array([[2.0, 0.0, HEIGHT_M]]), gain[:, :1, :1]).tolist() == [True]
+
+
+def test_no_reflectors_are_no_error():
+    none = Heard(SENSOR_M, AHEAD, {}, range(4), np.empty((0, 3)), np.empty((0, 4)))
+    assert confirmed(none, np.empty((0, 3)), np.empty((0, 4, 4))).tolist() == []
