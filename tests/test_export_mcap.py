@@ -353,7 +353,7 @@ def test_scans_omit_reflectors_that_are_not_confirmed_unless_they_are_nearest(tm
         cloud = given.points.replace(confirmed=flags)
         (path,) = export(tmp_path / "sure.mcap", [given.replace(points=cloud)], topics=["scan"], overwrite=True)
         found_m = np.array(read(path)[0]["/fused/scan", TIME_NS].ranges)
-        np.testing.assert_allclose(np.sort(found_m[np.isfinite(found_m)]), ranges_m, atol=1e-4)
+        np.testing.assert_allclose(np.unique(found_m[np.isfinite(found_m)]), ranges_m, atol=1e-4)
 
 
 def test_mcap_has_no_transform_of_the_platform_to_itself(tmp_path):

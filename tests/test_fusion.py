@@ -604,6 +604,19 @@ def test_parts_of_fused_images_keep_only_their_points():
     np.testing.assert_array_equal(part.points.position_m, image.points.position_m[chosen])
 
 
+def test_export_notes_that_scans_of_single_sensors_contain_foreign_echoes(recordings, fused_file, tmp_path):
+    noted = "scans of single sensors contain echoes of the other sensors' calls"
+    for source, options, is_noted in (
+        (recordings / "all.h5", ("--sensor", "front", "--topic", "scan"), True),
+        (recordings / "all.h5", ("--sensor", "front", "--topic", "points"), False),
+        (recordings / "front.h5", ("--topic", "scan"), False),
+        (fused_file, ("--topic", "scan"), False),
+    ):
+        code, output = run("export", source, "-o", tmp_path / "scans.mcap", "--force", *options)
+        assert code == 0, output
+        assert (noted in output) == is_noted
+
+
 def test_view_draws_the_points_of_the_fusion():
     view = ViewedScene()
     for name, image in images().items():

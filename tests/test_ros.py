@@ -17,7 +17,8 @@ from ertis_numba.devices.emulator import Emulator
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Stamp
 from ertis_numba.interop.ros_definitions import encoder
-from ertis_numba.interop.ros_messages import MESSAGES, ImageMessages, points_message, scan_message
+from ertis_numba.interop.ros_messages import MESSAGES, ImageMessages, points_message
+from ertis_numba.interop.scans import scan_message
 from ertis_numba.network.status import SensorStatus, Status
 from ertis_numba.ros import Participant, PublishingSettings, RosPublisher, interfaces
 from ertis_numba.ros.diagnostics import diagnostics_message

@@ -7,7 +7,8 @@ import pytest
 
 from ertis_numba.frames import PointCloud, Stamp
 from ertis_numba.fusion import Fuser
-from ertis_numba.interop.ros_messages import MESSAGES, points_message, scan_message
+from ertis_numba.interop.ros_messages import MESSAGES, points_message
+from ertis_numba.interop.scans import reflectors_ahead, scan_message
 from ertis_numba.ros import Participant, PublishingSettings, RosPublisher
 from ertis_numba.ros.fused_points import FusedImages, FusedPoints, joined
 from ertis_numba.settings import Settings
@@ -125,6 +126,7 @@ def test_fused_images_have_the_points_of_the_fuser(origin_m):
         for each in given.values():
             made += fusing.add(each.replace(stamp=replace(each.stamp, sync_count=sequence)), places)
     wanted = Fuser({"front": AHEAD, "left": LEFT})([*given.values()]).points
+    made = [fused for fused, _ in made]
     offset_m = np.subtract(made[-1].points.translation_m, origin_m)
     assert np.all(np.abs(offset_m) < 2)
     assert np.all(offset_m == np.round(offset_m))
@@ -133,6 +135,41 @@ def test_fused_images_have_the_points_of_the_fuser(origin_m):
     )
     np.testing.assert_allclose(found_m, wanted_m, atol=1e-5)
     assert made[-1].stamp.sensor == ("base_link_local" if any(origin_m) else "base_link")
+
+
+def test_reflectors_ahead_of_a_sensor_are_in_its_frame():
+    given = cloud("base_link", 0, n_points=4).replace(
+        position_m=np.float32([[0.0, 2.0, 0.2], [1.0, 1.5, 0.2], [0.0, -3.0, 0.2], [0.5, 4.0, 0.2]]),
+        confirmed=np.array([True, True, True, False]),
+    )
+    ahead = reflectors_ahead(given, stamped(2, "left"), LEFT)
+    # Behind the sensor is the third one; the fourth is neither confirmed nor the nearest.
+    np.testing.assert_allclose(ahead.position_m, [[1.5, 0.0, 0.0], [1.0, -1.0, 0.0]], atol=1e-6)
+    assert ahead.stamp.sensor == "left"
+    unsure = reflectors_ahead(given.replace(confirmed=np.zeros(4, bool)), stamped(2, "left"), LEFT)
+    np.testing.assert_allclose(unsure.position_m, [[1.0, -1.0, 0.0]], atol=1e-6)  # the nearest to the platform
+
+
+def test_scans_of_the_sensors_of_a_platform_show_fused_reflectors():
+    given, places = {"front": stamped(1, "front"), "left": stamped(2, "left")}, {"front": AHEAD, "left": LEFT}
+    participant = Recorded()
+    publisher = RosPublisher(participant, topics=["scan"])
+    for count in range(2):
+        for name, each in given.items():
+            publisher.publish(each.replace(stamp=replace(each.stamp, sync_count=count)), places[name])
+    same = {name: each.replace(stamp=replace(each.stamp, sync_count=1)) for name, each in given.items()}
+    fuser = Fuser(places)
+    fuser([same["left"]])
+    points = fuser(same.values()).points
+    for name, each in same.items():
+        wanted = scan_message(each.replace(points=reflectors_ahead(points, each, places[name])))
+        assert participant.topics[f"/{name}/scan"].messages[-1] == wanted
+    # The first image is alone. The second one begins the fusion, and the last two complete a pulse.
+    assert {name: len(each.messages) for name, each in participant.topics.items()} == {
+        "/front/scan": 2,
+        "/left/scan": 2,
+        "/fused/scan": 2,
+    }
 
 
 def test_sensors_without_mounting_are_not_fused():

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from ertis_numba.analysis.point_finder import PointFinder
-from ertis_numba.interop.ros_messages import MESSAGES, ImageMessages, points_message, scan_message
+from ertis_numba.interop.ros_messages import MESSAGES, ImageMessages, points_message
+from ertis_numba.interop.scans import scan_message
 from tests.files import image
 
 yaml = pytest.importorskip("yaml")

@@ -119,7 +119,7 @@ def export(
         _export_drive.require_fitting("tum", paths)
         _export_poses.export_poses(paths[0], target, sensor, force=force, quiet=quiet, as_json=as_json)
         return
-    from ertis_numba.storage import check_target, file_kind, open_recording
+    from ertis_numba.storage import check_target, file_kind, open_recording, sensor_names
 
     if _export_sound.is_chosen(target, file_format):
         _export_drive.require_fitting("wav", paths)
@@ -164,6 +164,12 @@ def export(
         unknown = [reader.sensor for reader in readers if reader.sensor not in known]
         remedy = "the export uses the frame of the sensor; give --mounting FILE for the frame of the platform"
         _mountings.note_unknown(unknown, remedy, quiet=quiet)
+    if name == "mcap" and sum(len(sensor_names(path)) for path in paths) > 1 and "scan" in (topics or TOPICS):
+        options.note(
+            "scans of single sensors contain echoes of the other sensors' calls; for /fused/scan, export the file that "
+            "'ertis process --fuse' writes",
+            quiet=quiet,
+        )
     measurements, sensors = options.counted(len(items), "measurement"), options.counted(len(readers), "sensor")
     options.say(f"{target}: {measurements} of {sensors} as {name}", quiet=quiet)
     if as_json:

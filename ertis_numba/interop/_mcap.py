@@ -22,10 +22,10 @@ from ertis_numba.interop.ros_messages import (
     mounting_message,
     occupancy_message,
     points_message,
-    scan_message,
     sonar_frame_message,
     sonar_image_message,
 )
+from ertis_numba.interop.scans import scan_message
 
 __all__ = ["map_mcap", "require_mcap", "write_mcap"]
 

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.nearest_echo import nearest_echo
 from ertis_numba.analysis.point_finder import same_directions
 from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Stamp
-from ertis_numba.geometry import unit_vectors, unrolled_rad
+from ertis_numba.geometry import unit_vectors
 from ertis_numba.interop._grey_image import GreyImage
 from ertis_numba.interop._mountings import PLATFORM, Mounting
 from ertis_numba.interop._points import ros_time
@@ -37,7 +36,6 @@ __all__ = [
     "odometry_message",
     "odometry_transform",
     "points_message",
-    "scan_message",
     "sonar_frame_message",
     "sonar_image_message",
 ]
@@ -59,8 +57,6 @@ _PLANAR: Final = np.ix_((0, 1, 5), (0, 1, 5))
 _UNKNOWN_TWIST: Final = np.diag([MAX_SPEED_M_S, MAX_SPEED_M_S, MAX_YAW_RATE_RAD_S]) ** 2
 _SONAR_SUFFIX = "_sonar"
 _FUSED = "fused"
-_HIDDEN_RAD: Final = math.radians(3.5)
-"""Angle from a reflector within which farther echoes may be those of sound that it reflected to another surface."""
 _SQRT_HALF = math.sqrt(0.5)
 _SONAR_TURN = (_SQRT_HALF, 0.0, _SQRT_HALF, 0.0)
 """Frame of marine_acoustic_msgs relative to that of the sensor: z forward, x up, y right.
@@ -133,74 +129,6 @@ def points_message(cloud: PointCloud) -> dict[str, Any]:
         "data": rows.tobytes(),
         "is_dense": cloud.uncertainty_m is not None,
     }
-
-
-def scan_message(
-    image: Energyscape, *, min_level_db: float = -20.0, floor_dbfs: float = -math.inf
-) -> dict[str, Any] | None:
-    """Return the nearest echo of each azimuth, as sensor_msgs/msg/LaserScan; None for images that are not planar.
-
-    The angles of a scan are evenly spaced. Each has the echo of the nearest direction of the image, or infinity. The
-    intensities are levels in dBFS. `ertis_numba.analysis.nearest_echo` describes both limits.
-
-    The scan of an image with `Energyscape.points` has these reflectors only, if they are confirmed or nearest to the
-    sensors. A reflector fills the beam nearest to it, and all beams within one standard deviation of its direction. In
-    other beams within 3.5°, half of the main lobe of an eRTIS array, the range beyond it is unknown, and infinite.
-    """
-    if not image.is_planar or len(image.azimuth_rad) < 2 or len(image.range_m) < 3:
-        return None
-    azimuth_rad = unrolled_rad(image.azimuth_rad)
-    order = np.argsort(azimuth_rad, kind="stable")
-    ascending = azimuth_rad[order]
-    angle_rad = np.linspace(ascending[0], ascending[-1], len(ascending))
-    nearest = order[np.searchsorted((ascending[:-1] + ascending[1:]) / 2, angle_rad)]
-    if image.points is not None:
-        ranges_m, levels_dbfs = _beams_of_points(image, image.points, angle_rad, min_level_db, floor_dbfs)
-    else:
-        range_m, level_dbfs = nearest_echo(image, min_level_db=min_level_db, floor_dbfs=floor_dbfs)
-        ranges_m, levels_dbfs = range_m[nearest], level_dbfs[nearest]
-    return {
-        "header": header(image.stamp),
-        "angle_min": float(angle_rad[0]),
-        "angle_max": float(angle_rad[-1]),
-        "angle_increment": float(angle_rad[1] - angle_rad[0]),
-        "time_increment": 0.0,  # One call serves all angles.
-        "scan_time": 0.0,
-        "range_min": float(image.range_m[0]),
-        "range_max": float(image.range_m[-1]),
-        "ranges": ranges_m.tolist(),
-        "intensities": levels_dbfs.tolist(),
-    }
-
-
-def _beams_of_points(
-    image: Energyscape, cloud: PointCloud, angle_rad: NDArray[np.float64], min_level_db: float, floor_dbfs: float
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return the range and level of the nearest reflector in each beam of a scan; infinite without one."""
-    cloud = cloud.strongest(None, min_level_db)
-    range_m = np.hypot(cloud.position_m[:, 0], cloud.position_m[:, 1], dtype=np.float64)
-    kept = (range_m >= image.range_m[0]) & (range_m <= image.range_m[-1])
-    kept &= (cloud.amplitude >= 10 ** (floor_dbfs / 20)) & _certain(cloud, range_m)
-    cloud, range_m = cloud.only(kept), range_m[kept]
-    ranges_m, levels_dbfs = np.full(len(angle_rad), np.inf), np.full(len(angle_rad), -np.inf, np.float32)
-    across_m = np.zeros(len(cloud)) if cloud.uncertainty_m is None else np.nan_to_num(cloud.uncertainty_m[:, 1])
-    turn, spacing_rad = 2 * math.pi, angle_rad[1] - angle_rad[0]
-    for point in np.argsort(-range_m, kind="stable"):  # Nearer points replace farther ones.
-        away_rad = np.abs((angle_rad - cloud.azimuth_rad[point] + math.pi) % turn - math.pi)
-        if away_rad.min() > spacing_rad:  # Outside the angles of the scan.
-            continue
-        hidden = away_rad <= _HIDDEN_RAD
-        ranges_m[hidden], levels_dbfs[hidden] = np.inf, -np.inf
-        beams = away_rad <= max(float(away_rad.min()), across_m[point] / range_m[point])
-        ranges_m[beams], levels_dbfs[beams] = range_m[point], 20 * math.log10(cloud.amplitude[point])
-    return ranges_m, levels_dbfs
-
-
-def _certain(cloud: PointCloud, range_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return True for confirmed reflectors and the nearest one, whose echo no other surface can have reflected."""
-    if cloud.confirmed is None:
-        return np.ones(len(cloud), np.bool_)
-    return np.asarray(cloud.confirmed | (range_m <= range_m.min(initial=np.inf)))
 
 
 class ImageMessages:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from ertis_numba.fusion.fuser import Fused, Fuser
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.interop._mountings import Mounting
 
-__all__ = ["LOCAL_FRAME", "FusedImages", "FusedPoints", "joined"]
+__all__ = ["LOCAL_FRAME", "FusedImages", "FusedPoints", "FusedPulse", "joined"]
 
 PLATFORM_FRAME: Final = "base_link"
 LOCAL_FRAME: Final = "base_link_local"
@@ -34,6 +34,13 @@ class FusedPoints:
         return [joined(group) for group in self._groups.add(cloud)]
 
 
+class FusedPulse(NamedTuple):
+    """Fused image of a SYNC pulse with its points, and the images of its sensors."""
+
+    image: Energyscape
+    images: Mapping[str, Energyscape]
+
+
 class FusedImages:
     """Fuser of the images of each SYNC pulse, whose points are reflectors that all sensors confirm."""
 
@@ -43,8 +50,8 @@ class FusedImages:
         self._fuser: tuple[dict[str, Mounting], Fuser] | None = None
         self._n_empty = 0
 
-    def add(self, image: Energyscape, mountings: Mapping[str, Mounting]) -> list[Energyscape]:
-        """Add an image, and return the fused images that are complete now, with their points.
+    def add(self, image: Energyscape, mountings: Mapping[str, Mounting]) -> list[FusedPulse]:
+        """Add an image, and return the pulses that are complete now.
 
         Images that are planar, unlike the first one of their pulse, or the reverse, are left out. A pulse that cannot
         be fused is left out with a note. The frame of the result is that of `joined`,
@@ -59,7 +66,7 @@ class FusedImages:
         fused = []
         for group in self._groups.add(image):
             try:
-                fused.append(self._fused(group, mountings))
+                fused.append(FusedPulse(self._fused(group, mountings), group))
             except ErtisError as error:  # Others of its pulses may be usable.
                 if str(error) != self._noted:
                     self._noted = str(error)

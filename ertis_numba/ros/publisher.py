@@ -6,6 +6,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, Self
 
+import numpy as np
+
 from ertis_numba import checks
 from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.errors import ArgumentError
@@ -17,10 +19,10 @@ from ertis_numba.interop.ros_messages import (
     TopicNames,
     mounting_message,
     points_message,
-    scan_message,
     sonar_frame_message,
     sonar_image_message,
 )
+from ertis_numba.interop.scans import reflectors_ahead, scan_message
 from ertis_numba.network.status import Status
 from ertis_numba.ros.diagnostics import diagnostics_message
 from ertis_numba.ros.fused_points import LOCAL_FRAME, FusedImages, FusedPoints
@@ -192,10 +194,13 @@ class RosPublisher:
         if self._settings.paused:
             self.left_out += len(wanted)
             return
+        is_fused = isinstance(item, Energyscape) and self._is_fused(stamp.sensor)
         counts = [
-            self._publish_points(item) if topic == "points" else self._publish_topic(topic, item) for topic in wanted
+            self._publish_points(item) if topic == "points" else self._publish_topic(topic, item)
+            for topic in wanted
+            if topic != "scan" or not is_fused  # Its scan needs the attribution of the fusion.
         ]
-        if isinstance(item, Energyscape):
+        if is_fused:
             counts.append(self._publish_fused(item))
         self.published += any(counts)
 
@@ -235,24 +240,37 @@ class RosPublisher:
     def _known_mountings(self) -> dict[str, Mounting]:
         return {name: place for name, place in self._frames.items() if place is not None and name != LOCAL_FRAME}
 
+    def _is_fused(self, sensor: str) -> bool:
+        """Return True if the images of a sensor are fused with those of others."""
+        mountings = self._known_mountings
+        return sensor in mountings and len(mountings) > 1 and not {"points", "scan"}.isdisjoint(self._wanted)
+
     def _publish_fused(self, image: Energyscape) -> int:
-        """Publish the fused points and the scan of each pulse that is complete now; return the number of messages."""
+        """Publish the fused points and the scans of each pulse that is complete now; return the number of messages."""
         mountings, count = self._known_mountings, 0
-        if image.stamp.sensor not in mountings or not {"points", "scan"} & {*self._wanted}:
-            return 0
-        if len(mountings) < 2:
-            return 0
-        for fused in self._fused_images.add(image, mountings):
+        for fused, images in self._fused_images.add(image, mountings):
             if fused.points is None:
                 continue
             if "points" in self._wanted:
                 cloud = fused.points.strongest(self._top, self._settings.min_level_db)
                 count += self._publish_fused_points(self._within_limits(cloud))
-            if "scan" in self._wanted and self._is_due("scan", _ALL_SENSORS, fused.stamp.timestamp_ns):
-                message = self._scan(fused)
-                if message is not None:
-                    self._topic(f"{self._base}/fused/scan", MESSAGES["scan"]).publish(message)
-                    count += 1
+            if "scan" in self._wanted:
+                count += self._publish_fused_scans(fused, fused.points, images)
+        return count
+
+    def _publish_fused_scans(self, fused: Energyscape, cloud: PointCloud, images: Mapping[str, Energyscape]) -> int:
+        """Publish the scans of a platform and of its sensors; return the number of messages."""
+        origin_m = np.array(cloud.translation_m or (0.0, 0.0, 0.0))
+        count = 0
+        for name, image in images.items():
+            translation_m, rotation_xyzw = self._known_mountings[name]
+            near = tuple((np.array(translation_m) - origin_m).tolist()), rotation_xyzw
+            count += self._publish_topic("scan", image.replace(points=reflectors_ahead(cloud, image, near)))
+        if self._is_due("scan", _ALL_SENSORS, fused.stamp.timestamp_ns):
+            message = self._scan(fused)
+            if message is not None:
+                self._topic(f"{self._base}/fused/scan", MESSAGES["scan"]).publish(message)
+                count += 1
         return count
 
     def _publish_fused_points(self, cloud: PointCloud) -> int:

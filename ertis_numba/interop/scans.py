@@ -1,0 +1,107 @@
+"""Laser scans of images, and of the reflectors that a fusion has located."""
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ertis_numba.analysis.nearest_echo import nearest_echo
+from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.geometry import unrolled_rad
+from ertis_numba.interop._mountings import Mounting
+from ertis_numba.interop.ros_messages import header
+
+__all__ = ["reflectors_ahead", "scan_message"]
+
+_HIDDEN_RAD: Final = math.radians(3.5)
+"""Angle from a reflector within which farther echoes may be those of sound that it reflected to another surface."""
+
+
+def scan_message(
+    image: Energyscape, *, min_level_db: float = -20.0, floor_dbfs: float = -math.inf
+) -> dict[str, Any] | None:
+    """Return the nearest echo of each azimuth, as sensor_msgs/msg/LaserScan; None for images that are not planar.
+
+    The angles of a scan are evenly spaced. Each has the echo of the nearest direction of the image, or infinity. The
+    intensities are levels in dBFS. `ertis_numba.analysis.nearest_echo` describes both limits.
+
+    The scan of an image with `Energyscape.points` has these reflectors only, if they are confirmed or nearest to the
+    sensors. A reflector fills the beam nearest to it, and all beams within one standard deviation of its direction. In
+    other beams within 3.5°, half of the main lobe of an eRTIS array, the range beyond it is unknown, and infinite.
+    """
+    if not image.is_planar or len(image.azimuth_rad) < 2 or len(image.range_m) < 3:
+        return None
+    azimuth_rad = unrolled_rad(image.azimuth_rad)
+    order = np.argsort(azimuth_rad, kind="stable")
+    ascending = azimuth_rad[order]
+    angle_rad = np.linspace(ascending[0], ascending[-1], len(ascending))
+    nearest = order[np.searchsorted((ascending[:-1] + ascending[1:]) / 2, angle_rad)]
+    if image.points is not None:
+        ranges_m, levels_dbfs = _beams_of_points(image, image.points, angle_rad, min_level_db, floor_dbfs)
+    else:
+        range_m, level_dbfs = nearest_echo(image, min_level_db=min_level_db, floor_dbfs=floor_dbfs)
+        ranges_m, levels_dbfs = range_m[nearest], level_dbfs[nearest]
+    return {
+        "header": header(image.stamp),
+        "angle_min": float(angle_rad[0]),
+        "angle_max": float(angle_rad[-1]),
+        "angle_increment": float(angle_rad[1] - angle_rad[0]),
+        "time_increment": 0.0,  # One call serves all angles.
+        "scan_time": 0.0,
+        "range_min": float(image.range_m[0]),
+        "range_max": float(image.range_m[-1]),
+        "ranges": ranges_m.tolist(),
+        "intensities": levels_dbfs.tolist(),
+    }
+
+
+def _beams_of_points(
+    image: Energyscape, cloud: PointCloud, angle_rad: NDArray[np.float64], min_level_db: float, floor_dbfs: float
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return the range and level of the nearest reflector in each beam of a scan; infinite without one."""
+    cloud = cloud.strongest(None, min_level_db)
+    range_m = np.hypot(cloud.position_m[:, 0], cloud.position_m[:, 1], dtype=np.float64)
+    kept = (range_m >= image.range_m[0]) & (range_m <= image.range_m[-1])
+    kept &= (cloud.amplitude >= 10 ** (floor_dbfs / 20)) & _certain(cloud)
+    cloud, range_m = cloud.only(kept), range_m[kept]
+    ranges_m, levels_dbfs = np.full(len(angle_rad), np.inf), np.full(len(angle_rad), -np.inf, np.float32)
+    across_m = np.zeros(len(cloud)) if cloud.uncertainty_m is None else np.nan_to_num(cloud.uncertainty_m[:, 1])
+    turn, spacing_rad = 2 * math.pi, angle_rad[1] - angle_rad[0]
+    for point in np.argsort(-range_m, kind="stable"):  # Nearer points replace farther ones.
+        away_rad = np.abs((angle_rad - cloud.azimuth_rad[point] + math.pi) % turn - math.pi)
+        if away_rad.min() > spacing_rad:  # Outside the angles of the scan.
+            continue
+        hidden = away_rad <= _HIDDEN_RAD
+        ranges_m[hidden], levels_dbfs[hidden] = np.inf, -np.inf
+        beams = away_rad <= max(float(away_rad.min()), across_m[point] / range_m[point])
+        ranges_m[beams], levels_dbfs[beams] = range_m[point], 20 * math.log10(cloud.amplitude[point])
+    return ranges_m, levels_dbfs
+
+
+def _certain(cloud: PointCloud) -> NDArray[np.bool_]:
+    """Return True for confirmed reflectors and the nearest one, whose echo no other surface can have reflected."""
+    if cloud.confirmed is None:
+        return np.ones(len(cloud), np.bool_)
+    range_m = np.hypot(cloud.position_m[:, 0], cloud.position_m[:, 1])
+    return np.asarray(cloud.confirmed | (range_m <= range_m.min(initial=np.inf)))
+
+
+def reflectors_ahead(cloud: PointCloud, image: Energyscape, mounting: Mounting) -> PointCloud:
+    """Return the reflectors of a platform that are certain, and in front of one of its sensors, in its frame.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Fused reflectors in the frame of the platform.
+    image : Energyscape
+        Image of the sensor at the same SYNC pulse.
+    mounting : (translation_m, rotation_xyzw)
+        Pose of the sensor on the platform.
+    """
+    translation_m, rotation_xyzw = mounting
+    rotation = Rotation.from_quat(rotation_xyzw)
+    position_m = rotation.inv().apply(cloud.position_m - np.array(translation_m)).astype(np.float32)
+    chosen = _certain(cloud) & (position_m[:, 0] > 0)
+    return cloud.replace(position_m=position_m, stamp=image.stamp, confirmed=None).only(chosen)
