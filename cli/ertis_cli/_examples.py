@@ -10,7 +10,7 @@ from typing import Final
 
 from ertis_cli._config import instead
 
-__all__ = ["description", "examples", "is_written", "named", "words_sha256"]
+__all__ = ["description", "examples", "is_written", "named", "stem", "words_sha256"]
 
 _RECORDINGS: Final = "ertis_examples.synthetic"
 """Package with the scenes and checksums of recordings."""
@@ -18,7 +18,7 @@ _RECORDINGS: Final = "ertis_examples.synthetic"
 _FOLDERS: Final = (("ertis_examples", ()), (_RECORDINGS, ()), (_RECORDINGS, ("scenes",)))
 """Packages, and folders in them, with examples."""
 
-_SUFFIXES: Final = {".toml", ".py", ".rviz"}
+_SUFFIXES: Final = {".toml", ".py", ".rviz", ".yaml"}
 _TOOLS: Final = {"__init__.py", "build.py", "gallery.py", "hall.py"}
 """Files of these packages that are not examples."""
 
@@ -51,12 +51,15 @@ def named(name: str) -> dict[str, Traversable]:
     from ertis_numba.errors import ArgumentError
 
     every = examples()
-    found = {file: item for file, item in every.items() if name in {file, PurePath(file).stem}}
+    found = {file: item for file, item in every.items() if name in {file, stem(file)}}
     if not found:
-        raise ArgumentError(
-            f"example {name!r} does not exist; {instead(name, {PurePath(file).stem for file in every})}"
-        )
+        raise ArgumentError(f"example {name!r} does not exist; {instead(name, {stem(file) for file in every})}")
     return found
+
+
+def stem(file: str) -> str:
+    """Return the name of a file without suffixes."""
+    return file.partition(".")[0]
 
 
 def is_written(path: Path, item: Traversable) -> bool:

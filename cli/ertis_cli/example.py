@@ -1,7 +1,7 @@
 """``ertis example``: list or write example scenes, recordings and scripts."""
 
 from importlib.resources import as_file
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -16,7 +16,7 @@ __all__ = ["example"]
 
 
 def _complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG001
-    names = sorted({PurePath(name).stem for name in _examples.examples()})
+    names = sorted({_examples.stem(name) for name in _examples.examples()})
     return [CompletionItem(name) for name in names if name.startswith(incomplete)]
 
 
