@@ -2,10 +2,11 @@
 
 import time
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import count
+from itertools import count, pairwise
+from statistics import median
 from typing import Final, Literal, NamedTuple
 
 from ertis_numba.errors import ArgumentError, SettingsError
@@ -20,6 +21,8 @@ __all__ = ["Acks", "PeerConnection", "SensorTrack", "Sharing", "Stream", "source
 
 _turns = count()
 _RECENT_S: Final = 3.0
+_SLOWEST: Final = 4  # Measurements that determine the rate if fewer are recent.
+_MISSED: Final = 2.5  # Intervals after which a sensor is silent.
 _DROPS_KEPT: Final = 256  # Limit per session.
 _REASONS: Final = 32  # Limit on reasons for missing numbers, per sensor.
 _NUMBERS_KEPT: Final = 512  # Limit on kept CRC-32 values, per session.
@@ -123,16 +126,22 @@ class SensorTrack:
     def _rate_hz(self) -> float:
         """Return the rate of recent measurements of the latest session, 0 if there are fewer than two.
 
-        After a pause, kept measurements arrive much faster than they were made.
+        The median interval ignores pauses. After a pause, kept measurements arrive much faster than they were made.
         """
         now_s = time.monotonic()
-        recent = [each for each in self.times if now_s - each.arrived_s < _RECENT_S]
-        recent = [each for each in recent if each.session_id == recent[-1].session_id]
+        latest = [each for each in self.times if each.session_id == self.times[-1].session_id]
+        recent = [each for each in latest if now_s - each.arrived_s < _RECENT_S]
+        recent = max(recent, latest[-_SLOWEST:], key=len)
         if len(recent) <= 1:
             return 0.0
-        measured_s = [each.measured_s for each in recent]
-        span_s = max(recent[-1].arrived_s - recent[0].arrived_s, max(measured_s) - min(measured_s))
-        return (len(recent) - 1) / span_s if span_s else 0.0
+        arrived_s, measured_s = (sorted(times_s) for times_s in zip(*(each[1:] for each in recent), strict=True))
+        interval_s = max(_median_interval_s(arrived_s), _median_interval_s(measured_s))
+        is_silent = now_s - arrived_s[-1] > max(_RECENT_S, _MISSED * interval_s)
+        return 0.0 if is_silent or not interval_s else 1 / interval_s
+
+
+def _median_interval_s(times_s: Sequence[float]) -> float:
+    return median(later_s - earlier_s for earlier_s, later_s in pairwise(times_s))
 
 
 @dataclass(slots=True, eq=False)
