@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.fusion.confirmation import Heard, confirmed
+from ertis_numba.fusion.confirmation import EchoPaths, confirmed
 
 YAW_RAD = np.radians([0.0, 90.0, 180.0, -90.0])
 AHEAD = np.stack([np.cos(YAW_RAD), np.sin(YAW_RAD), np.zeros(4)], axis=1)
@@ -48,7 +48,7 @@ def echoes_over_wall(place_m):
 def found(echoes, *places_m, flat=range(4), with_image=range(4)):
     receiver, direction, path_m = zip(*echoes, strict=True)
     rows = {number: np.flatnonzero(np.array(receiver) == number) for number in with_image}
-    heard = Heard(SENSOR_M, AHEAD, rows, flat, np.array(direction), np.repeat(np.array(path_m)[:, None], 4, axis=1))
+    heard = EchoPaths(SENSOR_M, AHEAD, rows, flat, np.array(direction), np.repeat(np.array(path_m)[:, None], 4, axis=1))
     return confirmed(heard, np.array(places_m), np.repeat(GAIN, len(places_m), axis=0)).tolist()
 
 
@@ -94,14 +94,14 @@ def test_mirror_images_behind_a_wall_are_not_confirmed():
 def test_a_lone_echo_confirms_nothing_on_a_platform_with_several_sensors():
     own = echo(0, np.array([2.0, 0.0, HEIGHT_M]), 3.6)
     rows = {0: np.array([0])}
-    heard = Heard(SENSOR_M, AHEAD, rows, range(4), own[1][None], np.array([[3.6, np.nan, np.nan, np.nan]]))
+    heard = EchoPaths(SENSOR_M, AHEAD, rows, range(4), own[1][None], np.array([[3.6, np.nan, np.nan, np.nan]]))
     gain = np.zeros((1, 4, 4))
     gain[0, 0, 0] = 1.0
     assert confirmed(heard, np.array([[2.0, 0.0, HEIGHT_M]]), gain).tolist() == [False]
-    alone = Heard(SENSOR_M[:1], AHEAD[:1], rows, range(1), own[1][None], np.array([[3.6]]))
+    alone = EchoPaths(SENSOR_M[:1], AHEAD[:1], rows, range(1), own[1][None], np.array([[3.6]]))
     assert confirmed(alone, np.array([[2.0, 0.0, HEIGHT_M]]), gain[:, :1, :1]).tolist() == [True]
 
 
 def test_no_reflectors_are_no_error():
-    none = Heard(SENSOR_M, AHEAD, {}, range(4), np.empty((0, 3)), np.empty((0, 4)))
+    none = EchoPaths(SENSOR_M, AHEAD, {}, range(4), np.empty((0, 3)), np.empty((0, 4)))
     assert confirmed(none, np.empty((0, 3)), np.empty((0, 4, 4))).tolist() == []

@@ -14,6 +14,7 @@ from ertis_bench.platform_scenes import platform_scene, random_reflectors
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
+from ertis_numba.air import absorption_db_m
 from ertis_numba.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.fusion.pairs import hypothesis, pair_of
 from ertis_numba.fusion.polar_grid import PolarGrid, close_directions
@@ -556,6 +557,14 @@ def test_fused_files_keep_the_points_of_the_fusion(fused_file):
         np.testing.assert_array_equal(getattr(image.points, name), getattr(located, name))
     assert located.confirmed.all()
     assert image.points.stamp == image.stamp
+
+
+def test_amplitudes_of_points_are_those_of_echoes_at_1_m():
+    # The call has -24 dB at 1 m, and the reflectors -6 dB; air absorbs the echo on 2 m of path.
+    lost_db = 2 * np.mean(absorption_db_m(ertis.Settings().air, np.linspace(25e3, 50e3, 50)))
+    located = fused().points.only(fused().points.confirmed)
+    assert len(located) == len(PLACES_M)
+    np.testing.assert_allclose(20 * np.log10(located.amplitude), -30.0 - lost_db, atol=1.5)
 
 
 def test_peaks_plots_and_exports_of_fused_files_show_the_points_of_the_fusion(fused_file, tmp_path):

@@ -79,7 +79,7 @@ def test_wheel_is_small_and_contains_no_recording_and_no_test(wheel):
         names = [name for name in archive.namelist() if ".dist-info/" not in name]
         sizes = {each.filename: each.compress_size for each in archive.infolist()}
     assert {name.partition("/")[0] for name in names} == {"ertis_bench", "ertis_cli", "ertis_examples", "ertis_numba"}
-    assert {Path(name).suffix for name in names} <= {".json", ".py", ".pyi", ".rviz", ".toml", ".typed", ""}
+    assert {Path(name).suffix for name in names} <= {".json", ".py", ".pyi", ".rviz", ".toml", ".typed", ".yaml", ""}
     # A recording has a megabyte. Code grows with each feature, so that data are limited by themselves.
     assert sum(sizes[name] for name in names if Path(name).suffix not in {".py", ".pyi"}) <= 30e3
     assert wheel.stat().st_size <= 2e6

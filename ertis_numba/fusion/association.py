@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
-from ertis_numba.fusion.confirmation import Heard, confirmed
+from ertis_numba.fusion.confirmation import EchoPaths, confirmed
 from ertis_numba.fusion.pairs import AUDIBLE
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
@@ -29,6 +29,7 @@ _N_CONFIRMING: Final = 3  # Echoes required for a reflector that the attribution
 _EXCESS: Final = 4.0  # Reflectivity relative to the bound of a cell, above which missing echoes exclude a candidate.
 _TINY: Final = 1e-30
 _ROUNDS: Final = 8
+_RESOLUTION_M: Final = 0.014  # Difference of paths that separates two echoes.
 _OUTLIER: Final = 2.0  # Residual with half weight, in standard deviations.
 _NEAREST_M: Final = 0.05
 _VERTICAL: Final = 1e-6
@@ -91,6 +92,14 @@ class _Candidates(NamedTuple):
         )
 
 
+class _Located(NamedTuple):
+    """Position, covariance and power at 1 m of one reflector."""
+
+    place_m: Floats
+    covariance_m2: Floats
+    reflectivity: float
+
+
 class Reflectors:
     """Reflectors that explain echoes jointly, each at the position that fits all of its echoes best.
 
@@ -117,6 +126,8 @@ class Reflectors:
     ----------
     position_m : (reflector, axis) float64
     covariance_m2 : (reflector, axis, axis) float64
+    reflectivity : (reflector,) float64
+        Power of its echo at 1 m.
     confirmed : (reflector,) bool
         Reflectors that echoes at enough pairs confirm, as in `ertis_numba.fusion.confirmation`.
     """
@@ -150,11 +161,12 @@ class Reflectors:
         self._is_free = np.ones(n_echoes, dtype=np.bool_)
         found = self._confirmed()
         self._add_lone(found)
-        self.position_m = np.array([each[0] for each in found]).reshape(-1, 3)
-        self.covariance_m2 = np.array([each[1] for each in found]).reshape(-1, 3, 3)
+        self.position_m = np.array([each.place_m for each in found]).reshape(-1, 3)
+        self.covariance_m2 = np.array([each.covariance_m2 for each in found]).reshape(-1, 3, 3)
+        self.reflectivity = np.array([each.reflectivity for each in found])
         flat = {number for number, receiver in receivers.items() if receiver.is_flat}
         rows = {each.receiver: self._rows[each.receiver] for each in echoes}
-        heard = Heard(self._sensor_m, self._ahead, rows, flat, self._direction, self._path_m)
+        heard = EchoPaths(self._sensor_m, self._ahead, rows, flat, self._direction, self._path_m)
         self.confirmed = confirmed(heard, self.position_m, self._gains(self.position_m))
 
     def _candidates(self) -> _Candidates:
@@ -227,7 +239,7 @@ class Reflectors:
         which, echo, distance = (np.concatenate(each) for each in zip(*found, strict=True))
         return which, echo, distance
 
-    def _confirmed(self) -> list[tuple[Floats, Floats]]:
+    def _confirmed(self) -> list[_Located]:
         """Return the reflectors that several echoes confirm, and mark these echoes as explained."""
         candidates = self._candidates()
         which, echo, emitter, distance = self._fits(candidates, 0.0)
@@ -257,7 +269,7 @@ class Reflectors:
                 np.subtract.at(score, which[entries], fit[entries])
         return found
 
-    def _accepted(self, candidates: _Candidates, best: int) -> tuple[tuple[Floats, Floats] | None, Numbers]:
+    def _accepted(self, candidates: _Candidates, best: int) -> tuple[_Located | None, Numbers]:
         """Return the reflector at a candidate if enough echoes confirm it, and all echoes that it explains."""
         here = candidates.only(best)
         extra_m, covariance_m2, echo = 0.0, np.empty((3, 3)), np.empty(0, np.int64)
@@ -273,7 +285,18 @@ class Reflectors:
             reflectivity = np.median(self._power[members] / np.maximum(gain, _TINY))
             here = _Candidates(here.echo, here.emitter, place_m[None], np.zeros((1, 3)), np.array([reflectivity]))
             extra_m = _REFINED_M
-        return (here.place_m[0], covariance_m2), np.unique(echo)
+        return _Located(here.place_m[0], covariance_m2, self._reflectivity(place_m, members, emitter)), np.unique(echo)
+
+    def _reflectivity(self, place_m: Floats, members: Numbers, emitter: Numbers) -> float:
+        """Return the power at 1 m of a reflector that fits its echoes best, by least squares.
+
+        Calls of emitters at about the same distance arrive together, with unknown phases.
+        """
+        apart_m = np.linalg.norm(place_m - self._sensor_m, axis=1)
+        together = np.exp(-(((apart_m - apart_m[emitter][:, None]) / _RESOLUTION_M) ** 2))
+        together[~np.isfinite(self._path_m[members])] = 0.0
+        gain = np.sum(self._gains(place_m[None])[0, self._receiver[members]] * together, axis=1)
+        return float(self._power[members] @ gain / max(gain @ gain, _TINY**2))
 
     def _members(self, echo: Numbers, emitter: Numbers, distance: Floats) -> tuple[Numbers, Numbers]:
         """Return the best echo of each pair, and its emitter; each echo at most once."""
@@ -287,16 +310,17 @@ class Reflectors:
                 found.append(entry)
         return echo[found], emitter[found]
 
-    def _add_lone(self, found: list[tuple[Floats, Floats]]) -> None:
+    def _add_lone(self, found: list[_Located]) -> None:
         """Add reflectors that a single own echo shows, unless the attribution explains it otherwise."""
         own = self._share[np.arange(len(self._receiver)), self._receiver]
         kept = self._is_free & (self._share.sum(axis=1) > _MIN_SHARE) & (own >= self._share.max(axis=1)) & (own > 0)
         for echo in np.flatnonzero(kept)[np.argsort(-self._power[kept], kind="stable")]:
             sensor = self._receiver[echo : echo + 1]
             place_m = self._sensor_m[sensor[0]] + self._path_m[echo, sensor[0]] / 2 * self._direction[echo]
-            _, covariance_m2 = self._located(np.array([echo]), sensor, place_m)
+            sensor_echo = np.array([echo])
+            _, covariance_m2 = self._located(sensor_echo, sensor, place_m)
             if _is_apart(place_m, covariance_m2, found):
-                found.append((place_m, covariance_m2))
+                found.append(_Located(place_m, covariance_m2, self._reflectivity(place_m, sensor_echo, sensor)))
 
     def _located(self, members: Numbers, emitter: Numbers, place_m: Floats) -> tuple[Floats, Floats]:
         """Return the position of a reflector and its covariance: (axis,) and (axis, axis) float64."""
@@ -323,15 +347,15 @@ class Reflectors:
         return position_m, covariance_m2
 
 
-def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[tuple[Floats, Floats]]) -> bool:
+def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[_Located]) -> bool:
     """Return True if no reflector is at a place.
 
     Another echo at a reflector is a shoulder of its main lobe, or overlaps with other echoes.
     """
     if not found:
         return True
-    offset_m = place_m - np.array([each[0] for each in found])
-    spread_m2 = np.array([each[1] for each in found]) + covariance_m2 + _SAME_M**2 * np.eye(3)
+    offset_m = place_m - np.array([each.place_m for each in found])
+    spread_m2 = np.array([each.covariance_m2 for each in found]) + covariance_m2 + _SAME_M**2 * np.eye(3)
     distance = np.einsum("ri,ri->r", offset_m, np.linalg.solve(spread_m2, offset_m[..., None])[..., 0])
     return bool(distance.min() >= _GATE)
 

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Heard", "confirmed"]
+__all__ = ["EchoPaths", "confirmed"]
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -23,12 +23,12 @@ _COUNTS_FROM: Final = 0.1  # Gain relative to the highest of all pairs, from whi
 _FACING: Final = 0.3  # Cosine from which a sensor may show the surface of a wall.
 _NEAREST_M: Final = 1e-9
 _PART: Final = 0.6
-_MIRROR_M: Final = 0.1  # Largest distance between a ghost and the place where a wall shows it.
+_MIRROR_M: Final = 0.06  # Largest distance between a ghost and the place where a wall shows it.
 _N_LEAST: Final = 2  # Echoes without which an own echo may be that of another sensor's call.
 _N_SURE: Final = 4  # Echoes that two reflections hardly cause at the right paths.
 
 
-class Heard(NamedTuple):
+class EchoPaths(NamedTuple):
     """Echoes of all receivers, and the geometry of their sensors.
 
     Attributes
@@ -52,7 +52,7 @@ class Heard(NamedTuple):
     path_m: Floats
 
 
-def confirmed(heard: Heard, place_m: Floats, gain: Floats) -> Flags:
+def confirmed(heard: EchoPaths, place_m: Floats, gain: Floats) -> Flags:
     """Return True for the reflectors that enough echoes confirm, each as a point or as a mirror-like wall.
 
     At least 60 % of the pairs that should hear a reflector must do so, rounded down, and four if there are as many. A
@@ -60,7 +60,7 @@ def confirmed(heard: Heard, place_m: Floats, gain: Floats) -> Flags:
 
     Parameters
     ----------
-    heard : Heard
+    heard : EchoPaths
     place_m : (reflector, axis) float64
     gain : (reflector, receiver, emitter) float64
         Power of its echoes relative to that ahead.
@@ -113,12 +113,12 @@ def _mirrored(place_m: Floats, normal: Floats) -> Flags:
     return found
 
 
-def _n_confirming(heard: Heard, origin_m: Floats, counts: Flags, *, is_image: bool = False) -> NDArray[np.int64]:
+def _n_confirming(heard: EchoPaths, origin_m: Floats, counts: Flags, *, is_image: bool = False) -> NDArray[np.int64]:
     """Return the number of pairs that hear each reflector: (reflector,) int64.
 
     Parameters
     ----------
-    heard : Heard
+    heard : EchoPaths
     origin_m : (reflector, emitter, axis) float64
         Place from which the sound of each emitter arrives: that of the reflector, or the mirror image of the emitter.
     counts : (reflector, receiver, emitter) bool

@@ -128,12 +128,15 @@ def joined(
     echoes, sensors, receivers, emitters, grid, bound
         As for `Reflectors`.
     image : Energyscape
-        Fused image, which yields amplitudes.
+        Fused image, which limits the amplitudes of reflectors that are not confirmed.
     """
     reflectors = Reflectors(echoes, sensors, receivers, emitters, grid, bound)
     position_m = reflectors.position_m
+    amplitude = np.sqrt(reflectors.reflectivity)
+    # Ghosts would grow with range, and with the correction of the emitter's directivity.
     cell = grid.cell_of(position_m)
-    amplitude = np.where(cell >= 0, _around(image.amplitude).reshape(-1).take(cell.clip(0)), np.float32(0))
+    shown = np.where(cell >= 0, _around(image.amplitude).reshape(-1).take(cell.clip(0)), np.float32(0))
+    amplitude = np.where(reflectors.confirmed, amplitude, np.minimum(amplitude, shown)).astype(np.float32)
     order = np.argsort(-amplitude, kind="stable")
     uncertainty_m = np.array(
         [_along_and_across(*each) for each in zip(position_m, reflectors.covariance_m2, strict=True)]

@@ -12,7 +12,7 @@ from ertis_numba.fusion.fuser import Fused, Fuser
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.interop._mountings import Mounting
 
-__all__ = ["LOCAL_FRAME", "FusedImages", "FusedPoints", "FusedPulse", "joined"]
+__all__ = ["LOCAL_FRAME", "FusedImages", "FusedPoints", "PulseImages", "joined"]
 
 PLATFORM_FRAME: Final = "base_link"
 LOCAL_FRAME: Final = "base_link_local"
@@ -34,7 +34,7 @@ class FusedPoints:
         return [joined(group) for group in self._groups.add(cloud)]
 
 
-class FusedPulse(NamedTuple):
+class PulseImages(NamedTuple):
     """Fused image of a SYNC pulse with its points, and the images of its sensors."""
 
     image: Energyscape
@@ -50,7 +50,7 @@ class FusedImages:
         self._fuser: tuple[dict[str, Mounting], Fuser] | None = None
         self._n_empty = 0
 
-    def add(self, image: Energyscape, mountings: Mapping[str, Mounting]) -> list[FusedPulse]:
+    def add(self, image: Energyscape, mountings: Mapping[str, Mounting]) -> list[PulseImages]:
         """Add an image, and return the pulses that are complete now.
 
         Images that are planar, unlike the first one of their pulse, or the reverse, are left out. A pulse that cannot
@@ -66,7 +66,7 @@ class FusedImages:
         fused = []
         for group in self._groups.add(image):
             try:
-                fused.append(FusedPulse(self._fused(group, mountings), group))
+                fused.append(PulseImages(self._fused(group, mountings), group))
             except ErtisError as error:  # Others of its pulses may be usable.
                 if str(error) != self._noted:
                     self._noted = str(error)
