@@ -91,6 +91,12 @@ def test_mirror_images_behind_a_wall_are_not_confirmed():
     assert found(echoes, POST_M, WALL_M, mirrored(POST_M)) == [True, True, False]
 
 
+def test_a_second_place_beside_a_reflector_does_not_make_it_a_mirror_image():
+    beside_m = POST_M * [0.99, 0.99, 1.0] + [0.02, -0.03, 0.0]
+    assert np.linalg.norm(beside_m) < np.linalg.norm(POST_M)
+    assert found(echoes_of_post(POST_M), POST_M, beside_m)[0]
+
+
 def test_a_lone_echo_confirms_nothing_on_a_platform_with_several_sensors():
     own = echo(0, np.array([2.0, 0.0, HEIGHT_M]), 3.6)
     rows = {0: np.array([0])}

@@ -105,7 +105,8 @@ def _mirrored(place_m: Floats, normal: Floats) -> Flags:
     image_m = place_m[:, None] - 2 * np.einsum("pwi,wi->pw", offset_m, normal)[..., None] * normal
     range_m, there_m = np.linalg.norm(place_m, axis=1), np.linalg.norm(image_m, axis=2)
     once_m = image_m * ((1 + range_m[:, None] / np.maximum(there_m, _NEAREST_M)) / 2)[..., None]
-    is_nearer = np.maximum(range_m[:, None], range_m) < np.linalg.norm(place_m, axis=1)[:, None, None]
+    is_nearer = np.maximum(range_m[:, None], range_m) + _MIRROR_M < range_m[:, None, None]
+    is_nearer &= ~np.eye(len(place_m), dtype=np.bool_)  # A reflector is no wall that mirrors itself.
     found = np.zeros(len(place_m), np.bool_)
     for each_m in (image_m, once_m):
         apart_m = np.linalg.norm(place_m[:, None, None] - each_m, axis=3)
