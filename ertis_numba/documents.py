@@ -246,8 +246,14 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     @classmethod
     def _load(cls, path: Path) -> tuple[Self, dict[str, Any]]:
         """Return the content of a file, and its tables as written but with the present names of keys."""
-        text = _text_of(path, f"a {cls.__name__.lower()} file (TOML)")
-        return cls.from_toml(text, str(path)), cls._tables(text)
+        wanted = f"a {cls.__name__.lower()} file (TOML)"
+        text = _text_of(path, wanted)
+        try:
+            return cls.from_toml(text, str(path)), cls._tables(text)
+        except SettingsError as error:
+            if type(error.__cause__) is not msgspec.DecodeError or path.suffix.lower() == ".toml":
+                raise
+            raise SettingsError(f"{path} is not TOML; choose {wanted}") from error
 
     @classmethod
     def _decoded(cls, text: str) -> Self:

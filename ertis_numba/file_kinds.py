@@ -62,6 +62,11 @@ _MATLAB = FileKind(
     "save its signals with audiowrite('{stem}.wav', single(signals), rate_hz, 'BitsPerSample', 32), and import that",
 )
 _HDF5 = FileKind("an HDF5 file", _IMPORT, is_hdf5=True)
+_TEXTS: Final = {
+    ".toml": "simulate a scene with 'ertis simulate {file}', and use settings with --settings",
+    ".tum": "add these poses to a recording with 'ertis import-poses REC.h5 {file}'",
+}
+"""Remedies for text files by their endings."""
 _TEXT = FileKind("a text file", f"choose a recording, or {_SAVE}", is_text=True)
 
 
@@ -210,7 +215,8 @@ def problem_of(path: str | Path, wanted: str = "a recording") -> str:
         "stem": str(path.with_suffix("")),
         "target": quoted(path.with_name(f"{path.stem}_pcm.wav")),
     }
-    return f"is {kind.name}; {kind.remedy.format(**names)}"
+    remedy = _TEXTS.get(path.suffix.lower(), kind.remedy) if kind is _TEXT else kind.remedy
+    return f"is {kind.name}; {remedy.format(**names)}"
 
 
 def quoted(path: Path) -> str:

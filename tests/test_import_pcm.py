@@ -209,7 +209,7 @@ REFUSED = {
     "nan": (
         lambda folder: write_wav(folder / "a.wav", np.where(np.arange(8) == 3, np.nan, numbers()).astype("f4")),
         {},
-        r"contains nan at sample 0 of channel 3; give finite numbers",
+        r"contains nan at sample 0 of channel 3; replace such samples in the file",
     ),
     "beyond float32": (
         lambda folder: write_wav(folder / "a.wav", np.where(np.arange(8) == 3, 1e300, numbers())),

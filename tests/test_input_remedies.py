@@ -30,6 +30,8 @@ def folder(tmp_path_factory):
     wavfile.write(folder / "none.wav", 192_000, np.zeros((0, 4), "<i2"))
     (folder / "zero.wav").touch()
     (folder / "lay.csv").write_text("y_mm,z_mm\n0,0\n20,0\n0,20\n20,20\n")
+    (folder / "a.tum").write_text("1700000000.5 1 2 3 0 0 0 1\n")
+    (folder / "a.bin").write_bytes(bytes(262_144))
     (folder / "s.json").write_text('{"seed": 1}\n')
     (folder / "s.xml").write_text("<scene/>\n")
     (folder / "latin.toml").write_bytes(b"# H\xf6he\nseed = 1\n")
@@ -53,6 +55,12 @@ CASES = {  # command: exit code and message
     "simulate latin.toml -o o.h5": (1, "it is not text in UTF-8 (byte 0xf6 at position 3); save it as UTF-8"),
     "simulate template.toml -o o.h5": (1, "sets no key; add reflectors or sound sources, see 'ertis settings scene'"),
     "simulate recs -o o.h5": (1, "recs: Is a directory; choose a scene file (TOML)"),
+    "process rec.h5 --settings lay.csv -o o.h5": (1, "lay.csv is not TOML; choose a settings file (TOML)"),
+    "info latin.toml": (1, "latin.toml is a text file; simulate a scene with 'ertis simulate latin.toml', and use"),
+    "process a.tum": (1, "a text file; add these poses to a recording with 'ertis import-poses REC.h5 a.tum'"),
+    "import-poses a.tum rec.h5": (2, "the recording comes before the poses; use 'ertis import-poses rec.h5 a.tum'"),
+    "import a.wav a.bin --passive --layout lay.csv -o o.h5": (2, "some files are PCM (.wav, .h5) and others are raw"),
+    "--config a.wav info rec.h5": (1, "a.wav: it is not text in UTF-8 (byte 0x"),
     "emulate s.json": (1, "s.json is a text file; choose a recording"),
     "process rec.h5 --settings a.wav -o o.h5": (1, "a.wav is a WAV file; choose a settings file (TOML)"),
     "odometry recs": (1, "recs is a folder; choose a recording, such as recs/first.h5"),

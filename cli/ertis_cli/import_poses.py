@@ -67,6 +67,7 @@ def import_poses(
     from ertis_numba.storage.poses import count_in_gaps
 
     checks.between("offset_s", offset_s, -_MAX_OFFSET_S, _MAX_OFFSET_S)
+    _require_order(path, trajectory_file)
     given = _poses.trajectory_of(trajectory_file, quiet=quiet, **reading)
     shifted: Trajectory = given.replace(time_ns=given.time_ns + round(offset_s * _NS_PER_S))
     recordings = _recordings(path)
@@ -99,6 +100,16 @@ def import_poses(
     if as_json:
         for report in reports:
             options.print_json(report)
+
+
+def _require_order(path: Path, trajectory_file: Path) -> None:
+    """Refuse poses before a recording."""
+    from ertis_numba.file_kinds import kind_of, quoted
+
+    first, second = kind_of(path), kind_of(trajectory_file)
+    if second is not None and second.is_hdf5 and not (path.is_dir() or (first is not None and first.is_hdf5)):
+        order = f"'ertis import-poses {quoted(trajectory_file)} {quoted(path)}'"
+        raise click.UsageError(f"the recording comes before the poses; use {order}", click.get_current_context())
 
 
 def _recordings(path: Path) -> list[Path]:

@@ -139,6 +139,11 @@ def import_raw(
     is_pcm = all(are_pcm)
     if folder is None:
         _require_content(raw)
+    if not is_pcm and any(are_pcm):
+        raise click.UsageError(
+            "some files are PCM (.wav, .h5) and others are raw data; import each kind separately",
+            click.get_current_context(),
+        )
     for name in of_pcm:
         if typed(name) and not is_pcm:
             option = f"--{name.removesuffix('_s').replace('_', '-')}"
@@ -147,11 +152,6 @@ def import_raw(
                 "file",
                 click.get_current_context(),
             )
-    if not is_pcm and any(are_pcm):
-        raise click.UsageError(
-            "some files are PCM (.wav, .h5) and others are raw data; import each kind separately",
-            click.get_current_context(),
-        )
     given = {"temperature_c": temperature, "humidity_percent": humidity}
     air = {name: value for name, value in given.items() if value is not None}
     measurements: PcmReader | RawReader
