@@ -10,7 +10,7 @@ from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.emission_time import emission_time_s, emission_times_s
+from ertis_numba.analysis.emission_time import EmissionTimes, describe_start, emission_time_s, emissions_of
 from ertis_numba.analysis.health.emission import describe_shift, fit_emission
 from ertis_numba.analysis.sound_checks import SoundChecks
 from ertis_numba.errors import StartMismatchWarning
@@ -97,7 +97,20 @@ def test_faulty_channel_does_not_hide_the_direct_sound():
 
 def test_emission_of_few_measurements_is_not_used():
     silent = measured(ARRAYS["grid of 9"], 0.0, direct=0.0)
-    assert emission_times_s([measured(ARRAYS["grid of 9"], 1e-3), silent]) == []
+    assert describe_start(map(emissions_of, [measured(ARRAYS["grid of 9"], 1e-3), silent]), SPEED_M_S) is None
+
+
+@pytest.mark.parametrize("array", ARRAYS)
+def test_second_emission_of_a_record_is_found(array):
+    first, second = (measured(ARRAYS[array], late_s, number=number) for number, late_s in enumerate((0.0, 11e-3)))
+    both = Measurement(first.data + second.data, first.settings)
+    assert emissions_of(first) == EmissionTimes(pytest.approx(0.0, abs=6e-6), None)
+    assert emissions_of(both) == EmissionTimes(pytest.approx(0.0, abs=6e-6), pytest.approx(11e-3, abs=6e-6))
+    text, remedy = describe_start([emissions_of(both)], SPEED_M_S)
+    assert text.startswith("a record contains several emissions, 11 ms apart")
+    assert re.fullmatch(r"import again with --length 0\.01[01]\d*", remedy)
+    ((subject, warning),) = SoundChecks().check(both)
+    assert (subject, warning.rpartition("; ")[2]) == ("start", "end each record before the next emission")
 
 
 SHIFTS = {

@@ -1,24 +1,48 @@
 """Time of the emission in a record, from the direct sound between the emitter and the microphones."""
 
 from collections.abc import Iterable
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.health.arrival import compress, strongest
-from ertis_numba.analysis.health.emission import fit_emission
+from ertis_numba.analysis.health.emission import describe_shift, fit_emission
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.stages.signals import signals_of
 
-__all__ = ["emission_time_s", "emission_times_s"]
+__all__ = ["EmissionTimes", "describe_start", "emission_time_s", "emissions_of"]
 
 _SEARCHED_S: Final = 0.1  # Direct sound arrives near the start of a record.
+_MAX_EMISSIONS: Final = 3
+_EQUALLY_LOUD: Final = 0.5  # Peak of another emission relative to the strongest one.
+
+
+class EmissionTimes(NamedTuple):
+    """First emission in a record, and the time until the next one.
+
+    Attributes
+    ----------
+    first_s : float
+        Time since the start of the record, which is negative if the emission began before.
+    interval_s : float, optional
+        Time from the first to the second emission; None if the record contains one.
+    """
+
+    first_s: float
+    interval_s: float | None
 
 
 def emission_time_s(measurement: Measurement) -> float | None:
-    """Return the time of the emission since the start of the record, which is negative if it began before.
+    """Return the time of the first emission since the start of the record, as `emissions_of` does."""
+    found = emissions_of(measurement)
+    return None if found is None else found.first_s
+
+
+def emissions_of(measurement: Measurement) -> EmissionTimes | None:
+    """Return the emissions whose direct sound the first 0.1 s of a record contain.
 
     The emitter is at the array's centre. The result is None if the strongest arrival may be an echo, and for arrays
     such as rings, at which direct sound equals an echo from ahead. Saturated direct sound has a result, too.
@@ -47,15 +71,48 @@ def emission_time_s(measurement: Measurement) -> float | None:
         first=0,
         last=signals.shape[1],
     )
-    arrived = strongest(found, float(2 * np.linalg.norm(positions_m, axis=1).max()) / speed_m_s)
-    if arrived is None:
+    width_s = float(2 * np.linalg.norm(positions_m, axis=1).max()) / speed_m_s
+    loudest = float(np.median(found.envelope.max(axis=1)))
+    at_s: list[float] = []
+    while len(at_s) < _MAX_EMISSIONS and np.median(found.envelope.max(axis=1)) > _EQUALLY_LOUD * loudest:
+        arrived = strongest(found, width_s)
+        times_s = None if arrived is None else arrived[0] - layout.delay_s[layout.enabled][sounding]
+        emission_s = None if times_s is None else fit_emission(times_s, positions_m[sounding], speed_m_s)
+        if arrived is None or emission_s is None:
+            break
+        at_s.append(emission_s)
+        seconds = found.start_s + np.arange(found.envelope.shape[1]) * found.step_s
+        is_near = np.abs(seconds - arrived[1]) <= settings.call.duration_s + 2 * width_s
+        found = replace(found, envelope=np.where(is_near, 0.0, found.envelope))
+    if not at_s:
         return None
-    times_s = arrived[0] - layout.delay_s[layout.enabled][sounding]
-    return fit_emission(times_s, positions_m[sounding], speed_m_s)
+    first_s, *later_s = sorted(at_s)
+    return EmissionTimes(first_s, later_s[0] - first_s if later_s else None)
 
 
-def emission_times_s(measurements: Iterable[Measurement]) -> list[float]:
-    """Return the times of the emissions of measurements whose direct sound is clear; none if most are not."""
-    times_s = [emission_time_s(each) for each in measurements]
-    known = [time_s for time_s in times_s if time_s is not None]
-    return known if 2 * len(known) > len(times_s) else []
+def describe_start(
+    emissions: Iterable[EmissionTimes | None], speed_m_s: float, *, delay_s: float | None = None
+) -> tuple[str, str] | None:
+    """Return a text about records that do not begin with their only emission, and a remedy; None if all do.
+
+    The direct sound is not compared unless that of most records is clear.
+
+    Parameters
+    ----------
+    emissions : iterable of EmissionTimes or None
+        Result of `emissions_of` for each record.
+    speed_m_s : float
+    delay_s : float, optional
+        Setting ``call.delay_s`` of records that are not imported; the remedy then names another value.
+    """
+    every = list(emissions)
+    known = [each for each in every if each is not None]
+    if 2 * len(known) <= len(every):
+        return None
+    intervals_s = [each.interval_s for each in known if each.interval_s is not None]
+    if 2 * len(intervals_s) > len(known):
+        interval_s = float(np.median(intervals_s))
+        text = f"a record contains several emissions, {1e3 * interval_s:.4g} ms apart; the later ones look like echoes"
+        remedy = "end each record before the next emission"
+        return text, remedy if delay_s is not None else f"import again with --length {round(interval_s, 6):g}"
+    return describe_shift([each.first_s for each in known], speed_m_s, delay_s=delay_s)

@@ -4,8 +4,7 @@ from typing import Final, Literal, NamedTuple
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import call_match
-from ertis_numba.analysis.emission_time import emission_time_s
-from ertis_numba.analysis.health.emission import describe_shift
+from ertis_numba.analysis.emission_time import EmissionTimes, describe_start, emissions_of
 from ertis_numba.analysis.layout_match import layout_match
 from ertis_numba.frames import Measurement
 
@@ -32,7 +31,7 @@ class SoundChecks:
 
     def __init__(self) -> None:
         self._count = 0
-        self._emission_s: list[float | None] = []
+        self._emissions: list[EmissionTimes | None] = []
         self._remaining: dict[Subject, int] = {"call": _MAX_TRIES, "start": 0, "layout": _MAX_TRIES}
 
     def check(self, measurement: Measurement) -> list[SoundMismatch]:
@@ -75,10 +74,7 @@ class SoundChecks:
         """Compare the direct sound with the distance of the emitter, in ever fewer measurements."""
         if self._count & (self._count - 1):
             return None
-        self._emission_s.append(emission_time_s(measurement))
-        known_s = [time_s for time_s in self._emission_s if time_s is not None]
-        if 2 * len(known_s) <= len(self._emission_s):
-            return None
+        self._emissions.append(emissions_of(measurement))
         settings = measurement.settings
-        shift = describe_shift(known_s, sound_speed_m_s(settings.air), delay_s=settings.call.delay_s)
+        shift = describe_start(self._emissions, sound_speed_m_s(settings.air), delay_s=settings.call.delay_s)
         return "" if shift is None else "; ".join(shift)

@@ -35,6 +35,7 @@ _MAX_STEPS: Final = 60
 _ROUNDS: Final = 4
 _GAIN: Final = 1.03  # A refinement that gains less is the last one.
 _SMOOTHED_HZ: Final = 1e3
+_WIDER: Final = 1.2
 _EDGE: Final = 0.1  # Power at the edges of a band relative to its middle.
 
 
@@ -116,7 +117,9 @@ def find_sweep(found: SoundSpectra) -> FoundSweep | None:
             low_hz, high_hz = centres_hz[occupied][0] - width_hz / 2, centres_hz[occupied][-1] + width_hz / 2
             found_at.append(_focused(found, curve, low_hz, high_hz))
     best, arrival = max(found_at, key=lambda each: float(np.median(each[1].peak)))
-    return FoundSweep(best, Sweep.of_curve(best, *_edges_hz(arrival, best)))
+    low_hz, high_hz = arrival.frequency_hz[[0, -1]]
+    wider = arrival_of(found, best, low_hz / _WIDER, high_hz * _WIDER)  # The ends may be too weak for a sub-band.
+    return FoundSweep(best, Sweep.of_curve(best, *_edges_hz(wider, best)))
 
 
 def _sub_bands(

@@ -13,9 +13,8 @@ from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import UNKNOWN_CALL, CallMatch, first_call_match
 from ertis_numba.analysis.direction_spacing import spacing_warning
-from ertis_numba.analysis.emission_time import emission_times_s
+from ertis_numba.analysis.emission_time import describe_start, emissions_of
 from ertis_numba.analysis.health import health
-from ertis_numba.analysis.health.emission import describe_shift
 from ertis_numba.analysis.layout_match import LayoutMatch, first_layout_match
 from ertis_numba.campaign.attitudes import unlevelled_image
 from ertis_numba.campaign.echo_measurements import EchoMeasurements, require_images
@@ -255,7 +254,7 @@ def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
     if call is not None and call.warning:  # The filter of another call does not find the times of arrival.
         return faults, "", call, None
     some = (replace(recording[index], settings=settings) for index in {0, len(recording) // 2, len(recording) - 1})
-    shift = describe_shift(emission_times_s(some), sound_speed_m_s(settings.air))
+    shift = describe_start(map(emissions_of, some), sound_speed_m_s(settings.air))
     of_report = LayoutMatch.of(report.findings)
     layout = of_report if of_report.warning else first_layout_match(heard())
     return faults, "; ".join(shift or ()), call, layout

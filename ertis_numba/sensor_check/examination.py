@@ -10,9 +10,8 @@ import numpy as np
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
-from ertis_numba.analysis.emission_time import emission_times_s
+from ertis_numba.analysis.emission_time import describe_start, emissions_of
 from ertis_numba.analysis.health import Health, health, merge
-from ertis_numba.analysis.health.emission import describe_shift
 from ertis_numba.atomic_files import remedy
 from ertis_numba.calibration import OtherLayoutError
 from ertis_numba.errors import ArgumentError, DataError, ErtisError
@@ -170,7 +169,8 @@ def _check_sensor(
     has_call = report is None or report.has_call
     match = _best_call_match(heard) if has_call else None
     residuals = _calibration_residuals(heard, report) if has_call else items.NO_CALL
-    shift = describe_shift(emission_times_s(heard), sound_speed_m_s(used.air)) if has_call else None
+    is_heard = has_call and (match is None or match.matches)  # The filter of another call does not find times.
+    shift = describe_start(map(emissions_of, heard), sound_speed_m_s(used.air)) if is_heard else None
     layout = microphones(used.array)
     found: dict[str, items.CheckResult] = {
         items.MICROPHONES: items.of_microphones(report),
