@@ -24,8 +24,11 @@ _SEARCH_STEP: Final = np.array([0.0125, 0.0125, math.radians(1.25)])  # of x, y 
 _MAX_STEPS: Final = 17  # per axis; larger reaches have larger steps.
 _SEARCH_SD: Final = 0.02, math.radians(2.0)
 _N_STARTS: Final = 6
+_N_STARTS_NEAR: Final = 3  # of searches near an expected displacement
 # One object, such as a person who walks by, shows in up to two places in the image of one sensor, and in up to three
-# in those of several sensors. They must not count as the surroundings of a platform at rest.
+# in those of several sensors. They must not count as the surroundings of a platform at rest. It is unlikely that they
+# move as the surroundings did before.
+_EXPECTED: Final = np.array([0.02, 0.02, math.radians(2.0)])
 _MIN_PLACES: Final = 3
 _MIN_PLACES_OF_SENSORS: Final = 4
 # Expected number of motions by which unrelated groups match as well; an upper limit of the rate of false alarms.
@@ -123,7 +126,10 @@ def fit_flow(
     pairs = flow.pairs(reach_m, reach_rad)
     if len(pairs.before) < 4:
         return None
-    found = [hypothesis(flow, pairs, each) for each in _starts(flow, pairs, centre, limit)]
+    found = [
+        hypothesis(flow, pairs, each)
+        for each in _starts(flow, pairs, centre, limit, _N_STARTS if start is None else _N_STARTS_NEAR)
+    ]
     # Standing still is more likely than its neighbours.
     found += [hypothesis(flow, pairs, each, NEAR_SCALES) for each in (np.zeros(3), *suspects)]
     best = max(found, key=lambda each: each.support)
@@ -132,7 +138,8 @@ def fit_flow(
         return None
     by_accident = float(np.sum(_gate_areas(flow, pairs)) / (4 * reach_m * reach_rad))
     n_false_alarms = _n_false_alarms(fit.n_matches, by_accident, limit)
-    min_places = _MIN_PLACES if len(np.unique(before.sensor)) == 1 else _MIN_PLACES_OF_SENSORS
+    is_expected = start is not None and bool(np.all(np.abs(best.displacement - start) < _EXPECTED))
+    min_places = _MIN_PLACES if is_expected or len(np.unique(before.sensor)) == 1 else _MIN_PLACES_OF_SENSORS
     fit = fit._replace(
         score=best.support,
         n_places=best.n_places,
@@ -167,7 +174,7 @@ def _with_other(fit: FlowFit, offset: Floats, ambiguity: float) -> FlowFit:
     return fit._replace(covariance=fit.covariance + ambiguity / (1 + ambiguity) * np.outer(offset, offset))
 
 
-def _starts(flow: EchoFlow, pairs: EchoPairs, centre: Floats, limit: Floats) -> Floats:
+def _starts(flow: EchoFlow, pairs: EchoPairs, centre: Floats, limit: Floats, n_starts: int) -> Floats:
     """Return the most likely displacements of a grid: (start, 3) float64."""
     counts = np.clip(2 * np.ceil(limit / _SEARCH_STEP).astype(int) + 1, 3, _MAX_STEPS)
     axes = [c + most * np.linspace(-1, 1, n) for c, most, n in zip(centre, limit, counts, strict=True)]
@@ -189,7 +196,7 @@ def _starts(flow: EchoFlow, pairs: EchoPairs, centre: Floats, limit: Floats) -> 
     for place in np.argsort(-score):
         if all(np.any(np.abs(grid[place] - other) > 2.5 * step) for other in found):
             found.append(grid[place])
-            if len(found) == _N_STARTS:
+            if len(found) == n_starts:
                 break
     return np.array(found)
 

@@ -17,6 +17,8 @@ FAR_SCALES: Final = 8.0, 5.0, 3.0, 2.0, 1.4, 1.0
 NEAR_SCALES: Final = 3.0, 2.0, 1.4, 1.0
 """Tolerances of fits that begin at a motion that may be the right one."""
 _ROUNDS: Final = 8
+_CONVERGED: Final = 1e-6  # m and rad
+_REACH: Final = 8.0  # Largest residual of a pair that a fit may use, in standard deviations and tolerances
 _OUTLIER: Final = math.exp(-0.5 * 9.0)  # Likelihood of an echo without a partner: three standard deviations.
 # All echoes of a person are within this distance, so they are evidence of one place only.
 _PLACE_M: Final = 0.7
@@ -69,14 +71,23 @@ def _described(flow: EchoFlow, pairs: EchoPairs, displacement: Floats, weight: F
 
 def refined(flow: EchoFlow, pairs: EchoPairs, displacement: Floats, scales: tuple[float, ...]) -> tuple[Floats, Floats]:
     """Return the displacement after a fit with decreasing tolerance, and the probabilities of pairs."""
-    sd = flow.deviations(pairs)
-    weight = np.zeros(len(pairs.before))
+    residual, _ = flow.linear(displacement, pairs)
+    square = np.sum((residual / flow.deviations(pairs)) ** 2, axis=0)
+    near = np.flatnonzero(square < (_REACH * scales[0]) ** 2)  # Other pairs would only take time.
+    close = EchoPairs(pairs.before[near], pairs.after[near])
+    sd = flow.deviations(close)
+    weight = np.zeros(len(near))
     for scale in (*scales, *([1.0] * _ROUNDS)):
-        residual, slopes = flow.linear(displacement, pairs)
+        residual, slopes = flow.linear(displacement, close)
         residual, slopes = residual / sd, slopes / sd[:, :, None]
-        weight = pair_weights(np.sum(residual**2, axis=0) / scale**2, flow, pairs)
-        displacement = displacement + _solved(slopes, residual, weight)
-    return displacement, weight
+        weight = pair_weights(np.sum(residual**2, axis=0) / scale**2, flow, close)
+        step = _solved(slopes, residual, weight)
+        displacement = displacement + step
+        if scale == 1.0 and np.all(np.abs(step) < _CONVERGED):
+            break
+    weights = np.zeros(len(pairs.before))
+    weights[near] = weight
+    return displacement, weights
 
 
 def pair_weights(square: Floats, flow: EchoFlow, pairs: EchoPairs) -> Floats:
