@@ -344,14 +344,16 @@ def comparisons(
     """Yield the index of each measurement, or of one, and the comparison of its energyscape with the ground truth."""
     from ertis_numba.analysis.compare import compare
     from ertis_numba.errors import DataError
+    from ertis_numba.fusion import PLATFORM
     from ertis_numba.storage import open_energyscapes
 
     with open_energyscapes(path, sensor=sensor) as images:
         if images.truth is None:
             images.settings.processing.require_sensor_frame("the ground truth is in the frame of the sensor")
-            raise DataError(
-                f"{path}: sensor {sensor} holds no ground truth; simulate a scene and process that recording"
-            )
+            remedy = "simulate a scene and process that recording"
+            if sensor == PLATFORM:
+                remedy = "that of fused images is not stored; compare the images of single sensors"
+            raise DataError(f"{path}: sensor {sensor} holds no ground truth; {remedy}")
         for index in places(measurement, len(images)):
             yield index, compare(images[index], images.truth.reflectors[index], min_level_db=min_level_db)
 

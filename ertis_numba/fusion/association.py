@@ -165,8 +165,8 @@ class Reflectors:
         self.covariance_m2 = np.array([each.covariance_m2 for each in found]).reshape(-1, 3, 3)
         self.reflectivity = np.array([each.reflectivity for each in found])
         flat = {number for number, receiver in receivers.items() if receiver.is_flat}
-        rows = {each.receiver: self._rows[each.receiver] for each in echoes}
-        heard = EchoPaths(self._sensor_m, self._ahead, rows, flat, self._direction, self._path_m)
+        with_image = {each.receiver: self._rows[each.receiver] for each in echoes}
+        heard = EchoPaths(self._sensor_m, self._ahead, with_image, flat, self._direction, self._path_m)
         self.confirmed = confirmed(heard, self.position_m, self._gains(self.position_m))
 
     def _candidates(self) -> _Candidates:

@@ -200,7 +200,7 @@ class RosPublisher:
             for topic in wanted
             if topic != "scan" or not is_fused  # Its scan needs the attribution of the fusion.
         ]
-        if is_fused:
+        if is_fused and isinstance(item, Energyscape):
             counts.append(self._publish_fused(item))
         self.published += any(counts)
 

@@ -88,7 +88,7 @@ class PointReader:
         )
         self._confirmed = np.asarray(group["point_confirmed"][:], np.int8)
         columns = self._position_m, self._amplitude, self._uncertainty_m, self._confirmed
-        lengths = {*map(len, columns), int(self._bounds[-1])}
+        lengths = {*(len(column) for column in columns), int(self._bounds[-1])}
         if len(lengths) != 1:
             raise DamagedError(f"{path}: point_count does not match the number of points; copy the file again")
 
