@@ -94,7 +94,7 @@ def test_nothing_is_written_if_images_get_worse(tmp_path):
         (["{folder}/absent.h5"], "absent.h5"),
         (["{all}", "--poses", "--target", "wall"], "--target is not for --poses"),
         (["{all}", "--poses"], "at least two"),
-        (["{all}", "--sensors", "front"], "--sensors is for --poses"),
+        (["{all}", "--sensors", "front"], "--sensors requires --poses"),
     ],
 )
 def test_errors_write_nothing(recordings, tmp_path, arguments, text):

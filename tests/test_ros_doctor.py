@@ -95,4 +95,4 @@ def test_doctor_reports_interfaces_that_cannot_be_used(tmp_path, monkeypatch, fl
 def test_options_of_ros_need_the_flag():
     done = CliRunner().invoke(cli, ["doctor", "--domain", "3"])
     assert done.exit_code == 2
-    assert "--domain and --interface are for --ros; add it" in done.stderr
+    assert "--domain and --interface require --ros; add --ros" in done.stderr
