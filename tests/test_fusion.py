@@ -706,7 +706,7 @@ def test_process_leaves_out_pulses_without_a_call(recordings, tmp_path):
         (["unmounted.h5", "--fuse"], 1, "the mounting of sensor 'front' is unknown; give --mounting"),
         (["all.h5", "--fuse", "--sensor", "left"], 2, "--sensor does not apply to --fuse"),
         (["all.h5", "--fuse", "-o", "all.png"], 2, "all.png is not an energyscape file"),
-        (["all.h5", "--emitter-diameter", "0.01"], 2, "--emitter-diameter applies to --fuse only"),
+        (["all.h5", "--emitter-diameter", "0.01"], 2, "--emitter-diameter requires --fuse; add --fuse"),
         (["all.h5", "--fuse", "--emitter-diameter", "9"], 2, "0.0<=x<=0.2"),
     ],
 )
