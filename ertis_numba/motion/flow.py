@@ -35,7 +35,7 @@ _MIN_PLACES_OF_SENSORS: Final = 4
 _MAX_FALSE_ALARMS: Final = 1e-3
 _STRONGEST: Final = 40  # Number of echoes per sensor that the search uses.
 _GATE: Final = 9.0
-_MIN_VARIANCE: Final = 0.01  # of residuals, relative to that by the deviations of echoes
+_MIN_VARIANCE: Final = 0.003  # of residuals, relative to that by the deviations of echoes
 # Errors of neighbouring echoes are correlated, so residuals underestimate those of the motion by these factors. They
 # were measured in simulated rooms other than those of `ertis bench motion`.
 _INFLATION: Final = np.diag([1.25, 1.25, 1.6])
