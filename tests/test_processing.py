@@ -4,6 +4,7 @@ import dataclasses
 import os
 import signal
 import time
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -336,6 +337,17 @@ def test_missed_error_budget_is_logged_once_per_sensor(cpu_loop, changes):
     found = [fields for event, fields in loop.lines if event == "error_budget"]
     assert [fields["sensor"] for fields in found] == ["quiet"]
     assert "images may exceed the error budget" in found[0]["text"]
+
+
+def test_sound_is_checked_ever_more_rarely(cpu_loop):
+    """The first measurement may be silent, and the start of records may drift; other settings begin anew."""
+    loop, found = cpu_loop.fresh(), []
+    for kind in (1, 2):
+        for number in range(1, 10):
+            job = SimpleNamespace(data=SimpleNamespace(sensor="left"), kind=SimpleNamespace(number=kind))
+            loop.processing._choose_checks(job)  # noqa: SLF001  a worker would take minutes
+            found += [(kind, number, job.predict)] * job.check_sound
+    assert found == [(kind, number, number == 1) for kind in (1, 2) for number in (1, 2, 4, 8)]
 
 
 @pytest.mark.parametrize("is_paper", [True, False])
