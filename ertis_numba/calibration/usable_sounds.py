@@ -17,7 +17,16 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, load_layout, microphones
 
-__all__ = ["Heard", "Microphones", "hear_all", "ordered", "require_sounds", "silent_channels", "unclear_channels"]
+__all__ = [
+    "Heard",
+    "Microphones",
+    "OtherLayoutError",
+    "hear_all",
+    "ordered",
+    "require_sounds",
+    "silent_channels",
+    "unclear_channels",
+]
 
 MIN_COHERENCE: Final = 0.6
 """Lower for channels that receive other sound, such as overlapping echoes."""
