@@ -71,7 +71,7 @@ def echoes_of(places_m, pairs=None, share=0.0, draws=None, *, is_flat=True):
 
 
 def reflectors(echoes, bound=np.inf, *, is_flat=True):
-    receivers = {number: SimpleNamespace(is_flat=is_flat) for number in range(N_SENSORS)}
+    receivers = {number: SimpleNamespace(is_flat=is_flat, pulse_m=0.014, width=0.14) for number in range(N_SENSORS)}
     models = dict.fromkeys(receivers, MODEL)
     return Reflectors(echoes, sensors(), receivers, models, GRID, np.full(GRID.n_cells, bound, dtype=np.float32))
 

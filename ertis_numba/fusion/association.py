@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import kernels
 from ertis_numba.fusion.confirmation import EchoPaths, confirmed
+from ertis_numba.fusion.overlaps import Overlap, PredictedEchoes, overlap
 from ertis_numba.fusion.pairs import AUDIBLE
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
@@ -26,6 +27,11 @@ _REFINED_M: Final = 0.005  # Standard deviation that overlapping echoes add to p
 _ALIKE: Final = 10.0  # Largest ratio of reflectivities between two echoes of a reflector.
 _MIN_SCORE: Final = 0.75  # Sum of the fits of two echoes halfway to the limit of the gate, one of them attributed.
 _N_CONFIRMING: Final = 3  # Echoes required for a reflector that the attribution of the images does not support.
+_USUAL_DB: Final = 6.0  # Reflectivity relative to the usual one, above which a reflector is a surprise, …
+_SURPRISE_DB: Final = 10.0  # … which counts as much as a missing echo for each so many decibels.
+_BESIDE_DB: Final = (-13.0, -16.0)  # Power of a call to the side from which its path is uncertain, and most uncertain.
+_BESIDE_M: Final = 6e-3
+_DISTURBED: Final = 0.25  # Power of overlapping echoes relative to one that they explain.
 _EXCESS: Final = 4.0  # Reflectivity relative to the bound of a cell, above which missing echoes exclude a candidate.
 _TINY: Final = 1e-30
 _ROUNDS: Final = 8
@@ -76,6 +82,8 @@ class _Candidates(NamedTuple):
     across : (candidate, axis) float64
         Horizontal vector across the direction, as long as one standard deviation.
     reflectivity : (candidate,) float64
+    is_ahead : (candidate,) bool
+        True in front of the receiver.
     """
 
     echo: Numbers
@@ -83,21 +91,30 @@ class _Candidates(NamedTuple):
     place_m: Floats
     across: Floats
     reflectivity: Floats
+    is_ahead: NDArray[np.bool_]
 
     def only(self, number: int) -> "_Candidates":
         """Return one of the candidates."""
-        one = slice(number, number + 1)
-        return _Candidates(
-            self.echo[one], self.emitter[one], self.place_m[one], self.across[one], self.reflectivity[one]
-        )
+        return _Candidates._make(each[number : number + 1] for each in self)
 
 
-class _Located(NamedTuple):
-    """Position, covariance and power at 1 m of one reflector."""
+class _LocatedReflector(NamedTuple):
+    """Located reflector.
+
+    Attributes
+    ----------
+    place_m : (axis,) float64
+    covariance_m2 : (axis, axis) float64
+    reflectivity : float
+    echo, emitter : (member,) int64
+        Echoes that locate it, and the emitters of their calls.
+    """
 
     place_m: Floats
     covariance_m2: Floats
     reflectivity: float
+    echo: Numbers
+    emitter: Numbers
 
 
 class Reflectors:
@@ -130,6 +147,7 @@ class Reflectors:
         Power of its echo at 1 m.
     confirmed : (reflector,) bool
         Reflectors that echoes at enough pairs confirm, as in `ertis_numba.fusion.confirmation`.
+        Power of the echo at 1 m.
     """
 
     def __init__(
@@ -159,8 +177,16 @@ class Reflectors:
         self._power = np.concatenate([each.power for each in echoes])
         self._rows = {number: np.flatnonzero(self._receiver == number) for number in receivers}
         self._is_free = np.ones(n_echoes, dtype=np.bool_)
-        found = self._confirmed()
-        self._add_lone(found)
+        # Only foreign echoes show the calls of sensors without an image.
+        self._has_image = np.isin(np.arange(n_sensors), [each.receiver for each in echoes])
+        self._is_incomplete = bool(np.isfinite(self._path_m[:, ~self._has_image]).any())
+        self._pulse_m, self._beam = np.ones((2, n_sensors))
+        for number, receiver in receivers.items():
+            self._pulse_m[number], self._beam[number] = receiver.pulse_m, receiver.width
+        self._is_flat = np.array([number in receivers and receivers[number].is_flat for number in range(n_sensors)])
+        candidates = self._candidates()
+        found = self._refined(self._confirmed(candidates))
+        self._add_lone(candidates, found)
         self.position_m = np.array([each.place_m for each in found]).reshape(-1, 3)
         self.covariance_m2 = np.array([each.covariance_m2 for each in found]).reshape(-1, 3, 3)
         self.reflectivity = np.array([each.reflectivity for each in found])
@@ -172,7 +198,14 @@ class Reflectors:
     def _candidates(self) -> _Candidates:
         """Return the candidates of all echoes, where their emitter is audible."""
         echo, emitter = np.nonzero(np.isfinite(self._path_m))
-        receiver, path_m, direction = self._receiver[echo], self._path_m[echo, emitter], self._direction[echo]
+        direction = self._direction[echo]
+        if self._is_incomplete:
+            mirrored = np.flatnonzero(self._is_flat[self._receiver[echo]])
+            ahead = self._ahead[self._receiver[echo[mirrored]]]
+            behind = direction[mirrored] - 2 * np.einsum("ci,ci->c", direction[mirrored], ahead)[:, None] * ahead
+            echo, emitter = np.append(echo, echo[mirrored]), np.append(emitter, emitter[mirrored])
+            direction = np.concatenate([direction, behind])
+        receiver, path_m = self._receiver[echo], self._path_m[echo, emitter]
         offset_m = self._sensor_m[emitter] - self._sensor_m[receiver]
         beyond = path_m**2 - np.einsum("ci,ci->c", offset_m, offset_m)
         to_m = beyond / np.maximum(2 * (path_m - np.einsum("ci,ci->c", direction, offset_m)), 1e-6)
@@ -183,7 +216,8 @@ class Reflectors:
         kept = np.flatnonzero((beyond > 0) & (to_m > _NEAREST_M) & is_possible)
         sideways = np.stack([-direction[kept, 1], direction[kept, 0], np.zeros(len(kept))], axis=1)
         across = sideways * (to_m[kept] * self._angle_sd_rad[echo[kept]])[:, None]
-        return _Candidates(echo[kept], emitter[kept], place_m[kept], across, reflectivity[kept])
+        is_ahead = np.einsum("ci,ci->c", direction[kept], self._ahead[receiver[kept]]) >= 0
+        return _Candidates(echo[kept], emitter[kept], place_m[kept], across, reflectivity[kept], is_ahead)
 
     def _limit(self, place_m: Floats) -> Floats:
         """Return the highest reflectivity that the images allow at places, 0 outside the grid."""
@@ -215,7 +249,8 @@ class Reflectors:
         slope = np.einsum("csi,ci->cs", toward, candidates.across)
         slope = slope[which] + slope[which, receiver][:, None]
         late_m = self._path_m[echo] - apart_m[which] - apart_m[which, receiver][:, None]
-        distance = turned[:, None] + late_m**2 / (slope**2 + self._path_sd_m[echo, None] ** 2 + extra_m**2)
+        beside_m2 = self._beside_m(candidates.place_m)[which] ** 2
+        distance = turned[:, None] + late_m**2 / (slope**2 + self._path_sd_m[echo, None] ** 2 + extra_m**2 + beside_m2)
         # Echoes of a reflector show about the same reflectivity; those from behind may be weaker.
         expected = candidates.reflectivity[which, None] * self._gains(candidates.place_m)[which, receiver]
         power, is_behind = self._power[echo, None], depth[which, receiver][:, None] < 0
@@ -239,9 +274,17 @@ class Reflectors:
         which, echo, distance = (np.concatenate(each) for each in zip(*found, strict=True))
         return which, echo, distance
 
-    def _confirmed(self) -> list[_Located]:
+    def _beside_m(self, place_m: Floats) -> Floats:
+        """Return errors of paths from emitters beside their beams: (place, emitter) float64.
+
+        There, what a piston radiates depends on the frequency, and echoes come early or late.
+        """
+        power_db = 10 * np.log10(np.maximum(self._radiated(place_m), _TINY))
+        high_db, low_db = _BESIDE_DB
+        return np.asarray(_BESIDE_M * np.clip((power_db - high_db) / (low_db - high_db), 0.0, 1.0))
+
+    def _confirmed(self, candidates: _Candidates) -> list[_LocatedReflector]:
         """Return the reflectors that several echoes confirm, and mark these echoes as explained."""
-        candidates = self._candidates()
         which, echo, emitter, distance = self._fits(candidates, 0.0)
         n_candidates, n_echoes = len(candidates.echo), len(self._receiver)
         # An echo confirms a candidate once, by the emitter that fits best.
@@ -249,7 +292,8 @@ class Reflectors:
         order = np.lexsort((-fit, echo, which))
         key = which[order] * n_echoes + echo[order]
         order = order[np.diff(key, prepend=-1) > 0]
-        score = np.bincount(which[order], fit[order], minlength=n_candidates)
+        score = np.bincount(which[order], fit[order], minlength=n_candidates) - self._surprise(candidates)
+        self._n_fitting = np.bincount(which[order], minlength=n_candidates)
         by_echo = order[np.argsort(echo[order], kind="stable")]
         bounds = np.searchsorted(echo[by_echo], np.arange(n_echoes + 1))
         found = []
@@ -269,7 +313,21 @@ class Reflectors:
                 np.subtract.at(score, which[entries], fit[entries])
         return found
 
-    def _accepted(self, candidates: _Candidates, best: int) -> tuple[_Located | None, Numbers]:
+    def _surprise(self, candidates: _Candidates) -> Floats:
+        """Return how much stronger candidates reflect than usual: (candidate,) float64.
+
+        Where an image is missing, the echoes of its sensor's call fit the calls of its neighbours as well. But these
+        would reach the place beside their beams, so that its reflector must be stronger.
+        """
+        if not self._is_incomplete or not len(candidates.echo):
+            return np.zeros(len(candidates.echo))
+        least = np.full(len(self._receiver), np.inf)
+        np.minimum.at(least, candidates.echo, candidates.reflectivity)
+        usual = float(np.median(least[np.isfinite(least)]))
+        excess_db = 10 * np.log10(np.maximum(candidates.reflectivity / max(usual, _TINY), 1.0))
+        return np.asarray(np.maximum(0.0, excess_db - _USUAL_DB) / _SURPRISE_DB)
+
+    def _accepted(self, candidates: _Candidates, best: int) -> tuple[_LocatedReflector | None, Numbers]:
         """Return the reflector at a candidate if enough echoes confirm it, and all echoes that it explains."""
         here = candidates.only(best)
         extra_m, covariance_m2, echo = 0.0, np.empty((3, 3)), np.empty(0, np.int64)
@@ -283,9 +341,10 @@ class Reflectors:
             place_m, covariance_m2 = self._located(members, emitter, here.place_m[0])
             gain = self._gains(place_m[None])[0, self._receiver[members], emitter]
             reflectivity = np.median(self._power[members] / np.maximum(gain, _TINY))
-            here = _Candidates(here.echo, here.emitter, place_m[None], np.zeros((1, 3)), np.array([reflectivity]))
+            here = here._replace(place_m=place_m[None], across=np.zeros((1, 3)), reflectivity=np.array([reflectivity]))
             extra_m = _REFINED_M
-        return _Located(here.place_m[0], covariance_m2, self._reflectivity(place_m, members, emitter)), np.unique(echo)
+        reflectivity = self._reflectivity(place_m, members, emitter)
+        return _LocatedReflector(place_m, covariance_m2, reflectivity, members, emitter), np.unique(echo)
 
     def _reflectivity(self, place_m: Floats, members: Numbers, emitter: Numbers) -> float:
         """Return the power at 1 m of a reflector that fits its echoes best, by least squares.
@@ -310,20 +369,112 @@ class Reflectors:
                 found.append(entry)
         return echo[found], emitter[found]
 
-    def _add_lone(self, found: list[_Located]) -> None:
+    def _refined(self, found: list[_LocatedReflector]) -> list[_LocatedReflector]:
+        """Return reflectors located with the errors of echoes that overlap, without those that overlaps explain."""
+        if not found:
+            return found
+        found = sorted(found, key=lambda each: -len(each.echo))
+        echo = np.concatenate([each.echo for each in found])
+        emitter = np.concatenate([each.emitter for each in found])
+        number = np.repeat(np.arange(len(found)), [len(each.echo) for each in found])
+        overlap = self._overlap(found, echo, number, emitter)
+        ends = np.cumsum([len(each.echo) for each in found])
+        rows = [slice(end - len(each.echo), end) for end, each in zip(ends, found, strict=True)]
+        is_kept = np.zeros(len(found), np.bool_)
+        for place, row in enumerate(rows):
+            is_kept[place] = np.median(overlap.only(row, is_kept).power) <= _DISTURBED
+        refined = []
+        for place in np.flatnonzero(is_kept).tolist():
+            each, disturbed = found[place], overlap.only(rows[place], is_kept)
+            place_m, covariance_m2 = self._located(each.echo, each.emitter, each.place_m, disturbed)
+            refined.append(each._replace(place_m=place_m, covariance_m2=covariance_m2))
+        return refined
+
+    def _overlap(
+        self,
+        found: Sequence[_LocatedReflector],
+        echo: Numbers,
+        number: Numbers | None = None,
+        emitter: Numbers | None = None,
+    ) -> Overlap:
+        """Return how much the echoes of reflectors disturb some echoes, which may be those of reflectors themselves."""
+        predicted = self._predicted(found)
+        is_other = np.ones((len(echo), len(found), len(self._sensor_m)), np.bool_)
+        if number is not None and emitter is not None:
+            is_other[np.arange(len(echo)), number, emitter] = False
+        return overlap(
+            predicted,
+            self._receiver[echo],
+            self._path_m[echo],
+            self._direction[echo],
+            self._power[echo],
+            is_other,
+            ahead=self._ahead,
+            pulse_m=self._pulse_m,
+            beam=self._beam,
+        )
+
+    def _radiated(self, place_m: Floats) -> Floats:
+        """Return the power of each call towards places, relative to ahead: (place, emitter) float64."""
+        away_m = place_m[:, None] - self._sensor_m
+        cosine = np.einsum("psi,si->ps", away_m, self._ahead) / np.maximum(np.linalg.norm(away_m, axis=2), _NEAREST_M)
+        return next(iter(self._emitters.values())).powers(cosine)
+
+    def _predicted(self, found: Sequence[_LocatedReflector]) -> PredictedEchoes:
+        """Return the echoes that reflectors cause."""
+        place_m = np.array([each.place_m for each in found])
+        away_m = place_m[:, None] - self._sensor_m
+        apart_m = np.maximum(np.linalg.norm(away_m, axis=2), _NEAREST_M)
+        toward = away_m / apart_m[..., None]
+        behind = np.where(self._is_flat, np.minimum(np.einsum("rsi,si->rs", toward, self._ahead), 0.0), 0.0)
+        return PredictedEchoes(
+            apart_m[:, :, None] + apart_m[:, None],
+            self._gains(place_m) * np.array([each.reflectivity for each in found])[:, None, None],
+            toward - 2 * behind[..., None] * self._ahead,
+        )
+
+    def _add_lone(self, candidates: _Candidates, found: list[_LocatedReflector]) -> None:
         """Add reflectors that a single own echo shows, unless the attribution explains it otherwise."""
         own = self._share[np.arange(len(self._receiver)), self._receiver]
         kept = self._is_free & (self._share.sum(axis=1) > _MIN_SHARE) & (own >= self._share.max(axis=1)) & (own > 0)
+        kept &= ~self._is_ambiguous(candidates)
+        if found:
+            kept[kept] = self._overlap(found, np.flatnonzero(kept)).power.sum(axis=1) < _DISTURBED
         for echo in np.flatnonzero(kept)[np.argsort(-self._power[kept], kind="stable")]:
             sensor = self._receiver[echo : echo + 1]
             place_m = self._sensor_m[sensor[0]] + self._path_m[echo, sensor[0]] / 2 * self._direction[echo]
             sensor_echo = np.array([echo])
             _, covariance_m2 = self._located(sensor_echo, sensor, place_m)
             if _is_apart(place_m, covariance_m2, found):
-                found.append(_Located(place_m, covariance_m2, self._reflectivity(place_m, sensor_echo, sensor)))
+                reflectivity = self._reflectivity(place_m, sensor_echo, sensor)
+                found.append(_LocatedReflector(place_m, covariance_m2, reflectivity, sensor_echo, sensor))
 
-    def _located(self, members: Numbers, emitter: Numbers, place_m: Floats) -> tuple[Floats, Floats]:
+    def _is_ambiguous(self, candidates: _Candidates) -> NDArray[np.bool_]:
+        """Return True for echoes that another call explains as well, if an image is missing: (echo,) bool.
+
+        Several sensors that could contradict the call of one without an image may fail to. Other calls must explain a
+        second echo.
+        """
+        found = np.zeros(len(self._receiver), np.bool_)
+        if self._is_incomplete:
+            is_own = (candidates.emitter == self._receiver[candidates.echo]) & candidates.is_ahead
+            own = np.zeros(len(found))
+            own[candidates.echo[is_own]] = candidates.reflectivity[is_own]
+            is_other = ~is_own & (candidates.reflectivity < _ALIKE * own[candidates.echo])
+            is_alone = np.count_nonzero(self._has_image) == 1
+            is_other &= (self._n_fitting > 1) | ~(is_alone | self._has_image[candidates.emitter])
+            found[candidates.echo[is_other]] = True
+        return found
+
+    def _located(
+        self, members: Numbers, emitter: Numbers, place_m: Floats, disturbed: Overlap | None = None
+    ) -> tuple[Floats, Floats]:
         """Return the position of a reflector and its covariance: (axis,) and (axis, axis) float64."""
+        path_sd_m, angle_sd_rad = self._path_sd_m[members], self._angle_sd_rad[members]
+        if disturbed is not None:
+            beside_m = self._beside_m(place_m[None])[0, emitter]
+            path_sd_m = np.sqrt(path_sd_m**2 + disturbed.path_m2 + beside_m**2)
+            angle_sd_rad = np.sqrt(angle_sd_rad**2 + disturbed.angle_rad2)
         receiver, direction = self._receiver[members], self._direction[members]
         ahead = self._ahead[receiver]
         depth = np.einsum("ei,ei->e", place_m - self._sensor_m[receiver], ahead)
@@ -336,7 +487,7 @@ class Reflectors:
             self._sensor_m[receiver],
             self._path_m[members, emitter],
             np.array([[each, *tangents(each)] for each in direction]),
-            np.stack([self._path_sd_m[members], self._angle_sd_rad[members]], axis=1),
+            np.stack([path_sd_m, angle_sd_rad], axis=1),
             _LEAST_INFORMATION_1_M2,
             _NEAREST_M,
             math.inf if is_alone else _OUTLIER,
@@ -347,7 +498,7 @@ class Reflectors:
         return position_m, covariance_m2
 
 
-def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[_Located]) -> bool:
+def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[_LocatedReflector]) -> bool:
     """Return True if no reflector is at a place.
 
     Another echo at a reflector is a shoulder of its main lobe, or overlaps with other echoes.

@@ -194,15 +194,17 @@ class Attribution:
     def _not_heard(self, evidence: Sequence[_Evidence], reflectivity: Singles) -> frozenset[int]:
         """Return emitters whose calls other sensors do not hear, where the reflectors of all images lead to expect it.
 
-        An emitter may be broken, covered, or not on the same SYNC chain. Without an own image, only foreign echoes show
-        its reflectors, so none are expected.
+        An emitter may be broken, covered, or not on the same SYNC chain. Without its own image, only foreign echoes
+        show the reflectors of an emitter. Others may take them for own ones, so nobody can tell.
         """
         own = {each.pair.emitter for each in evidence if each.pair.emitter == each.pair.receiver}
+        if any(each.pair.emitter not in own for each in evidence):
+            return frozenset()
         shown: dict[int, list[NDArray[np.float64]]] = {}
         strong = np.float32(_STRONG) * reflectivity.max()
         for each in evidence:
             pair = each.pair
-            if pair.emitter == pair.receiver or pair.emitter not in own:
+            if pair.emitter == pair.receiver:
                 continue
             sums = np.zeros(2)
             self._kernels.compare_echoes(

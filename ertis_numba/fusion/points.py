@@ -23,6 +23,7 @@ __all__ = ["PointFuser", "joined"]
 Floats = NDArray[np.float64]
 
 _TOP: Final = 128  # Points per image.
+_FAINTEST: Final = 10 ** (-22.0 / 20)  # Amplitude in the fused image relative to that of the echoes: others contradict.
 _FALSE_ALARM: Final = 1e-5  # Probability that noise alone yields a point of an image.
 _RANGE_SD_M: Final = 1e-3  # Errors that noise does not explain, such as those of mountings and of the air.
 _ANGLE_SD_RAD: Final = math.radians(0.25)
@@ -138,6 +139,7 @@ def joined(
     shown = np.where(cell >= 0, _around(image.amplitude).reshape(-1).take(cell.clip(0)), np.float32(0))
     amplitude = np.where(reflectors.confirmed, amplitude, np.minimum(amplitude, shown)).astype(np.float32)
     order = np.argsort(-amplitude, kind="stable")
+    order = order[shown[order] > _FAINTEST * np.sqrt(reflectors.reflectivity[order])]
     uncertainty_m = np.array(
         [_along_and_across(*each) for each in zip(position_m, reflectors.covariance_m2, strict=True)]
     ).reshape(-1, 2)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.noise import medians_of
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion.polar_grid import close_directions
@@ -82,6 +83,14 @@ class Receiver:
         self.directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
         self.is_flat = microphones(image.settings.array).is_flat
         """True if the array cannot distinguish front and back."""
+        call, speed_m_s = image.settings.call, sound_speed_m_s(image.settings.air)
+        self.pulse_m = speed_m_s / (call.high_frequency_hz - call.low_frequency_hz)
+        """Width of the compressed pulse, as length of a path."""
+        wave_m = 2 * speed_m_s / (call.high_frequency_hz + call.low_frequency_hz)
+        self.width = wave_m / max(
+            float(np.ptp(microphones(image.settings.array).enabled_positions_m[:, 1])), wave_m / 2
+        )
+        """Width of the main lobe, as difference of unit vectors."""
         self.n_steps = int(image.range_m[-1] / step_m) + 1
         steps = (image.range_m / step_m).astype(np.int64)
         self.has_range = np.isin(np.arange(self.n_steps), steps)

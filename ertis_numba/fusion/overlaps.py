@@ -1,0 +1,103 @@
+"""Echoes that overlap with those of other reflectors or calls, and their errors."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Overlap", "PredictedEchoes", "overlap"]
+
+Floats = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+_FAINT: Final = 1e-4  # Power relative to that of an echo, below which another one does not disturb it.
+_GRAZING: Final = 0.1  # Least cosine of the angle to the axis of the array.
+_SHIFT: Final = 0.28  # Error of a path or a direction relative to the distance of an equally strong echo.
+_DECAY: Final = -1.75  # Compressed pulses are 26 dB down at six widths, and 40 dB at fourteen.
+
+
+class PredictedEchoes(NamedTuple):
+    """Echoes that reflectors cause.
+
+    Attributes
+    ----------
+    path_m : (reflector, receiver, emitter) float64
+    power : (reflector, receiver, emitter) float64
+        0 for inaudible echoes.
+    direction : (reflector, receiver, axis) float64
+        Unit vectors from the receiver, in the frame of the platform.
+    """
+
+    path_m: Floats
+    power: Floats
+    direction: Floats
+
+
+class Overlap(NamedTuple):
+    """Disturbance of echoes by other ones, as squares, which add up over reflectors.
+
+    Attributes
+    ----------
+    power : (echo, reflector) float64
+        Power of the echoes of each reflector that overlap, relative to the echo.
+    path_m2, angle_rad2 : (echo, reflector) float64
+        Variances that they add to its path and to its direction.
+    """
+
+    power: Floats
+    path_m2: Floats
+    angle_rad2: Floats
+
+    def only(self, echo: slice, is_kept: NDArray[np.bool_]) -> "Overlap":
+        """Return the sums over some reflectors, for some echoes: (echo,) each."""
+        return Overlap(*(each[echo][:, is_kept].sum(axis=1) for each in self))
+
+
+def overlap(
+    predicted: PredictedEchoes,
+    receiver: Numbers,
+    path_m: Floats,
+    direction: Floats,
+    power: Floats,
+    is_other: NDArray[np.bool_],
+    *,
+    ahead: Floats,
+    pulse_m: Floats,
+    beam: Floats,
+) -> Overlap:
+    """Return how much the echoes of reflectors disturb others.
+
+    Two echoes within the width of the compressed pulse and of the beam have one maximum, or several at other places,
+    depending on their phases. The error grows with the ratio of the amplitudes, and with the distance up to the width.
+
+    Parameters
+    ----------
+    predicted : PredictedEchoes
+    receiver : (echo,) int64
+    path_m : (echo, emitter) float64
+        Length of the path if the emitter's call caused the echo; NaN for silent ones.
+    direction : (echo, axis) float64
+    power : (echo,) float64
+    is_other : (echo, reflector, emitter) bool
+        False for the prediction that is the echo.
+    ahead : (sensor, axis) float64
+        Directions in which the receivers look.
+    pulse_m : (sensor,) float64
+        Width of the compressed pulse, as length of a path.
+    beam : (sensor,) float64
+        Width of the main lobe, as difference of unit vectors.
+    """
+    facing, width_m, width = ahead[receiver], pulse_m[receiver, None, None], beam[receiver, None]
+    late_m = np.abs(path_m[:, None] - predicted.path_m.swapaxes(0, 1)[receiver])
+    turned = direction[:, None] - predicted.direction.swapaxes(0, 1)[receiver]
+    # A flat array observes directions in its plane, so its beam is wider to the side.
+    along = np.einsum("eri,ei->er", turned, facing)
+    across = np.sqrt(np.maximum(0.0, np.einsum("eri,eri->er", turned, turned) - along**2))
+    pulse = (1 + (late_m / width_m) ** 2) ** _DECAY  # with side lobes
+    near = pulse * np.exp(-((across / width) ** 2))[..., None]
+    ratio = near * predicted.power.swapaxes(0, 1)[receiver] / power[:, None, None]
+    ratio = np.where(is_other & (ratio > _FAINT), np.minimum(ratio, 1.0), 0.0)  # False for NaN.
+    path_m2 = np.where(ratio > 0, ratio * np.minimum(_SHIFT * late_m, width_m) ** 2, 0.0).sum(axis=2)
+    total = ratio.sum(axis=2)
+    facing_to = np.maximum(np.einsum("ei,ei->e", direction, facing), _GRAZING)
+    return Overlap(total, path_m2, total * (_SHIFT * np.minimum(across, width) / facing_to[:, None]) ** 2)
