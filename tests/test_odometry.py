@@ -174,6 +174,7 @@ def test_odometry_command_takes_mountings_from_a_file(folder, tmp_path):
             "of SYNC count 1 are 0.7 s apart; give recordings of one SYNC chain, whose",
         ),
         (["slow.h5"], 1, "slow.h5: no two successive pulses have enough echoes in common, at most a second apart"),
+        (["front.h5"], 1, "front.h5: no step determines the motion, because standing still, mirrored motion or the"),
         (["passive.h5"], 1, "passive.h5: all measurements are passive and have no echoes; give recordings of emitted"),
         (["both.h5", "--preset", "none"], 2, "preset 'none' is unknown"),
     ],

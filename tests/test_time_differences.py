@@ -103,19 +103,20 @@ def test_uncertainty_is_that_of_the_errors(weighting, band_hz, snr_db, n):
 
 @pytest.mark.parametrize("weighting", ["phat", "scot", "none"])
 @pytest.mark.parametrize(
-    ("band_hz", "snr_db", "n"),
+    ("band_hz", "snr_db", "n", "min_known"),
     [
-        ((39.6e3, 40.4e3), 30, 32768),
-        ((39.6e3, 40.4e3), 10, 4096),
-        ((39.4e3, 40.1e3), 20, 32768),
-        ((39e3, 41e3), 10, 32768),
-        ((25e3, 35e3), 0, 4096),
-        ((20e3, 80e3), -5, 1000),
+        ((39.6e3, 40.4e3), 30, 32768, 50),
+        ((39.6e3, 40.4e3), 10, 4096, 40),
+        ((39.4e3, 40.1e3), 20, 32768, 50),
+        ((39e3, 41e3), 10, 32768, 50),
+        ((25e3, 35e3), 0, 4096, 40),
+        ((20e3, 80e3), -5, 1000, 0),
     ],
 )
-def test_narrow_or_weak_sound_has_an_uncertainty_of_periods(weighting, band_hz, snr_db, n):
+def test_narrow_or_weak_sound_has_an_uncertainty_of_periods(weighting, band_hz, snr_db, n, min_known):
     errors = errors_in_uncertainties(weighting, band_hz, snr_db, n)
-    assert len(errors) == 0 or np.sqrt(np.mean(errors**2)) < 1.3
+    assert len(errors) >= min_known
+    assert len(errors) < 10 or np.sqrt(np.mean(errors**2)) < 1.3
     assert np.abs(errors).max(initial=0) < 4
 
 

@@ -31,8 +31,9 @@ class SoundChecks:
 
     def __init__(self) -> None:
         self._count = 0
+        self._is_other_call = self._is_shifted = False
         self._emissions: list[EmissionTimes | None] = []
-        self._remaining: dict[Subject, int] = {"call": _MAX_TRIES, "start": 0, "layout": _MAX_TRIES}
+        self._tries: dict[Literal["call", "layout"], int] = {"call": _MAX_TRIES, "layout": _MAX_TRIES}
 
     def check(self, measurement: Measurement) -> list[SoundMismatch]:
         """Return the settings that the sound of the next measurement contradicts.
@@ -43,37 +44,38 @@ class SoundChecks:
             The samples do not match the settings.
         """
         self._count += 1
-        found = []
-        for subject in [*self._remaining]:
-            warning = self._compare(subject, measurement)
-            if warning is None:
-                continue
-            if warning or subject != "start":
-                del self._remaining[subject]
-            if warning:
-                found.append(SoundMismatch(subject, warning))
-            if warning and subject == "call":
-                self._remaining.clear()
-                break
+        found: list[SoundMismatch] = []
+        if self._is_other_call:
+            return found
+        if warning := self._compare("call", measurement):
+            self._is_other_call = True
+            return [SoundMismatch("call", warning)]
+        if warning := self._start(measurement):
+            self._is_shifted = True
+            found.append(SoundMismatch("start", warning))
+        if warning := self._compare("layout", measurement):
+            found.append(SoundMismatch("layout", warning))
         return found
 
-    def _compare(self, subject: Subject, measurement: Measurement) -> str | None:
-        """Return a warning, empty if the sound agrees; None if this is not known."""
-        if subject == "start":
-            return self._start(measurement)
-        self._remaining[subject] -= 1
+    def _compare(self, subject: Literal["call", "layout"], measurement: Measurement) -> str:
+        """Return a warning if the sound contradicts the call or the layout; ask no more once it has been known."""
+        if not self._tries[subject]:
+            return ""
+        self._tries[subject] -= 1
         if subject == "call":
             call = call_match(measurement)
             known = None if call is None else call.warning or call.note
         else:
             layout = layout_match(measurement)
             known = None if layout is None else layout.warning
-        return "" if known is None and not self._remaining[subject] else known
+        if known is not None:
+            self._tries[subject] = 0
+        return known or ""
 
-    def _start(self, measurement: Measurement) -> str | None:
+    def _start(self, measurement: Measurement) -> str:
         """Compare the direct sound with the distance of the emitter, in ever fewer measurements."""
-        if self._count & (self._count - 1):
-            return None
+        if self._is_shifted or self._count & (self._count - 1):
+            return ""
         self._emissions.append(emissions_of(measurement))
         settings = measurement.settings
         shift = describe_start(self._emissions, sound_speed_m_s(settings.air), delay_s=settings.call.delay_s)

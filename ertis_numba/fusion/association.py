@@ -147,7 +147,6 @@ class Reflectors:
         Power of its echo at 1 m.
     confirmed : (reflector,) bool
         Reflectors that echoes at enough pairs confirm, as in `ertis_numba.fusion.confirmation`.
-        Power of the echo at 1 m.
     """
 
     def __init__(

@@ -64,7 +64,7 @@ class Predictions:
                 self._found.append(Predicted(sensor=sensor, event=_EVENTS[subject], warning=text))
         except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images
             text = f"the sound was not compared with the settings: {type(error).__name__}: {error}"
-            self._found.append(Predicted(sensor=sensor, event="call_mismatch", warning=text))
+            self._found.append(Predicted(sensor=sensor, event="check_failed", warning=text))
 
     def _report_grid(self, sensor: str, image: "Energyscape") -> None:
         """Report directions that are too far apart for the array."""

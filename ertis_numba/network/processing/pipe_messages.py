@@ -141,7 +141,7 @@ class Predicted(_Note, frozen=True, kw_only=True):
     """Warning about a sensor's images, and the log event that reports it."""
 
     sensor: str
-    event: Literal["error_budget", "call_mismatch", "start_mismatch", "layout_mismatch", "coarse_grid"]
+    event: Literal["error_budget", "call_mismatch", "start_mismatch", "layout_mismatch", "coarse_grid", "check_failed"]
     warning: str
 
 
