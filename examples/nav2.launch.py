@@ -5,7 +5,7 @@ The sensors send to a central node, `ertis serve`. The file starts `ertis ros`, 
     ertis map REC.h5 -o place.pgm
     ros2 launch ./nav2.launch.py map:=place.yaml params:=my_nav2_params.yaml
 
-`params` is the nav2_params.yaml of your robot with the sections of nav2.yaml, whose directory is the default.
+`params` is a parameter file of Nav2; by default, the nav2.yaml beside this file.
 """
 
 from pathlib import Path

@@ -114,7 +114,7 @@ def test_messages_go_to_stderr_unless_quiet(recording, tmp_path):
     assert "3 measurements, 9 directions" in done.stderr
     done = run("process", recording, "-o", tmp_path / "b.h5", *FAST, "--directions", "2d:31", "--quiet")
     assert done.stdout == ""
-    assert re.fullmatch(r"ertis: warning: .*: no sound above the noise is a sweep, .*\n", done.stderr)
+    assert re.fullmatch(r"ertis: warning: .*: the record contains no sweep above the noise, .*\n", done.stderr)
 
 
 def test_info_reports_recordings_and_energyscapes(recording, images):

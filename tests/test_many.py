@@ -106,7 +106,7 @@ def test_single_recording_is_reported_like_many(runs, out, monkeypatch):
     many = found["a.h5"].made
     place = f"{runs / 'a.h5'}: sensor eRTIS-7"
     on_call, on_line, on_grid = many.pop("warnings")
-    assert on_call.startswith(f"{place}: no sound above the noise is a sweep")
+    assert on_call.startswith(f"{place}: the record contains no sweep above the noise")
     assert on_line.startswith(f"{place} has its microphones on a horizontal line; the elevation is unknown")
     assert on_grid.startswith(f"{place}: directions are 30.0° apart")
     assert single.pop("output") == str(runs / "a.energy.h5")

@@ -297,9 +297,10 @@ def _note_left_out(sensor: str, count: int) -> None:
     """Print a note on maxima that were left out near the edges of the range axis."""
     if count:
         maxima = "1 maximum" if count == 1 else f"{count} maxima"
+        cause = "it may be a side lobe" if count == 1 else "they may be side lobes"
         options.note(
-            f"sensor {sensor}: {maxima} near the first or last range left out, "
-            "which side lobes of an echo beyond may cause; use 'ertis process' with a wider --range to tell them apart"
+            f"sensor {sensor}: {maxima} near the first or last range left out because {cause} of an echo outside the "
+            "range; process again with a wider --range"
         )
 
 

@@ -26,7 +26,7 @@ from ertis_numba.waveform import call_samples
 
 __all__ = ["UNKNOWN_CALL", "CallMatch", "call_match", "first_call_match"]
 
-UNKNOWN_CALL: Final = "no sound above the noise is a sweep, so that echoes were not compared with the call"
+UNKNOWN_CALL: Final = "the record contains no sweep above the noise, so the call was not checked"
 """Note on measurements that `call_match` cannot compare."""
 _WRONG: Final = "another call was emitted, and ranges in the image are wrong"
 _MIN_RATIO: Final = 1.3

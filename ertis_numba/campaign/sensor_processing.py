@@ -71,7 +71,8 @@ class SensorProcessing:
     prediction : Prediction or None
         Predicted error of the first measurement's image; None before it is computed, and for the paper's method.
     call_warning, start_warning, layout_warning : str
-        Warnings that the sound does not match the call, the start of the record or the layout; empty if it does.
+        Warnings that the sound does not match the call, the start of the record or the layout, or that the call could
+        not be checked; otherwise empty.
     """
 
     def __init__(

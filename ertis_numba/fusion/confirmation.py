@@ -56,7 +56,7 @@ def confirmed(heard: EchoPaths, place_m: Floats, gain: Floats) -> Flags:
     """Return True for the reflectors that enough echoes confirm, each as a point or as a mirror-like wall.
 
     At least 60 % of the pairs that should hear a reflector must do so, rounded down, and four if there are as many. A
-    platform with several sensors needs two. None is confirmed where a wall at one nearer reflector mirrors another.
+    platform with several sensors needs two. A reflector at the mirror image of another one is not confirmed.
 
     Parameters
     ----------

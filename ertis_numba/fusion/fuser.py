@@ -42,10 +42,11 @@ class Fused:
         Sensors whose calls no other sensor hears, although it should. Their emitters may be broken, or they are not on
         the same SYNC chain. They are fused without foreign echoes.
     without_echo : tuple of str
-        Fused sensors whose images hold no echo above their noise. If it names all, the pulse carried nothing. Computed
+        Fused sensors whose images hold no echo above their noise. If it names all, the pulse returned no echo. Computed
         with the points.
     noise : dict of str to float
-        Amplitude that noise hardly reaches in the image of each fused sensor; infinite if the image consists of zeros.
+        Detection threshold of each fused sensor: noise exceeds it anywhere in the image with a probability of 10⁻⁵.
+        Infinite if the image consists of zeros.
 
     Examples
     --------
@@ -82,12 +83,12 @@ class Fused:
 
     @property
     def noise(self) -> dict[str, float]:
-        """Amplitude that noise hardly reaches in the image of each fused sensor."""
+        """Detection threshold of each fused sensor: amplitude that noise exceeds in one of 100,000 images."""
         return {self._names[number]: floor for number, floor in self._located.floor.items()}
 
     @property
     def is_empty(self) -> bool:
-        """True if no image holds an echo above its noise, so that the pulse carried nothing."""
+        """True if no image holds an echo above its noise, so that the pulse returned no echo."""
         return len(self._located.without_echo) == len(self.sensors)
 
 

@@ -60,7 +60,7 @@ class PointFuser:
         self._extract = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP)
 
     def floor(self, image: Energyscape) -> NDArray[np.float32]:
-        """Return the amplitude that noise hardly reaches: (direction,) float32, infinite in an image of zeros."""
+        """Return the detection threshold (`_FALSE_ALARM`): (direction,) float32, infinite in an image of zeros."""
         return (
             echo_floor(image, _FALSE_ALARM)
             if image.amplitude.any()
@@ -76,7 +76,7 @@ class PointFuser:
         ----------
         image : Energyscape
         floor : (direction,) float32
-            Amplitude that noise hardly reaches.
+            Detection threshold, from `floor`.
         shares : Shares
         late_m : mapping of int to float
             Path of sound between the emission of this sensor and that of each emitter.

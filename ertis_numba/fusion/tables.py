@@ -32,7 +32,7 @@ class Located(NamedTuple):
     ----------
     points : PointCloud
     floor : dict of int to float
-        Amplitude that noise hardly reaches in the image of each sensor.
+        Detection threshold of each sensor: noise exceeds it anywhere in an image with a probability of 10⁻⁵.
     without_echo : list of int
         Sensors whose images have no echo above it.
     """

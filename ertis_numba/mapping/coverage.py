@@ -38,7 +38,7 @@ def heard_m(emitters: Emitters, clear: float, floor: float, last_m: float) -> fl
     clear : float
         Amplitude of a clear echo at 1 m.
     floor : float
-        Amplitude that noise hardly reaches in the image of the sensor.
+        Detection threshold: noise exceeds it anywhere in an image with a probability of 10⁻⁵.
     last_m : float
         Last range of the image.
     """

@@ -25,8 +25,9 @@ _MIN_BLOCK: Final = 8
 _MAX_BLOCK: Final = 1e15  # More than any record has.
 _TINY: Final = 1e-30
 _BY_CHANCE: Final = 1e-3  # Probability that one frequency looks coherent in noise.
-_MANY_BY_CHANCE: Final = 0.01
-_LEAKED_SHARES: Final = (0.3, 0.05, *(1e-3 * (3 / apart) ** 6 for apart in range(3, 13)))  # by distance, about
+_MANY_BY_CHANCE: Final = 0.01  # Probability that so many frequencies look coherent in noise.
+# Approximate power that leaks, by distance in frequencies.
+_LEAKED_SHARES: Final = (0.3, 0.05, *(1e-3 * (3 / apart) ** 6 for apart in range(3, 13)))
 _N_STEPS: Final = 4
 _WIDENED: Final = 3.0
 _MAX_COHERENCE: Final = 1 - 1e-9
@@ -43,8 +44,8 @@ class TimeDifference(NamedTuple):
     delay_s : float
         Time by which the sound arrives later at the second, in seconds.
     uncertainty_s : float
-        Standard deviation in seconds. Infinite without coherence, with fewer than three blocks, which cannot show it,
-        and at the largest delay, beyond which the right one may lie.
+        Standard deviation in seconds. Infinite if the signals are not coherent, if there are fewer than three blocks,
+        or if the delay is the largest permitted one.
     peak : float
         Correlation at the delay, relative to that of equal signals.
     """
@@ -133,8 +134,8 @@ def time_differences(
     n_block = round(min(signals.rate_hz / resolution_hz, _MAX_BLOCK))
     if not _MIN_BLOCK <= n_block <= n_samples:
         raise ArgumentError(
-            f"resolution_hz is {resolution_hz:g}, which needs {n_block} of {n_samples} samples; give a number from "
-            f"{signals.rate_hz / n_samples:.4g} to {signals.rate_hz / _MIN_BLOCK:.4g}"
+            f"resolution_hz = {resolution_hz:g} needs blocks of {n_block} samples, but the signals have {n_samples}; "
+            f"use {signals.rate_hz / n_samples:.4g} to {signals.rate_hz / _MIN_BLOCK:.4g}"
         )
     if isinstance(band_hz, np.ndarray):  # such as a row of AcousticCamera.band_hz
         band_hz = tuple(band_hz.tolist())

@@ -42,7 +42,7 @@ class PulseImages(NamedTuple):
 
 
 class FusedImages:
-    """Fuser of the images of each SYNC pulse, whose points are reflectors that all sensors confirm."""
+    """Fuser of the images of each SYNC pulse, whose points are the reflectors that all sensors locate."""
 
     def __init__(self, on_note: Callable[[str], None] = lambda _: None) -> None:
         self._note, self._noted = on_note, ""

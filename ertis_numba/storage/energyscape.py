@@ -117,7 +117,7 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         )
 
     def note_call(self, sensor: str, call_warning: str) -> None:
-        """Store a warning that a sensor's echoes do not match the call of its settings; empty if they do.
+        """Store a warning that echoes do not match the call, or that it could not be checked; empty if they match.
 
         Call this before the sensor's first energyscape is written.
         """
@@ -222,8 +222,8 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
     wavefront_error_db : float, or None
         Error of plane wavefronts at the first range, relative to spherical ones; None if it is within the budget.
     call_warning : str
-        Warning that echoes of the recording do not match the call of its settings; empty if they do, or if it was not
-        examined.
+        Warning that echoes of the recording do not match the call of its settings, or that the call could not be
+        checked; empty if they match, or if the program that wrote the file did not check the call.
     start_warning : str
         Warning that records do not begin with the emission; empty if they may, or if it was not examined.
     layout_warning : str
