@@ -57,9 +57,9 @@ docs: $(VENV)/ready-to-test  ## build the documentation; open site/index.html
 	$(BIN)/python -m sphinx -q -W --keep-going docs site
 
 data: $(VENV)/ready  ## rebuild data/synthetic from its scenes, and the gallery
-	$(BIN)/python data/synthetic/build.py
-	$(BIN)/python data/synthetic/hall.py
-	$(BIN)/python data/synthetic/gallery.py
+	$(BIN)/python data/build.py
+	$(BIN)/python data/hall.py
+	$(BIN)/python data/gallery.py
 
 pictures: $(VENV)/ready  ## redraw the pictures of the README; the viewer needs Chromium
 	$(BIN)/python -m pip install --quiet --editable '.[view,browser]'

@@ -99,8 +99,8 @@ def test_image_of_shipped_recording_shows_its_reflectors(name, method):
 
 
 def script(name):
-    """Return a script of the folder as a module."""
-    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
+    """Return a script of the folder above as a module."""
+    spec = importlib.util.spec_from_file_location(name, FOLDER.parent / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -19,8 +19,6 @@ _FOLDERS: Final = (("ertis_examples", ()), (_RECORDINGS, ()), (_RECORDINGS, ("sc
 """Packages, and folders in them, with examples."""
 
 _SUFFIXES: Final = {".toml", ".py", ".rviz", ".yaml"}
-_TOOLS: Final = {"__init__.py", "build.py", "gallery.py", "hall.py"}
-"""Files of these packages that are not examples."""
 
 
 def examples() -> dict[str, Traversable]:
@@ -35,7 +33,7 @@ def examples() -> dict[str, Traversable]:
             name = PurePath(item.name)
             if name.suffix == ".json" and package == _RECORDINGS:
                 found[f"{name.stem}.h5"] = folder / f"{name.stem}.toml"
-            elif name.suffix in _SUFFIXES and item.name not in _TOOLS:
+            elif name.suffix in _SUFFIXES and item.name != "__init__.py":
                 found[item.name] = item
     return dict(sorted(found.items()))
 

@@ -1,4 +1,4 @@
-"""Build the recordings of this folder from its scenes, as a part of ``make data``.
+"""Build the recordings of ``synthetic`` from its scenes, as a part of ``make data``.
 
 ``ertis simulate`` turns each ``NAME.toml`` into ``NAME.h5``. ``NAME.json`` lists the reflectors that an image of each
 sensor should show, and the SHA-256 of the sensor's samples as little-endian bytes. The samples are the same on every
@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from ertis_cli._examples import words_sha256
 from ertis_cli.main import cli
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parent / "synthetic"
 DATE = "1767225600"  # 2026-01-01: fixed, so that recordings do not depend on the day of the build
 
 

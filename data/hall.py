@@ -1,14 +1,14 @@
-"""Write the scene of the hall, ``scenes/hall.toml``, as a part of ``make data``."""
+"""Write the scene of the hall, ``synthetic/scenes/hall.toml``, as a part of ``make data``."""
 
 from pathlib import Path
 
 from ertis_bench.platform_trials.furnished_rooms import hall
 
-PATH = Path(__file__).parent / "scenes" / "hall.toml"
+PATH = Path(__file__).parent / "synthetic" / "scenes" / "hall.toml"
 HEAD = """\
 # A robot with four sensors drives three times round a hall of 16 m by 10 m, at 1 m/s and with 14 pulses per second.
 # World frame: x along the hall, y across, z up from the floor; the origin is the middle of the hall. The walls are
-# rows of small reflectors of random strength, as of rough brick. Written by data/synthetic/hall.py.
+# rows of small reflectors of random strength, as of rough brick. Written by data/hall.py.
 """
 _SEED = 1
 

@@ -1,4 +1,4 @@
-"""Draw and measure the scenes of ``scenes/`` for ``docs/how-to/gallery.md``, as a part of ``make data``.
+"""Draw and measure the scenes of ``synthetic/scenes`` for ``docs/how-to/gallery.md``, as a part of ``make data``.
 
 Pictures go to ``docs/pictures/gallery``; tables go between the markers ``<!-- scene NAME -->`` and
 ``<!-- /scene NAME -->``. All else on the page is written by hand.
@@ -19,8 +19,8 @@ from ertis_numba.analysis.compare import errors_of
 from ertis_numba.simulation import Scene
 from ertis_numba.simulation.effect_plan import EffectPlan, make_plan
 
-ROOT = Path(__file__).parents[2]
-SCENES = Path(__file__).parent / "scenes"
+ROOT = Path(__file__).parents[1]
+SCENES = Path(__file__).parent / "synthetic" / "scenes"
 PAGE = ROOT / "docs" / "how-to" / "gallery.md"
 PICTURES = ROOT / "docs" / "pictures" / "gallery"
 Takes = dict[str, list[tuple[ertis.Energyscape, list[ertis.Reflector]]]]
