@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 import scipy.signal
-from ertis_bench import reference_image
-from ertis_bench.reference_image import signals_of
+from ertis_bench.error_trials import reference_image
+from ertis_bench.error_trials.reference_image import signals_of
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import array_weights, microphones

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy
-from ertis_bench import passive_bearings
+from ertis_bench.passive import bearings as passive_bearings
 
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError

@@ -13,7 +13,6 @@ import pytest
 from click.testing import CliRunner
 from ertis_bench import (
     accuracy,
-    beamformers,
     checks,
     input_measurements,
     instruction_sets,
@@ -21,11 +20,10 @@ from ertis_bench import (
     markdown,
     paper,
     plans,
-    scaling,
-    simulation,
-    tables,
     timing,
 )
+from ertis_bench.cpu_times import beamformers, scaling
+from ertis_bench.simulation_trials import simulation
 from ertis_cli.main import cli
 
 from ertis_numba import figures, kernels, verification
@@ -149,7 +147,7 @@ def test_scaling_measures_every_series(monkeypatch):
     } <= found
     assert report["ceilings"][-1]["float32_gop_s"] > 1
     assert report["delay_and_sum"][0]["precision"] == "float32"
-    text = tables.scaling(report)
+    text = scaling.form(report)
     for name in ("directions", "directions, no beam grid, float32", "last range, m", "microphones", "threads"):
         assert f"| {name} | ms, mean ± std (median) | ranges |" in text
 

@@ -6,7 +6,7 @@ import subprocess
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import budgets
+from ertis_bench.error_trials import budgets
 from ertis_cli.main import cli
 
 from ertis_numba import kernels, verification

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench.faulty_arrays import faulty_array, record
+from ertis_bench.error_trials.faulty_arrays import faulty_array, record
 from ertis_cli.main import cli
 
 from ertis_numba.geometry import layout_file, load_layout

@@ -6,7 +6,7 @@ import importlib.metadata
 
 import numpy as np
 import pytest
-from ertis_bench.faulty_arrays import FaultyArray, calibration_errors, faulty_array, image_losses, record
+from ertis_bench.error_trials.faulty_arrays import FaultyArray, calibration_errors, faulty_array, image_losses, record
 
 from ertis_numba.calibration import calibrate
 from ertis_numba.calibration.channel_order import find_swaps

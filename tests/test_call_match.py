@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import budgets
+from ertis_bench.error_trials import budgets
 from ertis_cli.main import cli
 from scipy.signal import chirp
 

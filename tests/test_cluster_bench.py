@@ -4,7 +4,8 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from ertis_bench.network import performance
+from ertis_bench.network import imaging
+from ertis_bench.network_trials import performance
 from ertis_cli.main import cli
 
 from tests.dask_clusters import cluster_of_threads
@@ -22,7 +23,7 @@ def only_on_the_cluster(folder, duration_s, seed, *, rate_hz, scheduler, **optio
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
-    monkeypatch.setattr(performance, "_WARM_UP_S", 0.4)
+    monkeypatch.setattr(imaging, "_WARM_UP_S", 0.4)
     monkeypatch.setattr(performance, "processing", only_on_the_cluster)
     monkeypatch.setattr(performance.cluster, "local_cluster", cluster_of_threads)
 

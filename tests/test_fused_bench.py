@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench.network import fused_receiver, live_fusion, live_maps
-from ertis_bench.network.fused_receiver import FusedReceiverJob
-from ertis_bench.network.map_viewer import MapViewerJob, n_wrong
 from ertis_bench.network.sender import SETTINGS
+from ertis_bench.network_trials import fused_receiver, live_fusion, live_maps
+from ertis_bench.network_trials.fused_receiver import FusedReceiverJob
+from ertis_bench.network_trials.map_viewer import MapViewerJob, n_wrong
 from ertis_bench.platform_trials import clock_checks, differing_calls, emission_delays
 from ertis_cli.main import cli
 

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench.platform_scenes import platform_scene, random_reflectors
+from ertis_bench.platform_trials.platform_scenes import platform_scene, random_reflectors
 from ertis_cli.main import cli
 
 import ertis_numba as ertis

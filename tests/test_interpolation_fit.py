@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from ertis_bench.delay_interpolation import TEXTBOOK, fitted_error, textbook_error
+from ertis_bench.rejected_plans.delay_interpolation import TEXTBOOK, fitted_error, textbook_error
 from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ertis_bench import reference_image
+from ertis_bench.error_trials import reference_image
 
 from ertis_numba import kernels
 from ertis_numba.kernels._kernel_set import CONTRACTS

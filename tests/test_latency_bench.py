@@ -9,7 +9,7 @@ import time
 
 import pytest
 from click.testing import CliRunner
-from ertis_bench.network import latency, performance
+from ertis_bench.network import imaging, latency
 from ertis_bench.network.processor_time import ProcessorTime
 from ertis_cli.main import cli
 
@@ -19,7 +19,7 @@ from ertis_numba.network import trace
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch):
-    monkeypatch.setattr(performance, "_WARM_UP_S", 0.4)
+    monkeypatch.setattr(imaging, "_WARM_UP_S", 0.4)
 
 
 @pytest.mark.alone  # the limit of the serial line is a wall-clock time

@@ -4,9 +4,9 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from ertis_bench import verdicts
-from ertis_bench.random_scenes import OCTET, varied_scene
-from ertis_bench.verdicts import Trial
+from ertis_bench.simulation_trials import verdicts
+from ertis_bench.simulation_trials.random_scenes import OCTET, varied_scene
+from ertis_bench.simulation_trials.verdicts import Trial
 from ertis_cli.main import cli
 
 from ertis_numba.settings import Processing, Recording

@@ -4,7 +4,7 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from ertis_bench import campaign_scaling
+from ertis_bench.cpu_times import campaign_scaling
 from ertis_cli.main import cli
 
 from ertis_numba.campaign import Campaign

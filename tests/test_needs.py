@@ -8,8 +8,8 @@ import sys
 
 import numpy as np
 import pytest
-from ertis_bench.random_scenes import random_scene
-from ertis_bench.verdicts import Trial, with_one
+from ertis_bench.simulation_trials.random_scenes import random_scene
+from ertis_bench.simulation_trials.verdicts import Trial, with_one
 
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Emitter, Noise, Point, Scene, Sensor, Sonar, Wall

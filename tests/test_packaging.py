@@ -1,5 +1,6 @@
 """The installed package is complete."""
 
+import ast
 import configparser
 import os
 import subprocess
@@ -10,10 +11,26 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from ertis_cli import _examples
+from ertis_cli.bench import bench
 from ertis_cli.main import cli
 
 ROOT = Path(__file__).parents[1]
-IN_THE_REPOSITORY_ONLY = {f"ertis_bench.{name}" for name in ("health_trials", "passive", "peers", "platform_trials")}
+IN_THE_REPOSITORY_ONLY = {
+    f"ertis_bench.{name}"
+    for name in (
+        "cpu_times",
+        "error_trials",
+        "health_trials",
+        "network_trials",
+        "passive",
+        "peers",
+        "platform_trials",
+        "ptx",
+        "rejected_plans",
+        "simulation_trials",
+    )
+}
+IN_THE_WHEEL = {"accuracy", "gpu", "latency", "paper"}
 
 
 def test_every_package_is_listed():
@@ -61,17 +78,45 @@ def test_wheel_contains_every_example(wheel):
     assert {path.name for path in (ROOT / "ertis_numba" / "layouts").glob("*.toml")} <= layouts
 
 
-@pytest.mark.parametrize("name", ["fusion", "health", "map", "motion", "passive", "peers"])
-def test_benchmark_that_the_wheel_lacks_names_the_source_folder(monkeypatch, name):
-    for module in [*IN_THE_REPOSITORY_ONLY, *(each for each in sys.modules if "platform_trials." in each)]:
+def lacks(module):
+    """Return True for modules that the wheel lacks."""
+    return ".".join(module.split(".")[:2]) in IN_THE_REPOSITORY_ONLY
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [*([name] for name in sorted(bench.commands.keys() - IN_THE_WHEEL)), ["simulation", "--verdicts", "1"]],
+    ids=" ".join,
+)
+def test_benchmark_that_the_wheel_lacks_names_the_source_folder(monkeypatch, arguments):
+    for module in [*IN_THE_REPOSITORY_ONLY, *filter(lacks, sys.modules)]:
         monkeypatch.setitem(sys.modules, module, None)
-    done = CliRunner().invoke(cli, ["bench", name])
+    done = CliRunner().invoke(cli, ["bench", *arguments])
+    name = arguments[0]
     assert done.exit_code == 1
     assert (
         done.stderr
         == f"ertis: error: 'ertis bench {name}' exists only in the source folder; run 'pip install --editable .' in "
         "that folder\n"
     )
+
+
+def test_benchmarks_in_the_wheel_need_nothing_that_it_lacks(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        sources = {name: archive.read(name).decode() for name in archive.namelist() if name.startswith("ertis_bench/")}
+    assert {"ertis_bench/gpu.py", "ertis_bench/network/latency.py"} <= sources.keys()
+    for name, source in sources.items():
+        used = {word for node in ast.walk(ast.parse(source)) for word in _modules(node)}
+        assert not set(filter(lacks, used)), name
+
+
+def _modules(node):
+    """Return the modules that a node may import, and texts, which may be modules that a process runs."""
+    if isinstance(node, ast.Import):
+        return [each.name for each in node.names]
+    if isinstance(node, ast.ImportFrom):
+        return [f"{node.module}.{each.name}" for each in node.names]
+    return [node.value] if isinstance(node, ast.Constant) and isinstance(node.value, str) else []
 
 
 def test_wheel_is_small_and_contains_no_recording_and_no_test(wheel):

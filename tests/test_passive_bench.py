@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from ertis_bench import passive
 from ertis_bench.passive import agreement, false_alarms, separation, times
-from ertis_bench.passive_bearings import plane_wave_settings
+from ertis_bench.passive.bearings import plane_wave_settings
 
 from ertis_numba.errors import DataError
 

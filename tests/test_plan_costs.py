@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import costs as bench_costs
+from ertis_bench.cpu_times import costs as bench_costs
 from ertis_cli.main import cli
 
 from ertis_numba import kernels

@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 import pytest
-from ertis_bench.point_errors import Trials
+from ertis_bench.error_trials.point_errors import Trials
 
 N_TRIALS = 100
 LEAST, MOST = 0.54, 0.82  # chance moves 68 % by 4.7 points; this is three times as much

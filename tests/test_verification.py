@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import reference_image, verify_trials as campaign
-from ertis_bench.random_settings import Limits, random_measurement, random_settings
+from ertis_bench.error_trials import reference_image, verify_trials as campaign
+from ertis_bench.error_trials.random_settings import Limits, random_measurement, random_settings
 from ertis_cli.main import cli
 
 from ertis_numba import verification

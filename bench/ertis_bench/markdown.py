@@ -7,7 +7,7 @@ from pathlib import Path
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 
-__all__ = ["around", "place", "table", "update"]
+__all__ = ["around", "or_dash", "place", "table", "update"]
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: bool = True) -> str:
@@ -17,6 +17,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: bool =
     """
     rule = ["---", *["---:" if numbers else "---"] * (len(head) - 1)]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
+
+
+def or_dash(value: float | None, digits: int) -> str:
+    """Return a number with this many decimals, or a dash for None."""
+    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def update(path: Path, marker: str, text: str) -> None:

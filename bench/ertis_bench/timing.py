@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BURST", "round_robin", "summary"]
+__all__ = ["BURST", "in_words", "round_robin", "summary"]
 
 _WARM_UP = 3  # minimum number of warm-up calls
 # Minimum time of warm-up calls. After other work, threads need about a hundred short calls to settle on cores.
@@ -55,3 +55,8 @@ def summary(times_ms: NDArray[np.float64]) -> dict[str, float]:
         "std_ms": round(float(np.std(times_ms)), 3),
         "median_ms": round(float(np.median(times_ms)), 3),
     }
+
+
+def in_words(*, mean_ms: float, std_ms: float, median_ms: float, **_: object) -> str:
+    """Return the statistics of `summary` as text."""
+    return f"{mean_ms:.2f} ± {std_ms:.2f} ({median_ms:.2f})"

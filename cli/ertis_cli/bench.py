@@ -61,7 +61,10 @@ _update = click.option(
 
 @click.group()
 def bench() -> None:
-    """Run benchmarks of speed and accuracy."""
+    """Run benchmarks of speed and accuracy.
+
+    The wheel contains paper, accuracy, gpu and latency. The others exist only in the source folder.
+    """
 
 
 @bench.command()
@@ -143,8 +146,9 @@ def costs(*, count: int, targets: tuple[Path, ...], units: tuple[str, ...], quie
 
     Covers every instruction set of this machine. The table also has the nominal costs.
     """
-    from ertis_bench import costs as benchmark, markdown
+    from ertis_bench import markdown
 
+    benchmark = _in_source_folder("costs", "cpu_times.costs")
     for unit in units:
         if unit not in benchmark.UNITS:
             raise click.BadParameter(
@@ -177,9 +181,7 @@ def verification(**given: Any) -> None:
 
     Settings are random; nothing is timed.
     """
-    from ertis_bench import verify_trials as benchmark
-
-    _run("verification", benchmark, **given)
+    _run("verification", _in_source_folder("verification", "error_trials.verify_trials"), **given)
 
 
 @bench.command()
@@ -195,9 +197,7 @@ def beamformers(**given: Any) -> None:
 
     Includes weightings, at the default error budget.
     """
-    from ertis_bench import beamformers as benchmark
-
-    _run("beamformers", benchmark, **given)
+    _run("beamformers", _in_source_folder("beamformers", "cpu_times.beamformers"), **given)
 
 
 @bench.command()
@@ -210,9 +210,7 @@ def budgets(**given: Any) -> None:
 
     Distinguishes settings with and without a warning; nothing is timed.
     """
-    from ertis_bench import budgets as benchmark
-
-    _run("budgets", benchmark, **given)
+    _run("budgets", _in_source_folder("budgets", "error_trials.budgets"), **given)
 
 
 @bench.command()
@@ -228,9 +226,7 @@ def points(**given: Any) -> None:
 
     Varies grids, error budgets and noise; nothing is timed.
     """
-    from ertis_bench import point_errors as benchmark
-
-    _run("points", benchmark, **given)
+    _run("points", _in_source_folder("points", "error_trials.point_errors"), **given)
 
 
 @bench.command()
@@ -246,9 +242,7 @@ def points(**given: Any) -> None:
 @options.as_json
 def calibration(**given: Any) -> None:
     """Calibrate arrays with random errors, and count the faults found."""
-    from ertis_bench import calibration as benchmark
-
-    _run("calibration", benchmark, **given)
+    _run("calibration", _in_source_folder("calibration", "error_trials.calibration"), **given)
 
 
 @bench.command()
@@ -375,9 +369,7 @@ def scaling(**given: Any) -> None:
 
     Also varies the number of microphones.
     """
-    from ertis_bench import scaling as benchmark
-
-    _run("scaling", benchmark, **given)
+    _run("scaling", _in_source_folder("scaling", "cpu_times.scaling"), **given)
 
 
 @bench.command()
@@ -393,18 +385,15 @@ def scaling(**given: Any) -> None:
 @options.as_json
 def simulation(*, verdicts: int | None, **given: Any) -> None:
     """Time simulations with relevant and with all effects."""
-    from ertis_bench import simulation as benchmark
-
     if verdicts is None:
-        _run("simulation", benchmark, **given)
+        _run("simulation", _in_source_folder("simulation", "simulation_trials.simulation"), **given)
         return
-    from ertis_bench.verdicts import run
-
     from ertis_numba.errors import DataError
 
     if given["targets"]:
         raise click.UsageError("--verdicts writes no table; remove --update")
-    report = run(count=verdicts, say=lambda text: options.say(text, quiet=given["quiet"]))
+    trials = _in_source_folder("simulation", "simulation_trials.verdicts")
+    report = trials.run(count=verdicts, say=lambda text: options.say(text, quiet=given["quiet"]))
     if given["as_json"]:
         options.print_json(report)
     else:
@@ -436,9 +425,7 @@ def many(**given: Any) -> None:
 
     Compares all output files.
     """
-    from ertis_bench import campaign_scaling as benchmark
-
-    _run("many", benchmark, **given)
+    _run("many", _in_source_folder("many", "cpu_times.campaign_scaling"), **given)
 
 
 @bench.command()
@@ -450,9 +437,7 @@ def factorisation(**given: Any) -> None:
 
     Nothing is timed.
     """
-    from ertis_bench import factorisation as benchmark
-
-    _run("factorisation", benchmark, **given)
+    _run("factorisation", _in_source_folder("factorisation", "rejected_plans.factorisation"), **given)
 
 
 @bench.command()
@@ -464,9 +449,7 @@ def interpolation(**given: Any) -> None:
 
     Nothing is timed.
     """
-    from ertis_bench import delay_interpolation as benchmark
-
-    _run("interpolation", benchmark, **given)
+    _run("interpolation", _in_source_folder("interpolation", "rejected_plans.delay_interpolation"), **given)
 
 
 @bench.command()
@@ -478,9 +461,7 @@ def ptx(**given: Any) -> None:
 
     Compiles them for an H200; nothing is timed.
     """
-    from ertis_bench import ptx as benchmark
-
-    _run("ptx", benchmark, **given)
+    _run("ptx", _in_source_folder("ptx"), **given)
 
 
 @bench.command("health")
@@ -522,10 +503,9 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 
     Uses keys, and checks every sample and image.
     """
-    from ertis_bench.network import performance as benchmark
-
     from ertis_numba import checks
 
+    benchmark = _in_source_folder("network", "network_trials.performance")
     for part in only:
         checks.choice("--only", part, benchmark.PARTS)
     if given["duration_s"] is not None:

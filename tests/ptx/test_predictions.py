@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from ertis_bench import h200, instructions, markdown, ptx, tables
+from ertis_bench import markdown, ptx
+from ertis_bench.ptx import h200, instructions
 from ertis_cli.main import cli
 
 DOCS = Path(__file__).parents[2] / "docs" / "explanation" / "gpu.md"
@@ -73,7 +74,9 @@ def test_gpu_documentation_matches_the_compiled_code(report):
     here = ", ".join(f"{name} {number}" for name, number in report["compiled"].items())
     if made != here:
         pytest.skip(f"other compilers make other code: the page is of {made}, and here are {here}")
-    assert published.strip() == tables.ptx(report).strip(), "run: ertis bench ptx --update docs/explanation/gpu.md"
+    assert published.strip() == ptx.FORMS["ptx"](report).strip(), (
+        "run: ertis bench ptx --update docs/explanation/gpu.md"
+    )
 
 
 def test_gpu_loops_contain_only_needed_instructions(report):

@@ -11,7 +11,7 @@ from typing import Any, Final
 from ertis_bench import machine, serial_stream
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_bench.network import performance
+from ertis_bench.network import imaging
 from ertis_bench.network.oracle import read_diaries
 from ertis_bench.network.serving import percentile
 from ertis_numba.network.trace import VARIABLE
@@ -67,7 +67,7 @@ def _case(folder: Path, duration_s: float, seed: int, *, stores: bool) -> dict[s
     traces.mkdir()
     archive = folder / "recordings" if stores else None
     with _traced(traces):
-        found = performance.processing(
+        found = imaging.processing(
             folder, duration_s, seed, directions="90", n_sensors=4, rate_hz=10.0, goal="", archive=archive
         )
     arrived_ns = read_diaries([folder / "sender.ndjson"]).arrived_ns

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_bench.passive_bearings import BAND_HZ, NOISE_BAND_HZ, plane_wave_settings
+from ertis_bench.passive.bearings import BAND_HZ, NOISE_BAND_HZ, plane_wave_settings
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.cpu_cores import usable_cores
 from ertis_numba.frames import Measurement, Stamp

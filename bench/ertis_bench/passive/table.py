@@ -5,10 +5,10 @@ import importlib.util
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
-from ertis_bench import machine, passive_bearings
+from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_bench.passive import agreement, false_alarms, separation, times
+from ertis_bench.passive import agreement, bearings as passive_bearings, false_alarms, separation, times
 from ertis_bench.passive._acoular import PACKAGE
 
 __all__ = ["PARTS", "form", "run"]

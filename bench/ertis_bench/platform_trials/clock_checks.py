@@ -8,7 +8,7 @@ import numpy as np
 from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_bench.platform_scenes import EMITTERS_M, platform_scene, random_reflectors
+from ertis_bench.platform_trials.platform_scenes import EMITTERS_M, platform_scene, random_reflectors
 from ertis_numba.fusion import DirectSoundCheck
 from ertis_numba.settings import Processing, Recording
 from ertis_numba.simulation import Scene

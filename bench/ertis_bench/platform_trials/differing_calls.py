@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from ertis_bench.markdown import table
-from ertis_bench.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
+from ertis_bench.platform_trials.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
 from ertis_numba.frames import Energyscape, Measurement, PointCloud
 from ertis_numba.fusion import Fuser
 from ertis_numba.pipeline import Pipeline

@@ -6,8 +6,8 @@ from typing import Any, Final
 import numpy as np
 
 from ertis_bench.markdown import table
-from ertis_bench.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
 from ertis_bench.platform_trials.differing_calls import compared, points_of
+from ertis_bench.platform_trials.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
 
 __all__ = ["form", "run"]
 

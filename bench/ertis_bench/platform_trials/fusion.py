@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_bench.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
 from ertis_bench.platform_trials import clock_checks, differing_calls, emission_delays
+from ertis_bench.platform_trials.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion import Fused, Fuser

@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_bench.network.table import as_list
+from ertis_bench.network_trials.table import as_list
 
 from tests.faults.trials import command
 

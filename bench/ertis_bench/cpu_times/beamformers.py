@@ -14,7 +14,7 @@ from ertis_numba.beamformers import BEAMFORMERS, BeamformerName, WeightingName
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
 
-__all__ = ["form", "run"]
+__all__ = ["FORMS", "form", "run"]
 
 _DMAS_ORDERS: Final = (2, 3, 5)
 _MAX_ERROR_DB: Final = -20.0
@@ -107,3 +107,7 @@ def form(report: dict[str, Any]) -> str:
         "before the times. Predicted: as `ertis process` reports it."
     )
     return "\n\n".join([table(head, rows), f"Measured on {machine.sentence(report['machine'])}", conditions])
+
+
+FORMS = {"beamformers": form}
+"""Forms of the table, by the name in its markers."""

@@ -1,4 +1,4 @@
-"""Live view of acoustic maps, which checks some of them: ``python -m ertis_bench.network.map_viewer JOB``.
+"""Live view of acoustic maps, which checks some of them: ``python -m ertis_bench.network_trials.map_viewer JOB``.
 
 There is no browser, but the view draws every frame that a browser would show. It prints its counts after SIGUSR1.
 """
@@ -46,7 +46,7 @@ class MapViewerJob:
 
     def start(self) -> JsonLinesProcess:
         """Start the view."""
-        command = [sys.executable, "-m", "ertis_bench.network.map_viewer", json.dumps(asdict(self))]
+        command = [sys.executable, "-m", "ertis_bench.network_trials.map_viewer", json.dumps(asdict(self))]
         return JsonLinesProcess(command, stated=Path(self.stated))
 
 

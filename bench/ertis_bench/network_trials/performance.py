@@ -7,23 +7,20 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from ertis_bench import machine
-from ertis_bench.network import live_fusion, live_maps
+from ertis_bench.network.imaging import processing
 from ertis_bench.network.oracle import judged, read_diaries
 from ertis_bench.network.processes import central, survivors, until
 from ertis_bench.network.processor_time import ProcessorTime
-from ertis_bench.network.receiver import ReceiverJob, read_received
 from ertis_bench.network.sender import SETTINGS, SenderJob
-from ertis_bench.network.serving import Serve, accounts, create_keys, expected_of, percentile, some_words
+from ertis_bench.network.serving import create_keys, percentile
+from ertis_bench.network_trials import live_fusion, live_maps
+from ertis_bench.network_trials.table import network
 from ertis_numba import cluster
 from ertis_numba.errors import DataError
-from ertis_numba.settings import Settings
 
-__all__ = ["PARTS", "processing", "run", "storage"]
+__all__ = ["FORMS", "PARTS", "run", "storage"]
 
-_WARM_UP_S: Final = 3.0
 _STORAGE_S: Final = 300.0
 _OTHERS_S: Final = 60.0
 _CALIBRATION_S: Final = 8.0
@@ -125,108 +122,6 @@ def storage(
     } | judged(folder, archive, diaries)
 
 
-def processing(
-    folder: Path,
-    duration_s: float,
-    seed: int,
-    *,
-    directions: str,
-    n_sensors: int,
-    rate_hz: float,
-    goal: str,
-    part: str = "processing",
-    credit: int = 2,
-    scheduler: str | None = None,
-    archive: Path | None = None,
-) -> Found:
-    """Process the measurements of sensors here or on a dask cluster, and check the images in an application.
-
-    With ``archive``, the central node also stores the measurements in this folder.
-    """
-    sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
-    options, given, boss = create_keys(folder, sensors)
-    if scheduler is not None:
-        options += ["--scheduler", scheduler]
-    if archive is not None:
-        archive.mkdir()
-        options += ["--record", str(archive)]
-    settings = _settings(directions)
-    words = some_words(SETTINGS, folder / "words.npy", seed=seed)
-    expected = expected_of(settings, np.load(words), folder / "expected.npz")
-    diary, warm, images = folder / "sender.ndjson", folder / "warm.ndjson", folder / "images.ndjson"
-    with ExitStack() as stack:
-        serve = stack.enter_context(Serve.running(folder, "--directions", directions, *options, keys=boss))
-        boss_keys = (str(folder / "keys" / "boss.secret.toml"), boss.server)
-        look = ReceiverJob(
-            address=serve.publish, diary=str(images), expected=str(expected), keys=boss_keys, credit=credit
-        )
-        receiver = stack.enter_context(look.start())
-        receiver.wait_for("subscribed")
-        job = SenderJob(address=serve.listen, diary=str(warm), sensors=tuple(sensors), rate_hz=5.0, words=str(words))
-        job = job.replace(small=False, keys=given, seed=seed)
-        # Pipelines are created before the measurement starts.
-        with job.replace(count=round(5.0 * _WARM_UP_S)).start() as first:
-            first.wait_for("sent", timeout_s=120.0)
-        until(lambda: bool(read_received(images).numbers), timeout_s=120.0)
-        time.sleep(_WARM_UP_S)
-        before = read_diaries([warm])
-        serve.settle(len(before.kept))
-        begun = accounts(serve, before, read_received(images))
-        sender = stack.enter_context(
-            job.replace(diary=str(diary), rate_hz=rate_hz, count=round(duration_s * rate_hz)).start()
-        )
-        sender.wait_for("begun")
-        load = ProcessorTime(serve.processes() | {"sensor nodes": [sender.pid], "application": [receiver.pid]})
-        n_before = len(read_received(images).numbers)
-        end_s = time.monotonic() + duration_s - 1.0
-        while time.monotonic() < end_s:
-            serve.look(timeout_s=1.0)
-        n_images = len(read_received(images).numbers) - n_before
-        cpu_percent, cpu_ms = load.percent(), load.rows(n_images)
-        sender.wait_for("sent", timeout_s=duration_s + 60.0)
-        sent = read_diaries([warm, diary])
-        serve.settle(len(sent.kept))
-        serve.deliver(images)
-        receiver.signal(15)
-        receiver.wait()
-        received = read_received(images)
-        found = _since(begun, accounts(serve, sent, received))
-        status = serve.latest
-        serve.node.stop()
-    measured = read_diaries([diary]).offered
-    times_ms = [time_ms for key, time_ms in received.times_ms.items() if key in measured]
-    choice = "" if status is None or status.processing is None else status.processing.choice
-    return found | {
-        "part": part,
-        "directions": directions,
-        "sensors": n_sensors,
-        "rate_hz": rate_hz,
-        "goal": goal,
-        "choice": choice,
-        "p50_ms": percentile(times_ms, 0.5),
-        "p90_ms": percentile(times_ms, 0.9),
-        "p99_ms": percentile(times_ms, 0.99),
-        "slowest_ms": percentile(times_ms, 1.0),
-        "cpu_percent": cpu_percent,
-        "cpu_ms": cpu_ms,
-        "cpu_total_ms": sum(time_ms for *_, time_ms in cpu_ms),
-    }
-
-
-def _since(begun: Found, found: Found) -> Found:
-    """Return counts without those from the time before pipelines were created.
-
-    Counts of faults include that time.
-    """
-    since = {name: found[name] - begun[name] for name in ("sent", "received", "published", "images", "skipped")}
-    dropped = {name: count - begun["dropped"].get(name, 0) for name, count in found["dropped"].items()}
-    return found | since | {"dropped": {name: count for name, count in dropped.items() if count}}
-
-
-def _settings(directions: str) -> Settings:
-    return SETTINGS.replace(processing=SETTINGS.processing.replace(directions=directions))
-
-
 def _overload(folder: Path, duration_s: float, seed: int) -> Found:
     """Measure the rate of images under full load, then send twice that rate."""
     (folder / "calibration").mkdir()
@@ -292,3 +187,7 @@ PARTS: dict[str, tuple[str, Callable[[Path, float, int], Found]]] = {
     "cluster": ("90 directions, 4 sensors × 10 Hz, with own workers and on a dask cluster", _cluster),
 }
 """Measurements by name, each with its progress message and its function."""
+
+
+FORMS = {"network": network}
+"""Forms of the table, by the name in its markers."""

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from ertis_bench import machine
-from ertis_bench.faulty_arrays import calibration_errors, faulty_array, image_losses, record
+from ertis_bench.error_trials.faulty_arrays import calibration_errors, faulty_array, image_losses, record
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_numba.calibration import calibrate
 
-__all__ = ["form", "run"]
+__all__ = ["FORMS", "form", "run"]
 
 _QUANTITIES = ("gain (dB)", "delay (µs)", "x (mm)", "y (mm)", "z (mm)")
 _RECORDINGS = 20
@@ -100,3 +100,7 @@ def form(report: dict[str, Any]) -> str:
         f"calibration takes {report['median_s']:.1f} s (median) to {report['longest_s']:.1f} s. "
         f"{sentence(report['machine'])}"
     )
+
+
+FORMS = {"calibration": form}
+"""Forms of the table, by the name in its markers."""

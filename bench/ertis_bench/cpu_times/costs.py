@@ -62,7 +62,7 @@ def run(*, count: int, say: Callable[[str], None], units: Collection[str] = UNIT
         found[f"{device} {kernel_set.instruction_set}".strip()] = _medians(device, count, measured)
     for name in instruction_sets.lesser():
         say(f"device cpu, {name}: measuring {count} times")
-        with instruction_sets.start(name, ["-m", "ertis_bench.costs", str(count), *measured]) as child:
+        with instruction_sets.start(name, ["-m", "ertis_bench.cpu_times.costs", str(count), *measured]) as child:
             found[f"cpu {name}"] = json.loads(child.communicate()[0])
     if not is_whole:
         found = {device: _scaled(device, costs, units) for device, costs in found.items()}

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_bench.markdown import or_dash, table
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.settings import Processing, Settings
@@ -18,7 +19,7 @@ from ertis_numba.stages.error_model import decibels
 from ertis_numba.stages.interpolation_fit import one_thread
 from ertis_numba.stages.plan_elements import spectrum_of
 
-__all__ = ["CASES", "run"]
+__all__ = ["CASES", "FORMS", "form", "run"]
 
 CASES = (
     (32, "3000"),
@@ -118,3 +119,20 @@ def _node_products(
         return None
     count = aperture.count_grid_points(aperture.spacing(density, high_hz=high_hz, sound_speed_m_s=speed_m_s), n_taps)
     return count * len(part_m) * _DELAY_TAPS * _COMPLEX
+
+
+def form(report: dict[str, Any]) -> str:
+    """Return products per bin for direct sums, a beam grid of the whole array, and beam grids of its parts."""
+    parts = list(report["rows"][0]["parts"])
+    head = ["microphones", "directions", "no beam grid", "beam grid of the whole array"]
+    head += [f"of {n} sub-arrays" for n in parts[1:]]
+    rows = [
+        [str(row["microphones"]), str(row["directions"]), str(row["direct"])]
+        + [or_dash(row["parts"][n], 0) for n in parts]
+        for row in report["rows"]
+    ]
+    return table(head, rows)
+
+
+FORMS = {"factorisation": form}
+"""Forms of the table, by the name in its markers."""

@@ -1,4 +1,4 @@
-"""Application that fuses images, and checks them: ``python -m ertis_bench.network.fused_receiver JOB``."""
+"""Application that fuses images, and checks them: ``python -m ertis_bench.network_trials.fused_receiver JOB``."""
 
 import json
 import os
@@ -65,7 +65,7 @@ class FusedReceiverJob:
 
     def start(self) -> JsonLinesProcess:
         """Start the receiver. Its stderr goes to a file beside its diary."""
-        command = [sys.executable, "-m", "ertis_bench.network.fused_receiver", json.dumps(asdict(self))]
+        command = [sys.executable, "-m", "ertis_bench.network_trials.fused_receiver", json.dumps(asdict(self))]
         return JsonLinesProcess(command, stated=Path(self.diary).with_suffix(".txt"))
 
 

@@ -1,4 +1,4 @@
-"""Markdown report of `figures`."""
+"""Markdown report of `performance`."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ertis_bench import h200, input_measurements
-from ertis_bench.instructions import kinds, parse
+from ertis_bench import input_measurements
 from ertis_bench.paper import DIRECTIONS, RANGE_M
+from ertis_bench.ptx import h200
+from ertis_bench.ptx.instructions import kinds, parse
 from ertis_numba.kernels import KernelSet
 from ertis_numba.kernels._cuda import offline_compilation
 from ertis_numba.settings import Settings

@@ -8,13 +8,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_bench.network.fused_receiver import FusedPulse, FusedReceiverJob, read_fused
 from ertis_bench.network.oracle import read_diaries
 from ertis_bench.network.processes import until
 from ertis_bench.network.processor_time import ProcessorTime
 from ertis_bench.network.sender import SETTINGS, SenderJob
 from ertis_bench.network.serving import Serve, create_keys, percentile
-from ertis_bench.platform_scenes import EMITTERS_M, platform_scene, random_reflectors
+from ertis_bench.network_trials.fused_receiver import FusedPulse, FusedReceiverJob, read_fused
+from ertis_bench.platform_trials.platform_scenes import EMITTERS_M, platform_scene, random_reflectors
 from ertis_numba.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Scene

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench.instructions import Instruction, kinds, loops, way
+from ertis_bench.ptx.instructions import Instruction, kinds, loops, way
 from ertis_numba.kernels._cuda.beam_sums import DIRECTIONS, TILE
 
 __all__ = ["ASSUMED", "CC", "GPU", "LOOPS", "Loop", "main_loop", "predicted_us", "resident_warps"]

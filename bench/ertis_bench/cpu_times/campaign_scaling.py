@@ -22,7 +22,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
 
-__all__ = ["many", "run"]
+__all__ = ["FORMS", "form", "run"]
 
 _MEASUREMENTS: Final = 20  # per recording
 # Fixed creation time of all files, without which their bytes would differ.
@@ -173,7 +173,7 @@ def _row(name: str, times_s: dict[str, list[tuple[float, float]]]) -> dict[str, 
     }
 
 
-def many(report: dict[str, Any]) -> str:
+def form(report: dict[str, Any]) -> str:
     """Return the times and ratios, and the conditions of the measurement."""
     each = report["recordings"] * report["measurements"]
     head = ["configuration", "time, s", "speed-up", "time without the start, s", "speed-up", "measurements/s"]
@@ -198,3 +198,7 @@ def many(report: dict[str, Any]) -> str:
         "configurations were equal, byte by byte, and an image was compared with the exact one."
     )
     return "\n\n".join([_table(head, rows), f"Measured on {sentence(report['machine'])}", conditions])
+
+
+FORMS = {"many": form}
+"""Forms of the table, by the name in its markers."""

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_bench import machine
+from ertis_bench.error_trials.random_settings import Limits, recorded
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.network.processes import ask
-from ertis_bench.random_settings import Limits, recorded
 from ertis_numba import verification
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
@@ -27,7 +27,7 @@ from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, S
 from ertis_numba.storage import open_energyscapes, write_recording
 from ertis_numba.waveform import call_at
 
-__all__ = ["form", "measurement_of", "run", "tried"]
+__all__ = ["FORMS", "form", "measurement_of", "run", "tried"]
 
 _FLOOR_DB: Final = -100.0  # Below this level, rounding in single precision dominates the error.
 _DIRECTIONS: Final = 24  # compared with the exact image
@@ -241,3 +241,7 @@ def _lines(rows: Sequence[dict[str, Any]]) -> Iterator[list[str]]:
         kept = outcomes.count("kept") + outcomes.count("kept, warned")
         counts = (kept, outcomes.count("warned"), outcomes.count("missed"), outcomes.count("kept, warned"))
         yield [name, str(len(outcomes)), *map(str, counts)]
+
+
+FORMS = {"budgets": form}
+"""Forms of the table, by the name in its markers."""

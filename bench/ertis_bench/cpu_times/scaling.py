@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from ertis_bench import checks, input_measurements, machine, timing
+from ertis_bench.machine import sentence
+from ertis_bench.markdown import table
 from ertis_numba import kernels
 from ertis_numba.kernels._cpu import ceilings
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Settings
 
-__all__ = ["OPERATIONS_PER_POINT", "SERIES", "reached", "run"]
+__all__ = ["FORMS", "OPERATIONS_PER_POINT", "SERIES", "form", "reached", "run"]
 
 OPERATIONS_PER_POINT = 8  # one complex multiply-add per direction, range and microphone, without a beam grid
 _PRECISIONS = ("float32", "int16")
@@ -174,3 +176,58 @@ def reached(rows: list[dict[str, Any]], precision: str, ceiling: dict[str, float
         "written_gb_s": round(float(written_gb_s), 2),
         "of_copy": round(float(written_gb_s) * 2 / ceiling["copy_gb_s"], 3),
     }
+
+
+def form(report: dict[str, Any]) -> str:
+    """Return one table per series, the limits, and the reached shares."""
+    series: dict[str, list[list[str]]] = {}
+    for row in report["rows"]:
+        sums = "" if row["plan"] == "default" else f", no beam grid, {row['plan']}"
+        name = row["series"].replace("_m", ", m").replace("_", " ") + sums
+        series.setdefault(name, []).append([f"{row['value']:g}", timing.in_words(**row), f"{row['n_ranges']}"])
+    parts = [table([name, "ms, mean ± std (median)", "ranges"], rows) for name, rows in series.items()]
+    columns = {
+        "threads": "threads",
+        "copy_gb_s": "copy, GB/s",
+        "triad_gb_s": "triad, GB/s",
+        "float32_gop_s": "float32 multiply-add, Gop/s",
+        "int16_gop_s": "16-bit dot product, Gop/s",
+    }
+    measured = [key for key in columns if key in report["ceilings"][0]]
+    rows = [[f"{row[key]:g}" for key in measured] for row in report["ceilings"]]
+    parts.append(table([columns[key] for key in measured], rows))
+    parts += [_reached(**reached) for reached in report["delay_and_sum"]]
+    parts.append(f"Measured on {sentence(report['machine'])}")
+    parts.append(
+        f"{report['count']} measurements per line, device `cpu`, white noise, the lines of a table in turns of "
+        f"{timing.BURST}. Other values are 1850 directions, 0.5–5 m, 32 microphones and all threads. Each line has "
+        "the default plan for its settings. If a precision is named, every direction is summed without a beam grid, "
+        "with one sample per microphone. A batch contains several measurements, and the time is that of one of them. "
+        "Every image was compared with the exact one before it was timed; "
+        "warm-up calls of a fifth of a second are excluded. "
+        "Limits are the best of as many runs, over arrays of 64 MiB and in "
+        "registers; a multiplication and an addition are two operations."
+    )
+    return "\n\n".join(parts)
+
+
+def _reached(
+    *,
+    precision: str,
+    us_per_direction: float,
+    rest_of_chain_ms: float,
+    gop_s: float,
+    of_arithmetic: float,
+    written_gb_s: float,
+    of_copy: float,
+) -> str:
+    return (
+        f"Delay-and-sum with envelope in {precision} takes {us_per_direction:.2f} µs per direction (the slope over "
+        f"directions; the rest of the chain takes {rest_of_chain_ms:.2f} ms). That is {gop_s:.0f} Gop/s, "
+        f"{100 * of_arithmetic:.0f} % of the rate of the arithmetic alone. Its images are written at "
+        f"{written_gb_s:.2f} GB/s, {100 * of_copy:.0f} % of the rate of a copy."
+    )
+
+
+FORMS = {"scaling": form}
+"""Forms of the table, by the name in its markers."""

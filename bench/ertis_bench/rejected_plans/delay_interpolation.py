@@ -16,7 +16,7 @@ from ertis_numba.stages.error_model import decibels
 from ertis_numba.stages.interpolation_fit import DelayFit, Spectrum
 from ertis_numba.stages.plan_elements import spectrum_of
 
-__all__ = ["TEXTBOOK", "fitted_error", "form", "run", "textbook_error"]
+__all__ = ["FORMS", "TEXTBOOK", "fitted_error", "form", "run", "textbook_error"]
 
 TEXTBOOK = {
     "nearest sample": (1, False),
@@ -81,3 +81,7 @@ def _error(spectrum: Spectrum, step_s: float, weights: NDArray[Any], gain: NDArr
     made = gain[:, None] * (np.exp(phase * np.arange(len(weights))) @ weights)
     wrong = made - np.exp(phase * _fractions(len(weights)))
     return float(spectrum.power @ np.mean(np.abs(wrong) ** 2, axis=1))
+
+
+FORMS = {"interpolation": form}
+"""Forms of the table, by the name in its markers."""

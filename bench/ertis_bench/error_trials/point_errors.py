@@ -24,7 +24,7 @@ from ertis_numba.stages import planner
 from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.waveform import call_at
 
-__all__ = ["BUDGETS_DB", "GRIDS", "RATIOS", "Trials", "form", "run"]
+__all__ = ["BUDGETS_DB", "FORMS", "GRIDS", "RATIOS", "Trials", "form", "run"]
 
 GRIDS: Final = ("2d:181", "3d:600", "3d:3000")
 BUDGETS_DB: Final = (-100.0, -35.0, -20.0)
@@ -173,3 +173,7 @@ def form(report: dict[str, Any]) -> str:
 def _cell(row: dict[str, Any]) -> str:
     shares = " / ".join(f"{within:.0%}" for within in row["within"])
     return f"{shares} ({' / '.join(f'{largest:.1f}' for largest in row['largest'])})"
+
+
+FORMS = {"points": form}
+"""Forms of the table, by the name in its markers."""

@@ -1,4 +1,4 @@
-"""Markdown report of `ptx`."""
+"""Markdown report of `predictions`."""
 
 from typing import Any
 

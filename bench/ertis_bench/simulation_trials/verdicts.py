@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench.random_scenes import varied_scene
+from ertis_bench.simulation_trials.random_scenes import varied_scene
 from ertis_numba import kernels
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Settings

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from ertis_bench import machine, reference_image
+from ertis_bench import machine
+from ertis_bench.error_trials import reference_image
+from ertis_bench.error_trials.random_settings import random_measurement
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_bench.random_settings import random_measurement
 from ertis_numba import verification
 from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
 from ertis_numba.errors import ArgumentError, DataError
@@ -17,7 +18,7 @@ from ertis_numba.geometry import unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
 
-__all__ = ["MAX_DIFFERENCE_DB", "compared", "form", "run"]
+__all__ = ["FORMS", "MAX_DIFFERENCE_DB", "compared", "form", "run"]
 
 MAX_DIFFERENCE_DB = 1.0
 """Largest difference between verified and true errors that is not reported as wrong."""
@@ -113,3 +114,7 @@ def _lines(rows: Sequence[dict[str, Any]]) -> Iterator[list[str]]:
         largest_db = max((abs(row["verified_db"] - row["true_db"]) for row in audible), default=0.0)
         wrong = sum(row["wrong"] for row in mine)
         yield [name, str(len(mine)), str(len(audible)), str(wrong), f"{largest_db:.3f} dB"]
+
+
+FORMS = {"verification": form}
+"""Forms of the table, by the name in its markers."""

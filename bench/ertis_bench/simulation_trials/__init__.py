@@ -1,0 +1,1 @@
+"""Times of simulations, and trials of the choice of their effects."""
