@@ -10,10 +10,11 @@ import pytest
 from ertis_bench import machine
 from ertis_bench.network import serving
 from ertis_bench.network.diary import Diary, DiaryKey, Row
-from ertis_bench.network.oracle import Sent, compare, judged as judged_by_checker, read_diaries, read_folder
 from ertis_bench.network.processes import central
 from ertis_bench.network.receiver import Received, read_received
 from ertis_bench.network.sender import SMALL, SenderJob, words_of
+from ertis_bench.network.sent import Sent, read_diaries
+from ertis_bench.network_trials.oracle import compare, judged as judged_by_checker, read_folder
 
 from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement, Stamp

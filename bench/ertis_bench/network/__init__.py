@@ -1,1 +1,1 @@
-"""Benchmark of the network, and the oracle that verifies it."""
+"""Benchmark of the latency of the network, and its processes, which other benchmarks and trials share."""

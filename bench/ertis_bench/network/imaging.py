@@ -7,11 +7,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_bench.network.oracle import read_diaries
 from ertis_bench.network.processes import until
 from ertis_bench.network.processor_time import ProcessorTime
 from ertis_bench.network.receiver import ReceiverJob, read_received
 from ertis_bench.network.sender import SETTINGS, SenderJob
+from ertis_bench.network.sent import read_diaries
 from ertis_bench.network.serving import Serve, accounts, create_keys, expected_of, percentile, some_words
 from ertis_numba.settings import Settings
 

@@ -12,7 +12,7 @@ from ertis_bench import machine, serial_stream
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.network import imaging
-from ertis_bench.network.oracle import read_diaries
+from ertis_bench.network.sent import read_diaries
 from ertis_bench.network.serving import percentile
 from ertis_numba.network.trace import VARIABLE
 

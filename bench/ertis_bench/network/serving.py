@@ -11,9 +11,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench.network.oracle import Sent
 from ertis_bench.network.processes import JsonLinesProcess, central, survivors, until
 from ertis_bench.network.receiver import STEP, Received, read_received
+from ertis_bench.network.sent import Sent
 from ertis_numba.frames import Measurement
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair

@@ -8,10 +8,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_bench.network.oracle import read_diaries
 from ertis_bench.network.processes import until
 from ertis_bench.network.processor_time import ProcessorTime
 from ertis_bench.network.sender import SETTINGS, SenderJob
+from ertis_bench.network.sent import read_diaries
 from ertis_bench.network.serving import Serve, create_keys, percentile
 from ertis_bench.network_trials.fused_receiver import FusedPulse, FusedReceiverJob, read_fused
 from ertis_bench.platform_trials.platform_scenes import EMITTERS_M, platform_scene, random_reflectors

@@ -7,10 +7,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network.oracle import read_diaries
 from ertis_bench.network.processes import JsonLinesProcess
 from ertis_bench.network.processor_time import ProcessorTime
 from ertis_bench.network.sender import SETTINGS, SenderJob
+from ertis_bench.network.sent import read_diaries
 from ertis_bench.network.serving import Serve, create_keys, some_words
 from ertis_bench.network_trials.map_viewer import MapViewerJob
 

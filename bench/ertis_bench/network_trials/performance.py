@@ -9,12 +9,13 @@ from typing import Any, Final
 
 from ertis_bench import machine
 from ertis_bench.network.imaging import processing
-from ertis_bench.network.oracle import judged, read_diaries
 from ertis_bench.network.processes import central, survivors, until
 from ertis_bench.network.processor_time import ProcessorTime
 from ertis_bench.network.sender import SETTINGS, SenderJob
+from ertis_bench.network.sent import read_diaries
 from ertis_bench.network.serving import create_keys, percentile
 from ertis_bench.network_trials import live_fusion, live_maps
+from ertis_bench.network_trials.oracle import judged
 from ertis_bench.network_trials.table import network
 from ertis_numba import cluster
 from ertis_numba.errors import DataError

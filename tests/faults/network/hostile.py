@@ -12,9 +12,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network.oracle import judged, read_diaries
 from ertis_bench.network.processes import JsonLinesProcess, central, until
 from ertis_bench.network.sender import SenderJob
+from ertis_bench.network.sent import read_diaries
+from ertis_bench.network_trials.oracle import judged
 
 from ertis_numba.errors import DataError
 from ertis_numba.network import messages

@@ -8,9 +8,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network.oracle import judged, read_diaries, read_folder, tracebacks
 from ertis_bench.network.processes import ERTIS, JsonLinesProcess, survivors, until
 from ertis_bench.network.sender import SenderJob
+from ertis_bench.network.sent import read_diaries
+from ertis_bench.network_trials.oracle import judged, read_folder, tracebacks
 
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import KeyPair

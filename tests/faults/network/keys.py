@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 from ertis_bench.network.diary import Diary, DiaryKey, Row
-from ertis_bench.network.oracle import judged
 from ertis_bench.network.processes import until
 from ertis_bench.network.sender import SMALL
+from ertis_bench.network_trials.oracle import judged
 
 from ertis_numba.errors import ErtisError
 from ertis_numba.frames import Measurement, Stamp

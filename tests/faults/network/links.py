@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from click.testing import CliRunner
-from ertis_bench.network.oracle import judged, read_diaries
 from ertis_bench.network.processes import JsonLinesProcess, until
 from ertis_bench.network.sender import SenderJob
+from ertis_bench.network.sent import read_diaries
+from ertis_bench.network_trials.oracle import judged
 from ertis_cli.main import cli
 
 from ertis_numba.errors import DataError

@@ -6,11 +6,12 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network.oracle import read_diaries, tracebacks
 from ertis_bench.network.processes import JsonLinesProcess, until
 from ertis_bench.network.receiver import ReceiverJob, read_received
 from ertis_bench.network.sender import SMALL, SenderJob
+from ertis_bench.network.sent import read_diaries
 from ertis_bench.network.serving import Serve, accounts, percentile, some_words
+from ertis_bench.network_trials.oracle import tracebacks
 
 __all__ = ["overload", "subscribers"]
 

@@ -12,9 +12,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network.oracle import judged, read_diaries
 from ertis_bench.network.processes import JsonLinesProcess, central, until
 from ertis_bench.network.sender import SenderJob
+from ertis_bench.network.sent import read_diaries
+from ertis_bench.network_trials.oracle import judged
 
 from tests.faults.network.fuzz import inputs
 from tests.faults.network.kills import RestartedRecorder

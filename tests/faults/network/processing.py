@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from ertis_bench.network.oracle import judged, read_diaries, tracebacks
 from ertis_bench.network.processes import survivors, until
 from ertis_bench.network.receiver import ReceiverJob, read_received
 from ertis_bench.network.sender import SMALL, SenderJob
+from ertis_bench.network.sent import read_diaries
 from ertis_bench.network.serving import Serve, accounts, expected_of, some_words
+from ertis_bench.network_trials.oracle import judged, tracebacks
 
 from ertis_numba.network.messages import Group
 from ertis_numba.network.subscriber import Subscriber

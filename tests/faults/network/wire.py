@@ -13,9 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench.network.oracle import judged, read_diaries
 from ertis_bench.network.processes import until
 from ertis_bench.network.sender import SenderJob
+from ertis_bench.network.sent import read_diaries
+from ertis_bench.network_trials.oracle import judged
 
 from ertis_numba.errors import DataError, ErtisError
 from ertis_numba.network.central_client import CentralClient

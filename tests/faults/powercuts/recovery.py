@@ -6,8 +6,9 @@ from collections.abc import Callable, Set as AbstractSet
 from pathlib import Path
 
 from ertis_bench.network.diary import DiaryKey, Row
-from ertis_bench.network.oracle import Archived, Sent, compare, read_folder
 from ertis_bench.network.processes import ask
+from ertis_bench.network.sent import Sent
+from ertis_bench.network_trials.oracle import Archived, compare, read_folder
 
 from ertis_numba.errors import ErtisError
 from ertis_numba.journal import SUFFIX

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_bench.network.diary import DiaryKey, Row
-from ertis_bench.network.oracle import Sent, note
 from ertis_bench.network.processes import ERTIS, JsonLinesProcess
 from ertis_bench.network.sender import SenderJob
+from ertis_bench.network.sent import Sent, note
 
 from ertis_numba.errors import DataError
 from tests.faults import captures
