@@ -73,6 +73,7 @@ RUN_BY = {
         "test_network_page::test_network_page_on_one_machine_runs",
         "test_network_page::test_network_page_on_several_machines_runs",
     ],
+    ("nav2", "$"): ["test_guide::test_files_of_the_nav2_page_are_examples"],
     ("network", "python"): ["test_guide::test_code_of_the_network_page_runs"],
     ("numpy", "python"): [
         "test_numpy_page::test_page_examples_run",
@@ -175,6 +176,13 @@ def test_commands_of_the_guide_run(place, name):
     for command in commands_in(page(name)):
         run_here(place, command)
     assert (place / "REC.energy.h5").exists()
+
+
+def test_files_of_the_nav2_page_are_examples(place):
+    (command,) = commands_in(page("nav2"))
+    run_here(place, command)
+    for name in ("platform.toml", "nav2.yaml", "nav2.launch.py", "nav2.rviz"):
+        assert (place / name).exists()
 
 
 def test_code_of_the_concepts_page_runs(place):
