@@ -62,6 +62,15 @@ def test_platform_at_rest_does_not_move_with_a_person(way_m, count):
     assert odometry.poses[-1].is_measured == (count == 12)
 
 
+def test_smooth_walls_on_both_sides_are_not_evidence_of_standing_still():
+    """The nearest points of walls, and of their mirror images, move with the platform along a corridor."""
+    walls = np.array([[0.0, y_m, 0.0] for y_m in (-6.0, -3.6, -1.2, 1.2, 3.6, 6.0)])
+    odometry = ertis.Odometry(MOUNTINGS)
+    for pulse in range(3):
+        odometry.add([seen_from((0, 0, 0), walls, pulse)])
+    assert [pose.is_measured for pose in odometry.poses[1:]] == [False, False]
+
+
 def test_ego_velocity_refuses_a_single_moving_object():
     groups = [[seen_from((0, 0, 0), walker(pulse, PERSON, (0.1, 0.05)), pulse)] for pulse in (0, 1)]
     with pytest.raises(

@@ -22,6 +22,8 @@ _REACH: Final = 8.0  # Largest residual of a pair that a fit may use, in standar
 _OUTLIER: Final = math.exp(-0.5 * 9.0)  # Likelihood of an echo without a partner: three standard deviations.
 # All echoes of a person are within this distance, so they are evidence of one place only.
 _PLACE_M: Final = 0.7
+# Smooth walls reflect from their nearest point, which moves with the platform, so that it seems to stand still.
+_BESIDE_M: Final = 0.25
 
 
 class MotionHypothesis(NamedTuple):
@@ -33,7 +35,8 @@ class MotionHypothesis(NamedTuple):
     weight : (pair,) float64
         Probability of each pair.
     n_matches, n_places : int
-        Number of echoes, and of places at least 0.7 m apart, that the displacement explains.
+        Number of echoes, and of places at least 0.7 m apart, that the displacement explains. Places on one line
+        through the platform count as one.
     support : float
         Sum of the strengths of the strongest echoes of all places.
     """
@@ -61,12 +64,21 @@ def _described(flow: EchoFlow, pairs: EchoPairs, displacement: Floats, weight: F
     strength = flow.strengths(pairs)[is_match]
     order = np.argsort(-strength, kind="stable")
     place_m, strength = flow.before.position_m[pairs.before[is_match], :2][order], strength[order]
-    n_matches, n_places, support = len(order), 0, 0.0
+    support, places_m = 0.0, []
     while len(place_m):
-        n_places, support = n_places + 1, support + float(strength[0])
+        places_m.append(place_m[0])
+        support += float(strength[0])
         is_far = np.hypot(*(place_m - place_m[0]).T) > _PLACE_M
         place_m, strength = place_m[is_far], strength[is_far]
-    return MotionHypothesis(displacement, weight, n_matches, n_places, support)
+    return MotionHypothesis(displacement, weight, len(order), _n_independent(places_m), support)
+
+
+def _n_independent(places_m: list[Floats]) -> int:
+    """Return the number of places; one if all lie on a line through the platform, as mirror images of walls do."""
+    if not places_m:
+        return 0
+    beside_m = np.linalg.svd(np.array(places_m), compute_uv=False)[-1] / math.sqrt(len(places_m))
+    return 1 if beside_m < _BESIDE_M else len(places_m)
 
 
 def refined(flow: EchoFlow, pairs: EchoPairs, displacement: Floats, scales: tuple[float, ...]) -> tuple[Floats, Floats]:
