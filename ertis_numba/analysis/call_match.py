@@ -49,6 +49,7 @@ _MAX_NOISE: Final = 10**-1.4
 _SHARP: Final = 1.3  # Ratio of bandwidths at these levels; that of transducers is above 1.4.
 _MAX_SHARE: Final = 0.75  # Bandwidth of the echoes of another call relative to that of the call.
 _MIN_SHARE: Final = 0.5  # Bandwidth without sharp edges, below which the call is not known.
+_MAX_SWEEP_HZ: Final = 190e3  # What fills the record up to 200 kHz is noise of modulators, or a click.
 _MIN_BANDWIDTH_HZ: Final = 12e3  # Bandwidth of a call that is no tone.
 
 
@@ -130,7 +131,9 @@ def call_match(measurement: Measurement) -> CallMatch | None:
     if _is_heard(sound, call) and _is_alone(sound, call):
         return CallMatch(matches=True)
     found = find_sweep(sound)
-    return None if found is None else _compared(sound, found, call)
+    if found is None or found.sweep.high_hz > _MAX_SWEEP_HZ:
+        return CallMatch(matches=True) if _is_heard(sound, call) else None
+    return _compared(sound, found, call)
 
 
 def _filter_rad(call: Call, sound: SoundSpectra, part: slice) -> NDArray[np.float64]:
