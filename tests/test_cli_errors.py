@@ -145,7 +145,7 @@ CASES = {
         1,
         "key.toml, line 2, air: unknown key `tempreature_c`",
     ),
-    "not TOML": ("process rec.h5 -o out.h5 --settings nan.csv", 1, "nan.csv: "),
+    "not TOML": ("process rec.h5 -o out.h5 --settings nan.csv", 1, "nan.csv is not TOML; choose a settings file"),
     "missing settings": ("process rec.h5 -o out.h5 --settings none.toml", 1, "none.toml: No such file"),
     "other length": ("process rec.h5 -o out.h5 --settings long.toml", 1, "give the settings that it was recorded with"),
     # outputs

@@ -39,6 +39,7 @@ def settings_with(positions_m, band_hz, directions, azimuth=(-90.0, 90.0), eleva
         ertis.Settings()
         .replace(array=Array(positions_m=tuple(map(tuple, np.asarray(positions_m).tolist()))))
         .replace("passive.bands_hz", (band_hz,))
+        .replace("recording.n_samples", 655_360)  # Blocks last long enough for sound to cross 3 m.
         .replace(
             **{
                 "processing.mode": "passive",

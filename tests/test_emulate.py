@@ -424,7 +424,7 @@ def test_pulse_preparation_survives_a_rendering_error():
     ("arguments", "message"),
     [
         (["--log", "{recording}"], "is no log of 'ertis emulate'; choose another file"),
-        (["--sensor", ""], "has no sensor ''"),
+        (["--sensor", ""], "--sensor is empty; write a value, or leave it out"),
     ],
 )
 def test_foolish_options_are_refused_before_a_device_starts(recording, arguments, message):

@@ -141,7 +141,11 @@ def test_export_accepts_changing_air_except_in_npz(tmp_path):
 
 
 CASES = {
-    "no ending": ("rec.h5 -o a.xyz", 1, "known are .mcap, .ply, .pcd, .csv, .npz, .h5, .mat, .tum, .wav"),
+    "no ending": (
+        "rec.h5 -o a.xyz",
+        1,
+        "choose a name that ends in .mcap, .ply, .pcd, .csv, .npz, .h5, .mat, .tum, .wav",
+    ),
     "no output": ("rec.h5", 2, "Missing option '--output'"),
     "no format": ("rec.h5 -o a --format las", 2, "'las' is not one of 'mcap', 'ply'"),
     "no such place": ("img.h5 -o a.npz -m 4", 1, "--measurement is 4; give a whole number from 0 to 3"),

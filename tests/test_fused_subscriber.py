@@ -111,9 +111,10 @@ def test_pulse_without_all_images_is_fused_by_the_next_one():
 
 
 def test_mountings_of_the_central_node_are_used():
+    sent = [image(number, sensor=sensor, reflectors=[(20.0, 1.5, 0.1)]) for number in (0, 1) for sensor in MOUNTINGS]
     with (
         Publisher() as publisher,
-        publisher.playing(pulses(count=2)),
+        publisher.playing(sent),
         FusedSubscriber(publisher.address) as subscriber,
     ):
         fused = subscriber.receive(PATIENCE_S).fused

@@ -512,7 +512,12 @@ def test_key_of_the_key_folder_is_allowed_by_its_file_or_name(tmp_path, monkeypa
 
 
 @pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize("key", ["none.public.toml", ""])
-def test_key_that_is_nowhere_is_refused(key):
+def test_key_that_is_nowhere_is_refused():
     with pytest.raises(SettingsError, match="is neither a public key nor a file with one"):
-        _run("allow", key, "--role", "admin")
+        _run("allow", "none.public.toml", "--role", "admin")
+
+
+@pytest.mark.usefixtures("folder")
+def test_empty_key_is_refused():
+    done = CliRunner().invoke(keys_command, ["allow", "", "--role", "admin"], catch_exceptions=False)
+    assert (done.exit_code, "is empty; write a value" in done.output) == (2, True)

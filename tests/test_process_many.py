@@ -116,7 +116,11 @@ def test_images_beyond_the_budget_are_not_written(runs, monkeypatch):
         ),
         (["runs/a.h5", "--scheduler", "tcp://x:1"], 2, "--scheduler applies to several recordings"),
         (["none/*.h5", "-o", "out"], 1, "no file matches none/*.h5; give another pattern"),
-        (["runs", "-o", "runs/a.h5"], 1, "output runs/a.h5 is a file, but several recordings need a folder"),
+        (
+            ["runs", "-o", "runs/a.h5"],
+            2,
+            "-o runs/a.h5 names a file, but several recordings need a folder; use -o runs/a/",
+        ),
         (["runs", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], 1, "give one of them"),
         (["runs", "-o", "out", "--directions", "90", "--azimuth", "-9:9"], 2, "directions 90 have fixed limits"),
         (["runs", "-o", "out", "--method", "paper", "--explain"], 2, "--explain needs --method fast"),
