@@ -12,6 +12,7 @@ import zmq
 from click.testing import CliRunner
 from ertis_cli import _network
 from ertis_cli.keys import keys as keys_command
+from ertis_cli.main import cli
 from hypothesis import given, strategies as st
 
 from ertis_numba.errors import ArgumentError, SettingsError
@@ -519,5 +520,5 @@ def test_key_that_is_nowhere_is_refused():
 
 @pytest.mark.usefixtures("folder")
 def test_empty_key_is_refused():
-    done = CliRunner().invoke(keys_command, ["allow", "", "--role", "admin"], catch_exceptions=False)
+    done = CliRunner().invoke(cli, ["keys", "allow", "", "--role", "admin"])
     assert (done.exit_code, "is empty; write a value" in done.output) == (2, True)
