@@ -194,8 +194,8 @@ class Attribution:
     def _not_heard(self, evidence: Sequence[_Evidence], reflectivity: Singles) -> frozenset[int]:
         """Return emitters whose calls other sensors do not hear, where the reflectors of all images lead to expect it.
 
-        An emitter may be broken, covered, or not on the same SYNC chain. Without its own image, only foreign echoes
-        show the reflectors of an emitter. Others may take them for own ones, so nobody can tell.
+        An emitter may be broken, covered, or not on the same SYNC chain. If the image of an emitter's own sensor
+        is missing, other sensors may take the echoes of its calls for those of their own calls. No emitter is then named.
         """
         own = {each.pair.emitter for each in evidence if each.pair.emitter == each.pair.receiver}
         if any(each.pair.emitter not in own for each in evidence):

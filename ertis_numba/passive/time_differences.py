@@ -275,7 +275,7 @@ class _CrossSpectrum:
         self._most = n_chosen if weighting == "phat" else float((scale / divisor)[chosen].sum())
         # The mean of γ² / (1 − γ²) as measured in n blocks is (1 + n γ² / (1 − γ²)) / (n − 2).
         ratio = ((self._n_blocks - 2) * coherence / (1 - coherence) - 1) / self._n_blocks
-        # What is hardly above chance is no evidence for one of several maxima.
+        # A coherence that noise may reach by chance does not tell which of several maxima is right.
         chance = self._by_chance(_BY_CHANCE) / np.maximum(coherence, _TINY)
         self._evidence = np.abs(self._weighted) * np.maximum(1 - chance, 0)
         # Variance of a component of the weighted spectrum; doubled, as windows correlate it with its neighbours.
