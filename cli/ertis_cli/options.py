@@ -3,7 +3,6 @@
 import glob
 import json
 import math
-import re
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -299,16 +298,12 @@ def _expanded(_ctx: click.Context, _param: click.Parameter, paths: tuple[Path, .
 def _matches(path: Path) -> list[Path]:
     if path.exists() or not glob.has_magic(str(path)):
         return [path]
-    found = sorted(map(Path, glob.glob(str(path), recursive=True)), key=_natural_order)  # noqa: PTH207
+    from ertis_numba.interop.pcm_files import natural_order
+
+    found = [Path(name) for name in sorted(glob.glob(str(path), recursive=True), key=natural_order)]  # noqa: PTH207
     if not found:
         raise click.BadParameter(f"no file matches {path}; choose another pattern, or name the files")
     return found
-
-
-def _natural_order(path: Path) -> list[tuple[int, str]]:
-    """Return a key by which ``mic2.wav`` precedes ``mic10.wav``."""
-    parts = re.split(r"(\d+)", str(path))
-    return [(int(part), "") if part.isdecimal() else (-1, part.lower()) for part in parts]
 
 
 def output(text: str) -> Decorator:

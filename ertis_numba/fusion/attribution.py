@@ -195,7 +195,7 @@ class Attribution:
         """Return emitters whose calls other sensors do not hear, where the reflectors of all images lead to expect it.
 
         An emitter may be broken, covered, or not on the same SYNC chain. If the image of an emitter's own sensor
-        is missing, other sensors may take the echoes of its calls for those of their own calls. No emitter is then named.
+        is missing, other sensors may take the echoes of its calls for those of their own. No emitter is then named.
         """
         own = {each.pair.emitter for each in evidence if each.pair.emitter == each.pair.receiver}
         if any(each.pair.emitter not in own for each in evidence):
