@@ -11,14 +11,17 @@ agree::
 
 import signal
 import sys
+import threading
 
 import rclpy
 from nav_msgs.msg import Odometry
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 from ertis_numba.errors import ArgumentError, RefusedError
 from ertis_numba.network.pose_publisher import PosePublisher
+
+TURN_S = 0.1
 
 
 class PoseForwarder(Node):
@@ -46,15 +49,16 @@ class PoseForwarder(Node):
 
 def main(topic: str, address: str, *sensors: str) -> None:
     """Forward poses until the program is interrupted."""
-    # Handlers of rclpy end spin. A KeyboardInterrupt could come while it converts a message, and end as another error.
+    # A KeyboardInterrupt could come while rclpy converts a message, and end as another error.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: None)
-    rclpy.init()
+        signal.signal(number, lambda *_: ended.set())
     try:
         with PosePublisher(address, sensors, source="odometry") as publisher:
-            rclpy.spin(PoseForwarder(topic, publisher))
-    except ExternalShutdownException:
-        pass
+            forwarder = PoseForwarder(topic, publisher)
+            while not ended.is_set():
+                rclpy.spin_once(forwarder, timeout_sec=TURN_S)
     finally:
         rclpy.try_shutdown()
 

@@ -44,12 +44,14 @@ def test_help_takes_less_time_than_importing_the_libraries():
     assert ratio([*ERTIS, "--help"], times=5, promised=0.75)[0] < 0.75
 
 
+@pytest.mark.alone
 def test_warm_process_of_one_measurement_takes_less_time_than_four_imports(recording, tmp_path):
     """One thread, because threads that wait for each other on a busy machine use processor time."""
     command = [*ERTIS, "process", recording, "-o", tmp_path / "image.h5", "--directions", "3000", "--threads", "1"]
     assert ratio([*command, "--force"], times=6, promised=3.75)[0] < 3.75
 
 
+@pytest.mark.alone
 def test_first_run_takes_less_time_than_30_imports_and_reports_compilation(recording, tmp_path):
     for run in ("first", "again"):  # nothing of the first one is left to the other
         environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / run)}

@@ -65,4 +65,4 @@ def test_maxima_left_out_at_an_edge_are_counted(tmp_path, monkeypatch, edge):
         write_energyscapes("img.h5", [image], overwrite=True)
         noted[quarters] = CliRunner().invoke(cli, ["peaks", "img.h5"]).stderr
         assert (f"{count} maxima near the first or last range left out" in noted[quarters]) == (quarters < 0)
-    assert "may be side lobes of an echo outside the range; process again with a wider --range" in noted[-4]
+    assert "may be side lobes of an echo outside the range; use a wider range with 'ertis process --range'" in noted[-4]

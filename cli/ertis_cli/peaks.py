@@ -300,7 +300,7 @@ def _note_left_out(sensor: str, count: int) -> None:
         cause = "it may be a side lobe" if count == 1 else "they may be side lobes"
         options.note(
             f"sensor {sensor}: {maxima} near the first or last range left out because {cause} of an echo outside the "
-            "range; process again with a wider --range"
+            "range; use a wider range with 'ertis process --range'"
         )
 
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import scipy.fft
-import scipy.ndimage
+import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.sound_spectra import SoundSpectra
@@ -112,8 +111,9 @@ def find_sweep(found: SoundSpectra) -> FoundSweep | None:
     if best_score < _MIN_SCORE:
         return None
     found_at = []
-    for score, curve, occupied in coarse:
+    for score, curve, along in coarse:
         if score >= _ALTERNATIVE * best_score:
+            occupied = _run_around_highest(along)
             low_hz, high_hz = centres_hz[occupied][0] - width_hz / 2, centres_hz[occupied][-1] + width_hz / 2
             found_at.append(_focused(found, curve, low_hz, high_hz))
     best, arrival = max(found_at, key=lambda each: float(np.median(each[1].peak)))
@@ -134,13 +134,20 @@ def _sub_bands(
         offset_hz = found.frequency_hz[part] - centre_hz
         window = np.cos(np.pi * offset_hz / width_hz) ** 2
         filters = (window * np.exp(1j * np.pi * slopes_s_hz[:, None] * offset_hz**2)).astype(np.complex64)
-        n_fft = scipy.fft.next_fast_len(2 * len(offset_hz))
-        after = scipy.fft.ifft(filters[:, None] * found.bins[:, part], n_fft, axis=2)
-        powers = after.real**2 + after.imag**2
-        mean = np.maximum(powers.mean(axis=2), 1e-30)
-        ratios[place] = np.median(powers.max(axis=2) / mean, axis=1)
+        ratios[place] = np.median([_peak_ratios(filters, bins) for bins in found.bins[:, part]], axis=0)
         power[place] = float(np.mean(np.abs(found.bins[:, part]) ** 2))
     return centres_hz, ratios, power
+
+
+def _peak_ratios(filters: NDArray[np.complex64], bins: NDArray[np.complex64]) -> NDArray[np.float32]:
+    """Return the peak to mean power after each filter, which have equal magnitudes: (filter,) float32."""
+    n_fft = scipy.fft.next_fast_len(2 * len(bins))
+    after = scipy.fft.ifft(filters * bins, n_fft, axis=1, norm="forward", overwrite_x=True)
+    parts = after.view(np.float32)
+    np.multiply(parts, parts, out=parts)
+    peaks = (parts[:, ::2] + parts[:, 1::2]).max(axis=1)
+    mean = np.sum(np.abs(filters[0] * bins) ** 2)  # Parseval's theorem
+    return np.asarray(peaks / np.maximum(mean, 1e-30))
 
 
 def _best_curve(
@@ -149,8 +156,8 @@ def _best_curve(
     slopes_s_hz: NDArray[np.float64],
     modulation: Modulation,
     pivot_hz: float,
-) -> tuple[float, Curve, NDArray[np.bool_]]:
-    """Return the score of the curve that follows the sound through most sub-bands, the curve, and these sub-bands."""
+) -> tuple[float, Curve, NDArray[np.float64]]:
+    """Return the score of the curve that follows the sound through most sub-bands, the curve, and its excess there."""
     steepest, step = slopes_s_hz[-1], slopes_s_hz[1] - slopes_s_hz[0]
     rising = np.geomspace(steepest / 1e3, steepest, _N_CURVES)
     found = []
@@ -160,8 +167,7 @@ def _best_curve(
         inside = (places >= 0) & (places < len(slopes_s_hz))
         along = np.where(inside, excess[np.arange(len(places)), places.clip(0, len(slopes_s_hz) - 1).astype(int)], 0.0)
         found.append((float(along.sum()), curve, along))
-    score, curve, along = max(found, key=lambda each: each[0])
-    return score, curve, _run_around_highest(along)
+    return max(found, key=lambda each: each[0])
 
 
 def _run_around_highest(along: NDArray[np.float64]) -> NDArray[np.bool_]:
