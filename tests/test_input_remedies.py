@@ -68,7 +68,7 @@ CASES = {  # command: exit code and message
     "odometry 'x*.h5'": (2, "no file matches x*.h5; choose another pattern, or name the files"),
     "calibrate 'x*.h5'": (2, "no file matches x*.h5"),
     "import 'x*.wav' --passive --layout lay.csv": (2, "no file matches x*.wav"),
-    "info 're*.h5'": (1, "a file of acoustic maps, such as rec.h5"),
+    "peaks 're*.h5'": (1, "such as rec.h5"),
     "info ''": (2, "the path is empty; name a file"),
     "import a.wav --layout '' --passive -o o.h5": (2, "--layout is empty; write a value, or leave it out"),
     "process rec.h5 recs/first.h5 -o o.h5": (

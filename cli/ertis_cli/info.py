@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import _tables, options
+from ertis_cli._overview import files_of, overview
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.health import Health
@@ -34,26 +35,33 @@ _COLUMNS = {  # name: digits in the report, and in the table
 
 
 @click.command()
-@options.input_file("FILE")
+@options.input_files("FILE|DIR...")
 @click.option(
     "--health", "of_health", is_flag=True, help="Show array health, the state of each microphone of a recording."
 )
 @options.as_json
-def info(*, path: Path, of_health: bool, as_json: bool) -> None:
-    """Show the contents of a recording, an image file or a map.
+@click.pass_context
+def info(ctx: click.Context, *, paths: tuple[Path, ...], of_health: bool, as_json: bool) -> None:
+    """Show the contents of recordings, image files or maps.
+
+    Of several files, or of a folder with the folders in it, show one line per file. The exit code is then 1 if a file
+    cannot be read.
 
     In JSON, "sensors" lists the properties of each sensor. If there is only one sensor, the top level repeats its
-    properties.
+    properties. Of several files, "files" lists these reports.
 
     With --health, show the state of each microphone of a recording: ok, dead, stuck, saturated, or with an offset or an
     idle tone. At most 8 measurements, evenly spaced, are examined. The exit code is 0 even if faults are found.
     """
+    path, *others = paths
+    if of_health and (others or path.is_dir()):
+        raise click.UsageError("--health examines one recording; choose one file", ctx=ctx)
     if of_health:
         _report_health(path, as_json=as_json)
         return
-    from ertis_numba.storage import is_map
-
-    about, sections = (_map(path), []) if is_map(path) else _by_sensor(path)
+    if others or path.is_dir():
+        ctx.exit(overview(files_of(paths), _contents, as_json=as_json))
+    about, sections = _contents(path)
     flat = [{**about, **sections[0]}] if len(sections) == 1 else [about, *sections]
     if as_json:
         options.print_json({**flat[0], "sensors": sections})
@@ -66,6 +74,13 @@ def info(*, path: Path, of_health: bool, as_json: bool) -> None:
             label, unit = _label(name)
             shown = "none (passive)" if name == "call_khz" and value is None else f"{_readable(value)}{unit}"
             click.echo(f"{label:{width}}  {shown}")
+
+
+def _contents(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Return the properties of a file, and those of each sensor."""
+    from ertis_numba.storage import is_map
+
+    return (_map(path), []) if is_map(path) else _by_sensor(path)
 
 
 def _by_sensor(path: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:

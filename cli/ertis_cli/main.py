@@ -39,7 +39,7 @@ COMMANDS = {
     "import-poses": ("ertis_cli.import_poses:import_poses", "Add the poses of a platform to recordings."),
     "info": (
         "ertis_cli.info:info",
-        "Show the contents of a recording, an image file or a map.",
+        "Show the contents of recordings, image files or maps.",
     ),
     "keys": ("ertis_cli.keys:keys", "Create keys and manage the list of allowed keys."),
     "layouts": ("ertis_cli.layouts:layouts", "List the shipped layouts, or print one as TOML."),
