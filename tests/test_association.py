@@ -70,9 +70,9 @@ def echoes_of(places_m, pairs=None, share=0.0, draws=None, *, is_flat=True):
     return found
 
 
-def reflectors(echoes, bound=np.inf, *, is_flat=True):
+def reflectors(echoes, bound=np.inf, *, is_flat=True, model=MODEL):
     receivers = {number: SimpleNamespace(is_flat=is_flat, pulse_m=0.014, width=0.14) for number in range(N_SENSORS)}
-    models = dict.fromkeys(receivers, MODEL)
+    models = dict.fromkeys(receivers, model)
     return Reflectors(echoes, sensors(), receivers, models, GRID, np.full(GRID.n_cells, bound, dtype=np.float32))
 
 
@@ -113,11 +113,12 @@ def test_positions_are_more_precise_than_those_of_the_nearest_sensor():
     assert 1.2 < np.mean(normalized) < 3.5  # chi-squared with two degrees of freedom, wider for robust weights
 
 
-@pytest.mark.parametrize(("share", "count"), [(1.0, 1), (0.0, 0)])
-def test_own_echo_alone_is_a_reflector_if_the_attribution_agrees(share, count):
+@pytest.mark.parametrize(("share", "diameter_m", "count"), [(1.0, 0.012, 1), (0.0, 0.012, 0), (1.0, 0.0, 0)])
+def test_own_echo_alone_is_a_reflector_if_attributed_and_few_pairs_should_hear_it(share, diameter_m, count):
+    """Omnidirectional emitters would cause echoes at all pairs."""
     echoes = echoes_of(np.array([[1.5, 0.2, 0.0]]), pairs={(0, 0)})
     echoes[0].share[:, 0] = share
-    found = reflectors(echoes)
+    found = reflectors(echoes, model=Emitters(ertis.Settings(), [diameter_m] * N_SENSORS))
     assert len(found.position_m) == count
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.fusion.confirmation import EchoPaths, confirmed
+from ertis_numba.fusion.confirmation import EchoPaths, confirmation
 
 YAW_RAD = np.radians([0.0, 90.0, 180.0, -90.0])
 AHEAD = np.stack([np.cos(YAW_RAD), np.sin(YAW_RAD), np.zeros(4)], axis=1)
@@ -49,7 +49,7 @@ def found(echoes, *places_m, flat=range(4), with_image=range(4)):
     receiver, direction, path_m = zip(*echoes, strict=True)
     rows = {number: np.flatnonzero(np.array(receiver) == number) for number in with_image}
     heard = EchoPaths(SENSOR_M, AHEAD, rows, flat, np.array(direction), np.repeat(np.array(path_m)[:, None], 4, axis=1))
-    return confirmed(heard, np.array(places_m), np.repeat(GAIN, len(places_m), axis=0)).tolist()
+    return confirmation(heard, np.array(places_m), np.repeat(GAIN, len(places_m), axis=0)).is_confirmed.tolist()
 
 
 def test_reflectors_are_confirmed_by_echoes_of_all_sensors():
@@ -103,11 +103,42 @@ def test_a_lone_echo_confirms_nothing_on_a_platform_with_several_sensors():
     heard = EchoPaths(SENSOR_M, AHEAD, rows, range(4), own[1][None], np.array([[3.6, np.nan, np.nan, np.nan]]))
     gain = np.zeros((1, 4, 4))
     gain[0, 0, 0] = 1.0
-    assert confirmed(heard, np.array([[2.0, 0.0, HEIGHT_M]]), gain).tolist() == [False]
+    assert confirmation(heard, np.array([[2.0, 0.0, HEIGHT_M]]), gain).is_confirmed.tolist() == [False]
     alone = EchoPaths(SENSOR_M[:1], AHEAD[:1], rows, range(1), own[1][None], np.array([[3.6]]))
-    assert confirmed(alone, np.array([[2.0, 0.0, HEIGHT_M]]), gain[:, :1, :1]).tolist() == [True]
+    assert confirmation(alone, np.array([[2.0, 0.0, HEIGHT_M]]), gain[:, :1, :1]).is_confirmed.tolist() == [True]
 
 
 def test_no_reflectors_are_no_error():
     none = EchoPaths(SENSOR_M, AHEAD, {}, range(4), np.empty((0, 3)), np.empty((0, 4)))
-    assert confirmed(none, np.empty((0, 3)), np.empty((0, 4, 4))).tolist() == []
+    assert confirmation(none, np.empty((0, 3)), np.empty((0, 4, 4))).is_confirmed.tolist() == []
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_sound_over_a_slanting_wall_shows_no_reflector(seed):
+    """The wall is located between the feet of two sensors, so its normal is not the direction from either one."""
+    rng = np.random.default_rng([seed, 1])
+    turn_rad = np.radians(rng.uniform(20.0, 60.0))
+    normal, away_m = np.array([np.cos(turn_rad), np.sin(turn_rad), 0.0]), rng.uniform(1.4, 2.4)
+    along = np.array([-normal[1], normal[0], 0.0])
+    wall_m = away_m * normal + rng.uniform(-0.12, 0.12) * along + [0.0, 0.0, HEIGHT_M]
+    place_m = rng.uniform(0.3, 0.8) * normal + rng.choice([-1, 1]) * rng.uniform(0.7, 1.4) * along + [0, 0, HEIGHT_M]
+    image_m = place_m + 2 * (away_m - place_m @ normal) * normal
+    sensor_m = SENSOR_M[np.argmax([(image_m - each) @ ahead for each, ahead in zip(SENSOR_M, AHEAD, strict=True)])]
+    path_m = np.linalg.norm(place_m - sensor_m) + np.linalg.norm(image_m - sensor_m)
+    ghost_m = sensor_m + path_m / 2 * (image_m - sensor_m) / np.linalg.norm(image_m - sensor_m)
+    echoes = [*echoes_of_post(place_m), *echoes_of_post(ghost_m)]
+    assert found(echoes, place_m, ghost_m) == [True, True]
+    assert found(echoes, place_m, ghost_m, wall_m)[:2] == [True, False]
+
+
+def test_reflectors_behind_a_nearer_one_in_all_directions_are_not_confirmed():
+    """Sound that a wall and the nearer reflector send back arrives from the direction of the nearer one."""
+    behind_m = POST_M + 0.8 * (POST_M - SENSOR_M[0])
+    echoes = [each for each in echoes_of_post(behind_m) if each[0] == 0]
+    near = [each for each in echoes_of_post(POST_M) if each[0] in (0, 1)]
+    receiver, direction, path_m = zip(*sorted([*near, *echoes], key=lambda each: each[0]), strict=True)
+    rows = {number: np.flatnonzero(np.array(receiver) == number) for number in (0, 1)}
+    paths_m = np.repeat(np.array(path_m)[:, None], 4, axis=1)
+    heard = EchoPaths(SENSOR_M, AHEAD, rows, range(4), np.array(direction), paths_m)
+    sure = confirmation(heard, np.array([POST_M, behind_m]), np.repeat(GAIN, 2, axis=0))
+    assert sure.is_confirmed.tolist() == [True, False]

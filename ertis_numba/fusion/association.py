@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
-from ertis_numba.fusion.confirmation import EchoPaths, confirmed
+from ertis_numba.fusion.confirmation import EchoPaths, confirmation
 from ertis_numba.fusion.overlaps import Overlap, PredictedEchoes, overlap
 from ertis_numba.fusion.pairs import AUDIBLE
 from ertis_numba.fusion.polar_grid import PolarGrid
@@ -22,6 +22,8 @@ Numbers = NDArray[np.int64]
 
 _MIN_SHARE: Final = 0.5  # Share from which the attribution of the images supports an explanation.
 _GATE: Final = 16.0  # Squared Mahalanobis distance; four standard deviations along one axis.
+_MOUNTED_M: Final = 1.7e-3  # Standard deviations of paths and directions that errors of mountings and of the air add to
+_MOUNTED_RAD: Final = math.radians(0.22)  # the search for echoes of the same reflector.
 _SAME_M: Final = 0.015  # Distance within which a reflector explains a lone echo, in addition to uncertainties.
 _REFINED_M: Final = 0.005  # Standard deviation that overlapping echoes add to paths, once a reflector is located.
 _ALIKE: Final = 10.0  # Largest ratio of reflectivities between two echoes of a reflector.
@@ -32,6 +34,9 @@ _SURPRISE_DB: Final = 10.0  # … which counts as much as a missing echo for eac
 _BESIDE_DB: Final = (-13.0, -16.0)  # Power of a call to the side from which its path is uncertain, and most uncertain.
 _BESIDE_M: Final = 6e-3
 _DISTURBED: Final = 0.25  # Power of overlapping echoes relative to one that they explain.
+_MANY_PAIRS: Final = (
+    9  # Pairs that should hear a reflector, from which a lone echo is none: more than those of one call or two.
+)
 _EXCESS: Final = 4.0  # Reflectivity relative to the bound of a cell, above which missing echoes exclude a candidate.
 _TINY: Final = 1e-30
 _ROUNDS: Final = 8
@@ -173,6 +178,8 @@ class Reflectors:
         self._direction = np.concatenate([each.direction for each in echoes]).reshape(-1, 3)
         self._path_sd_m = np.concatenate([each.path_sd_m for each in echoes])
         self._angle_sd_rad = np.concatenate([each.angle_sd_rad for each in echoes])
+        self._gate_m = np.hypot(self._path_sd_m, _MOUNTED_M)
+        self._gate_rad = np.hypot(self._angle_sd_rad, _MOUNTED_RAD)
         self._power = np.concatenate([each.power for each in echoes])
         self._rows = {number: np.flatnonzero(self._receiver == number) for number in receivers}
         self._is_free = np.ones(n_echoes, dtype=np.bool_)
@@ -186,13 +193,17 @@ class Reflectors:
         candidates = self._candidates()
         found = self._refined(self._confirmed(candidates))
         self._add_lone(candidates, found)
-        self.position_m = np.array([each.place_m for each in found]).reshape(-1, 3)
-        self.covariance_m2 = np.array([each.covariance_m2 for each in found]).reshape(-1, 3, 3)
-        self.reflectivity = np.array([each.reflectivity for each in found])
         flat = {number for number, receiver in receivers.items() if receiver.is_flat}
         with_image = {each.receiver: self._rows[each.receiver] for each in echoes}
         heard = EchoPaths(self._sensor_m, self._ahead, with_image, flat, self._direction, self._path_m)
-        self.confirmed = confirmed(heard, self.position_m, self._gains(self.position_m))
+        place_m = np.array([each.place_m for each in found]).reshape(-1, 3)
+        sure = confirmation(heard, place_m, self._gains(place_m))
+        # Where many pairs should hear a reflector, the only echo of one comes from elsewhere, except that of a wall.
+        n_echoes_of = np.array([len(each.echo) for each in found], np.int64)
+        kept = (n_echoes_of > 1) | sure.is_wall | (sure.n_pairs < _MANY_PAIRS)
+        self.position_m, self.confirmed = place_m[kept], sure.is_confirmed[kept]
+        self.covariance_m2 = np.array([each.covariance_m2 for each in found]).reshape(-1, 3, 3)[kept]
+        self.reflectivity = np.array([each.reflectivity for each in found])[kept]
 
     def _candidates(self) -> _Candidates:
         """Return the candidates of all echoes, where their emitter is audible."""
@@ -214,7 +225,7 @@ class Reflectors:
         is_possible = (gain > 0) & (reflectivity <= self._limit(place_m))
         kept = np.flatnonzero((beyond > 0) & (to_m > _NEAREST_M) & is_possible)
         sideways = np.stack([-direction[kept, 1], direction[kept, 0], np.zeros(len(kept))], axis=1)
-        across = sideways * (to_m[kept] * self._angle_sd_rad[echo[kept]])[:, None]
+        across = sideways * (to_m[kept] * self._gate_rad[echo[kept]])[:, None]
         is_ahead = np.einsum("ci,ci->c", direction[kept], self._ahead[receiver[kept]]) >= 0
         return _Candidates(echo[kept], emitter[kept], place_m[kept], across, reflectivity[kept], is_ahead)
 
@@ -249,7 +260,7 @@ class Reflectors:
         slope = slope[which] + slope[which, receiver][:, None]
         late_m = self._path_m[echo] - apart_m[which] - apart_m[which, receiver][:, None]
         beside_m2 = self._beside_m(candidates.place_m)[which] ** 2
-        distance = turned[:, None] + late_m**2 / (slope**2 + self._path_sd_m[echo, None] ** 2 + extra_m**2 + beside_m2)
+        distance = turned[:, None] + late_m**2 / (slope**2 + self._gate_m[echo, None] ** 2 + extra_m**2 + beside_m2)
         # Echoes of a reflector show about the same reflectivity; those from behind may be weaker.
         expected = candidates.reflectivity[which, None] * self._gains(candidates.place_m)[which, receiver]
         power, is_behind = self._power[echo, None], depth[which, receiver][:, None] < 0
@@ -264,7 +275,7 @@ class Reflectors:
             free = rows[self._is_free[rows]]
             # For small angles, the chord equals the angle.
             angle_rad2 = np.maximum(0.0, 2 - 2 * seen[:, number] @ self._direction[free].T)
-            angle_rad2 /= across_rad2[:, number, None] + self._angle_sd_rad[free] ** 2
+            angle_rad2 /= across_rad2[:, number, None] + self._gate_rad[free] ** 2
             is_near = angle_rad2 < _GATE
             if not self._receivers[number].is_flat:
                 is_near &= depth[:, number, None] >= 0

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["EchoPaths", "confirmed"]
+__all__ = ["Confirmation", "EchoPaths", "confirmation"]
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -23,7 +23,10 @@ _COUNTS_FROM: Final = 0.1  # Gain relative to the highest of all pairs, from whi
 _FACING: Final = 0.3  # Cosine from which a sensor may show the surface of a wall.
 _NEAREST_M: Final = 1e-9
 _PART: Final = 0.6
-_MIRROR_M: Final = 0.06  # Largest distance between a ghost and the place where a wall shows it.
+_MIRROR_M: Final = 0.06  # Least difference of ranges of a ghost and a nearer reflector.
+_PLANE_M: Final = 0.04  # Largest distance of a located wall from the plane that a ghost implies, …
+_FOOT_M: Final = 0.4  # … and from the foot of the perpendicular to it.
+_SAME_RAD: Final = math.radians(2.5)  # Difference of directions below which a nearer reflector may send the sound.
 _N_LEAST: Final = 2  # Echoes without which an own echo may be that of another sensor's call.
 _N_SURE: Final = 4  # Echoes that two reflections hardly cause at the right paths.
 
@@ -52,11 +55,29 @@ class EchoPaths(NamedTuple):
     path_m: Floats
 
 
-def confirmed(heard: EchoPaths, place_m: Floats, gain: Floats) -> Flags:
-    """Return True for the reflectors that enough echoes confirm, each as a point or as a mirror-like wall.
+class Confirmation(NamedTuple):
+    """Confirmation of reflectors.
+
+    Attributes
+    ----------
+    is_confirmed : (reflector,) bool
+        True if enough echoes confirm a reflector, as a point or as a mirror-like wall.
+    is_wall : (reflector,) bool
+        True if enough echoes confirm a mirror-like wall.
+    n_pairs : (reflector,) int64
+        Pairs of emitter and receiver that should hear it.
+    """
+
+    is_confirmed: Flags
+    is_wall: Flags
+    n_pairs: NDArray[np.int64]
+
+
+def confirmation(heard: EchoPaths, place_m: Floats, gain: Floats) -> Confirmation:
+    """Return the confirmation of reflectors, each as a point or as a mirror-like wall.
 
     At least 60 % of the pairs that should hear a reflector must do so, rounded down, and four if there are as many. A
-    platform with several sensors needs two. A reflector at the mirror image of another one is not confirmed.
+    platform with several sensors needs two. A reflector that a nearer one and a wall explain is not confirmed.
 
     Parameters
     ----------
@@ -79,43 +100,78 @@ def confirmed(heard: EchoPaths, place_m: Floats, gain: Floats) -> Flags:
     n_pairs = counts.sum(axis=(1, 2))
     least = min(_N_LEAST, len(heard.sensor_m))
     needed = np.maximum(np.minimum(n_pairs, _N_SURE), _PART * n_pairs // 1).clip(least)
-    as_point = _n_confirming(heard, np.repeat(place_m[:, None], len(heard.sensor_m), axis=1), counts) >= needed
+    is_behind = _behind(heard, away_m)
+    n_confirming = _n_confirming(heard, np.repeat(place_m[:, None], len(heard.sensor_m), axis=1), counts)
+    as_point = _is_enough(n_confirming, needed, is_behind)
     as_wall = np.zeros_like(as_point)
     for facing in heard.rows:  # The normal of a wall is the direction from the sensor that faces it.
         toward = normal[:, facing]
         away_m = np.einsum("psi,pi->ps", place_m[:, None] - heard.sensor_m, toward)
         image_m = heard.sensor_m + 2 * away_m[..., None] * toward[:, None]
         n_confirming = _n_confirming(heard, image_m, counts, is_image=True)
-        as_wall |= (depth[:, facing] > _FACING) & (n_confirming >= needed)
-    facing, centred_m = np.argmax(depth, axis=1), place_m - heard.sensor_m.mean(axis=0)
-    return np.asarray((as_point | as_wall) & ~_mirrored(centred_m, normal[np.arange(len(normal)), facing]))
+        as_wall |= (depth[:, facing] > _FACING) & _is_enough(n_confirming, needed, is_behind)
+    is_ghost = _mirrored(place_m, heard.sensor_m[np.argmax(depth, axis=1)])
+    return Confirmation(np.asarray((as_point | as_wall) & ~is_ghost), as_wall, n_pairs)
 
 
-def _mirrored(place_m: Floats, normal: Floats) -> Flags:
-    """Return True for places where a wall at another reflector mirrors a third one, or halfway to its mirror image.
+def _is_enough(n_confirming: NDArray[np.int64], needed: Floats, is_behind: Flags) -> Flags:
+    """Return True for reflectors that enough pairs hear, not only from the directions of nearer ones."""
+    return np.asarray((n_confirming.sum(axis=1) >= needed) & ((n_confirming > 0) & ~is_behind).any(axis=1))
 
-    Sound that the wall reflects on both ways comes from the mirror image. On one way, its path is half as much longer.
+
+def _behind(heard: EchoPaths, away_m: Floats) -> Flags:
+    """Return True where a receiver hears a reflector from the direction of a nearer one: (reflector, receiver) bool.
+
+    Sound that a wall and the nearer one reflect arrives from there as well.
+    """
+    range_m = np.linalg.norm(away_m, axis=2)
+    toward = away_m / np.maximum(range_m, _NEAREST_M)[..., None]
+    depth = np.einsum("psi,si->ps", toward, heard.ahead)
+    flat = np.isin(np.arange(len(heard.sensor_m)), [*heard.flat])
+    toward = toward - 2 * np.where(flat, np.minimum(depth, 0.0), 0.0)[..., None] * heard.ahead
+    cosine = np.einsum("psi,qsi->pqs", toward, toward)
+    is_nearer = range_m + _MIRROR_M < range_m[:, None]
+    return np.asarray((is_nearer & (cosine > math.cos(_SAME_RAD))).any(axis=1))
+
+
+def _mirrored(place_m: Floats, sensor_m: Floats) -> Flags:
+    """Return True for places that sound over a nearer reflector and a wall at another one shows.
+
+    Sound that the wall reflects on both ways comes from the mirror image of the nearer reflector. Sound that it
+    reflects on one way comes from the same direction, on a path of half the additional length. Both imply a wall.
 
     Parameters
     ----------
-    place_m, normal : (reflector, axis) float64
-        Reflectors relative to the platform, and the normals that walls there would have.
+    place_m, sensor_m : (reflector, axis) float64
+        Reflectors, and the sensor that faces each of them.
     """
-    offset_m = place_m[:, None] - place_m  # (reflector, wall, axis)
-    image_m = place_m[:, None] - 2 * np.einsum("pwi,wi->pw", offset_m, normal)[..., None] * normal
-    range_m, there_m = np.linalg.norm(place_m, axis=1), np.linalg.norm(image_m, axis=2)
-    once_m = image_m * ((1 + range_m[:, None] / np.maximum(there_m, _NEAREST_M)) / 2)[..., None]
-    is_nearer = np.maximum(range_m[:, None], range_m) + _MIRROR_M < range_m[:, None, None]
-    is_nearer &= ~np.eye(len(place_m), dtype=np.bool_)  # A reflector is no wall that mirrors itself.
     found = np.zeros(len(place_m), np.bool_)
-    for each_m in (image_m, once_m):
-        apart_m = np.linalg.norm(place_m[:, None, None] - each_m, axis=3)
-        found |= ((apart_m < _MIRROR_M) & is_nearer).any(axis=(1, 2))
+    if not len(place_m):
+        return found
+    from_m = np.linalg.norm(place_m[:, None] - sensor_m, axis=2)  # (nearer reflector, reflector)
+    range_m = np.linalg.norm(place_m - sensor_m, axis=1)
+    toward = (place_m - sensor_m) / np.maximum(range_m, _NEAREST_M)[:, None]
+    for image_range_m in (np.broadcast_to(range_m, from_m.shape), 2 * range_m - from_m):
+        image_m = sensor_m + image_range_m[..., None] * toward
+        offset_m = image_m - place_m[:, None]
+        apart_m = np.linalg.norm(offset_m, axis=2)
+        normal = offset_m / np.maximum(apart_m, _NEAREST_M)[..., None]
+        between_m = (image_m + place_m[:, None]) / 2
+        depth_m = np.einsum("pgi,pgi->pg", between_m - sensor_m, normal)
+        foot_m = sensor_m + depth_m[..., None] * normal
+        is_possible = (from_m + _MIRROR_M < range_m) & (apart_m > 2 * _MIRROR_M) & (depth_m > _MIRROR_M)
+        nearer, ghost = np.nonzero(is_possible)
+        wall_m = place_m[:, None] - foot_m[nearer, ghost]
+        off_m = np.abs(np.einsum("wki,ki->wk", wall_m, normal[nearer, ghost]))
+        is_wall = (off_m < _PLANE_M) & (np.linalg.norm(wall_m, axis=2) < _FOOT_M)
+        numbers = np.arange(len(place_m))[:, None]
+        is_wall &= (numbers != nearer) & (numbers != ghost)
+        found[ghost[is_wall.any(axis=0)]] = True
     return found
 
 
 def _n_confirming(heard: EchoPaths, origin_m: Floats, counts: Flags, *, is_image: bool = False) -> NDArray[np.int64]:
-    """Return the number of pairs that hear each reflector: (reflector,) int64.
+    """Return the number of pairs that hear each reflector, by receiver: (reflector, receiver) int64.
 
     Parameters
     ----------
@@ -126,7 +182,7 @@ def _n_confirming(heard: EchoPaths, origin_m: Floats, counts: Flags, *, is_image
     is_image : bool
         Sound comes from mirror images, so that its path begins there.
     """
-    found = np.zeros(len(origin_m), np.int64)
+    found = np.zeros((len(origin_m), len(heard.sensor_m)), np.int64)
     for receiver, rows in heard.rows.items():
         to_m = origin_m - heard.sensor_m[receiver]
         apart_m = np.maximum(np.linalg.norm(to_m, axis=2), _NEAREST_M)
@@ -137,5 +193,5 @@ def _n_confirming(heard: EchoPaths, origin_m: Floats, counts: Flags, *, is_image
         turn = np.sqrt(np.maximum(0.0, 2 - 2 * seen @ heard.direction[rows].T))
         near = turn < (_ANGLE_RAD / np.maximum(np.abs(depth), _LEAST_COSINE))[..., None]
         near &= np.abs(heard.path_m[rows].T[None] - path_m[..., None]) < _PATH_M  # False for NaN.
-        found += (near.any(axis=2) & counts[:, receiver]).sum(axis=1)
+        found[:, receiver] = (near.any(axis=2) & counts[:, receiver]).sum(axis=1)
     return found
