@@ -1,16 +1,19 @@
 """Files that `ertis example` writes and the demonstration that `ertis demo` runs."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path, PurePath
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_cli import _examples, demo
 from ertis_cli.main import cli
+from scipy.io import wavfile
 
 from ertis_numba.simulation import load_scene
 from ertis_numba.storage import open_recording
@@ -39,7 +42,7 @@ def test_example_lists_every_file_with_a_sentence():
 def test_every_example_equals_its_source_file():
     sources = {path.name: path for path in (*(ROOT / "examples").iterdir(), *(ROOT / "data").rglob("*"))}
     for name, item in _examples.examples().items():
-        assert item.read_bytes() == sources[name.replace(".h5", ".toml")].read_bytes()
+        assert item.read_bytes() == sources[re.sub(r"\.(h5|wav)$", ".toml", name)].read_bytes()
 
 
 def test_every_recording_of_the_repository_is_an_example():
@@ -57,6 +60,20 @@ def test_example_copies_a_scene_and_simulates_its_recording(monkeypatch):
     assert len(load_scene("reflectors.toml").points) == 5
     run("example", "platform.toml", "-o", ".")
     assert {path.name for path in Path().iterdir()} == {"reflectors.h5", "reflectors.toml", "platform.toml"}
+
+
+def test_example_writes_sound_with_one_channel_per_microphone():
+    """The post at 1.2 m ahead and 0.3 m to the left reaches the microphone farthest to the left first."""
+    run("example", "echoes")
+    rate_hz, samples = wavfile.read("echoes.wav")
+    n_before, n_echo = (round(rate_hz * time_s) for time_s in (2 * np.hypot(1.2, 0.3) / 343.2 - 1e-4, 2.2e-3))
+    echo = samples[n_before : n_before + n_echo].astype(float)
+    assert np.std(echo) > 5 * np.std(samples[n_before - n_echo : n_before].astype(float))
+    lags = np.argmax(np.fft.irfft(np.fft.rfft(echo, axis=0) * np.fft.rfft(echo[:, -1:], axis=0).conj(), axis=0), axis=0)
+    np.testing.assert_allclose(lags, rate_hz / 343.2 * 0.2425 * np.linspace(0.028, 0, 8), atol=0.6)
+    assert "echoes.wav: unchanged" in run("example", "echoes.wav").stderr
+    Path("echoes.wav").write_bytes(b"other")
+    assert "echoes.wav" in run("example", "echoes", code=1).stderr
 
 
 def test_every_copied_scene_can_be_loaded():

@@ -6,22 +6,12 @@ import re
 import shlex
 
 import click
-import numpy as np
 import pytest
 from ertis_cli.main import cli
-from scipy.io import wavfile
 
-from ertis_numba.simulation import load_scene
-from ertis_numba.simulation.render import Simulator
 from tests.pages import GUIDE, ROOT, commands_in, in_background, page, run_here
 
 PAGES = [ROOT / "README.md", *GUIDE]
-PCM = """
-recording.encoding = "int16"
-recording.sample_rate_hz = 192000.0
-recording.n_samples = 6144
-processing.range_decimation = 4
-"""
 
 
 def commands(text):
@@ -76,11 +66,6 @@ def test_first_hour_page_runs(tmp_path, monkeypatch):
     assert all(len(step.splitlines()) <= 3 for step in steps)
     for name, content in re.findall(r"`([\w.]+)`:\n\n```\w+\n(.*?)```", text, re.DOTALL):
         (tmp_path / name).write_text(content)
-    scene = (tmp_path / "scene.toml").read_text().replace('name = "mine"\n', f'name = "mine"\n{PCM}')
-    (tmp_path / "pcm.toml").write_text(scene)
-    wavfile.write(
-        tmp_path / "echoes.wav", 192_000, np.array(Simulator(load_scene(tmp_path / "pcm.toml")).render().data)
-    )
     with contextlib.ExitStack() as background:
         for command in commands_in(text):
             if command.endswith("&"):

@@ -1,16 +1,17 @@
-"""Examples of the package, and recordings simulated from its scenes: names, descriptions and content."""
+"""Examples of the package, and recordings and sound simulated from its scenes: names, descriptions and content."""
 
 import ast
 import hashlib
 import json
 from importlib import resources
 from importlib.resources.abc import Traversable
+from io import BytesIO
 from pathlib import Path, PurePath
 from typing import Final
 
 from ertis_cli._config import instead
 
-__all__ = ["description", "examples", "is_written", "named", "stem", "words_sha256"]
+__all__ = ["content", "description", "examples", "is_written", "named", "stem", "words_sha256"]
 
 _RECORDINGS: Final = "ertis_examples.synthetic"
 """Package with the scenes and checksums of recordings."""
@@ -18,13 +19,17 @@ _RECORDINGS: Final = "ertis_examples.synthetic"
 _FOLDERS: Final = (("ertis_examples", ()), (_RECORDINGS, ()), (_RECORDINGS, ("scenes",)))
 """Packages, and folders in them, with examples."""
 
+_SOUND: Final = "echoes"
+"""Name of the scene that is also rendered as a WAV file."""
+
 _SUFFIXES: Final = {".toml", ".py", ".rviz", ".yaml"}
 
 
 def examples() -> dict[str, Traversable]:
     """Return the sources of examples by name, in alphabetical order.
 
-    The source of a recording is its scene. A file ``NAME.json`` beside the scene has the checksums of its samples.
+    The source of a recording and of a WAV file is its scene. A file ``NAME.json`` beside the scene of a recording has
+    the checksums of its samples.
     """
     found = {}
     for package, parts in _FOLDERS:
@@ -35,6 +40,8 @@ def examples() -> dict[str, Traversable]:
                 found[f"{name.stem}.h5"] = folder / f"{name.stem}.toml"
             elif name.suffix in _SUFFIXES and item.name != "__init__.py":
                 found[item.name] = item
+                if name.stem == _SOUND:
+                    found[f"{_SOUND}.wav"] = item
     return dict(sorted(found.items()))
 
 
@@ -67,13 +74,29 @@ def is_written(path: Path, item: Traversable) -> bool:
     if path.is_symlink() or not path.is_file():
         return False
     if path.suffix != ".h5":
-        return path.read_bytes() == item.read_bytes()
+        return path.read_bytes() == content(path, item)
     report = resources.files(_RECORDINGS) / f"{path.stem}.json"
     sensors = json.loads(report.read_text("utf-8"))["sensors"]
     try:
         return all(words_sha256(path, each["sensor"]) == each["words_sha256"] for each in sensors)
     except ErtisError:
         return False
+
+
+def content(path: Path, item: Traversable) -> bytes:
+    """Return the content of an example other than a recording: a copy of its source, or the sound of its scene."""
+    if path.suffix != ".wav":
+        return item.read_bytes()
+    from scipy.io import wavfile
+
+    from ertis_numba.simulation import load_scene
+    from ertis_numba.simulation.render import render
+
+    with resources.as_file(item) as scene:
+        samples = render(load_scene(scene))
+    file = BytesIO()
+    wavfile.write(file, round(samples.settings.recording.sample_rate_hz), samples.data)
+    return file.getvalue()
 
 
 def words_sha256(path: Path, sensor: str) -> str:
@@ -91,8 +114,8 @@ def words_sha256(path: Path, sensor: str) -> str:
 def description(name: str, item: Traversable) -> str:
     """Return the first sentence of a file's own description."""
     suffix = PurePath(name).suffix
-    if suffix == ".h5":
-        return f"Recording simulated from {PurePath(name).stem}.toml."
+    if suffix in {".h5", ".wav"}:
+        return f"{'Recording' if suffix == '.h5' else 'Sound'} simulated from {PurePath(name).stem}.toml."
     text = item.read_text("utf-8")
     if suffix == ".py":
         text = ast.get_docstring(ast.parse(text)) or ""

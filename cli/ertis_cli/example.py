@@ -64,7 +64,7 @@ def example(
             _simulate(ctx, item, path, force=force, quiet=quiet)
         else:
             with atomic_write(path, overwrite=force) as part:
-                part.write_bytes(item.read_bytes())
+                part.write_bytes(_examples.content(path, item))
             options.say(str(path), quiet=quiet)
     if as_json:
         options.print_json({"files": [str(path) for path in sources], "written": [str(path) for path in missing]})
