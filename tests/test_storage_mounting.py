@@ -164,11 +164,14 @@ def test_sensors_without_mounting_are_not_combined(tmp_path):
     assert "rec.h5 contains no mounting of a sensor; give a scene" in done.stderr
 
 
-def test_processing_keeps_that_a_mounting_is_unknown(tmp_path):
-    path = write_recording(tmp_path / "rec.h5", of("left", noise(SMALL, 1)))
+@pytest.mark.parametrize(("sensors", "count"), [(("left",), 0), (("left", "right"), 1)])
+def test_processing_keeps_that_a_mounting_is_unknown(tmp_path, sensors, count):
+    """A note says so if there are several images, which could be combined."""
+    path = write_recording(tmp_path / "rec.h5", [each for name in sensors for each in of(name, noise(SMALL, 1))])
     done = CliRunner().invoke(cli, ["process", str(path), "-o", str(tmp_path / "img.h5"), "--device", "cpu"])
     assert done.exit_code == 0, done.stderr
-    assert done.stderr.count("note: the mounting of sensor left is unknown") == 1
+    assert done.stderr.count("note: the mounting of sensors left, right is unknown") == count
+    assert done.stderr.count("note: the mounting of") == count
     assert place_of(tmp_path / "img.h5", "left") == (None, None)
 
 

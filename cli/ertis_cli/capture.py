@@ -284,7 +284,7 @@ def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
 
 def _note_mounting(path: Path | None, sensors: "Sequence[str]", *, quiet: bool) -> None:
     remedy = "give --mounting FILE to combine their images"
-    _mountings.note_unknown(sensors if path is None else [], remedy, quiet=quiet)
+    _mountings.note_unknown(sensors if path is None and len(sensors) > 1 else [], remedy, quiet=quiet)
 
 
 def _require_one_place(address: str | None, target: Path | None, *, for_address: tuple[object, ...]) -> None:

@@ -319,8 +319,8 @@ def _require_options_of_one(target: str | None) -> None:
 def _note_mountings(path: Path, *, quiet: bool) -> None:
     from ertis_numba.storage import open_energyscapes, sensor_names
 
-    unknown = []
-    for name in sensor_names(path):
+    names, unknown = sensor_names(path), []
+    for name in names if len(names) > 1 else ():  # A single image can remain in the frame of its sensor.
         with open_energyscapes(path, sensor=name) as images:
             if images.translation_m is None:
                 unknown.append(name)
