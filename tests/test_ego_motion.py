@@ -209,9 +209,7 @@ def test_covariance_of_a_path_is_that_of_its_random_errors():
     start = PlanarPose(0, 0.0, 0.0, 0.3, np.zeros((3, 3)))
 
     def end_of(displacements):
-        return functools.reduce(
-            lambda pose, step: pose.moved(step, covariance, 0, is_measured=True), displacements, start
-        )
+        return functools.reduce(lambda pose, step: pose.moved(step, covariance, 0), displacements, start)
 
     true = end_of(steps)
     squares = []
@@ -262,7 +260,7 @@ AHEAD = (0.0, 0.0, 0.0, 1.0)
     ids=["added", "moved", "reordered"],
 )
 def test_remounted_odometry_continues_its_path(changed, is_measured):
-    odometry = ertis.Odometry(MOUNTINGS)
+    odometry = ertis.Odometry(MOUNTINGS, alone=True)
     for pulse in range(2):
         odometry.add([seen_from((0.05 * pulse, 0, 0), places_m(), pulse)])
     odometry.remount(changed)

@@ -39,6 +39,44 @@ def test_single_flat_array_with_mirrored_echoes_does_not_claim_a_direction(seed,
     assert abs(found.velocity_m_s[0] - TWIST[0]) < 3 * found.sd[0]
 
 
+TURNED = (0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4))
+FRONT = {"sensor": ((0.2, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
+
+
+@pytest.mark.parametrize(
+    ("mountings", "twist", "alone", "doubt"),
+    [
+        (FRONT, (1.0, 0.0, 0.0), None, "other motion"),
+        (FRONT, (-0.4, 0.2, 0.3), None, "other motion"),
+        (FRONT, (1.0, 0.0, 0.0), False, "other motion"),
+        (FRONT, (1.0, 0.0, 0.0), True, ""),
+        (FRONT, (0.0, 0.5, 0.0), None, ""),  # Mirrored reflectors move sideways as well.
+        (FRONT, (0.0, 0.0, 0.0), None, ""),
+        (MOUNTINGS, (1.0, 0.0, 0.0), None, ""),  # The sensor is the platform.
+        (MOUNTINGS, (1.0, 0.0, 0.0), False, "other motion"),
+        ({"sensor": ((0.0, 0.0, 0.0), TURNED)}, (1.0, 0.5, 0.0), None, "other motion"),
+    ],
+)
+def test_single_flat_array_that_may_hear_others_does_not_distinguish_ahead_and_behind(mountings, twist, alone, doubt):
+    """Echoes of others' calls may be all that it hears."""
+    pulses = [[seen_from(np.array(twist) * pulse * TIME_NS / 1e9, places_m(4, 30), pulse, twist)] for pulse in range(3)]
+    odometry = ertis.Odometry(mountings, alone=alone)
+    velocities = [odometry.add(pulse) for pulse in pulses]
+    assert [pose.doubt for pose in odometry.poses[1:]] == [doubt] * 2
+    assert all((velocity is None) == bool(doubt) for velocity in velocities[1:])
+    found = ertis.ego_velocity(*pulses[:2], mountings, alone=alone)
+    assert (found.sd[:2].max() > 0.1) == bool(doubt)
+
+
+def test_single_omnidirectional_emitter_is_heard_from_behind():
+    pulses = [seen_from((0.1 * pulse, 0, 0), places_m(4, 30), pulse, (1.0, 0.0, 0.0)) for pulse in range(2)]
+    array = pulses[0].settings.array.replace(emitter_diameter_m=0.0)
+    omnidirectional = [pulse.replace(settings=pulse.settings.replace(array=array)) for pulse in pulses]
+    for clouds, is_doubtful in ((pulses, False), (omnidirectional, True)):
+        found = ertis.ego_velocity(clouds[:1], clouds[1:], MOUNTINGS)
+        assert (found.sd[0] > 0.5) == is_doubtful
+
+
 def walker(pulse, places, way_m):
     """Return places of a person who has walked for some pulses."""
     return places + np.array([*way_m, 0.0]) * pulse

@@ -97,7 +97,7 @@ def test_parameters_have_no_aliases_which_ros_refuses():
 def test_costmaps_use_the_topic_and_the_frames_of_ertis_ros(source):
     scan = scan_of([(1.0, 0.5)])
     assert (source["topic"], source["data_type"], source["sensor_frame"]) == ("/fused/scan", "LaserScan", "")
-    pose = PlanarPose(TIME_NS, 0.0, 0.0, 0.0, np.zeros((3, 3)), is_measured=True)
+    pose = PlanarPose(TIME_NS, 0.0, 0.0, 0.0, np.zeros((3, 3)))
     transform, odometry = odometry_transform(pose), odometry_message(pose, None)
     for costmap_of in COSTMAPS.values():
         assert costmap_of["robot_base_frame"] == scan["header"]["frame_id"] == transform["child_frame_id"]

@@ -127,7 +127,7 @@ def test_odometry_command_writes_the_trajectory_of_the_platform(folder, tmp_path
 
 
 def test_odometry_command_leaves_out_pulses_without_a_call(folder, tmp_path):
-    code, stdout, stderr = run(folder / "mixed.h5", "-o", tmp_path / "path.tum", "--json")
+    code, stdout, stderr = run(folder / "mixed.h5", "--alone", "-o", tmp_path / "path.tum", "--json")
     assert code == 0, stderr
     assert json.loads(stdout)["left_out"] == 1
     assert "note: 1 of 3 pulses left out, because no sensor emitted its call" in stderr
@@ -137,9 +137,16 @@ def test_odometry_command_leaves_out_pulses_without_a_call(folder, tmp_path):
 
 def test_odometry_command_leaves_out_silent_sensors(folder, tmp_path):
     for name in ("silent_back", "alone"):
-        code, _, stderr = run(folder / f"{name}.h5", "-o", tmp_path / f"{name}.tum")
+        code, _, stderr = run(folder / f"{name}.h5", "--alone", "-o", tmp_path / f"{name}.tum")
         assert code == 0, stderr
     assert (tmp_path / "silent_back.tum").read_text() == (tmp_path / "alone.tum").read_text()
+
+
+def test_odometry_command_of_a_single_sensor_names_the_option_for_one_that_emits_alone(folder, tmp_path):
+    code, _, stderr = run(folder / "alone.h5", "-o", tmp_path / "alone.tum")
+    assert code == 1
+    assert "pass --alone if no other sensor emits" in stderr
+    assert not (tmp_path / "alone.tum").exists()
 
 
 def test_odometry_command_names_its_output_after_the_recording(folder, tmp_path):

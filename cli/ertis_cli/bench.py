@@ -266,7 +266,21 @@ def fusion(**given: Any) -> None:
 
 
 @bench.command()
-@click.option("--count", type=click.IntRange(min=1), default=20, show_default=True, metavar="N", help="Rooms.")
+@click.option(
+    "--count",
+    type=click.IntRange(min=1),
+    default=20,
+    show_default=True,
+    metavar="N",
+    help="Rooms, or scenes of each kind.",
+)
+@click.option(
+    "--only",
+    multiple=True,
+    type=click.Choice(["scenes"]),
+    help="Run odometry in drawn scenes instead: moving objects, few reflectors, corridors, platforms at rest, and "
+    "others.",
+)
 @click.option(
     "--length",
     "length_m",
@@ -276,7 +290,7 @@ def fusion(**given: Any) -> None:
     metavar="M",
     help="Length of a path through a hall; 0 leaves out the hall.",
 )
-@_seed("Seed of the first room.")
+@_seed("Seed of the first room or scene.")
 @_update
 @options.quiet
 @options.as_json

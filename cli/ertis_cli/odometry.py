@@ -31,8 +31,8 @@ _REFUSALS = {
     "few echoes": "no two successive pulses have enough echoes in common, at most a second apart; record more pulses "
     "per second, or a place with more reflectors",
     "other motion": "no step determines the motion, because standing still, mirrored motion or the motion of objects "
-    "explains the echoes about as well; add the recordings of sensors that face other ways, or record a place with "
-    "more reflectors at rest",
+    "explains the echoes about as well; add the recordings of sensors that face other ways, pass --alone if no other "
+    "sensor emits, or record a place with more reflectors at rest",
 }
 
 
@@ -46,6 +46,12 @@ _REFUSALS = {
     metavar="TRAJ.tum",
     help="Trajectory to write in the TUM format; REC.odometry.tum beside the first recording by default.",
 )
+@click.option(
+    "--alone",
+    is_flag=True,
+    help="No sensor emits except those of the recordings. Otherwise, the motion of a single sensor along its axis is "
+    "unknown, because it may hear the calls of others from behind.",
+)
 @_pulses.processing
 @options.force
 @options.quiet
@@ -54,6 +60,7 @@ def odometry(
     *,
     paths: tuple[Path, ...],
     target: Path | None,
+    alone: bool,
     preset: str | None,
     settings_file: Path | None,
     device: str,
@@ -84,7 +91,7 @@ def odometry(
         changed = _pulses.image_settings(settings_file, preset)
         pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
         active = _pulses.active_groups(readers, changed, quiet=quiet)
-        found = odometry_of(readers, active.groups, pipelines, mountings, quiet=quiet)
+        found = odometry_of(readers, active.groups, pipelines, mountings, alone=alone or None, quiet=quiet)
     write_tum(file, found.trajectory, overwrite=force)
     measured = sum(pose.is_measured for pose in found.poses[1:]) / (len(found.poses) - 1)
     duration_s = (found.poses[-1].timestamp_ns - found.poses[0].timestamp_ns) / _NS_PER_S
@@ -110,6 +117,7 @@ def odometry_of(
     pipelines: "_pulses.PipelinesBySensor",
     mountings: "Mapping[str, Mounting]",
     *,
+    alone: bool | None = None,
     quiet: bool,
 ) -> "Odometry":
     """Return the odometry of pulses, under a progress bar.
@@ -125,6 +133,8 @@ def odometry_of(
     pipelines : PipelinesBySensor
     mountings : mapping of str to Mounting
         Mountings of all sensors.
+    alone : bool, optional
+        As for `Odometry`.
     quiet : bool
 
     Raises
@@ -137,7 +147,7 @@ def odometry_of(
     from ertis_numba.motion import Odometry
 
     _require_times(readers, groups)
-    found = Odometry(mountings)
+    found = Odometry(mountings, alone=alone)
     by_name = {reader.sensor: reader for reader in readers}
     settings = {reader.sensor: pipelines.settings(reader) for reader in readers}
     with options.progress(groups, length=len(groups), label="odometry", quiet=quiet) as shown:

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.fusion.rig import MountedSensor
+from ertis_numba.fusion.rig import MountedSensor, emitter_diameter_m
 from ertis_numba.geometry import Grid, microphones
 from ertis_numba.settings import Array, Call
 
@@ -52,6 +52,8 @@ class GroupEchoes(NamedTuple):
     delay_s, arrival_s : (echo,) float64
         Times after the start of the emission at which the platform was where the range and the azimuth apply.
     sound_speed_m_s : (echo,) float64
+    may_be_behind : (echo,) bool
+        True if the reflector may be behind a flat array, which shows it ahead.
     """
 
     sensor: NDArray[np.int64]
@@ -64,6 +66,18 @@ class GroupEchoes(NamedTuple):
     delay_s: Floats
     arrival_s: Floats
     sound_speed_m_s: Floats
+    may_be_behind: NDArray[np.bool_]
+
+    def behind(self, sensors: tuple[MountedSensor, ...], chosen: NDArray[np.int64]) -> "GroupEchoes":
+        """Return the echoes of which those of some sensors that may be behind their arrays are there."""
+        axes = np.array([sensor.rotation[:, 0] for sensor in sensors])[self.sensor]
+        offset_m = self.position_m - np.array([sensor.translation_m for sensor in sensors])[self.sensor]
+        is_behind = self.may_be_behind & np.isin(self.sensor, chosen)
+        back_m = 2 * np.where(is_behind, np.sum(offset_m * axes, axis=1), 0.0)[:, None] * axes
+        offset_m = offset_m - back_m
+        return self._replace(
+            position_m=self.position_m - back_m, azimuth_rad=np.arctan2(offset_m[:, 1], offset_m[:, 0])
+        )
 
 
 class EchoExtractor:
@@ -77,16 +91,20 @@ class EchoExtractor:
     ----------
     sensors : tuple of MountedSensor
         Sensors of the platform.
+    alone : bool, optional
+        True if no sensor emits except those of a group; by default, for a single sensor that is the platform itself,
+        with its origin and heading.
     """
 
-    def __init__(self, sensors: tuple[MountedSensor, ...]) -> None:
+    def __init__(self, sensors: tuple[MountedSensor, ...], *, alone: bool | None = None) -> None:
         self._mounted = sensors
+        self._is_alone = _is_platform(sensors) if alone is None else alone
         self._sensors = {sensor.name: (number, sensor) for number, sensor in enumerate(sensors)}
         self._extractors: dict[str, tuple[tuple[int, ...], PointExtractor]] = {}
 
     def __call__(self, group: Mapping[str, Energyscape | PointCloud]) -> GroupEchoes:
         """Return the echoes of a group of images or point clouds, by sensor."""
-        parts = [self._echoes(item) for item in group.values()]
+        parts = [self._echoes(item, group.keys()) for item in group.values()]
         echoes = GroupEchoes(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
         is_foreign = np.zeros(len(echoes.level), dtype=np.bool_)
         calls = {self._sensors[item.stamp.sensor][0]: item.settings.call for item in group.values()}
@@ -95,7 +113,7 @@ class EchoExtractor:
             is_foreign |= _foreign(echoes, number, self._mounted, calls, is_flat=_is_flat(item.settings.array))
         return GroupEchoes._make(column[~is_foreign] for column in echoes)
 
-    def _echoes(self, item: Energyscape | PointCloud) -> GroupEchoes:
+    def _echoes(self, item: Energyscape | PointCloud, others: Collection[str]) -> GroupEchoes:
         cloud = self._cloud(item) if isinstance(item, Energyscape) else item
         if item.stamp.sensor not in self._sensors:
             raise ArgumentError(
@@ -103,7 +121,7 @@ class EchoExtractor:
             )
         number, mounted = self._sensors[item.stamp.sensor]
         local_m = cloud.position_m.astype(np.float64)
-        off_axis = np.arctan2(np.hypot(local_m[:, 1], local_m[:, 2]), local_m[:, 0])
+        off_axis = _off_axis_rad(local_m)
         is_sharp = off_axis < _MAX_OFF_AXIS_RAD
         cloud = cloud.replace(
             position_m=cloud.position_m[is_sharp],
@@ -126,7 +144,21 @@ class EchoExtractor:
             start_s + range_m / speed_m_s - sweep_delay_s(cloud.settings.call),
             start_s + 2 * range_m / speed_m_s + cloud.settings.call.duration_s / 2,
             np.full(len(cloud), speed_m_s),
+            self._may_be_behind(item, mounted, local_m, others),
         )
+
+    def _may_be_behind(
+        self, item: Energyscape | PointCloud, mounted: MountedSensor, local_m: Floats, others: Collection[str]
+    ) -> NDArray[np.bool_]:
+        """Return True for echoes whose reflectors no other sensor would show if they were behind the array: (echo,)."""
+        may_be = np.full(len(local_m), _is_flat(item.settings.array))
+        if self._is_alone and emitter_diameter_m(item.settings):
+            return may_be & False
+        behind_m = (local_m * [-1.0, 1.0, 1.0]) @ mounted.rotation.T + mounted.translation_m
+        for name in others:
+            other_m = self._sensors[name][1].local_m(behind_m)
+            may_be &= (name == mounted.name) | (_off_axis_rad(other_m) > _MAX_OFF_AXIS_RAD)
+        return may_be
 
     def _cloud(self, image: Energyscape) -> PointCloud:
         known = self._extractors.get(image.stamp.sensor)
@@ -135,6 +167,16 @@ class EchoExtractor:
             made = PointExtractor(image.settings, grid, top=_TOP, min_level_db=_MIN_LEVEL_DB)
             known = self._extractors[image.stamp.sensor] = image.amplitude.shape, made
         return known[1](image)
+
+
+def _is_platform(sensors: tuple[MountedSensor, ...]) -> bool:
+    """Return True for a single sensor with the origin and the heading of the platform."""
+    (first, *others) = sensors
+    return not others and not first.translation_m[:2].any() and first.rotation[0, 0] == 1.0
+
+
+def _off_axis_rad(local_m: Floats) -> Floats:
+    return np.asarray(np.arctan2(np.hypot(local_m[:, 1], local_m[:, 2]), local_m[:, 0]))
 
 
 @functools.cache

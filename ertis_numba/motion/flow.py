@@ -73,11 +73,11 @@ class FlowFit(NamedTuple):
     n_matches: int
     share: float
     score: float
-    ambiguity: float = 0.0
-    other: Floats = np.zeros(3)
-    n_false_alarms: float = 0.0
-    n_places: int = 0
-    has_places: bool = False
+    ambiguity: float
+    other: Floats
+    n_false_alarms: float
+    n_places: int
+    has_places: bool
 
     @property
     def is_significant(self) -> bool:
@@ -133,21 +133,29 @@ def fit_flow(
     # Standing still is more likely than its neighbours.
     found += [hypothesis(flow, pairs, each, NEAR_SCALES) for each in (np.zeros(3), *suspects)]
     best = max(found, key=lambda each: each.support)
-    fit = _final(flow, pairs, best.displacement)
-    if fit is None:
+    fitted = _covariance(flow, pairs, best.displacement)
+    if fitted is None:
         return None
+    covariance, n_matches = fitted
     by_accident = float(np.sum(_gate_areas(flow, pairs)) / (4 * reach_m * reach_rad))
-    n_false_alarms = _n_false_alarms(fit.n_matches, by_accident, limit)
     is_expected = start is not None and bool(np.all(np.abs(best.displacement - start) < _EXPECTED))
     min_places = _MIN_PLACES if is_expected or len(np.unique(before.sensor)) == 1 else _MIN_PLACES_OF_SENSORS
-    fit = fit._replace(
+    other, ambiguity = worst_rival(flow, pairs, best, found, sensors, by_accident)
+    if ambiguity >= MAX_AMBIGUITY:
+        offset = other - best.displacement
+        covariance = covariance + ambiguity / (1 + ambiguity) * np.outer(offset, offset)
+    return FlowFit(
+        displacement=best.displacement,
+        covariance=covariance,
+        n_matches=n_matches,
+        share=n_matches / max(1, min(len(before.level), len(after.level))),
         score=best.support,
+        ambiguity=ambiguity,
+        other=other,
+        n_false_alarms=_n_false_alarms(n_matches, by_accident, limit),
         n_places=best.n_places,
         has_places=best.n_places >= min_places,
-        n_false_alarms=n_false_alarms,
     )
-    other, ambiguity = worst_rival(flow, pairs, best, found, sensors, by_accident)
-    return _with_other(fit._replace(other=other), other - best.displacement, ambiguity)
 
 
 def _gate_areas(flow: EchoFlow, pairs: EchoPairs) -> Floats:
@@ -164,14 +172,6 @@ def _n_false_alarms(n_matches: int, by_accident: float, limit: Floats) -> float:
     """
     n_displacements = float(np.prod(np.maximum(1.0, 2 * limit / _SEARCH_STEP)))
     return n_displacements * float(scipy.special.gammainc(n_matches, by_accident))
-
-
-def _with_other(fit: FlowFit, offset: Floats, ambiguity: float) -> FlowFit:
-    """Return a fit whose covariance includes another displacement, if that is almost as likely."""
-    fit = fit._replace(ambiguity=ambiguity)
-    if fit.is_certain:
-        return fit
-    return fit._replace(covariance=fit.covariance + ambiguity / (1 + ambiguity) * np.outer(offset, offset))
 
 
 def _starts(flow: EchoFlow, pairs: EchoPairs, centre: Floats, limit: Floats, n_starts: int) -> Floats:
@@ -210,8 +210,8 @@ def _rank(echoes: GroupEchoes) -> NDArray[np.int64]:
     return rank
 
 
-def _final(flow: EchoFlow, pairs: EchoPairs, displacement: Floats) -> FlowFit | None:
-    """Return the fit to the pairs that remain, with its covariance from their residuals."""
+def _covariance(flow: EchoFlow, pairs: EchoPairs, displacement: Floats) -> tuple[Floats, int] | None:
+    """Return the covariance by the residuals of matches, and their number; None if they do not determine the motion."""
     sd = flow.deviations(pairs)
     residual, slopes = flow.linear(displacement, pairs)
     residual, slopes = residual / sd, slopes / sd[:, :, None]
@@ -224,6 +224,4 @@ def _final(flow: EchoFlow, pairs: EchoPairs, displacement: Floats) -> FlowFit | 
     # A fit of three parameters to few echoes leaves residuals that are too small.
     spread = spread * 2 * n_matches / (2 * n_matches - 3) + _MIN_VARIANCE * normal
     inverse = np.linalg.inv(normal)
-    covariance = _INFLATION @ inverse @ spread @ inverse @ _INFLATION
-    share = n_matches / max(1, min(len(flow.before.level), len(flow.after.level)))
-    return FlowFit(displacement, covariance, n_matches, share, float(weight @ flow.strengths(pairs)))
+    return _INFLATION @ inverse @ spread @ inverse @ _INFLATION, n_matches

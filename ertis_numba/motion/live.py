@@ -21,10 +21,12 @@ class LiveOdometry:
     ----------
     on_note : callable
         Called with a line for each group that cannot be used.
+    alone : bool, optional
+        As for `Odometry`.
     """
 
-    def __init__(self, on_note: Callable[[str], None]) -> None:
-        self._note = on_note
+    def __init__(self, on_note: Callable[[str], None], *, alone: bool | None = None) -> None:
+        self._note, self._alone = on_note, alone
         self._mountings: Mountings = {}
         self._first: frozenset[str] = frozenset()  # Sensors of the first group.
         self._odometry: Odometry | None = None
@@ -53,7 +55,7 @@ class LiveOdometry:
             self._odometry = None
         is_second = self._odometry is not None and len(self._odometry.poses) == 1
         if self._odometry is None or (is_second and group.keys() - self._first):
-            self._odometry, self._first = Odometry(mountings), frozenset(group)
+            self._odometry, self._first = Odometry(mountings, alone=self._alone), frozenset(group)
         elif mountings != self._mountings:
             self._odometry.remount(mountings)
         self._mountings = dict(mountings)

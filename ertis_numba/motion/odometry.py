@@ -47,8 +47,6 @@ class PlanarPose(NamedTuple):
     x_m, y_m, yaw_rad : float
     covariance : (3, 3) float64
         Covariance of x, y and yaw since the start, in metres and radians.
-    is_measured : bool
-        False if the motion since the last group is unknown.
     doubt : {"", "pause", "few echoes", "other motion"}
         Reason why the motion is unknown; empty if it was measured. After a pause of more than a second, or if no more
         echoes match than those of noise or of one moving object (``few echoes``), the last velocity is assumed to have
@@ -60,7 +58,7 @@ class PlanarPose(NamedTuple):
     >>> import numpy as np
     >>> import ertis_numba as ertis
     >>> pose = ertis.PlanarPose(0, 0.0, 0.0, np.pi / 2, np.zeros((3, 3)))
-    >>> moved = pose.moved(np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)), 100_000_000, is_measured=True)
+    >>> moved = pose.moved(np.array([1.0, 0.0, 0.0]), np.zeros((3, 3)), 100_000_000)
     >>> round(moved.x_m, 3), round(moved.y_m, 3)
     (0.0, 1.0)
     """
@@ -70,12 +68,14 @@ class PlanarPose(NamedTuple):
     y_m: float
     yaw_rad: float
     covariance: Floats
-    is_measured: bool = True
     doubt: Doubt = ""
 
-    def moved(
-        self, displacement: Floats, covariance: Floats, timestamp_ns: int, *, is_measured: bool, doubt: Doubt = ""
-    ) -> "PlanarPose":
+    @property
+    def is_measured(self) -> bool:
+        """False if the motion since the last group is unknown."""
+        return not self.doubt
+
+    def moved(self, displacement: Floats, covariance: Floats, timestamp_ns: int, doubt: Doubt = "") -> "PlanarPose":
         """Return the pose after a displacement in the frame of this pose."""
         carried, turned = _propagation(self.yaw_rad, displacement)
         x_m, y_m, turn_rad = (turned @ displacement).tolist()
@@ -85,17 +85,20 @@ class PlanarPose(NamedTuple):
             self.y_m + y_m,
             math.remainder(self.yaw_rad + turn_rad, 2 * math.pi),
             carried @ self.covariance @ carried.T + turned @ covariance @ turned.T,
-            is_measured,
             doubt,
         )
 
 
 class _View(NamedTuple):
-    """Echoes of a group, and the pose and twist of the platform; None if the twist is unknown."""
+    """Echoes of a group, and the pose and twist of the platform; None if the twist is unknown.
+
+    ``change`` is the covariance of displacements from here, because the twist changed.
+    """
 
     echoes: GroupEchoes
     pose: PlanarPose
     twist: Floats | None
+    change: Floats = np.zeros((3, 3))
 
 
 class Odometry:
@@ -111,6 +114,10 @@ class Odometry:
     ----------
     mountings : mapping of str to (translation_m, rotation_xyzw)
         Mountings of the sensors, as for `Fuser`.
+    alone : bool, optional
+        True if no sensor emits except those with images. Then a flat array hears no calls of others from behind, which
+        would appear as if the platform drove backwards. By default, this is assumed only of a single sensor that is
+        the platform itself: at its origin, and with its heading.
 
     Raises
     ------
@@ -129,9 +136,9 @@ class Odometry:
     [[0.0, 0.0, 0.0]]
     """
 
-    def __init__(self, mountings: Mountings) -> None:
-        self._sensors = mounted_sensors(mountings)
-        self._extract = EchoExtractor(self._sensors)
+    def __init__(self, mountings: Mountings, *, alone: bool | None = None) -> None:
+        self._sensors, self._alone = mounted_sensors(mountings), alone
+        self._extract = EchoExtractor(self._sensors, alone=alone)
         self._last: _View | None = None
         self._keyframe: _View | None = None
         self._twist = np.zeros(3)
@@ -200,7 +207,7 @@ class Odometry:
         sensors = mounted_sensors(mountings)
         if not _begins_with(sensors, self._sensors):
             self._begin(None)
-        self._sensors, self._extract = sensors, EchoExtractor(sensors)
+        self._sensors, self._extract = sensors, EchoExtractor(sensors, alone=self._alone)
 
     def add(self, group: Iterable[Item]) -> EgoVelocity | None:
         """Add the images of a SYNC pulse, and return the velocity since the one before.
@@ -241,8 +248,10 @@ class Odometry:
             self._begin(echoes)
             return None
         self._twist, self._twist_ns = twist_of(found.displacement, time_s), timestamp_ns
+        change = _of_change(self._last.twist, self._twist, echoes) if self._last else np.zeros((3, 3))
+        found = found._replace(covariance=found.covariance + change)
         self._unknown, self._suspects = np.zeros(3), ()
-        self._locate(echoes, found, self._twist, timestamp_ns)
+        self._locate(echoes, found, self._twist, change, timestamp_ns)
         self._last = _View(echoes, self._path[-1], self._twist)
         return velocity_of(found, timestamp_ns, time_s)
 
@@ -261,7 +270,7 @@ class Odometry:
             self._suspects = twist_of(found.displacement, time_s), twist_of(found.other, time_s)
         before, self._unknown = self._unknown, self._unknown + deviation
         covariance = np.diag(self._unknown**2 - before**2)
-        self._path.append(self._path[-1].moved(way, covariance, timestamp_ns, is_measured=False, doubt=doubt))
+        self._path.append(self._path[-1].moved(way, covariance, timestamp_ns, doubt))
 
     def _begin(self, echoes: GroupEchoes | None) -> None:
         self._last = None if echoes is None else _View(echoes, self._path[-1], None)
@@ -292,9 +301,9 @@ class Odometry:
         fits = [each for each in (near, other) if each is not None]
         return _significant(max(fits, key=lambda each: each.score, default=None))
 
-    def _locate(self, echoes: GroupEchoes, found: FlowFit, twist: Floats, timestamp_ns: int) -> None:
+    def _locate(self, echoes: GroupEchoes, found: FlowFit, twist: Floats, change: Floats, timestamp_ns: int) -> None:
         """Add the pose relative to the keyframe, or to the last group if the keyframe is out of reach."""
-        step = self._path[-1].moved(found.displacement, found.covariance, timestamp_ns, is_measured=True)
+        step = self._path[-1].moved(found.displacement, found.covariance, timestamp_ns)
         keyframe = self._keyframe
         if keyframe is not None:
             expected = _relative(keyframe.pose, step)
@@ -312,10 +321,10 @@ class Odometry:
                 )
                 if fit is not None and _confirms(fit, found, expected):
                     self._path.append(
-                        keyframe.pose.moved(fit.displacement, fit.covariance, timestamp_ns, is_measured=True)
+                        keyframe.pose.moved(fit.displacement, fit.covariance + change + keyframe.change, timestamp_ns)
                     )
                     return
-        self._keyframe = self._last
+        self._keyframe = self._last and self._last._replace(change=change)
         self._path.append(step)
 
 
@@ -330,6 +339,15 @@ def _propagation(yaw_rad: float, displacement: Floats) -> tuple[Floats, Floats]:
 def _significant(fit: FlowFit | None) -> FlowFit | None:
     """Return a fit if unrelated echoes do not match as well by accident."""
     return fit if fit is not None and fit.is_significant else None
+
+
+def _of_change(before: Floats | None, after: Floats, echoes: GroupEchoes) -> Floats:
+    """Return the covariance of a displacement by a change of the velocity at an unknown instant: (3, 3) float64.
+
+    Echoes of a group are compensated by the mean velocity before it, which differs from that at the group.
+    """
+    change = np.zeros(3) if before is None else after - before
+    return np.asarray(np.diag((change * np.mean(echoes.arrival_s)) ** 2))
 
 
 def _confirms(fit: FlowFit, found: FlowFit, expected: Floats) -> bool:

@@ -1,5 +1,6 @@
 """Residuals of pairs of echoes between two groups, for a trial displacement of the platform."""
 
+import copy
 import math
 from typing import Final, NamedTuple
 
@@ -104,9 +105,15 @@ class EchoFlow:
         time_s: float,
         twists: tuple[Floats | None, Floats | None],
     ) -> None:
-        self.before, self.after, self._time_s = before, after, time_s
+        self.before, self.after, self._time_s, self._sensors = before, after, time_s, sensors
         self._offset_m = np.array([sensor.translation_m for sensor in sensors])[before.sensor]
         self._twists = [None if twist is None else twist[None] for twist in twists]
+
+    def behind(self, chosen: NDArray[np.int64]) -> "EchoFlow":
+        """Return the flow if echoes of some sensors that may be behind their arrays are there; pairs stay the same."""
+        found = copy.copy(self)
+        found.before, found.after = (each.behind(self._sensors, chosen) for each in (self.before, self.after))
+        return found
 
     def pairs(self, reach_m: float, reach_rad: float) -> EchoPairs:
         """Return the pairs of the same sensor whose range, azimuth and level differ little."""

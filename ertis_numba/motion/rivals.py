@@ -1,7 +1,7 @@
 """Rivals of a motion: standing still, mirrored motion, the motion of objects, and that by the spacing of posts."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -33,6 +33,7 @@ _MAX_ACCIDENTAL: Final = 0.02  # Expected number of rivals by accident
 # Displacements that a fit tells apart near its start, and near a mirrored motion, whose echoes do not move exactly so.
 _N_NEAR: Final = 33.0
 _N_MIRRORED: Final = 8 * _N_NEAR
+_MIN_PLACES: Final = 3  # of echoes that rule out reflectors behind arrays
 _PARALLEL: Final = 0.98  # Cosine of arrays that face along one line
 
 
@@ -67,12 +68,45 @@ def worst_rival(
     ambiguity : float
         Score relative to that of the best displacement; at least `MAX_AMBIGUITY` if the rival cannot be excluded.
     """
-    facing = _facing(flow, pairs, sensors)
-    mirrored = [_mirrored(best.displacement, sensor) for sensor in facing]
+    mirrored = [_mirrored(best.displacement, sensor) for sensor in _facing(flow, pairs, sensors)]
     rivals = [*found, *(hypothesis(flow, pairs, each, NEAR_SCALES) for each in mirrored)]
-    only = mirrored[0] if len(mirrored) == 1 else None
-    judged = [(each.displacement, _ambiguity(flow, pairs, best, each, by_accident, only)) for each in rivals]
+    judged = [(each.displacement, _ambiguity(flow, pairs, best, each, by_accident, mirrored)) for each in rivals]
+    judged += _behind(flow, pairs, best, sensors, by_accident)
     return max(judged, key=lambda each: each[1])
+
+
+def _behind(
+    flow: EchoFlow,
+    pairs: EchoPairs,
+    best: MotionHypothesis,
+    sensors: tuple[MountedSensor, ...],
+    by_accident: float,
+) -> Iterator[tuple[Floats, float]]:
+    """Yield displacements by which reflectors are behind some arrays, where no other sensor shows them, as rivals."""
+    is_match = (best.weight > 0.5) & flow.before.may_be_behind[pairs.before]
+    numbers, counts = np.unique(flow.before.sensor[pairs.before[is_match]], return_counts=True)
+    if counts.sum() <= _MIN_MATCHES * best.n_matches:
+        return
+    for chosen in {(*numbers,), *((number,) for number in numbers)}:
+        mirrored = flow.behind(np.array(chosen))
+        for number in chosen:
+            rival = hypothesis(mirrored, pairs, _mirrored(best.displacement, sensors[number]), NEAR_SCALES)
+            if np.any(np.abs(rival.displacement - best.displacement) > _ELSEWHERE / 3):
+                only_best = best.without(_explained(flow, pairs, rival) > 0.5, flow, pairs)
+                only_rival = rival.without(_explained(flow, pairs, best) > 0.5, mirrored, pairs)
+                is_sure = only_best.n_places >= _MIN_PLACES and _n_accidental(only_best, by_accident) < _MAX_ACCIDENTAL
+                better, worse = (only_best, only_rival) if is_sure else (best, rival)
+                yield rival.displacement, MAX_AMBIGUITY * worse.support / better.support / _MAX_SUPPORT
+
+
+def _explained(flow: EchoFlow, pairs: EchoPairs, found: MotionHypothesis) -> Floats:
+    """Return the probability that a hypothesis explains the first echo of each pair: (pair,) float64."""
+    return np.asarray(np.bincount(pairs.before, found.weight, len(flow.before.level))[pairs.before])
+
+
+def _n_accidental(found: MotionHypothesis, by_accident: float) -> float:
+    """Return the expected number of hypotheses near a given one that explain as many unrelated echoes."""
+    return _N_NEAR * float(scipy.special.gammainc(found.n_matches, by_accident))
 
 
 def _facing(flow: EchoFlow, pairs: EchoPairs, sensors: tuple[MountedSensor, ...]) -> list[MountedSensor]:
@@ -91,14 +125,14 @@ def _ambiguity(
     best: MotionHypothesis,
     rival: MotionHypothesis,
     by_accident: float,
-    mirrored: Floats | None,
+    mirrored: Sequence[Floats],
 ) -> float:
     apart = np.abs(rival.displacement - best.displacement)
     if np.all(apart < _ELSEWHERE / 3):
         return 0.0
     strengths = flow.strengths(pairs)
     score = float(best.weight @ strengths)
-    explained = np.bincount(pairs.before, best.weight, len(flow.before.level))[pairs.before]
+    explained = _explained(flow, pairs, best)
     shared = 0.0
     if np.any(apart > _ELSEWHERE) and (rival.weight * explained) @ strengths > _SHARED * score:
         shared = float(rival.weight @ strengths) / max(score, 1e-30)
@@ -106,18 +140,15 @@ def _ambiguity(
 
 
 def _ambiguity_of_others(
-    best: MotionHypothesis, rival: MotionHypothesis, by_accident: float, mirrored: Floats | None
+    best: MotionHypothesis, rival: MotionHypothesis, by_accident: float, mirrored: Sequence[Floats]
 ) -> float:
     """Return the ambiguity by a rival that explains other echoes."""
-    if rival.n_matches <= _MIN_MATCHES_MIRRORED * best.n_matches:
+    if rival.n_matches <= _MIN_MATCHES * best.n_matches or _n_accidental(rival, by_accident) > _MAX_ACCIDENTAL:
         return 0.0
-    n_accidental = float(scipy.special.gammainc(rival.n_matches, by_accident))
-    if mirrored is not None and _is_near(rival.displacement, mirrored, best.displacement):
-        return float(_N_MIRRORED * n_accidental < _MAX_ACCIDENTAL)
-    if rival.n_matches <= _MIN_MATCHES * best.n_matches or _N_NEAR * n_accidental > _MAX_ACCIDENTAL:
-        return 0.0
+    if len(mirrored) > 1 and any(_is_near(rival.displacement, each, best.displacement) for each in mirrored):
+        return 0.0  # Calls of others from behind agree with the best one, unless all of its echoes are from behind.
     relative = max(rival.support / best.support, rival.n_places / best.n_places)
-    return MAX_AMBIGUITY * relative / (_MAX_SUPPORT if mirrored is None else _MAX_SUPPORT_ONE_LINE)
+    return MAX_AMBIGUITY * relative / (_MAX_SUPPORT_ONE_LINE if len(mirrored) == 1 else _MAX_SUPPORT)
 
 
 def _is_near(displacement: Floats, mirrored: Floats, best: Floats) -> bool:

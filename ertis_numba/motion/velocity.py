@@ -65,7 +65,9 @@ class EgoVelocity:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
-def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mountings) -> EgoVelocity:
+def ego_velocity(
+    before: Iterable[Item], after: Iterable[Item], mountings: Mountings, *, alone: bool | None = None
+) -> EgoVelocity:
     """Return the velocity of a platform from the images of two SYNC pulses; use `Odometry` for several.
 
     Echoes of reflectors at rest shift in range and azimuth as the platform moves. The velocity is that which explains
@@ -79,6 +81,8 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
         Images or point clouds of two successive SYNC pulses, at most one of each sensor.
     mountings : mapping of str to (translation_m, rotation_xyzw)
         Mountings of the sensors, as for `Fuser`.
+    alone : bool, optional
+        True if no sensor emits except those with images, as for `Odometry`.
 
     Returns
     -------
@@ -126,7 +130,7 @@ def ego_velocity(before: Iterable[Item], after: Iterable[Item], mountings: Mount
             f"before has sensors {', '.join(groups[0])}, and after has {', '.join(groups[1])}; give images of the same "
             "sensors"
         )
-    extract = EchoExtractor(sensors)
+    extract = EchoExtractor(sensors, alone=alone)
     found = fit_flow(extract(groups[0]), extract(groups[1]), sensors, time_s)
     if found is None:
         raise DataError(

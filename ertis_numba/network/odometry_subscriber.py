@@ -72,6 +72,8 @@ class OdometrySubscriber(ResultSubscriber[ReceivedPulse, OdometryArrival]):
         All by default.
     keys : ClientKeys, optional
         None on loopback only.
+    alone : bool, optional
+        True if no sensor emits except those received, as for `Odometry`.
     on_note : callable, optional
         Called with a line for each change of the connection, by a thread, and for each pulse that cannot be used.
 
@@ -99,10 +101,11 @@ class OdometrySubscriber(ResultSubscriber[ReceivedPulse, OdometryArrival]):
         mountings: Mountings | None = None,
         sensors: Sequence[str] | None = None,
         keys: ClientKeys | None = None,
+        alone: bool | None = None,
         on_note: Callable[[str], None] | None = None,
     ) -> None:
         super().__init__(PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note))
-        self._odometry = LiveOdometry(on_note or (lambda _: None))
+        self._odometry = LiveOdometry(on_note or (lambda _: None), alone=alone)
         self._stamps: dict[str, Stamp] = {}  # of the last pulse, by sensor
 
     @property

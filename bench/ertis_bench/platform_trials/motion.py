@@ -1,11 +1,11 @@
-"""Errors of ego-velocity in furnished rooms, and of odometry along the walls of a hall.
+"""Errors of ego-velocity in furnished rooms, and of odometry along the walls of a hall and in drawn scenes.
 
-Images are simulated through PDM. Nothing is timed except the estimates themselves.
+Images of rooms and halls are simulated through PDM. Nothing is timed except the estimates themselves.
 """
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -14,6 +14,7 @@ import ertis_numba as ertis
 from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
+from ertis_bench.platform_trials import drawn_odometry
 from ertis_bench.platform_trials.furnished_rooms import (
     Motion,
     PlatformImager,
@@ -30,7 +31,9 @@ _EVERY: Final = 2  # pulses of the hall, so that groups are 0.14 m apart
 _TO_SHOWN: Final = np.array([1.0, 1.0, math.degrees(1.0)])
 
 
-def run(*, count: int, length_m: float, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
+def run(
+    *, count: int, length_m: float, seed: int, say: Callable[[str], None], only: Sequence[str] = ()
+) -> dict[str, Any]:
     """Estimate velocities in random rooms, and the path through a hall.
 
     Parameters
@@ -43,7 +46,11 @@ def run(*, count: int, length_m: float, seed: int, say: Callable[[str], None]) -
         Seed of the first room, and of the hall.
     say : callable
         Function that reports progress.
+    only : sequence of str
+        ``scenes`` for odometry in drawn scenes instead, ``count`` of each kind.
     """
+    if only:
+        return drawn_odometry.run(count=count, seed=seed, say=say)
     errors, deviations, seconds = [], [], []
     for number in range(seed, seed + count):
         motion = random_motion(number)
@@ -111,6 +118,8 @@ def _hall(seed: int, length_m: float, say: Callable[[str], None]) -> dict[str, A
 
 def form(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
+    if "scenes" in report:
+        return drawn_odometry.form(report)
     names = ("forward (m/s)", "left (m/s)", "yaw rate (°/s)")
     rows = [
         [name, f"{rms:.4f}", f"{predicted:.4f}", f"{rms / predicted:.2f}", f"{largest:.4f}"]
