@@ -82,7 +82,7 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 	$(BIN)/ertis bench network --only fusion --update docs/how-to/fusion.md
 	$(BIN)/ertis bench network --only maps --update docs/how-to/passive.md
 	$(BIN)/ertis bench motion --length 90 --seed 2000 --update docs/how-to/motion.md
-	$(BIN)/ertis bench motion --only scenes --count 10 --seed 9000 --update docs/how-to/motion.md
+	$(BIN)/ertis bench motion --only scenes --count 10 --seed 9500 --update docs/how-to/motion.md
 	$(BIN)/ertis bench map --update docs/how-to/mapping.md
 	$(BIN)/ertis bench map --only space --update docs/how-to/mapping.md
 	$(BIN)/ertis bench scaling --update docs/reference/benchmarks.md

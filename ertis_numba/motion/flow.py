@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.fusion.rig import MountedSensor
 from ertis_numba.motion.echoes import GroupEchoes
-from ertis_numba.motion.hypotheses import NEAR_SCALES, hypothesis, pair_weights
+from ertis_numba.motion.hypotheses import NEAR_SCALES, PLACE_M, hypothesis, pair_weights
 from ertis_numba.motion.residuals import EchoFlow, EchoPairs
 from ertis_numba.motion.rivals import MAX_AMBIGUITY, worst_rival
 
@@ -35,6 +35,7 @@ _MIN_PLACES_OF_SENSORS: Final = 4
 _MAX_FALSE_ALARMS: Final = 1e-3
 _STRONGEST: Final = 40  # Number of echoes per sensor that the search uses.
 _GATE: Final = 9.0
+_MIN_WEIGHT: Final = 0.01  # of pairs that count as echoes of a place
 _MIN_VARIANCE: Final = 0.003  # of residuals, relative to that by the deviations of echoes
 # Errors of neighbouring echoes are correlated, so residuals underestimate those of the motion by these factors. They
 # were measured in simulated rooms other than those of `ertis bench motion`.
@@ -223,5 +224,21 @@ def _covariance(flow: EchoFlow, pairs: EchoPairs, displacement: Floats) -> tuple
     spread = np.einsum("apx,p,ap,apy->xy", slopes, weight**2, residual**2, slopes)
     # A fit of three parameters to few echoes leaves residuals that are too small.
     spread = spread * 2 * n_matches / (2 * n_matches - 3) + _MIN_VARIANCE * normal
+    # Echoes of one place have errors in common, such as those of several calls from one reflector.
+    place = _place_of(flow.before.position_m[pairs.before, :2], weight)
+    pulls = np.zeros((place.max(initial=0) + 1, 3))
+    np.add.at(pulls, place, np.einsum("apx,p,ap->px", slopes, weight, residual))
+    common = max(1.0, float(np.trace(np.linalg.solve(spread, pulls.T @ pulls))) / 3)
     inverse = np.linalg.inv(normal)
-    return _INFLATION @ inverse @ spread @ inverse @ _INFLATION, n_matches
+    return common * _INFLATION @ inverse @ spread @ inverse @ _INFLATION, n_matches
+
+
+def _place_of(position_m: Floats, weight: Floats) -> NDArray[np.int64]:
+    """Return the number of the place of each pair: (pair,) int64."""
+    place, left = np.zeros(len(position_m), np.int64), weight > _MIN_WEIGHT
+    while left.any():
+        strongest = position_m[np.argmax(np.where(left, weight, 0.0))]
+        is_here = left & (np.hypot(*(position_m - strongest).T) < PLACE_M)
+        place[is_here] = place.max() + 1
+        left &= ~is_here
+    return place

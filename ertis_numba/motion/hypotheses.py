@@ -21,7 +21,7 @@ _CONVERGED: Final = 1e-6  # m and rad
 _REACH: Final = 8.0  # Largest residual of a pair that a fit may use, in standard deviations and tolerances
 _OUTLIER: Final = math.exp(-0.5 * 9.0)  # Likelihood of an echo without a partner: three standard deviations.
 # All echoes of a person are within this distance, so they are evidence of one place only.
-_PLACE_M: Final = 0.7
+PLACE_M: Final = 0.7
 # Smooth walls reflect from their nearest point, which moves with the platform, so that it seems to stand still.
 _BESIDE_M: Final = 0.25
 
@@ -68,7 +68,7 @@ def _described(flow: EchoFlow, pairs: EchoPairs, displacement: Floats, weight: F
     while len(place_m):
         places_m.append(place_m[0])
         support += float(strength[0])
-        is_far = np.hypot(*(place_m - place_m[0]).T) > _PLACE_M
+        is_far = np.hypot(*(place_m - place_m[0]).T) > PLACE_M
         place_m, strength = place_m[is_far], strength[is_far]
     return MotionHypothesis(displacement, weight, len(order), _n_independent(places_m), support)
 
