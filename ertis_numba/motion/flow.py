@@ -141,7 +141,8 @@ def fit_flow(
     by_accident = float(np.sum(_gate_areas(flow, pairs)) / (4 * reach_m * reach_rad))
     is_expected = start is not None and bool(np.all(np.abs(best.displacement - start) < _EXPECTED))
     min_places = _MIN_PLACES if is_expected or len(np.unique(before.sensor)) == 1 else _MIN_PLACES_OF_SENSORS
-    other, ambiguity = worst_rival(flow, pairs, best, found, sensors, by_accident)
+    expected = None if start is None else (start, limit)
+    other, ambiguity = worst_rival(flow, pairs, best, found, sensors, by_accident, expected)
     if ambiguity >= MAX_AMBIGUITY:
         offset = other - best.displacement
         covariance = covariance + ambiguity / (1 + ambiguity) * np.outer(offset, offset)

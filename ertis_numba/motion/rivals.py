@@ -44,6 +44,7 @@ def worst_rival(
     found: Sequence[MotionHypothesis],
     sensors: tuple[MountedSensor, ...],
     by_accident: float,
+    expected: tuple[Floats, Floats] | None,
 ) -> tuple[Floats, float]:
     """Return the displacement that rivals the best one most, and its ambiguity.
 
@@ -61,6 +62,8 @@ def worst_rival(
     sensors : tuple of MountedSensor
     by_accident : float
         Expected number of matches of one displacement by accident.
+    expected : ((3,) float64, (3,) float64), optional
+        Displacement by the last motion, and the largest difference from it. Mirrored motions beyond it are no rivals.
 
     Returns
     -------
@@ -71,7 +74,8 @@ def worst_rival(
     mirrored = [_mirrored(best.displacement, sensor) for sensor in _facing(flow, pairs, sensors)]
     rivals = [*found, *(hypothesis(flow, pairs, each, NEAR_SCALES) for each in mirrored)]
     judged = [(each.displacement, _ambiguity(flow, pairs, best, each, by_accident, mirrored)) for each in rivals]
-    judged += _behind(flow, pairs, best, sensors, by_accident)
+    behind = _behind(flow, pairs, best, sensors, by_accident)
+    judged += [each for each in behind if expected is None or np.all(np.abs(each[0] - expected[0]) < expected[1])]
     return max(judged, key=lambda each: each[1])
 
 
