@@ -10,7 +10,7 @@ from ertis_bench.error_trials import budgets
 from ertis_cli.main import cli
 from scipy.signal import chirp
 
-from ertis_numba.analysis.call_match import call_match, first_call_match
+from ertis_numba.analysis.call_match import SILENT, call_match, first_call_match
 from ertis_numba.errors import CallMismatchWarning
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
@@ -42,7 +42,7 @@ def heard(emitted, *, echoes=((6e-3, 1.0),), noise=0.0, seed=0, settings=SETTING
 def test_call_match_finds_sweeps_of_the_opposite_direction(modulation, noise):
     settings = SETTINGS.replace(call=CALL.replace(modulation=modulation))
     found = call_match(heard(REVERSED.replace(modulation=modulation), noise=noise, settings=settings))
-    assert not found.matches
+    assert found.verdict == "differs"
     assert (found.sweep.modulation, found.sweep.start_hz < found.sweep.stop_hz) == (modulation, True)
     assert found.sweep.duration_s == pytest.approx(CALL.duration_s, rel=0.2)
     assert re.search(rf"{modulation} sweep from about 2\d to", found.warning)
@@ -54,7 +54,7 @@ def test_call_match_finds_sweeps_of_the_opposite_direction(modulation, noise):
 )
 def test_call_match_finds_other_presets(emitted):
     found = call_match(heard(emitted, noise=0.5))
-    assert not found.matches
+    assert found.verdict == "differs"
     assert found.sweep.duration_s == pytest.approx(emitted.duration_s, rel=0.2)
     assert "opposite" not in found.warning
 
@@ -110,7 +110,7 @@ def test_call_match_names_the_emitted_sweep(emitted, scene):
     given = chirps(*EMITTED[emitted], **SCENES[scene])
     stated = STATED[(2 * [*EMITTED].index(emitted) + [*SCENES].index(scene)) % len(STATED)]
     found = compared(given, *stated)
-    assert not found.matches, stated
+    assert found.verdict == "differs", stated
     assert found.sweep.modulation == {"logarithmic": "exponential"}.get(method, method)
     assert found.sweep.duration_s == pytest.approx(1e-3 * duration_ms, rel=0.2)
     assert found.sweep.start_hz == pytest.approx(1e3 * start_khz, rel=0.15)
@@ -135,7 +135,7 @@ def test_call_match_finds_pulses_of_a_tone():
 
 def test_call_match_states_that_a_narrow_band_permits_no_judgement():
     found = compared(chirps(48, 38, 0.5, "linear"), 80, 20, 2.5)
-    assert found.matches
+    assert found.verdict == "unknown"
     assert re.match(r"echoes contain only about 3\d to 4\d kHz of the call", found.note)
     assert "if its emitter has no such band, another call was emitted" in found.note
 
@@ -144,38 +144,41 @@ def test_call_match_accepts_linear_calls_in_motion():
     """At 2 m/s, echoes are 1.2 % shorter, and their frequencies as much higher."""
     factor = 1 + 2 * 2.0 / 343
     moving = chirps(80 * factor, 20 * factor, 2.5 / factor, "linear")
-    assert compared(moving, 80, 20, 2.5, "linear").matches
+    assert compared(moving, 80, 20, 2.5, "linear").verdict == "matches"
 
 
 def test_call_match_does_not_judge_direct_sound_that_began_before_the_record():
     """The start of the call is missing, as if its band ended earlier."""
-    assert compared(chirps(50, 25, 2.5, "hyperbolic", echoes=[(-0.5e-3, 3.0), (9e-3, 0.05)]), 50, 25, 2.5).matches
+    assert (
+        compared(chirps(50, 25, 2.5, "hyperbolic", echoes=[(-0.5e-3, 3.0), (9e-3, 0.05)]), 50, 25, 2.5).verdict
+        == "matches"
+    )
 
 
 def test_call_match_accepts_the_call_beside_a_louder_reversed_one():
     both = heard(CALL).data + 3 * heard(REVERSED, echoes=((9e-3, 1.0),)).data
-    assert call_match(Measurement(both, SETTINGS)).matches
+    assert call_match(Measurement(both, SETTINGS)).verdict == "matches"
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_call_match_accepts_many_echoes_of_the_call(seed):
     random = np.random.default_rng(seed)
     echoes = np.stack([random.uniform(1e-3, 14e-3, 60), random.standard_normal(60)], axis=1)
-    assert call_match(heard(CALL, echoes=echoes, noise=0.1, seed=seed)).matches
+    assert call_match(heard(CALL, echoes=echoes, noise=0.1, seed=seed)).verdict == "matches"
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_call_match_accepts_random_settings_and_scenes(seed):
     measurement, _ = budgets.measurement_of(seed)
     found = call_match(measurement)
-    assert found is None or found.matches
+    assert found.verdict != "differs"
 
 
 def test_call_match_does_not_judge_noise_and_silence():
     silent, noisy = heard(CALL, echoes=()), heard(CALL, echoes=(), noise=1.0)
-    assert call_match(silent) is None
-    assert call_match(noisy) is None
-    assert not first_call_match([silent, noisy, heard(REVERSED)]).matches
+    assert call_match(silent) is SILENT
+    assert call_match(noisy) is SILENT
+    assert first_call_match([silent, noisy, heard(REVERSED)]).verdict == "differs"
 
 
 def test_process_warns_of_another_call_on_stderr_and_in_the_file(tmp_path):

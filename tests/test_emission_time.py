@@ -108,9 +108,9 @@ def test_second_emission_of_a_record_is_found(array):
     assert emissions_of(both) == EmissionTimes(pytest.approx(0.0, abs=6e-6), pytest.approx(11e-3, abs=6e-6))
     text, remedy = describe_start([emissions_of(both)], SPEED_M_S)
     assert text.startswith("a record contains several emissions, 11 ms apart")
-    assert re.fullmatch(r"import again with --length 0\.01[01]\d*", remedy)
+    assert re.fullmatch(r"end each record before the next emission, or import again with --length 0\.01[01]\d*", remedy)
     ((subject, warning),) = SoundChecks().check(both)
-    assert (subject, warning.rpartition("; ")[2]) == ("start", "end each record before the next emission")
+    assert (subject, warning.rpartition("; ")[2]) == ("start", remedy)
 
 
 SHIFTS = {
@@ -143,14 +143,18 @@ def test_small_shifts_are_not_described(late_s):
 @pytest.mark.parametrize(
     ("late_s", "delay_s", "remedy"),
     [
-        ([1.37e-3], 0.0, "set call.delay_s = 0.00137 in the settings"),
-        ([-0.5e-3], 2e-3, "set call.delay_s = 0.0015 in the settings"),
-        ([-0.5e-3], 0.0, "start recording 0.5 ms earlier"),
-        ([0.0, 5e-4], 0.0, "trigger each record by its emission"),
+        (
+            [1.37e-3],
+            0.0,
+            "set call.delay_s = 0.00137 in the settings, or import again with a larger --skip, by 0",
+        ),
+        ([-5e-4], 2e-3, "set call.delay_s = 0.0015 in the settings, or import again with a smaller --skip, by 0.0005"),
+        ([-5e-4], 0.0, "start recording 0.5 ms earlier, or import again with a smaller --skip"),
+        ([0.0, 5e-4], 0.0, "trigger each record by its emission, or import again with --sync-channel, "),
     ],
 )
-def test_remedy_of_records_that_are_not_imported(late_s, delay_s, remedy):
-    assert describe_shift(late_s, SPEED_M_S, delay_s=delay_s)[1] == remedy
+def test_remedy_of_shifted_records(late_s, delay_s, remedy):
+    assert describe_shift(late_s, SPEED_M_S, delay_s=delay_s)[1].startswith(remedy)
 
 
 @pytest.mark.parametrize("late_s", [1.37e-3, -0.5e-3])

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.analysis.health.array_match import unobservable
+from ertis_numba.analysis.health import health
 from ertis_numba.analysis.layout_match import first_layout_match, layout_match
 from ertis_numba.errors import LayoutMismatchWarning
 from ertis_numba.frames import Measurement, Stamp
@@ -140,13 +140,84 @@ def test_scaled_layouts_are_named_by_their_unit(factor):
 
 
 @pytest.mark.parametrize(
-    ("count", "named"), [(16, ""), (7, "a wrong unit of the positions"), (5, "order, unit and timing of the channels")]
+    ("count", "named"),
+    [
+        (16, "scale of the positions, up to a factor of about 2: an echo fits such arrays as well"),
+        (7, "a wrong unit of the positions: 7 microphones are too few"),
+        (5, "order, unit and timing of the channels: 5 microphones are too few"),
+    ],
 )
 def test_health_states_what_no_echo_reveals(count, named):
-    found = unobservable(disc(0.1, count))
-    assert found[-1].startswith("mirrored or turned positions: ")
-    assert not named or found[0] == f"{named}: {count} microphones are too few"
-    assert len(found) == 1 + bool(named)
+    found = health(heard(disc(0.1, count))).not_observable
+    assert found[-1].startswith("mirrored or turned positions: ") or count == 5
+    assert named in found or (count == 5 and f"{count} microphones are too few to fit" in found[0])
+
+
+def wrong_orders(places_m):
+    """Yield arrays that a recording of these positions may be read as, and the property that is then wrong."""
+    for place in (1, 3):
+        yield "order", np.roll(places_m, place, axis=0)
+    yield "order", places_m[::-1]
+    swapped = places_m.copy()
+    swapped[[0, 2]] = swapped[[2, 0]]
+    yield "order", swapped
+    for factor in (0.8, 1.2, 1.25):
+        yield "scale", factor * places_m
+
+
+def ring(size_m, count):
+    turn = 2 * np.pi * np.arange(count) / count
+    return size_m / 2 * np.stack([0 * turn, np.cos(turn), np.sin(turn)], axis=1)
+
+
+def line(size_m, count):
+    return np.linspace([0, -size_m / 2, 0], [0, size_m / 2, 0], count)
+
+
+@pytest.mark.parametrize("count", [4, 6, 7, 9, 12])
+@pytest.mark.parametrize("shape", [disc, ring, line])
+def test_wrong_orders_and_scales_of_few_microphones_are_named_or_not_observable(shape, count):
+    for seed, (wrong_property, positions_m) in enumerate(wrong_orders(shape(0.08, count))):
+        given = heard(shape(0.08, count), array=Array(positions_m=positions_m), seed=seed, source_m=(0.9, 0.3, 0.2))
+        report = health(given)
+        named = [text.partition(":")[0] for text in report.not_observable]
+        words = {"order": ("order",), "scale": ("scale", "unit")}[wrong_property]
+        assert report.findings or any(word in text for word in words for text in named), (positions_m, named)
+
+
+@pytest.mark.parametrize("count", [4, 6, 7, 9, 12, 16])
+@pytest.mark.parametrize("shape", [disc, ring, line])
+def test_right_orders_of_few_microphones_are_not_accused(shape, count):
+    for seed, size_m in enumerate((0.03, 0.08, 0.2)):
+        assert not health(heard(shape(size_m, count), seed=seed, source_m=(0.8, 0.3 * seed - 0.3, 0.1))).findings
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        {"start_frequency_hz": 25e3, "stop_frequency_hz": 50e3},
+        {"modulation": "linear"},
+        {"duration_s": 1e-3},
+        {"start_frequency_hz": 41.5e3, "stop_frequency_hz": 20.75e3, "duration_s": 3e-3},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("count", [8, 12, 16])
+def test_health_accuses_no_channels_of_another_call(call, count):
+    for seed in range(3):
+        given = heard(disc(0.2, count), seed=seed, source_m=(0.8, 0.2 * seed, 0.1))
+        report = health(
+            dataclasses.replace(given, settings=given.settings.replace(call=given.settings.call.replace(**call)))
+        )
+        assert not report.findings
+
+
+def test_rotated_and_swapped_orders_are_named():
+    places_m = disc(0.2, 12)
+    swapped = places_m[[0, 5, 2, 3, 4, 1, *range(6, 12)]]
+    for positions_m, name in ((np.roll(places_m, 2, axis=0), "rotated by 10"), (swapped, "channels 1 and 5 swapped")):
+        found = layout_match(heard(places_m, array=Array(positions_m=positions_m)))
+        assert name in found.warning
 
 
 def test_large_arrays_are_judged_by_some_microphones():

@@ -10,24 +10,27 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.call_start import WIDER, start_match
+from ertis_numba.analysis.emission_time import emission_time_s
+from ertis_numba.analysis.health.limits import MAX_SHIFT_S
 from ertis_numba.analysis.sound_spectra import SoundSpectra, some_signals, sound_spectra
 from ertis_numba.analysis.sweep_search import (
     FoundSweep,
+    GatedArrival,
     arrival_of,
     find_sweep,
     power_after,
     refined,
     sub_band_hz,
+    sweep_along,
 )
 from ertis_numba.analysis.sweeps import Curve, Sweep, curve_of
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Call
 from ertis_numba.waveform import call_samples
 
-__all__ = ["UNKNOWN_CALL", "CallMatch", "call_match", "first_call_match"]
+__all__ = ["SILENT", "CallMatch", "call_match", "first_call_match"]
 
-UNKNOWN_CALL: Final = "the record contains no sweep above the noise, so the call was not checked"
-"""Note on measurements that `call_match` cannot compare."""
 _WRONG: Final = "another call was emitted, and ranges in the image are wrong"
 _MIN_RATIO: Final = 1.3
 """Ratio of the peak powers of another sweep and the call, above which the call does not match."""
@@ -39,16 +42,6 @@ _MIN_BINS: Final = 8  # Fewer are too few for pulse compression.
 _MAX_MICS: Final = 6
 _PADDING_S: Final = 5e-3
 _MAX_MEASUREMENTS: Final = 8
-_WIDER: Final = 1.5  # Ratio of the band in which sound of the same sweep is searched to the band of the call.
-_GATE_S: Final = 0.4e-3
-_MAX_OUTSIDE: Final = 0.15  # Share of the power of an arrival outside of the call's band.
-_MIN_OUTSIDE: Final = 0.3  # That power relative to the background.
-_MARGIN: Final = 2.0  # Skirts of the call's spectrum, in units of its inverse duration.
-_LEVELS: Final = (10**-0.6, 10**-1.2)
-_MAX_NOISE: Final = 10**-1.4
-_SHARP: Final = 1.3  # Ratio of bandwidths at these levels; that of transducers is above 1.4.
-_MAX_SHARE: Final = 0.75  # Bandwidth of the echoes of another call relative to that of the call.
-_MIN_SHARE: Final = 0.5  # Bandwidth without sharp edges, below which the call is not known.
 _MAX_SWEEP_HZ: Final = 190e3  # What fills the record up to 200 kHz is noise of modulators, or a click.
 _MIN_BANDWIDTH_HZ: Final = 12e3  # Bandwidth of a call that is no tone.
 
@@ -59,19 +52,19 @@ class CallMatch:
 
     Attributes
     ----------
-    matches : bool
-        False if the sound is a sweep other than the call.
+    verdict : {"matches", "differs", "unknown"}
+        ``differs`` if the sound is a sweep other than the call.
     loss_db : float
         Peak level after the matched filter of that sweep, relative to the peak after the call's own; 0 by default.
     sweep : Sweep, optional
-        Sweep of the sound; None if the sound is the call.
+        Sweep of the sound if it differs from the call.
     call : Call, optional
         Call with which it was compared.
     note : str
-        Reason why the match is not certain; empty by default.
+        Reason why the match is unknown; empty by default.
     """
 
-    matches: bool
+    verdict: Literal["matches", "differs", "unknown"]
     loss_db: float = 0.0
     sweep: Sweep | None = None
     call: Call | None = None
@@ -80,8 +73,8 @@ class CallMatch:
     @property
     def warning(self) -> str:
         """One-line warning; empty if the echoes match the call."""
-        if self.matches or self.sweep is None or self.call is None:
-            return ""
+        if self.sweep is None or self.call is None:
+            return self.note
         text = f"echoes do not match the call of the settings: they look like {self.sweep}"
         opposite = self.call.waveform is None and (self.sweep.stop_hz > self.sweep.start_hz) != (
             self.call.stop_frequency_hz > self.call.start_frequency_hz
@@ -93,20 +86,34 @@ class CallMatch:
         return f"{text}. Ranges in the image are wrong; set the emitted call as [call] in a settings file"
 
 
-def first_call_match(measurements: Iterable[Measurement]) -> CallMatch | None:
-    """Return the match of the first measurement with sound above the noise; None if the first 8 contain no sound."""
+SILENT: Final = CallMatch("unknown", note="the record contains no sweep above the noise, so the call was not checked")
+"""Result for measurements without a sweep."""
+
+
+def first_call_match(measurements: Iterable[Measurement], *, best: bool = False) -> CallMatch:
+    """Return the first match among 8 measurements that is known; otherwise the first unknown one with sound.
+
+    Parameters
+    ----------
+    measurements : iterable of Measurement
+    best : bool
+        Prefer a later match to a mismatch, because another sonar may be louder at times; False by default.
+    """
+    every = []
     for measurement in itertools.islice(measurements, _MAX_MEASUREMENTS):
-        found = call_match(measurement)
-        if found is not None:
-            return found
-    return None
+        every.append(call_match(measurement))
+        if every[-1].verdict == "matches" or (every[-1].verdict == "differs" and not best):
+            return every[-1]
+    ranks = ("differs", "unknown")
+    return min(every, key=lambda each: (ranks.index(each.verdict), each is SILENT), default=SILENT)
 
 
-def call_match(measurement: Measurement) -> CallMatch | None:
+def call_match(measurement: Measurement) -> CallMatch:
     """Compare the call with the sweep that the strongest sound contains, over the whole band of the record.
 
     If the call's filter compresses part of the sound, and no similar sweep compresses that part better, the call
-    matches, because another sensor may be louder.
+    matches, because another sensor may be louder. Its emission must begin at the first frequency of the call, because
+    ranges are wrong otherwise.
 
     Parameters
     ----------
@@ -114,8 +121,8 @@ def call_match(measurement: Measurement) -> CallMatch | None:
 
     Returns
     -------
-    CallMatch or None
-        None if the sound does not permit a comparison: it is not above the noise, or is not a sweep.
+    CallMatch
+        The verdict is ``unknown`` if the sound is not above the noise or not a sweep, or hides its first frequency.
 
     Raises
     ------
@@ -124,16 +131,32 @@ def call_match(measurement: Measurement) -> CallMatch | None:
     """
     call = measurement.settings.call
     signals, rate_hz = some_signals(measurement, _MAX_MICS)
-    low_hz = min(sub_band_hz(rate_hz) / 2, call.low_frequency_hz / _WIDER)
+    low_hz = min(sub_band_hz(rate_hz) / 2, call.low_frequency_hz / WIDER)
     sound = sound_spectra(signals, rate_hz, low_hz=low_hz, padding_s=call.end_s + _PADDING_S)
     if len(sound.frequency_hz) < _MIN_BINS:
-        return None
-    if _is_heard(sound, call) and _is_alone(sound, call):
-        return CallMatch(matches=True)
+        return SILENT
+    found = _match(sound, call)
+    is_clear = found is SILENT or found.verdict != "unknown"
+    emission_s = None if is_clear else emission_time_s(measurement)
+    if emission_s is None or abs(emission_s) > MAX_SHIFT_S:
+        return found
+    return CallMatch("matches", found.loss_db)  # Direct sound at the right time shows that ranges are right.
+
+
+def _match(sound: SoundSpectra, call: Call) -> CallMatch:
+    """Return the match of a call with a sound, without the time of the direct sound."""
+    is_heard, curve = _is_heard(sound, call), curve_of(call)
+    if is_heard and curve is None:
+        return CallMatch("matches")
+    if is_heard and curve is not None:
+        arrival = arrival_of(sound, curve, call.low_frequency_hz, call.high_frequency_hz)
+        better, gain = refined(arrival, curve)
+        if gain < _MIN_RATIO or _differs_by_motion(better, curve):
+            return _judged(sound, arrival, better, call)
     found = find_sweep(sound)
-    if found is None or found.sweep.high_hz > _MAX_SWEEP_HZ:
-        return CallMatch(matches=True) if _is_heard(sound, call) else None
-    return _compared(sound, found, call)
+    if found is not None and found.sweep.high_hz <= _MAX_SWEEP_HZ:
+        return _compared(sound, found, call)
+    return _judged(sound, arrival, better, call) if is_heard else SILENT
 
 
 def _filter_rad(call: Call, sound: SoundSpectra, part: slice) -> NDArray[np.float64]:
@@ -156,17 +179,6 @@ def _is_heard(sound: SoundSpectra, call: Call) -> bool:
     return _snr(power) >= _MIN_SNR and _crest(power, half) >= _MIN_CREST
 
 
-def _is_alone(sound: SoundSpectra, call: Call) -> bool:
-    """Return True if no similar sweep compresses the strongest arrival better, and it fills the call's band."""
-    curve = curve_of(call)
-    if curve is None:
-        return True
-    arrival = arrival_of(sound, curve, call.low_frequency_hz, call.high_frequency_hz)
-    better, gain = refined(arrival, curve)
-    is_similar = gain < _MIN_RATIO or _differs_by_motion(better, curve)
-    return is_similar and _band_of(sound, FoundSweep(curve, Sweep.of_call(call)), call) == "same"
-
-
 def _differs_by_motion(curve: Curve, own: Curve | None) -> bool:
     """Return True if motion may cause the difference of two curves; hyperbolic sweeps tolerate motion."""
     return (
@@ -176,51 +188,42 @@ def _differs_by_motion(curve: Curve, own: Curve | None) -> bool:
     )
 
 
-def _band_of(sound: SoundSpectra, found: FoundSweep, call: Call) -> Literal["same", "other", "narrow"]:
-    """Compare the band of the strongest arrival with that of the call; transducers have bands without sharp edges."""
-    low_hz = min(found.sweep.low_hz, call.low_frequency_hz / _WIDER)
-    high_hz = max(found.sweep.high_hz, call.high_frequency_hz * _WIDER)
-    whole_hz = (call.low_frequency_hz, call.high_frequency_hz)
-    arrival = arrival_of(sound, found.curve, low_hz, high_hz, gate_s=_GATE_S, whole_hz=whole_hz)
-    if not arrival.peak.any():
-        return "same"
-    at_hz, power, background = arrival.frequency_hz, arrival.power, arrival.background
-    margin_hz = _MARGIN / call.duration_s
-    outside = (at_hz < call.low_frequency_hz - margin_hz) | (at_hz > call.high_frequency_hz + margin_hz)
-    beyond = float(power[outside].sum())
-    if beyond > _MAX_OUTSIDE * power.sum() and beyond > _MIN_OUTSIDE * background[outside].sum():
-        return "other"
-    inside = (at_hz >= call.low_frequency_hz) & (at_hz <= call.high_frequency_hz)
-    expected = np.abs(found.curve.slopes_s_hz(at_hz[inside])) + 1e-30  # A sweep stays there for this time.
-    power, background = power[inside] / expected, background[inside] / expected
-    if len(power) < _MIN_BINS or background.max() > _MAX_NOISE * power.max():
-        bandwidth_hz = call.high_frequency_hz - call.low_frequency_hz
-        return "narrow" if found.sweep.high_hz - found.sweep.low_hz < _MAX_SHARE * bandwidth_hz else "same"
-    inner, outer = (int(np.ptp(np.flatnonzero(power > level * power.max()))) for level in _LEVELS)
-    if outer < _MAX_SHARE * len(power) and outer < _SHARP * inner:
-        return "other"
-    return "narrow" if outer < _MIN_SHARE * len(power) else "same"
-
-
-def _compared(sound: SoundSpectra, found: FoundSweep, call: Call) -> CallMatch | None:
-    """Return the match of the call with the sweep of the sound; None if that is no sweep."""
+def _compared(sound: SoundSpectra, found: FoundSweep, call: Call) -> CallMatch:
+    """Return the match of the call with the sweep of the sound, which is unknown if that is no sweep."""
     sweep, bandwidth_hz = found.sweep, call.high_frequency_hz - call.low_frequency_hz
-    if not sweep.is_compressible and not (sweep.is_tone and bandwidth_hz > _MIN_BANDWIDTH_HZ):
-        return None
+    is_tone = sweep.is_tone and bandwidth_hz > _MIN_BANDWIDTH_HZ
+    is_near = sweep.high_hz > call.low_frequency_hz / WIDER and sweep.low_hz < call.high_frequency_hz * WIDER
+    if not sweep.is_compressible and not (is_tone and is_near):
+        return SILENT
     part = sound.band(min(sweep.low_hz, call.low_frequency_hz), max(sweep.high_hz, call.high_frequency_hz))
     best = power_after(sound, found.curve.phase_rad(sound.frequency_hz[part]), part)
     if _snr(best) < _MIN_SNR:
-        return None
+        return SILENT
     own = power_after(sound, _filter_rad(call, sound, part), part)
     ratio = float(np.median(best.max(axis=1) / np.maximum(own.max(axis=1), 1e-30)))
-    loss_db, band = max(0.0, 10 * math.log10(ratio)), _band_of(sound, found, call)
-    is_other = ratio > _MIN_RATIO and not _differs_by_motion(found.curve, curve_of(call))
-    if sweep.is_tone or is_other or band == "other":
-        return CallMatch(matches=False, loss_db=loss_db, sweep=sweep, call=call)
-    if band == "narrow":
-        note = f"echoes contain only about {sweep.band} of the call; if its emitter has no such band, {_WRONG}"
-        return CallMatch(matches=True, loss_db=loss_db, call=call, note=note)
-    return CallMatch(matches=True, loss_db=loss_db, call=call)
+    loss_db = max(0.0, 10 * math.log10(ratio))
+    if sweep.is_tone or (ratio > _MIN_RATIO and not _differs_by_motion(found.curve, curve_of(call))):
+        return CallMatch("differs", loss_db, sweep, call)
+    own_curve = curve_of(call)
+    if own_curve is None:
+        return CallMatch("matches", loss_db)
+    arrival = arrival_of(sound, own_curve, call.low_frequency_hz, call.high_frequency_hz)
+    return _judged(sound, arrival, found.curve, call, loss_db)
+
+
+def _judged(sound: SoundSpectra, arrival: GatedArrival, better: Curve, call: Call, loss_db: float = 0.0) -> CallMatch:
+    """Return the match of a call whose curve is nearly that of the sound, by the start of the emission."""
+    start = start_match(sound, call, better, arrival)
+    if start == "same":
+        return CallMatch("matches", loss_db)
+    sweep = sweep_along(sound, better, call.low_frequency_hz / WIDER, call.high_frequency_hz * WIDER)
+    if start == "before":
+        return CallMatch("differs", loss_db, sweep, call)
+    reason = f"echoes contain only about {sweep.band} of the call; if its emitter has no such band"
+    if start == "unknown":
+        first = f"{call.start_frequency_hz / 1e3:g} kHz"
+        reason = f"echoes do not show whether the emission begins at {first} as the call does; if it does not"
+    return CallMatch("unknown", loss_db, call=call, note=f"{reason}, {_WRONG}")
 
 
 def _snr(power: NDArray[np.float32]) -> float:

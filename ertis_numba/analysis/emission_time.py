@@ -91,7 +91,7 @@ def emissions_of(measurement: Measurement) -> EmissionTimes | None:
 
 
 def describe_start(
-    emissions: Iterable[EmissionTimes | None], speed_m_s: float, *, delay_s: float | None = None
+    emissions: Iterable[EmissionTimes | None], speed_m_s: float, *, delay_s: float = 0.0
 ) -> tuple[str, str] | None:
     """Return a text about records that do not begin with their only emission, and a remedy; None if all do.
 
@@ -102,8 +102,8 @@ def describe_start(
     emissions : iterable of EmissionTimes or None
         Result of `emissions_of` for each record.
     speed_m_s : float
-    delay_s : float, optional
-        Setting ``call.delay_s`` of records that are not imported; the remedy then names another value.
+    delay_s : float
+        Setting ``call.delay_s``, for which the remedy names another value.
     """
     every = list(emissions)
     known = [each for each in every if each is not None]
@@ -113,6 +113,6 @@ def describe_start(
     if 2 * len(intervals_s) > len(known):
         interval_s = float(np.median(intervals_s))
         text = f"a record contains several emissions, {1e3 * interval_s:.4g} ms apart; the later ones look like echoes"
-        remedy = "end each record before the next emission"
-        return text, remedy if delay_s is not None else f"import again with --length {round(interval_s, 6):g}"
+        length = f"import again with --length {round(interval_s, 6):g}"
+        return text, f"end each record before the next emission, or {length}"
     return describe_shift([each.first_s for each in known], speed_m_s, delay_s=delay_s)

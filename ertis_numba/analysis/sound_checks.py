@@ -3,7 +3,7 @@
 from typing import Final, Literal, NamedTuple
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.call_match import call_match
+from ertis_numba.analysis.call_match import SILENT, call_match
 from ertis_numba.analysis.emission_time import EmissionTimes, describe_start, emissions_of
 from ertis_numba.analysis.layout_match import layout_match
 from ertis_numba.frames import Measurement
@@ -24,14 +24,19 @@ class SoundMismatch(NamedTuple):
 class SoundChecks:
     """Checks of the measurements of one sensor, each of which reports at most one mismatch.
 
-    Call and layout are compared until a measurement has sound above the noise, in at most 8 measurements. The start of
-    the record may change later, so that it is compared in measurements 1, 2, 4, 8 and so on. Another call ends all
-    checks, because its filter does not find the times of arrival.
+    Call and layout are compared until they are known, in at most 8 measurements; a note on a call that may differ is
+    reported before. The start of the record may change later, so that it is compared in measurements 1, 2, 4, 8 and so
+    on. Another call ends all checks, because its filter does not find the times of arrival.
+
+    Parameters
+    ----------
+    thinned : bool
+        Compare the start in ever fewer measurements; False for a caller that checks ever fewer measurements.
     """
 
-    def __init__(self) -> None:
-        self._count = 0
-        self._is_other_call = self._is_shifted = False
+    def __init__(self, *, thinned: bool = True) -> None:
+        self._thinned, self._count = thinned, 0
+        self._is_other_call = self._is_shifted = self._is_noted = False
         self._emissions: list[EmissionTimes | None] = []
         self._tries: dict[Literal["call", "layout"], int] = {"call": _MAX_TRIES, "layout": _MAX_TRIES}
 
@@ -44,39 +49,43 @@ class SoundChecks:
             The samples do not match the settings.
         """
         self._count += 1
-        found: list[SoundMismatch] = []
         if self._is_other_call:
-            return found
-        if warning := self._compare("call", measurement):
-            self._is_other_call = True
-            return [SoundMismatch("call", warning)]
-        if warning := self._start(measurement):
-            self._is_shifted = True
-            found.append(SoundMismatch("start", warning))
-        if warning := self._compare("layout", measurement):
-            found.append(SoundMismatch("layout", warning))
-        return found
+            return []
+        found = [SoundMismatch("call", self._call(measurement))]
+        if not self._is_other_call:
+            found.append(SoundMismatch("start", self._start(measurement)))
+            found.append(SoundMismatch("layout", self._layout(measurement)))
+        return [each for each in found if each.warning]
 
-    def _compare(self, subject: Literal["call", "layout"], measurement: Measurement) -> str:
-        """Return a warning if the sound contradicts the call or the layout; ask no more once it has been known."""
-        if not self._tries[subject]:
+    def _call(self, measurement: Measurement) -> str:
+        """Return a warning if the sound contradicts the call, or a note if it may."""
+        if not self._tries["call"]:
             return ""
-        self._tries[subject] -= 1
-        if subject == "call":
-            call = call_match(measurement)
-            known = None if call is None else call.warning or call.note
-        else:
-            layout = layout_match(measurement)
-            known = None if layout is None else layout.warning
-        if known is not None:
-            self._tries[subject] = 0
-        return known or ""
+        match = call_match(measurement)
+        self._tries["call"] -= 1
+        if match.verdict != "unknown":
+            self._tries["call"] = 0
+            self._is_other_call = match.verdict == "differs"
+            return match.warning
+        if match is SILENT or self._is_noted:
+            return ""
+        self._is_noted = True
+        return match.warning
+
+    def _layout(self, measurement: Measurement) -> str:
+        """Return a warning if the sound contradicts the layout."""
+        if not self._tries["layout"]:
+            return ""
+        layout = layout_match(measurement)
+        self._tries["layout"] = 0 if layout is not None else self._tries["layout"] - 1
+        return "" if layout is None else layout.warning
 
     def _start(self, measurement: Measurement) -> str:
         """Compare the direct sound with the distance of the emitter, in ever fewer measurements."""
-        if self._is_shifted or self._count & (self._count - 1):
+        if self._is_shifted or (self._thinned and self._count & (self._count - 1)):
             return ""
         self._emissions.append(emissions_of(measurement))
         settings = measurement.settings
         shift = describe_start(self._emissions, sound_speed_m_s(settings.air), delay_s=settings.call.delay_s)
-        return "" if shift is None else "; ".join(shift)
+        self._is_shifted = shift is not None
+        return "; ".join(shift or ())

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.sound_spectra import SoundSpectra
 from ertis_numba.analysis.sweeps import MODULATIONS, Curve, Modulation, Sweep
 
-__all__ = ["FoundSweep", "GatedArrival", "arrival_of", "find_sweep", "power_after", "refined", "sub_band_hz"]
+__all__ = [
+    "FoundSweep",
+    "GatedArrival",
+    "arrival_of",
+    "find_sweep",
+    "power_after",
+    "refined",
+    "sub_band_hz",
+]
 
 _SUB_BAND_HZ: Final = 10e3
 _SUB_BAND: Final = 0.045  # Largest sub-band relative to the sample rate.
@@ -118,8 +126,8 @@ def find_sweep(found: SoundSpectra) -> FoundSweep | None:
             found_at.append(_focused(found, curve, low_hz, high_hz))
     best, arrival = max(found_at, key=lambda each: float(np.median(each[1].peak)))
     low_hz, high_hz = arrival.frequency_hz[[0, -1]]
-    wider = arrival_of(found, best, low_hz / _WIDER, high_hz * _WIDER)  # The ends may be too weak for a sub-band.
-    return FoundSweep(best, Sweep.of_curve(best, *_edges_hz(wider, best)))
+    # The ends may be too weak for a sub-band.
+    return FoundSweep(best, sweep_along(found, best, low_hz / _WIDER, high_hz * _WIDER))
 
 
 def _sub_bands(
@@ -266,10 +274,14 @@ def _peaks(arrival: GatedArrival, phases_rad: NDArray[np.float64], n_fft: int) -
     return np.asarray((after.real**2 + after.imag**2).max(axis=2), dtype=np.float64)
 
 
-def _edges_hz(arrival: GatedArrival, curve: Curve) -> tuple[float, float]:
-    """Return the edges of the band of an arrival; its power at a frequency is relative to the time spent there."""
+def sweep_along(found: SoundSpectra, curve: Curve, low_hz: float, high_hz: float) -> Sweep:
+    """Return the sweep that follows a curve through the strongest arrival, as far as it sounds in a band.
+
+    Its power at a frequency is relative to the time spent there.
+    """
+    arrival = arrival_of(found, curve, low_hz, high_hz)
     slopes_s_hz = np.abs(curve.slopes_s_hz(arrival.frequency_hz))
     is_sound = (arrival.power > arrival.background) & (arrival.power > _MIN_POWER * arrival.power.max())
     power = np.where(is_sound, arrival.power, 0) / np.maximum(slopes_s_hz, 1e-30)
     loud = np.flatnonzero(power >= _EDGE * power.max())
-    return float(arrival.frequency_hz[loud[0]]), float(arrival.frequency_hz[loud[-1]])
+    return Sweep.of_curve(curve, float(arrival.frequency_hz[loud[0]]), float(arrival.frequency_hz[loud[-1]]))

@@ -11,7 +11,7 @@ from typing import Any
 
 from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.call_match import UNKNOWN_CALL, CallMatch, first_call_match
+from ertis_numba.analysis.call_match import CallMatch, first_call_match
 from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.analysis.emission_time import describe_start, emissions_of
 from ertis_numba.analysis.health import health
@@ -34,7 +34,7 @@ __all__ = ["Pipelines", "RecordingJob", "check_recording", "prepare_recording"]
 
 Pipelines = Callable[[Sequence[Settings]], AbstractContextManager[Sequence[Pipeline]]]
 _Show = Callable[[str, dict[str, Any]], None]
-_Checks = tuple[str, str, CallMatch | None, LayoutMatch | None]
+_Checks = tuple[str, str, CallMatch, LayoutMatch | None]
 
 
 class RecordingJob:
@@ -251,10 +251,11 @@ def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
         return (replace(each, settings=settings) for each in itertools.chain([first], others))
 
     call = first_call_match(heard())
-    if call is not None and call.warning:  # The filter of another call does not find the times of arrival.
+    if call.verdict == "differs":  # The filter of another call does not find the times of arrival.
         return faults, "", call, None
     some = (replace(recording[index], settings=settings) for index in {0, len(recording) // 2, len(recording) - 1})
-    shift = describe_start(map(emissions_of, some), sound_speed_m_s(settings.air))
+    speed_m_s, delay_s = sound_speed_m_s(settings.air), settings.call.delay_s
+    shift = describe_start(map(emissions_of, some), speed_m_s, delay_s=delay_s)
     of_report = LayoutMatch.of(report.findings)
     layout = of_report if of_report.warning else first_layout_match(heard())
     return faults, "; ".join(shift or ()), call, layout
@@ -293,7 +294,7 @@ def _check_sensor(
         if options.strict:
             raise DataError(text)
         warn(text)
-    run.call_warning = UNKNOWN_CALL if match is None else match.warning or match.note
+    run.call_warning = match.warning
     for text in (*_call_notes(run, recording), *_grid_notes(run.pipeline)):
         warn(f"{place}{text}")
     heard = None

@@ -9,7 +9,7 @@ import numpy as np
 
 from ertis_numba import checks
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.call_match import CallMatch, first_call_match
+from ertis_numba.analysis.call_match import first_call_match
 from ertis_numba.analysis.emission_time import describe_start, emissions_of
 from ertis_numba.analysis.health import Health, health, merge
 from ertis_numba.atomic_files import remedy
@@ -167,10 +167,12 @@ def _check_sensor(
         clock = check_clock(stamps, used.recording.duration_s, nominal_rate_hz)
     report = merge([health(measurement) for measurement in heard]) if heard else None
     has_call = report is None or report.has_call
-    match = _best_call_match(heard) if has_call else None
-    residuals = _calibration_residuals(heard, report) if has_call else items.NO_CALL
-    is_heard = has_call and (match is None or match.matches)  # The filter of another call does not find times.
-    shift = describe_start(map(emissions_of, heard), sound_speed_m_s(used.air)) if is_heard else None
+    match = first_call_match(heard, best=True) if has_call else None
+    residuals: CalibrationResiduals | OtherLayoutError | str = items.NO_CALL if match is None else items.OTHER_CALL
+    shift = None
+    if match is not None and match.verdict != "differs":  # The filter of another call does not find times.
+        residuals = _calibration_residuals(heard, report)
+        shift = describe_start(map(emissions_of, heard), sound_speed_m_s(used.air), delay_s=used.call.delay_s)
     layout = microphones(used.array)
     found: dict[str, items.CheckResult] = {
         items.MICROPHONES: items.of_microphones(report),
@@ -179,7 +181,7 @@ def _check_sensor(
         items.MEASUREMENTS: items.of_storage(stored),
         items.TIMING: items.of_timing(clock),
         items.DRIFT: items.of_drift(clock),
-        items.CALL: items.of_call(match, has_call=has_call),
+        items.CALL: items.of_call(match),
         items.CALIBRATION: items.of_calibration(residuals, report),
     }
     return SensorCheck(
@@ -221,17 +223,6 @@ def _band_note(heard: Sequence[Measurement], used: Settings) -> str | None:
         if measurement.stamp.behaviour == "passive":
             outside.add(measurement)
     return outside.note
-
-
-def _best_call_match(heard: Sequence[Measurement]) -> CallMatch | None:
-    """Return the first match of the call, otherwise the first mismatch: another sonar may be louder at times."""
-    mismatch = None
-    for measurement in heard:
-        match = first_call_match([measurement])
-        if match is not None and match.matches:
-            return match
-        mismatch = mismatch or match
-    return mismatch
 
 
 def _calibration_residuals(

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple
 
-from ertis_numba.analysis.call_match import UNKNOWN_CALL, CallMatch
+from ertis_numba.analysis.call_match import CallMatch
 from ertis_numba.analysis.health import Health
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_GAIN_DB, MAX_WHITE_DB
 from ertis_numba.calibration import OtherLayoutError
@@ -31,6 +31,7 @@ __all__ = [
     "MICROPHONES",
     "NOISE",
     "NO_CALL",
+    "OTHER_CALL",
     "SAMPLES",
     "TIMING",
     "CheckResult",
@@ -61,6 +62,7 @@ COPY: Final = "copy the file again, or record again"
 """Remedy for damaged files."""
 _NO_NOISE: Final = "no microphone without a fault has a measurable noise"
 NO_CALL: Final = "no call was emitted"
+OTHER_CALL: Final = "another call was emitted"
 
 _DEVIATIONS: Final = 4.0
 _WORTH_S: Final = 1e-6  # 18 degrees of a period at 50 kHz.
@@ -193,15 +195,13 @@ def of_drift(clock: ClockCheck) -> CheckResult:
     return _result_of((), f"{clock.drift_ppm or 0.0:+.0f} ± {clock.rate_sd_ppm or 0.0:.0f} ppm relative to the host")
 
 
-def of_call(match: CallMatch | None, *, has_call: bool) -> CheckResult:
-    """Return the match of the call."""
-    if not has_call:
-        return CheckResult("not known", NO_CALL)
+def of_call(match: CallMatch | None) -> CheckResult:
+    """Return the match of the call; None without one."""
     if match is None:
-        return CheckResult("not known", UNKNOWN_CALL)
-    if match.note:
+        return CheckResult("not known", NO_CALL)
+    if match.verdict == "unknown":
         return CheckResult("not known", match.note)
-    if match.matches:
+    if match.verdict == "matches":
         return _result_of((), "echoes match the call of the settings")
     text, _, rest = match.warning.partition(". ")
     return _result_of([CheckFault(check=CALL, text=text, remedy=rest.partition("; ")[2])], "")

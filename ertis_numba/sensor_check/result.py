@@ -82,7 +82,7 @@ class SensorCheck:
     clock : ClockCheck
         Timing of the measurements.
     call : CallMatch or None
-        Match of the call; None if there is no sound.
+        Match of the call; None if no call was emitted.
     calibration : CalibrationResiduals or None
         Deviations from the layout; None if they are not known.
     """

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.health.arrival import Compressed, strongest
+from ertis_numba.analysis.health.other_orders import other_orders, spreads_s
 from ertis_numba.analysis.health.report import Finding
+from ertis_numba.analysis.health.wave_shapes import curved_m, places_of
 from ertis_numba.geometry import Layout, layout_names, load_layout
 
 __all__ = ["ARRAY_FAULTS", "SIZE", "find_other_array", "unobservable"]
@@ -37,13 +39,13 @@ _KEPT: Final = 0.9  # Share of the microphones whose residuals count, so that a 
 _WIDE_S: Final = 0.4e-3  # Delay across the largest shipped layout, on either side.
 _WIDER: Final = 12.0  # Centimetres in place of millimetres delay sound ten times as much.
 _MAX_SLOWNESS: Final = 1.1  # Slowness across the array relative to that of sound; a larger one is impossible.
+_MIN_EXCLUDED: Final = 4.0  # Residuals of an order that an arrival excludes, relative to those of the given one.
 _CLEAR: Final = 0.05  # Residuals of a clear arrival relative to its delays across the array.
 _DEVIATIONS: Final = 8.0
 _CURVATURES: Final = (1.0, 2.0)  # A wall and a point at the same path, times the path.
 # Limits of the size relative to the given one; a record that begins before the emission explains a larger one, too.
 _MAX_GROWTH: Final = 2.5
 _MIN_SHRINKAGE: Final = 0.67
-_DEGENERATE_M: Final = 1e-3
 _ITERATIONS: Final = 6
 _LEAST_CURVATURE: Final = 1e-3
 
@@ -70,9 +72,27 @@ class _Match:
     n_spare: int = 0
 
 
-def unobservable(positions_m: NDArray[np.float64]) -> tuple[str, ...]:
-    """Return the faults of an array that no echo can reveal, with the reasons: positions (mic, 3) float64."""
-    n_mics, n_unknowns = len(positions_m), 1 + _places(positions_m).shape[1]
+def unobservable(
+    times_s: NDArray[np.float64],
+    positions_m: NDArray[np.float64],
+    path_m: float,
+    speed_m_s: float,
+    *,
+    is_direct: bool = False,
+) -> tuple[str, ...]:
+    """Return the faults of an array that an arrival cannot reveal, with the reasons.
+
+    Parameters
+    ----------
+    times_s : (mic,) float64
+    positions_m : (mic, 3) float64
+    path_m : float
+        Way of the sound since the emission.
+    speed_m_s : float
+    is_direct : bool
+        True for direct sound, whose curvature shows the size of the array; False by default.
+    """
+    n_mics, n_unknowns = len(positions_m), 1 + places_of(positions_m).shape[1]
     n_spare = _kept(n_mics, n_unknowns) - n_unknowns
     if n_mics < 2:
         return ()
@@ -81,8 +101,23 @@ def unobservable(positions_m: NDArray[np.float64]) -> tuple[str, ...]:
     if n_spare < _MIN_SPARE:
         return f"order, unit and timing of the channels: {few}", *found
     if n_spare < _MIN_SPARE_OF_SIZE:
-        return f"a wrong unit of the positions: {few}", *found
+        found.insert(0, f"a wrong unit of the positions: {few}")
+    if n_spare >= _MIN_SPARE_OF_SIZE and not is_direct:
+        found.insert(0, "scale of the positions, up to a factor of about 2: an echo fits such arrays as well")
+    orders = _by_order(times_s)
+    if len(orders):
+        own_s, *others_s = spreads_s(np.stack([times_s, *orders]), positions_m, path_m, speed_m_s)
+        limit_s = max(_MIN_SPREAD_S, _MIN_EXCLUDED * own_s)
+        count = int(np.count_nonzero(np.asarray(others_s) < limit_s))
+        if count:
+            found.insert(0, f"order of the channels: {count} other orders fit this arrival about as well")
     return tuple(found)
+
+
+def _by_order(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the times of arrival in other orders of the channels: (order, mic) float64."""
+    orders = other_orders(len(times_s))
+    return times_s[np.array([order for _, order in orders])] if orders else np.zeros((0, len(times_s)))
 
 
 def find_other_array(
@@ -141,13 +176,14 @@ def _other_order(
     better, count = [], len(channels)
     for fault, name, match in found:
         # Residuals of n spare channels are r times as small in one of r^n cases. Channels left out are more cases.
-        cases = len(found) * math.comb(count, count - _kept(count, 1)) / _CHANCE
+        cases = (len(found) + len(other_orders(count))) * math.comb(count, count - _kept(count, 1)) / _CHANCE
         limit_s = own.spread_s / max(_MIN_RATIO, cases ** (1 / max(1, match.n_spare)))
         if match.slowness <= _MAX_SLOWNESS and max(match.spread_s, _MIN_RESIDUAL_S) < limit_s:
             better.append((match.spread_s, fault, name, match, limit_s))
     if not better:
         return None
-    spread_s, fault, name, match, limit_s = min(better, key=lambda each: each[0])
+    # Several names may mean one order.
+    spread_s, fault, name, match, limit_s = min(better, key=lambda each: round(each[0], 9))
     if fault == SIZE:
         return _of_size(channels, 1 / (_multiple(layout)[1] or 1.0), layout)
     measured_s, detail = match.delay_s, f"{name} by {1e6 * match.delay_s:.1f} µs"
@@ -167,6 +203,13 @@ def _alternatives(
         match = _best(times_s, other_m[channels], path_m, speed_m_s)
         if match is not None:
             yield SIZE if name == multiple_of else _ORDER, name, match
+    count = len(channels)
+    if count == len(layout.enabled) and len(orders := _by_order(times_s)):
+        positions_m = layout.positions_m[channels]
+        best = int(np.argmin(spreads_s(orders, positions_m, path_m, speed_m_s)))
+        match = _best(orders[best], positions_m, path_m, speed_m_s)
+        if match is not None:
+            yield _ORDER, other_orders(count)[best][0], match
     for name, late in _halves(len(layout.enabled)):
         match = _best(times_s, layout.positions_m[channels], path_m, speed_m_s, late=late[channels])
         if match is not None:
@@ -226,12 +269,6 @@ def _of_size(channels: list[int], factor: float, layout: Layout, about: str = ""
     )
 
 
-def _places(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return positions along the axes in which the array extends: (mic, used axis) float64."""
-    _, extent, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=False)
-    return np.asarray(positions_m @ axes[extent / np.sqrt(len(positions_m)) > _DEGENERATE_M].T)
-
-
 def _best(
     times_s: NDArray[np.float64],
     positions_m: NDArray[np.float64],
@@ -241,7 +278,7 @@ def _best(
     late: NDArray[np.bool_] | None = None,
 ) -> _Match | None:
     """Return the best fit of a reflector, a wall or the direct sound; None if the array has too few microphones."""
-    places_m = _places(positions_m)
+    places_m = places_of(positions_m)
     n_axes = places_m.shape[1]
     n_unknowns = 1 + n_axes + (late is not None)
     if n_axes == 0 or _kept(len(positions_m), n_unknowns) < n_unknowns + _MIN_SPARE:
@@ -254,7 +291,7 @@ def _best(
         for _ in range(_ITERATIONS):
             solution, spread_s = _solve(times_s - curved_s, matrix)
             slope_m = places_m @ solution[1 : 1 + n_axes] * speed_m_s
-            curved_s = _curved_m(positions_m, slope_m, curvature / path_m) / speed_m_s
+            curved_s = curved_m(positions_m, slope_m, curvature / path_m) / speed_m_s
         solution, spread_s = _solve(times_s - curved_s, matrix)
         slowness = float(np.linalg.norm(solution[1 : 1 + n_axes])) * speed_m_s
         matches.append(_Match(spread_s, slowness, 0.0 if late is None else float(solution[-1]), n_spare))
@@ -281,16 +318,6 @@ def _solve(times_s: NDArray[np.float64], matrix: NDArray[np.float64]) -> tuple[N
     return np.asarray(solution), float(np.sqrt(np.sum(residual_s**2) / max(1, count - matrix.shape[1])))
 
 
-def _curved_m(positions_m: NDArray[np.float64], slope_m: NDArray[np.float64], curvature: float) -> NDArray[np.float64]:
-    """Return the way of a spherical wave relative to a plane one of the same direction: (mic,) float64.
-
-    For the distance R of the source in direction u, and p·u = -slope, it is sqrt(R² + 2 R slope + p²) - R - slope.
-    """
-    radius_m = 1 / curvature
-    squared_m2 = np.maximum(0.0, radius_m**2 + 2 * radius_m * slope_m + np.sum(positions_m**2, axis=1))
-    return np.asarray(np.sqrt(squared_m2) - radius_m - slope_m)
-
-
 def _scales(
     times_s: NDArray[np.float64], positions_m: NDArray[np.float64], path_m: float, speed_m_s: float
 ) -> tuple[float, float, float]:
@@ -299,12 +326,12 @@ def _scales(
     A wavefront whose source is a path P away has the curvature 1 / P, or 2 / P after a reflector of half the path.
     Positions that are too small by k have a curvature that is too large by k squared.
     """
-    places_m, curvature = _places(positions_m), 1 / path_m
+    places_m, curvature = places_of(positions_m), 1 / path_m
     slope_m, bent_m = np.zeros(len(places_m)), np.zeros(len(places_m))
     for _ in range(_ITERATIONS):
         step = 0.01 * curvature
-        bent_m = _curved_m(positions_m, slope_m, curvature)
-        change_s = (_curved_m(positions_m, slope_m, curvature + step) - bent_m) / step / speed_m_s
+        bent_m = curved_m(positions_m, slope_m, curvature)
+        change_s = (curved_m(positions_m, slope_m, curvature + step) - bent_m) / step / speed_m_s
         matrix = np.column_stack([np.ones(len(places_m)), places_m, change_s])
         solution, spread_s = _solve(times_s - bent_m / speed_m_s, matrix)
         error = _DEVIATIONS * spread_s * float(np.sqrt(np.linalg.pinv(matrix.T @ matrix)[-1, -1]))

@@ -55,9 +55,7 @@ def fit_emission(times_s: NDArray[np.float64], positions_m: NDArray[np.float64],
     return float(np.median((times_s - sphere_s)[used]))
 
 
-def describe_shift(
-    late_s: Sequence[float], speed_m_s: float, *, delay_s: float | None = None
-) -> tuple[str, str] | None:
+def describe_shift(late_s: Sequence[float], speed_m_s: float, *, delay_s: float = 0.0) -> tuple[str, str] | None:
     """Return a text about records that do not begin with the emission, and a remedy; None if all do.
 
     Parameters
@@ -65,8 +63,8 @@ def describe_shift(
     late_s : sequence of float
         Times of the emissions since the starts of their records, in seconds.
     speed_m_s : float
-    delay_s : float, optional
-        Setting ``call.delay_s`` of records that are not imported; the remedy then names another value.
+    delay_s : float
+        Setting ``call.delay_s``, for which the remedy names another value.
     """
     if not late_s:
         return None
@@ -76,29 +74,22 @@ def describe_shift(
             f"the direct sound drifts from {_side(first_s)} to {_side(last_s)} than the distance of the emitter "
             f"allows; ranges are wrong by up to {_centimetres(max(abs(first_s), abs(last_s)), speed_m_s)}"
         )
-        remedy = "import again with --sync-channel, or with the exact time between emissions (--length)"
-        return text, remedy if delay_s is None else "trigger each record by its emission"
+        imported = "import again with --sync-channel, or with the exact time between emissions (--length)"
+        return text, f"trigger each record by its emission, or {imported}"
     if abs(middle_s) <= MAX_SHIFT_S:
         return None
     text = (
         f"the direct sound arrives {_side(middle_s)} than the distance of the emitter allows; all ranges are "
         f"{_centimetres(abs(middle_s), speed_m_s)} too {'large' if middle_s > 0 else 'small'}"
     )
-    return text, _remedy(middle_s) if delay_s is None else _remedy_by_delay(middle_s, delay_s)
+    return text, _remedy(middle_s, delay_s)
 
 
-def _remedy(late_s: float) -> str:
-    """Return the remedy for an imported record."""
-    if late_s > 0:
-        return f"import again with --skip {round(late_s, 6):g}, plus the value of an earlier --skip"
-    return f"start recording {-1e3 * late_s:.3g} ms earlier, or import again with a smaller --skip"
-
-
-def _remedy_by_delay(late_s: float, delay_s: float) -> str:
-    """Return the remedy for any other record."""
-    if delay_s + late_s >= 0:
-        return f"set call.delay_s = {round(delay_s + late_s, 6):g} in the settings"
-    return f"start recording {-1e3 * late_s:.3g} ms earlier"
+def _remedy(late_s: float, delay_s: float) -> str:
+    if delay_s + late_s < 0:
+        return f"start recording {-1e3 * late_s:.3g} ms earlier, or import again with a smaller --skip"
+    change = f"a {'larger' if late_s > 0 else 'smaller'} --skip, by {round(abs(late_s), 6):g}"
+    return f"set call.delay_s = {round(delay_s + late_s, 6):g} in the settings, or import again with {change}"
 
 
 def _side(late_s: float) -> str:

@@ -122,7 +122,7 @@ def health(measurement: Measurement) -> Health:
     heard = [item.channel for item in reported if not set(item.faults) & _DEAF and item.channel not in deaf]
     not_observable: tuple[str, ...] = () if has_call else (f"{DESCRIPTIONS}: no call was emitted",)
     if has_call and heard and not any("resolve" in text for text in unknown):
-        shown, not_observable = by_wavefront(whole, heard, settings, n_samples=min(len(record), MAX_SAMPLES))
+        shown, not_observable = _of_call(measurement, whole, heard, len(record))
         findings += shown
     findings = [*_of_channels(found.values()), *findings]
     channels = _with_faults(found, findings)
@@ -146,6 +146,20 @@ def health(measurement: Measurement) -> Health:
     gain = (call.high_frequency_hz - call.low_frequency_hz) * duration_s * len(noise)
     dynamic_range_db = 10 * math.log10(gain / 2) - noise_dbfs
     return replace(report, noise_dbfs=noise_dbfs, dynamic_range_db=dynamic_range_db)
+
+
+def _of_call(
+    measurement: Measurement, signals: Callable[[int], NDArray[np.float32]], heard: list[int], n_samples: int
+) -> tuple[list[Finding], tuple[str, ...]]:
+    """Return the findings from the wavefront of the call, and the faults that it hides: all, if another was emitted."""
+    from ertis_numba.analysis.call_match import call_match  # noqa: PLC0415  it uses parts of this package
+
+    settings = measurement.settings
+    findings, hidden = by_wavefront(signals, heard, settings, n_samples=min(n_samples, MAX_SAMPLES))
+    is_complete = n_samples == settings.recording.n_samples
+    if findings and is_complete and call_match(measurement).verdict == "differs":
+        return [], (f"{DESCRIPTIONS}: another call was emitted",)
+    return findings, hidden
 
 
 def _by_words(

@@ -19,7 +19,7 @@ from ertis_numba.settings import Settings
 
 __all__ = ["DESCRIPTIONS", "by_array", "by_wavefront"]
 
-DESCRIPTIONS = "polarity, order and delay of channels, and a shift of the record"
+DESCRIPTIONS = "polarity, order and delay of channels, scale of the positions, and a shift of the record"
 _COMPACT_SHARE = 0.75  # Minimum share of the microphones that a wavefront must fit.
 _MIN_PATH_M = 0.2  # Minimum path of an echo; shorter paths are indistinguishable from the direct sound.
 _MIN_DEPTH_M = 0.01  # Minimum spread of distances from the emitter. On a ring, its sound equals an echo from ahead.
@@ -149,9 +149,10 @@ def by_wavefront(
     fit = direct if is_direct else echo
     if fit.share < _COMPACT_SHARE:
         return shifts, (f"{DESCRIPTIONS}: no single wavefront fits the strongest arrival",)
+    hidden = unobservable(times_s, positions_m, arrival.path_m, speed_m_s, is_direct=is_direct)
     findings = [*shifts, *_of_channels(arrival.found, times_s, fit, channels, layout)]
     shift = () if is_direct else ("a shift of the record: the strongest arrival is not the direct sound",)
-    return findings, (*shift, *unobservable(positions_m))
+    return findings, (*shift, *hidden)
 
 
 def _shifts(emission_s: float, channels: Sequence[int], speed_m_s: float) -> list[Finding]:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Final, Literal
 from ertis_numba.network.processing.pipe_messages import Predicted
 
 if TYPE_CHECKING:
-    from ertis_numba.analysis.sound_checks import Subject
+    from ertis_numba.analysis.sound_checks import SoundChecks, Subject
     from ertis_numba.frames import Energyscape, Measurement
+    from ertis_numba.settings import Array, Call
 
 __all__ = ["Predictions"]
 
@@ -33,6 +34,7 @@ class Predictions:
         self._waiting: deque[tuple[str, Energyscape | None, Measurement]] = deque()
         self._found: deque[Predicted] = deque()
         self._thread: threading.Thread | None = None
+        self._checks: dict[str, tuple[Call, Array, SoundChecks]] = {}
 
     @property
     def busy(self) -> bool:
@@ -60,7 +62,11 @@ class Predictions:
         from ertis_numba.analysis.sound_checks import SoundChecks  # noqa: PLC0415
 
         try:
-            for subject, text in SoundChecks().check(measurement):
+            call, array = measurement.settings.call, measurement.settings.array
+            known = self._checks.get(sensor)
+            if known is None or known[:2] != (call, array):
+                known = self._checks[sensor] = (call, array, SoundChecks(thinned=False))
+            for subject, text in known[2].check(measurement):
                 self._found.append(Predicted(sensor=sensor, event=_EVENTS[subject], warning=text))
         except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images
             text = f"the sound was not compared with the settings: {type(error).__name__}: {error}"
