@@ -20,7 +20,7 @@ from ertis_numba.fusion.pairs import hypothesis, pair_of
 from ertis_numba.fusion.polar_grid import PolarGrid, close_directions
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, mounted_sensors
-from ertis_numba.fusion.tables import FusionTables, Located
+from ertis_numba.fusion.tables import FusionTables
 from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording
@@ -113,7 +113,8 @@ def test_fused_image_suppresses_foreign_echoes():
 def test_power_of_a_pixel_counts_once(monkeypatch):
     """Power that no reflector explains is no echo of several emitters at once."""
     kept = []
-    monkeypatch.setattr(FusionTables, "located", lambda *given: kept.append(given[2].shares) or Located(None, {}, []))
+    monkeypatch.setattr(FusionTables, "pulse_reflectors", lambda *given: kept.append(given[2].shares))
+    monkeypatch.setattr(FusionTables, "points", lambda *_: None)
     _ = ertis.fuse(images().values(), mountings()).points
     for receiver in range(len(YAWS)):
         total = sum(share for (_, number), share in kept[0].items() if number == receiver)

@@ -1,5 +1,6 @@
 """Fused images of all sensors of one or several recordings."""
 
+from collections import Counter
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -71,6 +72,7 @@ def write_fused(
         for text in clocks.warnings():
             options.warn(text)
         incomplete = empty = 0
+        unheard: Counter[str] = Counter()
         writer = stack.enter_context(
             EnergyscapeWriter(target, overwrite=force, mounting={PLATFORM: ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})
         )
@@ -81,8 +83,12 @@ def write_fused(
                 if fused.missing:
                     options.note(f"pulse {number} has no image of {', '.join(fused.missing)}", quiet=quiet)
                 empty += fused.is_empty
+                unheard.update(fused.unheard)
                 writer.write(_numbered(fused, number))
     _pulses.note_empty(empty, len(groups), quiet=quiet)
+    silent = [_silent(name, count, len(groups)) for name, count in unheard.items()]
+    for text in silent:
+        options.warn(text)
     pulses = options.counted(len(groups), "pulse")
     options.say(f"{target}: {pulses} of {', '.join(by_name)}, fused", quiet=quiet)
     if as_json:
@@ -93,8 +99,9 @@ def write_fused(
             "incomplete": incomplete,
             "empty": empty,
             "left_out": active.n_passive,
+            "unheard": dict(unheard),
         }
-        warnings = [*clocks.warnings(), *pipelines.warnings]
+        warnings = [*clocks.warnings(), *pipelines.warnings, *silent]
         options.print_json(report | {"direct_sound": _direct_sound(clocks), "warnings": warnings})
 
 
@@ -123,6 +130,11 @@ def _direct_sound(check: "DirectSoundCheck") -> list[dict[str, Any]]:
         }
         for each in check.sounds
     ]
+
+
+def _silent(sensor: str, count: int, n_pulses: int) -> str:
+    """Return a warning of a sensor whose call is not heard in some pulses."""
+    return f"no sensor hears the call of {sensor} in {count} of {n_pulses} pulses; check its emitter and its SYNC line"
 
 
 def _require_several(readers: "Sequence[RecordingReader]") -> None:

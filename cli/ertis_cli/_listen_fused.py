@@ -78,6 +78,7 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
         x, y, _ = fused.points.position_m[nearest].tolist()
         place = f"{range_m[nearest]:.3f} m at {math.degrees(math.atan2(y, x)):+.1f}°"
     absent = f", without {' '.join(fused.missing)}" if fused.missing else ""
+    absent += f", {' '.join(fused.unheard)} not heard" if fused.unheard else ""
     age = "-" if age_ms is None else f"{age_ms:.1f} ms"
     row = (
         f"{fused.image.stamp.sync_count:8d}  {age:>8}  {len(range_m):6d}  {place:24}  {' '.join(fused.sensors)}{absent}"

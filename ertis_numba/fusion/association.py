@@ -1,7 +1,7 @@
 """Association of the echoes of all sensors with the reflectors that cause them."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
 
-__all__ = ["Reflectors", "SensorEchoes", "tangents"]
+__all__ = ["LocatedReflector", "Reflectors", "SensorEchoes", "tangents"]
 
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -76,6 +76,11 @@ class SensorEchoes(NamedTuple):
     power: Floats
     share: Floats
 
+    def without(self, emitters: Collection[int]) -> "SensorEchoes":
+        """Return the echoes as those of other emitters only."""
+        kept = ~np.isin(self.emitters, [*emitters])
+        return self._replace(emitters=self.emitters[kept], path_m=self.path_m[:, kept], share=self.share[:, kept])
+
 
 class _Candidates(NamedTuple):
     """Possible reflectors, each derived from one echo and one emitter.
@@ -103,7 +108,7 @@ class _Candidates(NamedTuple):
         return _Candidates._make(each[number : number + 1] for each in self)
 
 
-class _LocatedReflector(NamedTuple):
+class LocatedReflector(NamedTuple):
     """Located reflector.
 
     Attributes
@@ -146,12 +151,15 @@ class Reflectors:
 
     Attributes
     ----------
+    located : tuple of LocatedReflector
     position_m : (reflector, axis) float64
     covariance_m2 : (reflector, axis, axis) float64
     reflectivity : (reflector,) float64
         Power of its echo at 1 m.
     confirmed : (reflector,) bool
         Reflectors that echoes at enough pairs confirm, as in `ertis_numba.fusion.confirmation`.
+    n_unexplained : int
+        Echoes that no reflector explains together with others.
     """
 
     def __init__(
@@ -201,9 +209,11 @@ class Reflectors:
         # Where many pairs should hear a reflector, the only echo of one comes from elsewhere, except that of a wall.
         n_echoes_of = np.array([len(each.echo) for each in found], np.int64)
         kept = (n_echoes_of > 1) | sure.is_wall | (sure.n_pairs < _MANY_PAIRS)
+        self.located = tuple(found[number] for number in np.flatnonzero(kept))
         self.position_m, self.confirmed = place_m[kept], sure.is_confirmed[kept]
-        self.covariance_m2 = np.array([each.covariance_m2 for each in found]).reshape(-1, 3, 3)[kept]
-        self.reflectivity = np.array([each.reflectivity for each in found])[kept]
+        self.covariance_m2 = np.array([each.covariance_m2 for each in self.located]).reshape(-1, 3, 3)
+        self.reflectivity = np.array([each.reflectivity for each in self.located])
+        self.n_unexplained = int(self._is_free.sum())
 
     def _candidates(self) -> _Candidates:
         """Return the candidates of all echoes, where their emitter is audible."""
@@ -289,11 +299,11 @@ class Reflectors:
 
         There, what a piston radiates depends on the frequency, and echoes come early or late.
         """
-        power_db = 10 * np.log10(np.maximum(self._radiated(place_m), _TINY))
+        power_db = 10 * np.log10(np.maximum(self.radiated(place_m), _TINY))
         high_db, low_db = _BESIDE_DB
         return np.asarray(_BESIDE_M * np.clip((power_db - high_db) / (low_db - high_db), 0.0, 1.0))
 
-    def _confirmed(self, candidates: _Candidates) -> list[_LocatedReflector]:
+    def _confirmed(self, candidates: _Candidates) -> list[LocatedReflector]:
         """Return the reflectors that several echoes confirm, and mark these echoes as explained."""
         which, echo, emitter, distance = self._fits(candidates, 0.0)
         n_candidates, n_echoes = len(candidates.echo), len(self._receiver)
@@ -337,7 +347,7 @@ class Reflectors:
         excess_db = 10 * np.log10(np.maximum(candidates.reflectivity / max(usual, _TINY), 1.0))
         return np.asarray(np.maximum(0.0, excess_db - _USUAL_DB) / _SURPRISE_DB)
 
-    def _accepted(self, candidates: _Candidates, best: int) -> tuple[_LocatedReflector | None, Numbers]:
+    def _accepted(self, candidates: _Candidates, best: int) -> tuple[LocatedReflector | None, Numbers]:
         """Return the reflector at a candidate if enough echoes confirm it, and all echoes that it explains."""
         here = candidates.only(best)
         extra_m, covariance_m2, echo = 0.0, np.empty((3, 3)), np.empty(0, np.int64)
@@ -354,7 +364,7 @@ class Reflectors:
             here = here._replace(place_m=place_m[None], across=np.zeros((1, 3)), reflectivity=np.array([reflectivity]))
             extra_m = _REFINED_M
         reflectivity = self._reflectivity(place_m, members, emitter)
-        return _LocatedReflector(place_m, covariance_m2, reflectivity, members, emitter), np.unique(echo)
+        return LocatedReflector(place_m, covariance_m2, reflectivity, members, emitter), np.unique(echo)
 
     def _reflectivity(self, place_m: Floats, members: Numbers, emitter: Numbers) -> float:
         """Return the power at 1 m of a reflector that fits its echoes best, by least squares.
@@ -379,7 +389,7 @@ class Reflectors:
                 found.append(entry)
         return echo[found], emitter[found]
 
-    def _refined(self, found: list[_LocatedReflector]) -> list[_LocatedReflector]:
+    def _refined(self, found: list[LocatedReflector]) -> list[LocatedReflector]:
         """Return reflectors located with the errors of echoes that overlap, without those that overlaps explain."""
         if not found:
             return found
@@ -402,7 +412,7 @@ class Reflectors:
 
     def _overlap(
         self,
-        found: Sequence[_LocatedReflector],
+        found: Sequence[LocatedReflector],
         echo: Numbers,
         number: Numbers | None = None,
         emitter: Numbers | None = None,
@@ -424,15 +434,19 @@ class Reflectors:
             beam=self._beam,
         )
 
-    def _radiated(self, place_m: Floats) -> Floats:
+    def radiated(self, place_m: Floats) -> Floats:
         """Return the power of each call towards places, relative to ahead: (place, emitter) float64."""
         away_m = place_m[:, None] - self._sensor_m
         cosine = np.einsum("psi,si->ps", away_m, self._ahead) / np.maximum(np.linalg.norm(away_m, axis=2), _NEAREST_M)
         return next(iter(self._emitters.values())).powers(cosine)
 
-    def _predicted(self, found: Sequence[_LocatedReflector]) -> PredictedEchoes:
+    def predicted(self) -> PredictedEchoes:
+        """Return the echoes that the reflectors should cause if all sensors emit."""
+        return self._predicted(self.located)
+
+    def _predicted(self, found: Sequence[LocatedReflector]) -> PredictedEchoes:
         """Return the echoes that reflectors cause."""
-        place_m = np.array([each.place_m for each in found])
+        place_m = np.array([each.place_m for each in found]).reshape(-1, 3)
         away_m = place_m[:, None] - self._sensor_m
         apart_m = np.maximum(np.linalg.norm(away_m, axis=2), _NEAREST_M)
         toward = away_m / apart_m[..., None]
@@ -443,7 +457,7 @@ class Reflectors:
             toward - 2 * behind[..., None] * self._ahead,
         )
 
-    def _add_lone(self, candidates: _Candidates, found: list[_LocatedReflector]) -> None:
+    def _add_lone(self, candidates: _Candidates, found: list[LocatedReflector]) -> None:
         """Add reflectors that a single own echo shows, unless the attribution explains it otherwise."""
         own = self._share[np.arange(len(self._receiver)), self._receiver]
         kept = self._is_free & (self._share.sum(axis=1) > _MIN_SHARE) & (own >= self._share.max(axis=1)) & (own > 0)
@@ -457,7 +471,7 @@ class Reflectors:
             _, covariance_m2 = self._located(sensor_echo, sensor, place_m)
             if _is_apart(place_m, covariance_m2, found):
                 reflectivity = self._reflectivity(place_m, sensor_echo, sensor)
-                found.append(_LocatedReflector(place_m, covariance_m2, reflectivity, sensor_echo, sensor))
+                found.append(LocatedReflector(place_m, covariance_m2, reflectivity, sensor_echo, sensor))
 
     def _is_ambiguous(self, candidates: _Candidates) -> NDArray[np.bool_]:
         """Return True for echoes that another call explains as well, if an image is missing: (echo,) bool.
@@ -508,7 +522,7 @@ class Reflectors:
         return position_m, covariance_m2
 
 
-def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[_LocatedReflector]) -> bool:
+def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[LocatedReflector]) -> bool:
     """Return True if no reflector is at a place.
 
     Another echo at a reflector is a shoulder of its main lobe, or overlaps with other echoes.

@@ -45,15 +45,15 @@ class Attributed(NamedTuple):
     reflectivity : (cell,) float32
         Power of the echo of each cell's reflector at 1 m.
     shares : Shares
-    unheard : frozenset of int
-        Emitters whose calls no other sensor hears, although it should.
+    suspects : frozenset of int
+        Emitters whose calls no other sensor seems to hear, although it should. Ghosts may pretend this.
     bound : (cell,) float32
         Highest reflectivity that all pairs allow; infinite where none can see the cell.
     """
 
     reflectivity: Singles
     shares: Shares
-    unheard: frozenset[int]
+    suspects: frozenset[int]
     bound: Singles
 
 
@@ -148,7 +148,7 @@ class Attribution:
         alone = self._mean(own, images, None)
         bound = self._bound(evidence)
         confirmed = self._confirmed(evidence, alone)
-        reflectivity = alone
+        reflectivity, suspects = alone, frozenset[int]()
         shares: Shares = {}
         for suppression in _SUPPRESSION:
             if suppression == _SUPPRESSION[-1]:
@@ -157,14 +157,13 @@ class Attribution:
                     # Remaining ghosts cause no foreign echoes either, so they must not decide alone.
                     shares = self._all_shares(images, reflectivity, confirmed, suppression)
                     unheard &= self._not_heard(evidence, self._mean(own, images, shares))
-                if unheard:
-                    return self._without(self._unheard | unheard)(images)
+                suspects = unheard
                 reflectivity = np.minimum(reflectivity, bound)
             shares = self._all_shares(images, reflectivity, confirmed, suppression)
             if suppression < _SUPPRESSION[-1]:
                 reflectivity = self._mean(own, images, shares)
         _limit_sums(shares)
-        return Attributed(np.minimum(self._mean(evidence, images, shares), bound), shares, self._unheard, bound)
+        return Attributed(np.minimum(self._mean(evidence, images, shares), bound), shares, suspects, bound)
 
     def single(self, images: Mapping[int, CoarseImage]) -> Singles:
         """Return the mean reflectivity if each sensor takes all echoes for its own: (cell,) float32.
@@ -176,8 +175,10 @@ class Attribution:
         own = [pair for pair in self._pairs if pair.emitter == pair.receiver]
         return self._mean([self._evidence(pair, images[pair.receiver]) for pair in own], images, None)
 
-    def _without(self, unheard: frozenset[int]) -> "Attribution":
+    def without(self, unheard: frozenset[int]) -> "Attribution":
         """Return an attribution that expects no echoes of some emitters at other sensors."""
+        if unheard == self._unheard:
+            return self
         if unheard not in self._reduced:
             self._reduced[unheard] = Attribution(
                 self._grid, self._pairs, self._hypotheses, self._receivers, unheard, self._known

@@ -13,7 +13,7 @@ from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.pulses import is_same_pulse
 from ertis_numba.fusion.rig import Mountings, emitter_diameter_m, mounted_sensors
-from ertis_numba.fusion.tables import FusionTables, Located
+from ertis_numba.fusion.tables import FusionTables, PulseReflectors
 from ertis_numba.settings import MAX_EMITTER_M
 
 __all__ = ["Fused", "Fuser", "fuse"]
@@ -39,8 +39,9 @@ class Fused:
     missing : tuple of str
         Sensors with a mounting, but without an image.
     unheard : tuple of str
-        Sensors whose calls no other sensor hears, although it should. Their emitters may be broken, or they are not on
-        the same SYNC chain. They are fused without foreign echoes.
+        Sensors whose calls are not heard at reflectors where they should be, in this pulse and the two before. Their
+        emitters may be broken, or they are not on the same SYNC chain. They are fused without echoes of their calls.
+        Computed with the points.
     without_echo : tuple of str
         Fused sensors whose images hold no echo above their noise. If it names all, the pulse returned no echo. Computed
         with the points.
@@ -63,33 +64,34 @@ class Fused:
     image: Energyscape
     sensors: tuple[str, ...]
     missing: tuple[str, ...]
-    unheard: tuple[str, ...]
-    _locate: Callable[[], Located] = field(repr=False)
+    _solve: Callable[[], PulseReflectors] = field(repr=False)
+    _locate: Callable[[PulseReflectors, Energyscape], PointCloud] = field(repr=False)
     _names: tuple[str, ...] = field(repr=False)
 
     @functools.cached_property
-    def _located(self) -> Located:
-        return self._locate()
-
-    @property
     def points(self) -> PointCloud:
         """Reflectors in the frame of the platform."""
-        return self._located.points
+        return self._locate(self._solve(), self.image)
+
+    @property
+    def unheard(self) -> tuple[str, ...]:
+        """Sensors whose calls are not heard at reflectors where they should be."""
+        return tuple(self._names[number] for number in sorted(self._solve().unheard))
 
     @property
     def without_echo(self) -> tuple[str, ...]:
         """Fused sensors whose images hold no echo above their noise."""
-        return tuple(self._names[number] for number in self._located.without_echo)
+        return tuple(self._names[number] for number in self._solve().without_echo)
 
     @property
     def noise(self) -> dict[str, float]:
         """Detection threshold of each fused sensor: amplitude that noise exceeds in one of 100,000 images."""
-        return {self._names[number]: floor for number, floor in self._located.floor.items()}
+        return {self._names[number]: float(floor.max()) for number, floor in self._solve().floor.items()}
 
     @property
     def is_empty(self) -> bool:
         """True if no image holds an echo above its noise, so that the pulse returned no echo."""
-        return len(self._located.without_echo) == len(self.sensors)
+        return len(self._solve().without_echo) == len(self.sensors)
 
 
 class Fuser:
@@ -152,6 +154,7 @@ class Fuser:
         self._start_s: dict[int, float] = {}  # of the calls of all sensors so far
         self._diameter_m: dict[int, float] = {}  # of the emitters of all sensors so far
         self._tables: FusionTables | None = None
+        self._last: Callable[[], PulseReflectors] | None = None  # of the pulse before
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -182,17 +185,20 @@ class Fuser:
         self._start_s |= {number: image.settings.call.start_s for number, image in group.items()}
         self._diameter_m |= self._diameters_m(group)
         if self._tables is None or not self._tables.fit(group, self._diameter_m):
-            self._tables = self._new_tables(group)
+            self._tables, self._last = self._new_tables(group), None
         tables = self._tables
+        before = None if self._last is None else self._last()
+        unheard, pulses = (frozenset[int](), ()) if before is None else (before.unheard, before.pulses)
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
-        found = tables.attribution(group)(coarse)
-        image = tables.image(found.reflectivity, group)
+        found = tables.attribution(group).without(unheard)(coarse)
+        solve = self._last = functools.cache(lambda: tables.pulse_reflectors(group, found, unheard, pulses))
+        image = tables.image((solve().attributed if unheard or found.suspects else found).reflectivity, group)
         return Fused(
             image=image,
             sensors=tuple(self._mountings[number].name for number in group),
             missing=tuple(sensor.name for number, sensor in enumerate(self._mountings) if number not in group),
-            unheard=tuple(self._mountings[number].name for number in sorted(found.unheard)),
-            _locate=lambda: tables.located(group, found, image),
+            _solve=solve,
+            _locate=tables.points,
             _names=self.sensors,
         )
 

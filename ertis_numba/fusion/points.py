@@ -15,7 +15,7 @@ from ertis_numba.fusion.association import Reflectors, SensorEchoes, tangents
 from ertis_numba.fusion.attribution import Shares
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
-from ertis_numba.fusion.rig import Emitters, MountedSensor
+from ertis_numba.fusion.rig import MountedSensor
 from ertis_numba.geometry import Grid
 
 __all__ = ["PointFuser", "joined"]
@@ -113,25 +113,17 @@ class PointFuser:
         return found
 
 
-def joined(
-    echoes: Sequence[SensorEchoes],
-    sensors: Sequence[MountedSensor],
-    receivers: Mapping[int, Receiver],
-    emitters: Mapping[int, Emitters],
-    image: Energyscape,
-    grid: PolarGrid,
-    bound: NDArray[np.float32],
-) -> PointCloud:
+def joined(reflectors: Reflectors, image: Energyscape, grid: PolarGrid) -> PointCloud:
     """Return one point for each reflector, in the frame of the platform, strongest first.
 
     Parameters
     ----------
-    echoes, sensors, receivers, emitters, grid, bound
-        As for `Reflectors`.
+    reflectors : Reflectors
     image : Energyscape
         Fused image, which limits the amplitudes of reflectors that are not confirmed.
+    grid : PolarGrid
+        Cells of the image.
     """
-    reflectors = Reflectors(echoes, sensors, receivers, emitters, grid, bound)
     position_m = reflectors.position_m
     amplitude = np.sqrt(reflectors.reflectivity)
     # Ghosts would grow with range, and with the correction of the emitter's directivity.

@@ -15,13 +15,14 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones, mounting
 from ertis_numba.settings import Array, Settings
 
-__all__ = ["Emitters", "MountedSensor", "Mountings", "emitter_diameter_m", "mounted_sensors"]
+__all__ = ["USUAL_DIAMETER_M", "Emitters", "MountedSensor", "Mountings", "emitter_diameter_m", "mounted_sensors"]
 
 Floats = NDArray[np.float64]
 Mountings = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 """Position x, y, z in m, and unit quaternion x, y, z, w from the sensor frame to the platform frame, by sensor."""
 
-_USUAL_DIAMETER_M: Final = 0.012  # of an emitter whose settings and layout state none
+USUAL_DIAMETER_M: Final = 0.012
+"""Diameter of an emitter whose settings and layout state none."""
 _N_FREQUENCIES = 12  # of the band, over which the power of an emitter is averaged
 _NEAREST_M = 0.05  # Distance below which spreading does not increase.
 _STRAY_DB = -20.0  # Power that an emitter radiates at least to its front, which no piston model predicts.
@@ -85,7 +86,7 @@ def emitter_diameter_m(settings: Settings, given_m: float | None = None) -> floa
         Diameter that replaces that of the settings.
     """
     stated_m = _stated_diameter_m(settings.array) if given_m is None else given_m
-    return _USUAL_DIAMETER_M if stated_m is None else stated_m
+    return USUAL_DIAMETER_M if stated_m is None else stated_m
 
 
 @functools.cache

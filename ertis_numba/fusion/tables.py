@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.fusion.association import Reflectors, SensorEchoes
 from ertis_numba.fusion.attribution import Attributed, Attribution, Rivalries
+from ertis_numba.fusion.emissions import (
+    EmissionCounts,
+    expected_echoes,
+    is_better,
+    silence_ratios,
+    silent_one,
+    suspect,
+)
 from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
 from ertis_numba.fusion.points import PointFuser, joined
 from ertis_numba.fusion.polar_grid import PolarGrid
@@ -17,29 +26,50 @@ from ertis_numba.fusion.receivers import CoarseImage, Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
 from ertis_numba.settings import Settings
 
-__all__ = ["PLATFORM", "FusionTables", "Located"]
+__all__ = ["PLATFORM", "FusionTables", "PulseReflectors"]
 
 PLATFORM: Final = "base_link"
 """Name of the platform's frame in REP 105, and of the sensor of fused images."""
 
+_N_PULSES: Final = 3  # Pulses that count as evidence of emitters; these may fail or recover.
 _DIRECT_SOUND_M: Final = 0.1  # Range before and after direct sound in which it hides echoes.
 
 
-class Located(NamedTuple):
-    """Points of a group of images.
+class PulseReflectors(NamedTuple):
+    """Reflectors of a group of images, associated without the emitters that are not heard.
 
     Attributes
     ----------
-    points : PointCloud
-    floor : dict of int to float
-        Detection threshold of each sensor: noise exceeds it anywhere in an image with a probability of 10⁻⁵.
+    attributed : Attributed
+    reflectors : Reflectors
+    floor : dict of int to (direction,) float32
+        Detection thresholds of each sensor, `PointFuser.floor`.
     without_echo : list of int
         Sensors whose images have no echo above it.
+    unheard : frozenset of int
+        Emitters whose calls are not heard.
+    pulses : tuple of EmissionCounts
+        Evidence of this pulse and of the ones before.
+    cost : int
+        Echoes that reflectors do not explain, and those that they should cause but that are missed.
     """
 
-    points: PointCloud
-    floor: dict[int, float]
+    attributed: Attributed
+    reflectors: Reflectors
+    floor: dict[int, NDArray[np.float32]]
     without_echo: list[int]
+    unheard: frozenset[int]
+    pulses: tuple[EmissionCounts, ...]
+    cost: int
+
+
+class _Explained(NamedTuple):
+    """Explanation of the echoes of a group, with the number of unexplained and missed echoes as its cost."""
+
+    reflectors: Reflectors
+    counts: EmissionCounts
+    without_echo: list[int]
+    cost: int
 
 
 class FusionTables:
@@ -143,16 +173,105 @@ class FusionTables:
             stamp=replace(first.stamp, sensor=PLATFORM),
         )
 
-    def located(self, group: Mapping[int, Energyscape], attributed: Attributed, image: Energyscape) -> Located:
-        """Return the points of a group."""
+    def pulse_reflectors(
+        self,
+        group: Mapping[int, Energyscape],
+        attributed: Attributed,
+        unheard: frozenset[int],
+        pulses: tuple[EmissionCounts, ...],
+    ) -> PulseReflectors:
+        """Return the reflectors of a group, and the emitters that are not heard.
+
+        Parameters
+        ----------
+        group : mapping of int to Energyscape
+        attributed : Attributed
+            Attribution without the emitters that the pulses before have not heard.
+        unheard : frozenset of int
+            These emitters.
+        pulses : tuple of EmissionCounts
+            Evidence of the pulses before.
+        """
         floor = {number: self._points[number].floor(each) for number, each in group.items()}
-        found = [
+        explained = self._explained(group, attributed, floor, unheard)
+        for number in unheard:
+            others = unheard - {number}
+            emitting = self._without(group, others)
+            rival = self._explained(group, emitting, floor, others)
+            is_shown = silence_ratios([rival.counts])[number] < 0 and not is_better(explained.cost, rival.cost)
+            if is_shown or is_better(rival.cost, explained.cost):
+                unheard, attributed, explained, pulses = others, emitting, rival, ()
+        while (suspected := suspect((*pulses, explained.counts)[-_N_PULSES:], unheard)) is not None:
+            rivals = {}
+            for number in self._judged(group) - unheard:
+                each = self._without(group, unheard | {number})
+                rivals[number] = each, self._explained(group, each, floor, unheard | {number})
+            found = silent_one(
+                suspected,
+                explained.counts,
+                {number: each.cost for number, (_, each) in rivals.items()},
+                {number: each.counts for number, (_, each) in rivals.items()},
+            )
+            if found is None:
+                break
+            unheard, (attributed, explained) = unheard | {found}, rivals[found]
+        evidence = (*pulses, explained.counts)[-_N_PULSES:]
+        still = frozenset(number for number in unheard if silence_ratios(evidence)[number] > 0)
+        return PulseReflectors(
+            attributed, explained.reflectors, floor, explained.without_echo, still, evidence, explained.cost
+        )
+
+    def _without(self, group: Mapping[int, Energyscape], unheard: frozenset[int]) -> Attributed:
+        """Return the attribution of a group whose sensors do not hear some emitters."""
+        coarse = {number: self.coarse(number, each) for number, each in group.items()}
+        return self.attribution(group).without(unheard)(coarse)
+
+    def points(self, found: PulseReflectors, image: Energyscape) -> PointCloud:
+        """Return the points of a group, given its fused image."""
+        return joined(found.reflectors, image, self.grid)
+
+    def _explained(
+        self,
+        group: Mapping[int, Energyscape],
+        attributed: Attributed,
+        floor: Mapping[int, NDArray[np.float32]],
+        unheard: frozenset[int],
+    ) -> "_Explained":
+        """Return the reflectors that explain the echoes if some emitters are silent."""
+        echoes = [each.without(unheard) for each in self._echoes(group, attributed, floor)]
+        reflectors = Reflectors(echoes, self._sensors, self._receivers, self._emitters, self.grid, attributed.bound)
+        late_m = {number: self._heard_m(group, number) for number in group}
+        expected = expected_echoes(reflectors, group, floor, self._receivers, late_m, self._deaf, silent=unheard)
+        counts = EmissionCounts.of(expected, reflectors, self._judged(group))
+        n_missed = int(np.delete(expected.is_missed, [*unheard], axis=2).sum())
+        without_echo = [each.receiver for each in echoes if not len(each.power)]
+        return _Explained(reflectors, counts, without_echo, reflectors.n_unexplained + n_missed)
+
+    def _echoes(
+        self, group: Mapping[int, Energyscape], attributed: Attributed, floor: Mapping[int, NDArray[np.float32]]
+    ) -> list[SensorEchoes]:
+        return [
             self._points[number].echoes(each, floor[number], attributed.shares, self._late_m[number])
             for number, each in group.items()
         ]
-        points = joined(found, self._sensors, self._receivers, self._emitters, image, self.grid, attributed.bound)
-        without_echo = [each.receiver for each in found if not len(each.power)]
-        return Located(points, {number: float(each.max()) for number, each in floor.items()}, without_echo)
+
+    def _heard_m(self, group: Mapping[int, Energyscape], number: int) -> dict[int, float]:
+        """Return the path of sound between the emission of a receiver and that of each emitter that it may hear."""
+        passive = _key(group)[1]
+        return {
+            emitter: delay_m
+            for emitter, delay_m in self._late_m[number].items()
+            if emitter not in passive and self._same_call(emitter, number)
+        }
+
+    def _judged(self, group: Mapping[int, Energyscape]) -> frozenset[int]:
+        """Return the emitters that a group may show to be silent.
+
+        If the image of an emitter's own sensor is missing, other sensors may take the echoes of its calls for those of
+        their own. No emitter is then judged.
+        """
+        emitting = {*self._emitting} - _key(group)[1]
+        return frozenset(emitting if emitting <= group.keys() else ())
 
     def _same_call(self, emitter: int, number: int) -> bool:
         """Return True unless the calls are known to differ, so that the matched filter suppresses the foreign one."""

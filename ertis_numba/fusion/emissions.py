@@ -1,0 +1,215 @@
+"""Emitters that the sensors hear: echoes of each call at the reflectors that other calls locate."""
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.frames import Energyscape
+from ertis_numba.fusion.association import Reflectors
+from ertis_numba.fusion.overlaps import PredictedEchoes, overlap
+from ertis_numba.fusion.receivers import Receiver
+
+__all__ = [
+    "EmissionCounts",
+    "ExpectedEchoes",
+    "expected_echoes",
+    "is_better",
+    "silence_ratios",
+    "silent_one",
+    "suspect",
+]
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# Logarithms of likelihood ratios of a silent emitter. One echo in fifty that an emitter should cause is missed, because
+# a reflector does not exist; a third of those that a silent one should cause seem to be heard, since others are there.
+_MISSED: Final = math.log(0.67 / 0.02)
+_HEARD: Final = math.log(0.33 / 0.98)
+_DEPENDENT: Final = 0.5  # Independent echoes per echo, as several sensors hear one reflector.
+_CERTAIN: Final = math.log(1e3)
+_ALIKE: Final = 3  # Difference of unexplained and missed echoes within which explanations are equally good.
+_N_OTHERS: Final = 2  # Echoes of other calls that locate a reflector.
+_RADIATED: Final = 10 ** (-16.5 / 10)  # Power to the side, below which models of emitters are uncertain.
+_VISIBLE: Final = 10 ** (8.0 / 10)  # Power of an expected echo relative to noise and side lobes.
+_SIDE_LOBES: Final = 10 ** (-17.0 / 10)  # Power relative to the strongest echo of any direction at a similar range.
+_DISTURBED: Final = 10 ** (-8.0 / 10)  # Power of other echoes relative to one, from which they may hide it.
+_LOST: Final = 10 ** (-5.0 / 10)  # Power relative to an expected echo that others weaken, below which it is missed.
+_WITHIN: Final = math.cos(math.radians(4.0))  # Directions in which an echo may appear.
+_NEAR_M: Final = 0.008  # Ranges in which it may appear, …
+_BESIDE_M: Final = 0.03  # … and those with its side lobes.
+_TINY: Final = 1e-30
+
+
+class ExpectedEchoes(NamedTuple):
+    """Echoes that reflectors should cause, for each reflector, receiver and emitter.
+
+    Attributes
+    ----------
+    is_heard, is_missed : (reflector, receiver, emitter) bool
+        Both are false if noise or other echoes may hide the echo.
+    """
+
+    is_heard: Flags
+    is_missed: Flags
+
+
+class EmissionCounts(NamedTuple):
+    """Echoes of each call that should be heard in one pulse.
+
+    Attributes
+    ----------
+    heard, missed : (emitter,) int64
+    """
+
+    heard: NDArray[np.int64]
+    missed: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, expected: ExpectedEchoes, reflectors: Reflectors, judged: Collection[int]) -> "EmissionCounts":
+        """Return the counts at reflectors that echoes of other calls locate.
+
+        Parameters
+        ----------
+        expected : ExpectedEchoes
+        reflectors : Reflectors
+        judged : collection of int
+            Emitters to judge. Without the image of its own sensor, nobody can tell.
+        """
+        numbers = np.arange(expected.is_heard.shape[2])
+        n_others = np.array([(each.emitter[:, None] != numbers).sum(axis=0) for each in reflectors.located])
+        counts = (n_others.reshape(-1, len(numbers)) >= _N_OTHERS) & np.isin(numbers, [*judged])
+        counts &= reflectors.radiated(reflectors.position_m) > _RADIATED
+        return cls(*((each & counts[:, None]).sum(axis=(0, 1)) for each in expected))
+
+
+def silence_ratios(pulses: Sequence[EmissionCounts]) -> Floats:
+    """Return the logarithm of how much better silence of each emitter explains the pulses than emission: (emitter,)."""
+    heard, missed = np.sum(pulses, axis=0)
+    return np.asarray(_DEPENDENT * (missed * _MISSED + heard * _HEARD))
+
+
+def suspect(pulses: Sequence[EmissionCounts], known: Collection[int] = ()) -> int | None:
+    """Return the emitter, except known ones, that seems silent with a likelihood ratio of 1000 or more, or None."""
+    ratio = silence_ratios(pulses)
+    ratio[[*known]] = -math.inf
+    best = int(ratio.argmax())
+    return best if ratio[best] > _CERTAIN else None
+
+
+def silent_one(
+    suspected: int, joint: EmissionCounts, costs: Mapping[int, int], counts: Mapping[int, EmissionCounts]
+) -> int | None:
+    """Return the emitter whose silence explains the echoes best, or None if that of several does about equally well.
+
+    Echoes of one emitter fit another one that is silent, at slightly shifted places. The wrong explanation usually
+    leaves more echoes unexplained, and misses more of those that it predicts.
+
+    Parameters
+    ----------
+    suspected : int
+        Emitter that seems silent. Another one explains this if its own silence lets the suspected one be heard.
+    joint : EmissionCounts
+        Evidence if all emit. Emitters that it shows are rivals only if their silence explains clearly more.
+    costs : mapping of int to int
+        Unexplained and missed echoes if an emitter is silent.
+    counts : mapping of int to EmissionCounts
+        Evidence if an emitter is silent.
+    """
+    shown = silence_ratios([joint])
+    likely = []
+    for number, cost in costs.items():
+        ratio = silence_ratios([counts[number]])
+        is_rival = ratio[suspected] <= 0 and (shown[number] >= 0 or is_better(cost, costs[suspected]))
+        if (number == suspected or is_rival) and ratio[number] > 0:
+            likely.append(number)
+    least = min((costs[each] for each in likely), default=0)
+    best = [each for each in likely if not is_better(least, costs[each])]
+    return best[0] if len(best) == 1 else None
+
+
+def is_better(cost: int, other: int) -> bool:
+    """Return True if an explanation costs clearly less than another one."""
+    return cost + _ALIKE < other
+
+
+def expected_echoes(
+    reflectors: Reflectors,
+    images: Mapping[int, Energyscape],
+    floors: Mapping[int, NDArray[np.float32]],
+    receivers: Mapping[int, Receiver],
+    late_m: Mapping[int, Mapping[int, float]],
+    deaf: Mapping[int, Flags],
+    silent: Collection[int] = (),
+) -> ExpectedEchoes:
+    """Return the echoes that reflectors should cause in images.
+
+    Parameters
+    ----------
+    reflectors : Reflectors
+    images : mapping of int to Energyscape
+        Images by receiver.
+    floors : mapping of int to (direction,) float32
+        Detection thresholds.
+    receivers : mapping of int to Receiver
+    late_m : mapping of int to mapping of int to float
+        Path of sound between the emissions of each receiver and of each emitter that it may hear.
+    deaf : mapping of int to (step,) bool
+        Steps at which direct sound hides echoes.
+    silent : collection of int
+        Emitters whose echoes hide no others.
+    """
+    predicted = reflectors.predicted()
+    is_heard, is_missed = np.zeros((2, *predicted.power.shape), np.bool_)
+    for number, image in images.items():
+        receiver, senders = receivers[number], [*late_m[number]]
+        path_m, power = predicted.path_m[:, number, senders], predicted.power[:, number, senders]
+        other = _disturbance(predicted, number, receiver, late_m[number], silent)
+        arrival_m = path_m + np.array([*late_m[number].values()])
+        column = np.searchsorted(image.range_m, arrival_m / 2).clip(0, len(image.range_m) - 1)
+        near, beside = (math.ceil(each / float(np.diff(image.range_m[:2])[0])) for each in (_NEAR_M, _BESIDE_M))
+        step = (arrival_m / 2 / receiver.step_m).astype(np.int64).clip(0, receiver.n_steps - 1)
+        cosine = predicted.direction[:, number] @ receiver.mounting.rotation @ receiver.directions.T
+        shown = np.array([image.amplitude[each].max(axis=0, initial=0.0) for each in cosine > _WITHIN])
+        shown = shown.reshape(len(path_m), len(image.range_m))
+        side = _highest(np.broadcast_to(image.amplitude.max(axis=0), shown.shape), column, beside) ** 2 * _SIDE_LOBES
+        counts = (column >= beside) & (column < len(image.range_m) - beside) & ~deaf[number][step]
+        counts &= (power > _VISIBLE * np.maximum(side, float(floors[number].max()) ** 2)) & (other < _DISTURBED)
+        counts &= (cosine > _WITHIN).any(axis=1, keepdims=True)
+        is_loud = _highest(shown, column, near) ** 2 > _LOST * (1 - np.sqrt(np.minimum(other, 1.0))) ** 2 * power
+        is_heard[:, number, senders], is_missed[:, number, senders] = counts & is_loud, counts & ~is_loud
+    return ExpectedEchoes(is_heard, is_missed)
+
+
+def _disturbance(
+    predicted: PredictedEchoes, number: int, receiver: Receiver, late_m: Mapping[int, float], silent: Collection[int]
+) -> Floats:
+    """Return the power of other echoes at expected ones of a receiver, relative to these: (reflector, emitter)."""
+    emitters, delay_m = [*late_m], np.array([*late_m.values()])
+    path_m, power = predicted.path_m[:, [number]][..., emitters], predicted.power[:, [number]][..., emitters]
+    here = PredictedEchoes(path_m, np.where(np.isin(emitters, [*silent]), 0.0, power), predicted.direction[:, [number]])
+    found = np.zeros((len(path_m), len(emitters)))
+    for column in range(len(emitters)):
+        is_other = np.ones((len(path_m), *power[:, 0].shape), np.bool_)
+        is_other[np.arange(len(path_m)), np.arange(len(path_m)), column] = False
+        found[:, column] = overlap(
+            here,
+            np.zeros(len(path_m), np.int64),
+            path_m[:, 0, column, None] + delay_m[column] - delay_m,
+            here.direction[:, 0],
+            np.maximum(power[:, 0, column], _TINY),
+            is_other,
+            ahead=receiver.mounting.rotation[None, :, 0],
+            pulse_m=np.array([receiver.pulse_m]),
+            beam=np.array([receiver.width]),
+        ).power.sum(axis=1)
+    return found
+
+
+def _highest(rows: NDArray[np.float32], columns: NDArray[np.int64], margin: int) -> Floats:
+    """Return the highest value around each of several columns of a row: (row, column) float64."""
+    near = (columns[..., None] + np.arange(-margin, margin + 1)).clip(0, rows.shape[1] - 1)
+    return np.asarray(rows[np.arange(len(rows))[:, None, None], near].max(axis=2), np.float64)

@@ -1,0 +1,111 @@
+"""Sensors whose emitters are broken, in scenes that are rendered without the simulator."""
+
+import functools
+
+import numpy as np
+import pytest
+
+import ertis_numba as ertis
+from ertis_numba.fusion.emissions import EmissionCounts, silent_one, suspect
+from tests.small_platforms import HEIGHT_M, images_of, mounted, random_reflectors, rendered, settings_of
+
+PLACES_M = np.array([[1.6, 0.2, HEIGHT_M], [1.2, -1.0, HEIGHT_M], [-1.0, -1.3, HEIGHT_M]])
+"""Reflectors in front, between front and right, and between back and right, but none before the left sensor."""
+
+
+@functools.cache
+def images(seed, number, diameter_m, dead=None, count=4):
+    """Images of one pulse of a slowly moving platform among random reflectors, or those without one on the left."""
+    places_m, strength_db = (PLACES_M, np.zeros(3)) if seed is None else random_reflectors(seed)
+    signals = rendered(
+        mounted(count),
+        settings_of(),
+        places_m - [0.02 * number, 0.03 * number, 0.0],
+        strength_db,
+        diameter_m=diameter_m,
+        random=np.random.default_rng(number),
+        dead=(dead,),
+    )
+    return tuple(images_of(signals, settings_of(), number).values())
+
+
+def named(pulses, diameter_m, count=4):
+    fuser = ertis.Fuser(mounted(count), emitter_diameter_m=diameter_m)
+    return [fuser(each).unheard for each in pulses]
+
+
+@pytest.mark.parametrize(("seed", "diameter_m", "dead"), [(506, 0.0, "front"), (501, 0.012, "right")])
+def test_dead_emitter_is_named_within_three_pulses_until_it_recovers(seed, diameter_m, dead):
+    """In the first scene, the echoes of neighbours also fit calls of the dead emitter."""
+    healthy = [images(seed, number, diameter_m) for number in range(2)]
+    broken = [images(seed, number, diameter_m, dead) for number in range(2, 5)]
+    recovered = [images(seed, number, diameter_m) for number in range(5, 8)]
+    found = named([*healthy, *broken, *recovered], diameter_m)
+    assert found[:2] == [(), ()]
+    assert found[4] == (dead,)
+    assert set(found) == {(), (dead,)}
+    assert found[-1] == ()
+
+
+@pytest.mark.parametrize("diameter_m", [0.0, 0.012])
+def test_sensor_with_nothing_before_it_is_not_dead(diameter_m):
+    assert set(named([images(None, number, diameter_m) for number in range(3)], diameter_m)) == {()}
+
+
+def test_dead_emitter_of_two_sensors_is_named():
+    assert named([images(502, number, 0.0, "left", 2) for number in range(3)], 0.0, 2)[-1] == ("left",)
+
+
+def test_points_of_a_dead_emitter_are_reflectors():
+    """Echoes of neighbours in the image of a sensor that does not emit are not taken for its own."""
+    places_m, _ = random_reflectors(502)
+    fused = ertis.fuse(images(502, 0, 0.0, "front"), mounted(), emitter_diameter_m=0.0)
+    assert fused.unheard == ("front",)
+    apart_m = np.linalg.norm(fused.points.position_m[:, None] - places_m, axis=2).min(axis=1)
+    assert len(apart_m) >= 8
+    assert apart_m.max() < 0.03
+
+
+def counts(heard, missed):
+    return EmissionCounts(np.array(heard), np.array(missed))
+
+
+@pytest.mark.parametrize(
+    ("pulses", "known", "expected"),
+    [
+        ([counts([9, 9], [0, 0])], (), None),
+        ([counts([9, 0], [0, 4])], (), 1),
+        ([counts([9, 0], [0, 2])], (), None),  # too few
+        ([counts([9, 0], [0, 2])] * 2, (), 1),  # several pulses
+        ([counts([9, 30], [0, 4])], (), None),  # others have heard it
+        ([counts([9, 0], [0, 4])], (1,), None),  # known
+    ],
+)
+def test_emitter_is_suspected_if_its_silence_is_more_likely(pulses, known, expected):
+    assert suspect(pulses, known) == expected
+
+
+@pytest.mark.parametrize(
+    ("costs", "missed", "expected"),
+    [
+        ((40, 2, 38), (8, 8, 8), 1),
+        ((3, 2, 40), (8, 0, 8), 0),  # as good, but only one of them misses echoes
+        ((3, 2, 40), (8, 8, 8), None),  # Two explanations are equally good.
+        ((3, 2, 4), (0, 0, 0), None),
+    ],
+)
+def test_silence_that_explains_most_is_named(costs, missed, expected):
+    found = {number: counts([0, 0, 0], np.where(np.arange(3) == number, each, 0)) for number, each in enumerate(missed)}
+    assert silent_one(0, counts([0] * 3, [8, 0, 0]), dict(enumerate(costs)), found) == expected
+
+
+@pytest.mark.parametrize(
+    ("joint", "other", "expected"),
+    [
+        (counts([0, 0], [8, 0]), counts([0, 0], [8, 8]), 0),  # Silence of the other one leaves the first unheard.
+        (counts([0, 0], [8, 0]), counts([8, 0], [0, 8]), None),
+        (counts([0, 8], [8, 0]), counts([8, 0], [0, 8]), 0),  # The other one is heard.
+    ],
+)
+def test_equally_good_explanation_is_a_rival_if_others_do_not_contradict_it(joint, other, expected):
+    assert silent_one(0, joint, {0: 2, 1: 2}, {0: counts([0, 3], [8, 0]), 1: other}) == expected
