@@ -271,6 +271,21 @@ def test_remounted_odometry_continues_its_path(changed, is_measured):
     assert velocity.velocity_m_s == pytest.approx([0.5, 0.0], abs=0.01)
 
 
+@pytest.mark.parametrize("late_ns", [-300_000_000, 40_000_000, 300_000_000])
+def test_clock_of_a_missing_sensor_does_not_change_the_velocity(late_ns):
+    """The first sensor has another clock, and misses the middle pulse."""
+    given = dict.fromkeys(("other", "sensor"), ((0.0, 0.0, 0.0), AHEAD))
+    odometry, velocities = ertis.Odometry(given, alone=True), []
+    for pulse in range(4):
+        times_ns = {"sensor": 10**9 + pulse * TIME_NS, "other": 10**9 + pulse * TIME_NS + late_ns}
+        names = ["sensor"] if pulse == 2 else ["other", "sensor"]
+        pose = (0.05 * pulse, 0, 0)
+        group = [seen_from(pose, places_m(), pulse, sensor=name, timestamp_ns=times_ns[name]) for name in names]
+        velocities.append(odometry.add(group))
+    for velocity in velocities[1:]:
+        assert (velocity.time_s, *velocity.velocity_m_s) == pytest.approx((0.1, 0.5, 0.0), abs=0.01)
+
+
 def test_odometry_without_groups_has_no_trajectory():
     with pytest.raises(DataError, match="there is no pose yet; add the images"):
         ertis.Odometry(MOUNTINGS).trajectory  # noqa: B018  it raises

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from ertis_numba.frames import Stamp, Trajectory
+from ertis_numba.frames import Trajectory
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.motion.odometry import Odometry, PlanarPose
 from ertis_numba.motion.velocity import EgoVelocity, Item, stamp_of
@@ -50,8 +50,7 @@ class LiveOdometry:
         mountings : mapping of str to (translation_m, rotation_xyzw)
             Mountings of these and other sensors.
         """
-        stamp = stamp_of(group)
-        if self._has_restarted(stamp):
+        if self._has_restarted(group):
             self._odometry = None
         is_second = self._odometry is not None and len(self._odometry.poses) == 1
         if self._odometry is None or (is_second and group.keys() - self._first):
@@ -59,22 +58,27 @@ class LiveOdometry:
         elif mountings != self._mountings:
             self._odometry.remount(mountings)
         self._mountings = dict(mountings)
-        poses = self._odometry.poses
-        if poses and stamp.timestamp_ns <= poses[-1].timestamp_ns:
-            early_s = (poses[-1].timestamp_ns - stamp.timestamp_ns) / 1e9
+        early_s = self._early_s_of(group)
+        if early_s is not None:
             self._note(
-                f"SYNC pulse {stamp.sync_count} is left out: it is {early_s:.3g} s before the last one; was a clock "
-                "set back?"
+                f"SYNC pulse {stamp_of(group).sync_count} is left out: it is {early_s:.3g} s before the last one; was "
+                "a clock set back?"
             )
             return None
         self._early_s = None
         velocity = self._odometry.add(group.values())
         return self._odometry.poses[-1], velocity
 
-    def _has_restarted(self, stamp: Stamp) -> bool:
-        """Return True if all pulses have been before the last one for a second: their clock was set back."""
+    def _early_s_of(self, group: Mapping[str, Item]) -> float | None:
+        """Return the time of a group before the last pose; None if it is later."""
         poses = self._odometry.poses if self._odometry is not None else ()
-        if not poses or stamp.timestamp_ns > poses[-1].timestamp_ns:
+        if self._odometry is None or not poses or self._odometry.time_ns_of(group) > poses[-1].timestamp_ns:
+            return None
+        return (poses[-1].timestamp_ns - self._odometry.time_ns_of(group)) / 1e9
+
+    def _has_restarted(self, group: Mapping[str, Item]) -> bool:
+        """Return True if all pulses have been before the last one for a second: their clock was set back."""
+        if self._early_s_of(group) is None:
             self._early_s = None
             return False
         now_s = time.monotonic()

@@ -1,7 +1,7 @@
 """Odometry: path of a platform by integrating its motion between groups of images."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -13,7 +13,7 @@ from ertis_numba.fusion.rig import MountedSensor, Mountings, mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor, GroupEchoes
 from ertis_numba.motion.flow import FlowFit, fit_flow
 from ertis_numba.motion.residuals import twist_of
-from ertis_numba.motion.velocity import MAX_TIME_S, EgoVelocity, Item, grouped, stamp_of, velocity_of
+from ertis_numba.motion.velocity import MAX_TIME_S, EgoVelocity, Item, grouped, time_after_ns, times_ns_of, velocity_of
 
 __all__ = ["Odometry", "PlanarPose"]
 
@@ -146,6 +146,7 @@ class Odometry:
         self._unknown = np.zeros(3)  # Standard deviations of the way since the last measured group.
         self._suspects: tuple[Floats, ...] = ()  # Twists of the last groups with several possible motions.
         self._path: list[PlanarPose] = []
+        self._times_ns: dict[str, int] = {}  # of the last group, by sensor
 
     @property
     def poses(self) -> tuple[PlanarPose, ...]:
@@ -230,13 +231,14 @@ class Odometry:
             The group is not later than the one before, or its items are not of the same pulse.
         """
         items = grouped(group, "group")
-        timestamp_ns = stamp_of(items).timestamp_ns
+        timestamp_ns = self.time_ns_of(items)
         if self._path and timestamp_ns <= self._path[-1].timestamp_ns:
             raise DataError(
                 f"group is {(self._path[-1].timestamp_ns - timestamp_ns) / 1e9:.3g} s before the last one; add groups "
                 "in order of time"
             )
         echoes = self._extract(items)
+        self._times_ns = times_ns_of(items)
         if not self._path:
             self._path.append(PlanarPose(timestamp_ns, 0.0, 0.0, 0.0, np.zeros((3, 3))))
             self._begin(echoes)
@@ -254,6 +256,33 @@ class Odometry:
         self._locate(echoes, found, self._twist, change, timestamp_ns)
         self._last = _View(echoes, self._path[-1], self._twist)
         return velocity_of(found, timestamp_ns, time_s)
+
+    def time_ns_of(self, group: Mapping[str, Item]) -> int:
+        """Return the time of the pose that a group would add, by the clocks of its sensors at the last group.
+
+        Clocks of sensors may differ, so the time since the last group is the median of that by each clock.
+
+        Parameters
+        ----------
+        group : mapping of str to Energyscape or PointCloud
+            Images or point clouds of a SYNC pulse, by sensor.
+
+        Returns
+        -------
+        int
+            Nanoseconds, as in `Stamp`.
+
+        Examples
+        --------
+        >>> import ertis_numba as ertis
+        >>> odometry = ertis.Odometry({"sensor": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})
+        >>> with ertis.open_recording("reflectors.h5") as recording:
+        ...     image = ertis.Pipeline(recording.settings).process(recording[0])
+        >>> odometry.time_ns_of({image.stamp.sensor: image}) == image.stamp.timestamp_ns
+        True
+        """
+        last_ns = self._path[-1].timestamp_ns if self._path else 0
+        return time_after_ns(group, self._times_ns, last_ns)
 
     def _guess(self, found: FlowFit | None, time_s: float, timestamp_ns: int) -> None:
         """Add the pose by the more likely of several motions, or else by the last velocity, for at most a second.

@@ -15,7 +15,7 @@ from ertis_numba.motion.echoes import EchoExtractor
 from ertis_numba.motion.flow import FlowFit, fit_flow
 from ertis_numba.motion.residuals import twist_of
 
-__all__ = ["EgoVelocity", "Item", "ego_velocity", "grouped", "stamp_of", "velocity_of"]
+__all__ = ["EgoVelocity", "Item", "ego_velocity", "grouped", "stamp_of", "time_after_ns", "times_ns_of", "velocity_of"]
 
 Item: TypeAlias = Energyscape | PointCloud
 Floats = NDArray[np.float64]
@@ -120,7 +120,7 @@ def ego_velocity(
     sensors = mounted_sensors(mountings)
     groups = [grouped(before, "before"), grouped(after, "after")]
     first, second = (stamp_of(group) for group in groups)
-    time_s = (second.timestamp_ns - first.timestamp_ns) / 1e9
+    time_s = (time_after_ns(groups[1], times_ns_of(groups[0]), first.timestamp_ns) - first.timestamp_ns) / 1e9
     if not 0 < time_s <= MAX_TIME_S:
         raise DataError(
             f"after is {time_s:.3g} s later than before; give groups in order of time, at most {MAX_TIME_S:g} s apart"
@@ -189,3 +189,26 @@ def grouped(items: Iterable[Item], name: str) -> Mapping[str, Item]:
 def stamp_of(group: Mapping[str, Item]) -> Stamp:
     """Return the earliest stamp of a group, which is the time of its pulse, as in `Fuser`."""
     return min((item.stamp for item in group.values()), key=lambda stamp: stamp.timestamp_ns)
+
+
+def times_ns_of(group: Mapping[str, Item]) -> dict[str, int]:
+    """Return the times of a group, by sensor."""
+    return {sensor: item.stamp.timestamp_ns for sensor, item in group.items()}
+
+
+def time_after_ns(group: Mapping[str, Item], before: Mapping[str, int], before_ns: int) -> int:
+    """Return the time of a group after another one, by the clocks of the sensors of both.
+
+    Clocks of sensors may differ by more than a period of SYNC, so the time between the groups is the median of those
+    by each clock.
+
+    Parameters
+    ----------
+    group : mapping of str to Energyscape or PointCloud
+    before : mapping of str to int
+        Times of the group before, by sensor.
+    before_ns : int
+        Time of that group.
+    """
+    passed_ns = [time_ns - before[sensor] for sensor, time_ns in times_ns_of(group).items() if sensor in before]
+    return before_ns + round(float(np.median(passed_ns))) if passed_ns else stamp_of(group).timestamp_ns
