@@ -85,6 +85,7 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 	$(BIN)/ertis bench motion --only scenes --count 10 --seed 9500 --update docs/how-to/motion.md
 	$(BIN)/ertis bench map --update docs/how-to/mapping.md
 	$(BIN)/ertis bench map --only space --update docs/how-to/mapping.md
+	$(BIN)/ertis bench map --only shifts --update docs/how-to/mapping.md
 	$(BIN)/ertis bench scaling --update docs/reference/benchmarks.md
 	$(BIN)/ertis bench simulation --update docs/reference/benchmarks.md
 	$(BIN)/ertis bench many --update docs/how-to/many.md

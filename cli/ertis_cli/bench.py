@@ -325,8 +325,10 @@ def motion(**given: Any) -> None:
 @click.option(
     "--only",
     multiple=True,
-    type=click.Choice(["space"]),
-    help="Map rooms in three dimensions instead, with rough floors and ceilings and without a hall.",
+    type=click.Choice(["space", "shifts"]),
+    metavar="PART",
+    help="Run only this part: space maps rooms in three dimensions, with rough floors and ceilings and without a hall, "
+    "and shifts maps the example platform with poses that are moved by a part of a cell.",
 )
 @_seed("Seed of the first room, and of the hall.", default=1)
 @_update

@@ -16,6 +16,7 @@ import ertis_numba as ertis
 from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
+from ertis_bench.platform_trials import map_shifts
 from ertis_bench.platform_trials.furnished_rooms import (
     HALL_M,
     HEIGHT_M,
@@ -198,8 +199,11 @@ def run(
     say : callable
         Function that reports progress.
     only : sequence of str
-        ``space`` for maps of three dimensions instead, of rooms with rough floors and ceilings.
+        ``space`` for maps of three dimensions instead, of rooms with rough floors and ceilings, or ``shifts`` for maps
+        of the example platform whose poses are moved by a part of a cell.
     """
+    if "shifts" in only:
+        return map_shifts.run(seed=seed, say=say)
     dimensions = 3 if only else 2
     rows = []
     for number in range(seed, seed + count):
@@ -226,6 +230,8 @@ def run(
 
 def form(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
+    if "shifts" in report:
+        return map_shifts.form(report)
     is_planar = report["dimensions"] == 2
     kind = "wall" if is_planar else "surface"
     head = [
