@@ -87,6 +87,8 @@ def write_fused(
                 writer.write(_numbered(fused, number))
     _pulses.note_empty(empty, len(groups), quiet=quiet)
     silent = [_silent(name, count, len(groups)) for name, count in unheard.items()]
+    if contradiction := fuser.emitter_warning():
+        silent.append(contradiction)
     for text in silent:
         options.warn(text)
     pulses = options.counted(len(groups), "pulse")

@@ -132,6 +132,8 @@ def mapping(
             for group in shown:
                 mapper.add([pipelines.image(by_name[name][place.index]) for name, place in group.items()], trajectory)
     occupancy = mapper.map
+    if contradiction := mapper.emitter_warning():
+        options.warn(contradiction)
     _pulses.note_empty(mapper.n_empty, len(located), quiet=quiet)
     if height_m is not None and not mapper.n_points and mapper.n_empty < len(located):
         _report_heights(occupancy, height_m, quiet=quiet)
@@ -143,6 +145,7 @@ def mapping(
         "left_out": active.n_passive + len(groups) - len(located),
         "empty": mapper.n_empty,
         "notes": list(trajectory.notes),
+        "warnings": [] if contradiction is None else [contradiction],
     }
     size = " × ".join(f"{side_m:.2f}" for side_m in report["size_m"])
     options.say(

@@ -17,6 +17,7 @@ __all__ = [
     "ExpectedEchoes",
     "expected_echoes",
     "is_better",
+    "is_much_better",
     "silence_ratios",
     "silent_one",
     "suspect",
@@ -32,6 +33,8 @@ _HEARD: Final = math.log(0.33 / 0.98)
 _DEPENDENT: Final = 0.5  # Independent echoes per echo, as several sensors hear one reflector.
 _CERTAIN: Final = math.log(1e3)
 _ALIKE: Final = 3  # Difference of unexplained and missed echoes within which explanations are equally good.
+_TIMES: Final = 1.25  # Ratio of the lengths of two descriptions, of which the longer one is wrong, …
+_MORE: Final = 9  # … and their difference.
 _N_OTHERS: Final = 2  # Echoes of other calls that locate a reflector.
 _RADIATED: Final = 10 ** (-16.5 / 10)  # Power to the side, below which models of emitters are uncertain.
 _VISIBLE: Final = 10 ** (8.0 / 10)  # Power of an expected echo relative to noise and side lobes.
@@ -134,6 +137,11 @@ def silent_one(
 def is_better(cost: int, other: int) -> bool:
     """Return True if an explanation costs clearly less than another one."""
     return cost + _ALIKE < other
+
+
+def is_much_better(length: int, other: int) -> bool:
+    """Return True if a description of echoes is so much shorter that the other one is wrong."""
+    return other > _TIMES * length + _MORE
 
 
 def expected_echoes(

@@ -10,9 +10,10 @@ import numpy as np
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.fusion.emissions import is_much_better
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.pulses import is_same_pulse
-from ertis_numba.fusion.rig import Mountings, emitter_diameter_m, mounted_sensors
+from ertis_numba.fusion.rig import USUAL_DIAMETER_M, Mountings, emitter_diameter_m, mounted_sensors
 from ertis_numba.fusion.tables import FusionTables, PulseReflectors
 from ertis_numba.settings import MAX_EMITTER_M
 
@@ -20,6 +21,7 @@ __all__ = ["Fused", "Fuser", "fuse"]
 
 _SPACING_DEG: Final = 1.0, 4.0  # of planar and of three-dimensional images
 _STEP_M: Final = 0.015, 0.03
+_N_COMPARED: Final = 3  # Pulses that other emitters are tried for.
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +79,11 @@ class Fused:
     def unheard(self) -> tuple[str, ...]:
         """Sensors whose calls are not heard at reflectors where they should be."""
         return tuple(self._names[number] for number in sorted(self._solve().unheard))
+
+    @property
+    def description_length(self) -> int:
+        """Unexplained and missed echoes, and two numbers for each reflector; more with wrong emitters or mountings."""
+        return self._solve().length
 
     @property
     def without_echo(self) -> tuple[str, ...]:
@@ -142,7 +149,7 @@ class Fuser:
         range_step_m: float | None = None,
         silent: Collection[str] = (),
     ) -> None:
-        self._mountings = mounted_sensors(mountings)
+        self._given, self._mountings = mountings, mounted_sensors(mountings)
         self._numbers = {sensor.name: number for number, sensor in enumerate(self._mountings)}
         if emitter_diameter_m is not None:
             checks.between("emitter_diameter_m", emitter_diameter_m, 0.0, MAX_EMITTER_M)
@@ -155,6 +162,8 @@ class Fuser:
         self._diameter_m: dict[int, float] = {}  # of the emitters of all sensors so far
         self._tables: FusionTables | None = None
         self._last: Callable[[], PulseReflectors] | None = None  # of the pulse before
+        self._first: list[tuple[tuple[Energyscape, ...], Callable[[], PulseReflectors]]] = []
+        self._options = {"spacing_deg": spacing_deg, "range_step_m": range_step_m, "silent": tuple(silent)}
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -192,6 +201,8 @@ class Fuser:
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
         found = tables.attribution(group).without(unheard)(coarse)
         solve = self._last = functools.cache(lambda: tables.pulse_reflectors(group, found, unheard, pulses))
+        if len(self._first) < _N_COMPARED:
+            self._first.append((tuple(group.values()), solve))
         image = tables.image((solve().attributed if unheard or found.suspects else found).reflectivity, group)
         return Fused(
             image=image,
@@ -200,6 +211,41 @@ class Fuser:
             _solve=solve,
             _locate=tables.points,
             _names=self.sensors,
+        )
+
+    def emitter_warning(self) -> str | None:
+        """Return a warning if echoes contradict the stated diameter of the emitters, else None.
+
+        The first three pulses are fused again, with omnidirectional emitters in place of pistons, or the reverse. This
+        takes as long as the tables of a second `Fuser`. Emitters of different kinds are not compared.
+
+        Returns
+        -------
+        str or None
+            A line that names the better diameter. None if the other kind does not explain the echoes much better.
+
+        Examples
+        --------
+        >>> import ertis_numba as ertis
+        >>> unturned = (0.0, 0.0, 0.0, 1.0)
+        >>> ertis.Fuser({"left": ((0.0, 0.1, 0.0), unturned)}).emitter_warning() is None
+        True
+        """
+        diameters_m = {*self._diameter_m.values()}
+        if not self._first or len(self._mountings) < 2 or (0.0 in diameters_m and len(diameters_m) > 1):
+            return None
+        other_m = 0.0 if 0.0 not in diameters_m else USUAL_DIAMETER_M
+        other = Fuser(self._given, emitter_diameter_m=other_m, **self._options)  # type: ignore[arg-type]  # by name
+        stated = sum(solve().length for _, solve in self._first)
+        better = sum(other(images).description_length for images, _ in self._first)
+        if not is_much_better(better, stated):
+            return None
+        names = ("pistons", "omnidirectional ones")
+        right, wrong = names if other_m else names[::-1]
+        return (
+            f"the echoes are those of emitters that are {right}, but the settings state {wrong}; set "
+            f"array.emitter_diameter_m to their diameter{'' if other_m else ', 0 for omnidirectional ones'}, or use "
+            "--emitter-diameter"
         )
 
     def has_tables(self, images: Iterable[Energyscape]) -> bool:

@@ -62,6 +62,11 @@ class PulseReflectors(NamedTuple):
     pulses: tuple[EmissionCounts, ...]
     cost: int
 
+    @property
+    def length(self) -> int:
+        """Length of the description: unexplained and missed echoes, and two numbers for the place of each reflector."""
+        return self.cost + 2 * len(self.reflectors.located)
+
 
 class _Explained(NamedTuple):
     """Explanation of the echoes of a group, with the number of unexplained and missed echoes as its cost."""

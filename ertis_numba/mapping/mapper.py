@@ -125,6 +125,10 @@ class Mapper:
         """Number of groups so far whose images hold no echo above their noise."""
         return self._n_empty
 
+    def emitter_warning(self) -> str | None:
+        """Return a warning if echoes contradict the stated diameter of the emitters, as `Fuser.emitter_warning`."""
+        return self._fuser.emitter_warning()
+
     def add(self, images: Iterable[Energyscape], pose: Pose, *, fused: Fused | None = None) -> None:
         """Add the images of one SYNC pulse.
 
