@@ -141,7 +141,7 @@ def form(report: dict[str, Any]) -> str:
             str(row["few_echoes"]),
             str(row["other_motion"]),
             or_dash(row["nees"], 2),
-            f"{or_dash(row['largest_sd'], 1)} σ",
+            f"{row['largest_sd']:.1f} σ" if row["measured"] else "–",
             or_dash(row["end_nees"], 2),
         ]
         for row in scenes["rows"]

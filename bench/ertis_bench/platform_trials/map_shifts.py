@@ -19,7 +19,7 @@ __all__ = ["compared", "form", "run"]
 
 Floats = NDArray[np.float64]
 
-_N_PULSES: Final = 6, 11, 21
+_N_PULSES: Final = 6, 11
 _N_SHIFTS: Final = 16
 _CELL_M: Final = 0.05
 _NEAR_M: Final = 1.5 * _CELL_M + 1e-6
