@@ -65,6 +65,8 @@ class SensorEchoes(NamedTuple):
     power : (echo,) float64
     share : (echo, emitter) float64
         Share of each emitter according to the attribution of the images.
+    is_faint : (echo,) bool
+        Echoes that only confirm reflectors that others show.
     """
 
     receiver: int
@@ -75,6 +77,7 @@ class SensorEchoes(NamedTuple):
     angle_sd_rad: Floats
     power: Floats
     share: Floats
+    is_faint: NDArray[np.bool_]
 
     def without(self, emitters: Collection[int]) -> "SensorEchoes":
         """Return the echoes as those of other emitters only."""
@@ -190,7 +193,7 @@ class Reflectors:
         self._gate_rad = np.hypot(self._angle_sd_rad, _MOUNTED_RAD)
         self._power = np.concatenate([each.power for each in echoes])
         self._rows = {number: np.flatnonzero(self._receiver == number) for number in receivers}
-        self._is_free = np.ones(n_echoes, dtype=np.bool_)
+        self._is_free = ~np.concatenate([each.is_faint for each in echoes])
         # Only foreign echoes show the calls of sensors without an image.
         self._has_image = np.isin(np.arange(n_sensors), [each.receiver for each in echoes])
         self._is_incomplete = bool(np.isfinite(self._path_m[:, ~self._has_image]).any())
@@ -217,7 +220,7 @@ class Reflectors:
 
     def _candidates(self) -> _Candidates:
         """Return the candidates of all echoes, where their emitter is audible."""
-        echo, emitter = np.nonzero(np.isfinite(self._path_m))
+        echo, emitter = np.nonzero(np.isfinite(self._path_m) & self._is_free[:, None])
         direction = self._direction[echo]
         if self._is_incomplete:
             mirrored = np.flatnonzero(self._is_flat[self._receiver[echo]])

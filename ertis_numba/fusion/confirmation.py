@@ -110,7 +110,7 @@ def confirmation(heard: EchoPaths, place_m: Floats, gain: Floats) -> Confirmatio
         image_m = heard.sensor_m + 2 * away_m[..., None] * toward[:, None]
         n_confirming = _n_confirming(heard, image_m, counts, is_image=True)
         as_wall |= (depth[:, facing] > _FACING) & _is_enough(n_confirming, needed, is_behind)
-    is_ghost = _mirrored(place_m, heard.sensor_m[np.argmax(depth, axis=1)])
+    is_ghost = _mirrored(place_m, heard.sensor_m, np.argmax(depth, axis=1))
     return Confirmation(np.asarray((as_point | as_wall) & ~is_ghost), as_wall, n_pairs)
 
 
@@ -134,33 +134,38 @@ def _behind(heard: EchoPaths, away_m: Floats) -> Flags:
     return np.asarray((is_nearer & (cosine > math.cos(_SAME_RAD))).any(axis=1))
 
 
-def _mirrored(place_m: Floats, sensor_m: Floats) -> Flags:
+def _mirrored(place_m: Floats, sensor_m: Floats, facing: NDArray[np.int64]) -> Flags:
     """Return True for places that sound over a nearer reflector and a wall at another one shows.
 
     Sound that the wall reflects on both ways comes from the mirror image of the nearer reflector. Sound that it
-    reflects on one way comes from the same direction, on a path of half the additional length. Both imply a wall.
+    reflects on one way comes from the same direction, after the way from the receiver or from the sensor that faces the
+    nearer reflector to the latter. Both imply a wall.
 
     Parameters
     ----------
-    place_m, sensor_m : (reflector, axis) float64
-        Reflectors, and the sensor that faces each of them.
+    place_m : (reflector, axis) float64
+    sensor_m : (sensor, axis) float64
+    facing : (reflector,) int64
+        The sensor that faces each reflector.
     """
     found = np.zeros(len(place_m), np.bool_)
     if not len(place_m):
         return found
-    from_m = np.linalg.norm(place_m[:, None] - sensor_m, axis=2)  # (nearer reflector, reflector)
-    range_m = np.linalg.norm(place_m - sensor_m, axis=1)
-    toward = (place_m - sensor_m) / np.maximum(range_m, _NEAREST_M)[:, None]
-    for image_range_m in (np.broadcast_to(range_m, from_m.shape), 2 * range_m - from_m):
-        image_m = sensor_m + image_range_m[..., None] * toward
+    heard_m = sensor_m[facing]
+    from_m = np.linalg.norm(place_m[:, None] - heard_m, axis=2)  # (nearer reflector, ghost)
+    range_m = np.linalg.norm(place_m - heard_m, axis=1)
+    toward = (place_m - heard_m) / np.maximum(range_m, _NEAREST_M)[:, None]
+    is_nearer = from_m + _MIRROR_M < range_m
+    lit_m = np.linalg.norm(place_m - heard_m, axis=1)[:, None]  # by the sensor that faces the nearer reflector
+    images_m = np.broadcast_to(range_m, from_m.shape), 2 * range_m - from_m, 2 * range_m - lit_m
+    for image_range_m in images_m:
+        image_m = heard_m + image_range_m[..., None] * toward
         offset_m = image_m - place_m[:, None]
-        apart_m = np.linalg.norm(offset_m, axis=2)
-        normal = offset_m / np.maximum(apart_m, _NEAREST_M)[..., None]
-        between_m = (image_m + place_m[:, None]) / 2
-        depth_m = np.einsum("pgi,pgi->pg", between_m - sensor_m, normal)
-        foot_m = sensor_m + depth_m[..., None] * normal
-        is_possible = (from_m + _MIRROR_M < range_m) & (apart_m > 2 * _MIRROR_M) & (depth_m > _MIRROR_M)
-        nearer, ghost = np.nonzero(is_possible)
+        between_m = np.linalg.norm(offset_m, axis=2)
+        normal = offset_m / np.maximum(between_m, _NEAREST_M)[..., None]
+        depth_m = np.einsum("pgi,pgi->pg", (image_m + place_m[:, None]) / 2 - heard_m, normal)
+        foot_m = heard_m + depth_m[..., None] * normal
+        nearer, ghost = np.nonzero(is_nearer & (between_m > 2 * _MIRROR_M) & (depth_m > _MIRROR_M))
         wall_m = place_m[:, None] - foot_m[nearer, ghost]
         off_m = np.abs(np.einsum("wki,ki->wk", wall_m, normal[nearer, ghost]))
         is_wall = (off_m < _PLANE_M) & (np.linalg.norm(wall_m, axis=2) < _FOOT_M)

@@ -24,6 +24,8 @@ Floats = NDArray[np.float64]
 
 _TOP: Final = 128  # Points per image.
 _FAINTEST: Final = 10 ** (-22.0 / 20)  # Amplitude in the fused image relative to that of the echoes: others contradict.
+_MIN_LEVEL_DB: Final = -26.0  # Lowest level of echoes relative to the strongest of an image.
+_FAINT: Final = 10 ** (-20.0 / 20)  # Amplitude relative to it, below which echoes only confirm reflectors.
 _FALSE_ALARM: Final = 1e-5  # Probability that noise alone yields a point of an image.
 _RANGE_SD_M: Final = 0.5e-3  # Errors that noise does not explain, such as those of the array and of interpolation.
 _ANGLE_SD_RAD: Final = math.radians(0.125)
@@ -57,7 +59,9 @@ class PointFuser:
     ) -> None:
         self._number, self._mounting, self._receiver = number, sensors[number], receiver
         self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
-        self._extract = PointExtractor(image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP)
+        self._extract = PointExtractor(
+            image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP, min_level_db=_MIN_LEVEL_DB
+        )
 
     def floor(self, image: Energyscape) -> NDArray[np.float32]:
         """Return the detection threshold (`_FALSE_ALARM`): (direction,) float32, infinite in an image of zeros."""
@@ -100,6 +104,7 @@ class PointFuser:
             angle_sd_rad=np.hypot(uncertainty_m[:, 1] / range_m, _ANGLE_SD_RAD),
             power=cloud.amplitude[is_heard].astype(np.float64) ** 2,
             share=self._shares(row, range_m, [shares[emitter, self._number] for emitter in emitters]),
+            is_faint=cloud.amplitude[is_heard] < _FAINT * cloud.amplitude.max(initial=0.0),
         )
 
     def _shares(self, row: NDArray[np.int64], range_m: Floats, shares: Sequence[NDArray[np.float32]]) -> Floats:
