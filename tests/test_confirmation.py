@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import ertis_numba as ertis
 from ertis_numba.fusion.confirmation import EchoPaths, confirmation
 
 YAW_RAD = np.radians([0.0, 90.0, 180.0, -90.0])
@@ -142,3 +143,16 @@ def test_reflectors_behind_a_nearer_one_in_all_directions_are_not_confirmed():
     heard = EchoPaths(SENSOR_M, AHEAD, rows, range(4), np.array(direction), paths_m)
     sure = confirmation(heard, np.array([POST_M, behind_m]), np.repeat(GAIN, 2, axis=0))
     assert sure.is_confirmed.tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("confirmed", "shown"),
+    [(None, [0, 1, 2, 3]), ([False, True, False, True], [1, 2, 3]), ([False] * 4, [2]), ([True] * 4, [0, 1, 2, 3])],
+)
+def test_the_strongest_points_are_confirmed_or_the_nearest(confirmed, shown):
+    position_m = np.array([[3.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0], [2.5, 0, 0]], np.float32)
+    amplitude = np.array([40.0, 1.0, 0.8, 0.5], np.float32)
+    flags = None if confirmed is None else np.array(confirmed)
+    cloud = ertis.PointCloud(position_m, amplitude, ertis.Settings(), confirmed=flags)
+    assert cloud.strongest(None, -40.0).amplitude.tolist() == amplitude[shown].tolist()
+    assert len(cloud.strongest(1, -40.0)) == 1

@@ -9,7 +9,16 @@ from ertis_bench.network.sender import SETTINGS
 from ertis_bench.network_trials import fused_receiver, live_fusion, live_maps
 from ertis_bench.network_trials.fused_receiver import FusedReceiverJob
 from ertis_bench.network_trials.map_viewer import MapViewerJob, n_wrong
-from ertis_bench.platform_trials import clock_checks, differing_calls, emission_delays
+from ertis_bench.platform_trials import clock_checks, differing_calls, emission_delays, fused_scans
+from ertis_bench.platform_trials.rendered_rooms import (
+    Face,
+    Room,
+    images_of,
+    mounted,
+    nearest_m,
+    rendered,
+    settings_of,
+)
 from ertis_cli.main import cli
 
 from ertis_numba.frames import Measurement
@@ -138,3 +147,37 @@ def test_delays_bench_compares_delays(tmp_path, monkeypatch):
     assert (together["spurious"], apart["spurious"]) == (0, 0)
     assert together["rms_m"] != apart["rms_m"]
     assert "| 12 mm | 1 ms | " in target.read_text("utf-8")
+
+
+def test_scans_of_confirmed_reflectors_are_compared_with_rays(tmp_path, monkeypatch):
+    monkeypatch.setattr(fused_scans, "EMITTERS_M", (0.012,))
+    target = tmp_path / "page.md"
+    marker = "ertis bench fusion --only scans"
+    target.write_text(f"<!-- {marker} -->\nold\n<!-- /{marker} -->\n", "utf-8")
+    options = ["--only", "scans", "--count", "2", "--seed", "5010", "--json", "--quiet", "--update", str(target)]
+    done = CliRunner().invoke(cli, ["bench", "fusion", *options])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    (row,) = json.loads(done.stdout)["scans"]
+    assert (row["off"], row["nearer"]) == (0, 0)
+    assert row["beams"] >= row["shown"] > 0.5 * row["posts"]
+    assert "| 12 mm | " in target.read_text("utf-8")
+
+
+def test_rays_meet_the_nearest_surface():
+    face = Face(np.array([2.0, -1.0]), np.array([2.0, 1.0]), 0.5)
+    room = Room(np.array([[1.0, 0.0], [0.0, 3.0]]), np.zeros(2), (face,))
+    rays_rad = np.array([0.0, 0.3, np.pi / 2, np.pi])
+    np.testing.assert_allclose(nearest_m(room, rays_rad), [1.0, 2 / np.cos(0.3), 3.0, np.inf])
+
+
+@pytest.mark.parametrize("diameter_m", [0.012, 0.0])
+def test_rendered_sound_arrives_when_mirror_images_predict(diameter_m):
+    """The echo of a wall comes from the mirror image of the sensor, as far behind the wall."""
+    settings = settings_of()
+    room = Room(np.empty((0, 2)), np.empty(0), (Face(np.array([1.5, -9.0]), np.array([1.5, 9.0]), 0.5),))
+    sensors = mounted({"front": (0.2, 0.0, 0.0)})
+    signals = rendered(sensors, settings, room, diameter_m=diameter_m, random=np.random.default_rng(0))
+    image = images_of(signals, settings)["front"]
+    direction, place = np.unravel_index(image.amplitude.argmax(), image.amplitude.shape)
+    assert image.range_m[place] == pytest.approx(1.3, abs=0.01)
+    assert image.azimuth_rad[direction] == pytest.approx(0.0, abs=0.04)

@@ -159,7 +159,7 @@ class PointCloud(DegreesFromRadians):
         )
 
     def strongest(self, top: int | None, min_level_db: float) -> Self:
-        """Return the strongest points, which come first.
+        """Return the strongest points, which come first, without uncertain reflectors of a fusion.
 
         Parameters
         ----------
@@ -180,8 +180,20 @@ class PointCloud(DegreesFromRadians):
         >>> len(cloud.strongest(1, -20.0))
         1
         """
-        lowest = self.amplitude.max(initial=0.0) * 10 ** (min_level_db / 20)
-        return self.only(np.flatnonzero((self.amplitude >= lowest) & (self.amplitude > 0))[:top])
+        lowest = self.amplitude[self.is_certain].max(initial=0.0) * 10 ** (min_level_db / 20)
+        return self.only(np.flatnonzero((self.amplitude >= lowest) & (self.amplitude > 0) & self.is_certain)[:top])
+
+    @property
+    def is_certain(self) -> NDArray[np.bool_]:
+        """Points that are no ghosts of a fusion: (point,) bool.
+
+        These are confirmed reflectors and the nearest one, whose echo no other surface can have reflected. All points
+        are certain if `confirmed` is unknown.
+        """
+        if self.confirmed is None:
+            return np.ones(len(self), np.bool_)
+        range_m = np.linalg.norm(self.position_m, axis=1)
+        return np.asarray(self.confirmed | (range_m <= range_m.min(initial=np.inf)))
 
     def to_structured(self) -> NDArray[np.void]:
         """Return the points as a NumPy structured array, with the field names of exported files.

@@ -7,16 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.nearest_echo import nearest_echo
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.geometry import unrolled_rad
+from ertis_numba.geometry import microphones, unrolled_rad
 from ertis_numba.interop._mountings import Mounting
 from ertis_numba.interop.ros_messages import header
+from ertis_numba.settings import Settings
 
 __all__ = ["reflectors_ahead", "scan_message"]
 
-_HIDDEN_RAD: Final = math.radians(3.5)
-"""Angle from a reflector within which farther echoes may be those of sound that it reflected to another surface."""
+_HALF_POWER: Final = 0.44  # Half of the main lobe of an array of length 1, at half power, in wavelengths.
 
 
 def scan_message(
@@ -29,7 +30,9 @@ def scan_message(
 
     The scan of an image with `Energyscape.points` has these reflectors only, if they are confirmed or nearest to the
     sensors. A reflector fills the beam nearest to it, and all beams within one standard deviation of its direction. In
-    other beams within 3.5°, half of the main lobe of an eRTIS array, the range beyond it is unknown, and infinite.
+    other beams within half of the main lobe of the array, 3.5° for eRTIS at 25 to 50 kHz, the range beyond it is
+    unknown, and infinite: farther echoes may be those of sound that it reflected to another surface. This holds for
+    points without `PointCloud.confirmed` as well.
     """
     if not image.is_planar or len(image.azimuth_rad) < 2 or len(image.range_m) < 3:
         return None
@@ -64,28 +67,27 @@ def _beams_of_points(
     cloud = cloud.strongest(None, min_level_db)
     range_m = np.hypot(cloud.position_m[:, 0], cloud.position_m[:, 1], dtype=np.float64)
     kept = (range_m >= image.range_m[0]) & (range_m <= image.range_m[-1])
-    kept &= (cloud.amplitude >= 10 ** (floor_dbfs / 20)) & _certain(cloud)
+    kept &= cloud.amplitude >= 10 ** (floor_dbfs / 20)
     cloud, range_m = cloud.only(kept), range_m[kept]
     ranges_m, levels_dbfs = np.full(len(angle_rad), np.inf), np.full(len(angle_rad), -np.inf, np.float32)
     across_m = np.zeros(len(cloud)) if cloud.uncertainty_m is None else np.nan_to_num(cloud.uncertainty_m[:, 1])
-    turn, spacing_rad = 2 * math.pi, angle_rad[1] - angle_rad[0]
+    turn, spacing_rad, hidden_rad = 2 * math.pi, angle_rad[1] - angle_rad[0], _half_lobe_rad(image.settings)
     for point in np.argsort(-range_m, kind="stable"):  # Nearer points replace farther ones.
         away_rad = np.abs((angle_rad - cloud.azimuth_rad[point] + math.pi) % turn - math.pi)
         if away_rad.min() > spacing_rad:  # Outside the angles of the scan.
             continue
-        hidden = away_rad <= _HIDDEN_RAD
+        hidden = away_rad <= hidden_rad
         ranges_m[hidden], levels_dbfs[hidden] = np.inf, -np.inf
         beams = away_rad <= max(float(away_rad.min()), across_m[point] / range_m[point])
         ranges_m[beams], levels_dbfs[beams] = range_m[point], 20 * math.log10(cloud.amplitude[point])
     return ranges_m, levels_dbfs
 
 
-def _certain(cloud: PointCloud) -> NDArray[np.bool_]:
-    """Return True for confirmed reflectors and the nearest one, whose echo no other surface can have reflected."""
-    if cloud.confirmed is None:
-        return np.ones(len(cloud), np.bool_)
-    range_m = np.hypot(cloud.position_m[:, 0], cloud.position_m[:, 1])
-    return np.asarray(cloud.confirmed | (range_m <= range_m.min(initial=np.inf)))
+def _half_lobe_rad(settings: Settings) -> float:
+    """Return half of the width of the main lobe ahead, at half power and at the middle frequency of the call."""
+    call, mics_m = settings.call, microphones(settings.array).enabled_positions_m
+    wave_m = 2 * sound_speed_m_s(settings.air) / (call.low_frequency_hz + call.high_frequency_hz)
+    return math.asin(min(1.0, _HALF_POWER * wave_m / max(float(np.ptp(mics_m[:, 1])), wave_m / 2)))
 
 
 def reflectors_ahead(cloud: PointCloud, image: Energyscape, mounting: Mounting) -> PointCloud:
@@ -103,5 +105,5 @@ def reflectors_ahead(cloud: PointCloud, image: Energyscape, mounting: Mounting) 
     translation_m, rotation_xyzw = mounting
     rotation = Rotation.from_quat(rotation_xyzw)
     position_m = rotation.inv().apply(cloud.position_m - np.array(translation_m)).astype(np.float32)
-    chosen = _certain(cloud) & (position_m[:, 0] > 0)
+    chosen = cloud.is_certain & (position_m[:, 0] > 0)
     return cloud.replace(position_m=position_m, stamp=image.stamp, confirmed=None).only(chosen)
