@@ -175,7 +175,7 @@ class _Air:
         self._diameter_m = diameter_m
 
     def radiated(self, sensor_m: Floats, ahead: Floats, leg: _Leg) -> Spectrum:
-        """Return what an emitter sends on a way; nothing behind the baffle of a piston."""
+        """Return the spectrum that an emitter sends on a way; 0 behind the baffle of a piston."""
         toward = leg.first_m - sensor_m
         cosine = float(toward @ ahead) / max(1e-9, float(np.linalg.norm(toward)))
         if not self._diameter_m:
