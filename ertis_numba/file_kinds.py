@@ -181,7 +181,7 @@ def kind_of(path: str | Path) -> FileKind | None:
         (_is_mpeg(head), FileKind("an MP3 or AAC file", _FFMPEG)),
         (head[:2] in _PICKLES and last == b".", FileKind("a Python pickle", _SAVE)),
         (head[:2] == b"MZ" and b"This program" in head, FileKind("a program (Windows)", _NO_SIGNALS)),
-        (_is_text(head), _TEXT),
+        (_is_text(head, is_short=Path(path).suffix.lower() in {*_TEXTS, ".csv", ".txt"}), _TEXT),
     )
     return next((kind for fits, kind in checks if fits), None)
 
@@ -250,8 +250,8 @@ def _is_mpeg(head: bytes) -> bool:
     return length > 6 and head[length : length + 2] == head[:2]
 
 
-def _is_text(head: bytes) -> bool:
-    """Return True for lines of text in UTF-8 or UTF-16, longer than a word of any format."""
+def _is_text(head: bytes, *, is_short: bool) -> bool:
+    """Return True for lines of text in UTF-8 or UTF-16; they are longer than a word of any format, or may be short."""
     if head[:2] in {b"\xff\xfe", b"\xfe\xff"} and head.count(0) * 3 > len(head):
         return True
     try:
@@ -262,4 +262,6 @@ def _is_text(head: bytes) -> bool:
             return False
     lines = text.split("\n")
     has_lines = len(lines) > 1 or text[:1] in {"{", "[", "<"}
-    return has_lines and len(set(text)) > 4 and all(each.isprintable() or each in "\t\r\n\f" for each in text)
+    return (is_short or (has_lines and len(set(text)) > 4)) and all(
+        each.isprintable() or each in "\t\r\n\f" for each in text
+    )

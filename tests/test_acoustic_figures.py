@@ -239,8 +239,12 @@ def test_map_lies_over_a_photo_as_a_pinhole_camera_sees_it(photo):
         ({"band_hz": (1e3, 2e3)}, ArgumentError, "no band lies within 1000 to 2000 Hz"),
         ({"photo_fov_deg": (60, 40)}, ArgumentError, "photo and photo_fov_deg need each other"),
         ({"photo": "none.png", "photo_fov_deg": (60, 180)}, ArgumentError, r"photo_fov_deg\[1\] is 180"),
-        ({"photo": "none.png", "photo_fov_deg": (60, 40)}, DataError, "none.png: No such file or directory; give"),
-        ({"photo": __file__, "photo_fov_deg": (60, 40)}, DataError, "not a readable picture; give a .png or .jpg"),
+        ({"photo": "none.png", "photo_fov_deg": (60, 40)}, DataError, "none.png: No such file or directory; choose"),
+        (
+            {"photo": __file__, "photo_fov_deg": (60, 40)},
+            DataError,
+            "not a readable picture; open it in another program, and save it",
+        ),
         ({"dynamic_range_db": 0}, ArgumentError, "dynamic_range_db"),
     ],
 )

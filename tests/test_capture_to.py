@@ -371,7 +371,7 @@ def test_sensor_nodes_are_warned_of_a_shared_sensor_name(tmp_path):
         (["--mounting", "none.toml"], "none.toml", 1),
         (
             ["--mounting", "empty.toml"],
-            "empty.toml sets no key; add reflectors or sound sources, see 'ertis settings scene'",
+            "empty.toml sets no key; add sensors, reflectors or sources, see 'ertis settings scene'",
             1,
         ),
     ],

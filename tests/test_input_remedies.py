@@ -35,6 +35,7 @@ def folder(tmp_path_factory):
     (folder / "s.json").write_text('{"seed": 1}\n')
     (folder / "s.xml").write_text("<scene/>\n")
     (folder / "latin.toml").write_bytes(b"# H\xf6he\nseed = 1\n")
+    (folder / "short.csv").write_text("1,2\n")
     (folder / "template.toml").write_text("# seed = 0\n")
     return folder
 
@@ -53,7 +54,10 @@ CASES = {  # command: exit code and message
     "simulate s.json -o o.h5": (1, "s.json is JSON, not TOML; choose a scene file (TOML)"),
     "simulate s.xml -o o.h5": (1, "s.xml is XML, not TOML; choose a scene file (TOML)"),
     "simulate latin.toml -o o.h5": (1, "it is not text in UTF-8 (byte 0xf6 at position 3); save it as UTF-8"),
-    "simulate template.toml -o o.h5": (1, "sets no key; add reflectors or sound sources, see 'ertis settings scene'"),
+    "simulate template.toml -o o.h5": (
+        1,
+        "sets no key; add sensors, reflectors or sources, see 'ertis settings scene'",
+    ),
     "simulate recs -o o.h5": (1, "recs: Is a directory; choose a scene file (TOML)"),
     "process rec.h5 --settings lay.csv -o o.h5": (1, "lay.csv is not TOML; choose a settings file (TOML)"),
     "info latin.toml": (1, "latin.toml is a text file; simulate a scene with 'ertis simulate latin.toml', and use"),
@@ -61,6 +65,9 @@ CASES = {  # command: exit code and message
     "import-poses a.tum rec.h5": (2, "the recording comes before the poses; use 'ertis import-poses rec.h5 a.tum'"),
     "import a.wav a.bin --passive --layout lay.csv -o o.h5": (2, "some files are PCM (.wav, .h5) and others are raw"),
     "--config a.wav info rec.h5": (1, "a.wav: it is not text in UTF-8 (byte 0x"),
+    "info short.csv": (1, "short.csv is a text file; choose a recording, or save its signals as WAV"),
+    "process rec.h5 --preset set.toml -o o.h5": (1, "is the name of a file; use it as settings (--settings set.toml)"),
+    "record --output ''": (2, "the path is empty; name a folder"),
     "emulate s.json": (1, "s.json is a text file; choose a recording"),
     "process rec.h5 --settings a.wav -o o.h5": (1, "a.wav is a WAV file; choose a settings file (TOML)"),
     "odometry recs": (1, "recs is a folder; choose a recording, such as recs/first.h5"),

@@ -9,6 +9,8 @@ from typing import Any, cast
 
 import click
 
+from ertis_numba import checks
+
 __all__ = [
     "add_variables",
     "config",
@@ -130,9 +132,7 @@ def _take(ctx: click.Context, path: Path) -> None:
     try:
         tables = tomllib.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        if isinstance(error, UnicodeDecodeError):
-            reason = f"it is not text in UTF-8 (byte {error.object[error.start]:#04x} at position {error.start})"
+        reason = checks.reason_unreadable(error) if isinstance(error, OSError | UnicodeDecodeError) else error
         raise click.ClickException(f"{path}: {reason}; give a readable TOML file (--config)") from error
     ctx.default_map = _defaults(ctx, cast("click.Group", ctx.command), tables, f"{path}: ")
     ctx.meta[_FILE] = path

@@ -40,7 +40,7 @@ __all__ = ["capture"]
 @click.option("--to", "address", metavar="ADDRESS", help="Central node to send to, instead of writing a recording.")
 @click.option(
     "--spool",
-    type=options.FILE,
+    type=options.FOLDER,
     metavar="DIR",
     help="With --to: keep measurements in this folder until the central node acknowledges them; in memory by default.",
 )

@@ -42,7 +42,7 @@ def keys() -> None:
 @click.option(
     "--dir",
     "folder",
-    type=options.FILE,
+    type=options.FOLDER,
     metavar="DIR",
     help="Folder for the key files; the key folder of this user by default.",
 )

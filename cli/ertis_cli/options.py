@@ -33,6 +33,7 @@ __all__ = [
     "ERROR_BUDGET",
     "FALSE_ALARM",
     "FILE",
+    "FOLDER",
     "INTERVAL",
     "NAMES",
     "PREPARING",
@@ -153,12 +154,18 @@ class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
 
 
 class _File(click.Path):
+    noun = "file"
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         return (
             super().convert(value, param, ctx)
             if str(value)
-            else self.fail("the path is empty; name a file", param, ctx)
+            else self.fail(f"the path is empty; name a {self.noun}", param, ctx)
         )
+
+
+class _Folder(_File):
+    noun = "folder"
 
 
 CHANNELS = _Channels()
@@ -166,6 +173,7 @@ DIRECTION = _Direction()
 ELEVATION = _Elevation()
 ERROR_BUDGET = _ErrorBudget()
 FILE = _File(path_type=Path)
+FOLDER = _Folder(path_type=Path)
 INTERVAL = _Interval()
 NAMES = _Names()
 TEXT_PATH = _File()

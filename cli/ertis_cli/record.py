@@ -13,7 +13,7 @@ __all__ = ["record"]
 @click.command()
 @click.option("--listen", metavar="ADDRESS", help="Address for sensor nodes; tcp://127.0.0.1:5601 by default.")
 @click.option(
-    "--output", "-o", "folder", type=options.FILE, required=True, metavar="DIR", help="Folder for recordings."
+    "--output", "-o", "folder", type=options.FOLDER, required=True, metavar="DIR", help="Folder for recordings."
 )
 @_central_watch.name
 @_central_watch.rotate_size

@@ -14,7 +14,7 @@ __all__ = ["serve"]
 @click.command()
 @click.option("--listen", metavar="ADDRESS", help="Address for sensor nodes; tcp://127.0.0.1:5601 by default.")
 @click.option("--publish", metavar="ADDRESS", help="Address for applications; tcp://127.0.0.1:5602 by default.")
-@click.option("--record", "folder", type=options.FILE, metavar="DIR", help="Also store measurements in this folder.")
+@click.option("--record", "folder", type=options.FOLDER, metavar="DIR", help="Also store measurements in this folder.")
 @_central_watch.name
 @_central_watch.rotate_size
 @_central_watch.rotate_every
@@ -55,7 +55,7 @@ __all__ = ["serve"]
 )
 @click.option(
     "--quarantine",
-    type=options.FILE,
+    type=options.FOLDER,
     metavar="DIR",
     help="Dead-letter folder for measurements that made two workers fail.",
 )

@@ -319,8 +319,11 @@ def _picture(path: str | Path) -> NDArray[Any]:
     try:
         return np.asarray(imread(path))
     except (OSError, ValueError, SyntaxError) as error:  # Errors of the readers of pictures.
-        reason = getattr(error, "strerror", None) or "not a readable picture"
-        raise DataError(f"photo {path}: {reason}; give a .png or .jpg") from error
+        if isinstance(error, OSError) and error.strerror:
+            raise DataError(f"photo {path}: {error.strerror}; choose a .png or .jpg") from error
+        raise DataError(
+            f"photo {path} is not a readable picture; open it in another program, and save it as .png or .jpg"
+        ) from error
 
 
 def spectrum(

@@ -12,7 +12,7 @@ from ertis_numba.fusion.rig import MountedSensor
 from ertis_numba.motion.echoes import GroupEchoes
 from ertis_numba.motion.hypotheses import NEAR_SCALES, PLACE_M, hypothesis, pair_weights
 from ertis_numba.motion.residuals import EchoFlow, EchoPairs
-from ertis_numba.motion.rivals import MAX_AMBIGUITY, worst_rival
+from ertis_numba.motion.rivals import ELSEWHERE, MAX_AMBIGUITY, worst_rival
 
 __all__ = ["FlowFit", "fit_flow"]
 
@@ -28,7 +28,6 @@ _N_STARTS_NEAR: Final = 3  # of searches near an expected displacement
 # One object, such as a person who walks by, shows in up to two places in the image of one sensor, and in up to three
 # in those of several sensors. They must not count as the surroundings of a platform at rest. It is unlikely that they
 # move as the surroundings did before.
-_EXPECTED: Final = np.array([0.02, 0.02, math.radians(2.0)])
 _MIN_PLACES: Final = 3
 _MIN_PLACES_OF_SENSORS: Final = 4
 # Expected number of motions by which unrelated groups match as well; an upper limit of the rate of false alarms.
@@ -139,7 +138,7 @@ def fit_flow(
         return None
     covariance, n_matches = fitted
     by_accident = float(np.sum(_gate_areas(flow, pairs)) / (4 * reach_m * reach_rad))
-    is_expected = start is not None and bool(np.all(np.abs(best.displacement - start) < _EXPECTED))
+    is_expected = start is not None and bool(np.all(np.abs(best.displacement - start) < ELSEWHERE))
     min_places = _MIN_PLACES if is_expected or len(np.unique(before.sensor)) == 1 else _MIN_PLACES_OF_SENSORS
     expected = None if start is None else (start, limit)
     other, ambiguity = worst_rival(flow, pairs, best, found, sensors, by_accident, expected)

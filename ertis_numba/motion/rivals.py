@@ -12,14 +12,15 @@ from ertis_numba.fusion.rig import MountedSensor
 from ertis_numba.motion.hypotheses import NEAR_SCALES, MotionHypothesis, hypothesis
 from ertis_numba.motion.residuals import EchoFlow, EchoPairs
 
-__all__ = ["MAX_AMBIGUITY", "worst_rival"]
+__all__ = ["ELSEWHERE", "MAX_AMBIGUITY", "worst_rival"]
 
 Floats = NDArray[np.float64]
 
 # In simulated rooms, correct displacements had ambiguities of at most 0.65. Wrong ones, by the spacing of equal posts,
 # had at least 0.75, as one post of four without a partner.
 MAX_AMBIGUITY: Final = 0.7
-_ELSEWHERE: Final = np.array([0.02, 0.02, math.radians(2.0)])  # Differences of displacements that are not the same.
+ELSEWHERE: Final = np.array([0.02, 0.02, math.radians(2.0)])
+"""Differences of displacements, in metres, metres and radians, that are not the same."""
 # Share of the echoes that a rival must explain otherwise, to be compared by all of its echoes.
 _SHARED: Final = 0.2
 # Rivals of other echoes are compared by the places of these echoes. The reflectors at rest are unknown if another
@@ -95,7 +96,7 @@ def _behind(
         mirrored = flow.behind(np.array(chosen))
         for number in chosen:
             rival = hypothesis(mirrored, pairs, _mirrored(best.displacement, sensors[number]), NEAR_SCALES)
-            if np.any(np.abs(rival.displacement - best.displacement) > _ELSEWHERE / 3):
+            if np.any(np.abs(rival.displacement - best.displacement) > ELSEWHERE / 3):
                 only_best = best.without(_explained(flow, pairs, rival) > 0.5, flow, pairs)
                 only_rival = rival.without(_explained(flow, pairs, best) > 0.5, mirrored, pairs)
                 is_sure = only_best.n_places >= _MIN_PLACES and _n_accidental(only_best, by_accident) < _MAX_ACCIDENTAL
@@ -132,13 +133,13 @@ def _ambiguity(
     mirrored: Sequence[Floats],
 ) -> float:
     apart = np.abs(rival.displacement - best.displacement)
-    if np.all(apart < _ELSEWHERE / 3):
+    if np.all(apart < ELSEWHERE / 3):
         return 0.0
     strengths = flow.strengths(pairs)
     score = float(best.weight @ strengths)
     explained = _explained(flow, pairs, best)
     shared = 0.0
-    if np.any(apart > _ELSEWHERE) and (rival.weight * explained) @ strengths > _SHARED * score:
+    if np.any(apart > ELSEWHERE) and (rival.weight * explained) @ strengths > _SHARED * score:
         shared = float(rival.weight @ strengths) / max(score, 1e-30)
     return max(shared, _ambiguity_of_others(best, rival.without(explained > 0.5, flow, pairs), by_accident, mirrored))
 
@@ -157,7 +158,7 @@ def _ambiguity_of_others(
 
 def _is_near(displacement: Floats, mirrored: Floats, best: Floats) -> bool:
     """Return True if a displacement is the mirrored one, rather than the best or any other."""
-    away, apart = (float(np.max(np.abs(each - mirrored) / _ELSEWHERE)) for each in (displacement, best))
+    away, apart = (float(np.max(np.abs(each - mirrored) / ELSEWHERE)) for each in (displacement, best))
     return away < min(2.0, max(0.5, 0.4 * apart))
 
 

@@ -80,6 +80,8 @@ def preset_tables(name: str, kind: PresetKind | None = None) -> dict[str, dict[s
     of_rtisdev = {tables["rtisdev"]: own for own, tables in _shipped().items() if "rtisdev" in tables}
     own = of_rtisdev.get(name, name)
     if own not in _shipped():
+        if str(own).lower().endswith(".toml"):
+            raise ArgumentError(f"preset {own!r} is the name of a file; use it as settings (--settings {own})")
         checks.choice("preset", own, presets(kind))
     tables = _shipped()[own]
     if kind not in {None, _kind(tables)}:
