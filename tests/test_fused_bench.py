@@ -9,7 +9,7 @@ from ertis_bench.network.sender import SETTINGS
 from ertis_bench.network_trials import fused_receiver, live_fusion, live_maps
 from ertis_bench.network_trials.fused_receiver import FusedReceiverJob
 from ertis_bench.network_trials.map_viewer import MapViewerJob, n_wrong
-from ertis_bench.platform_trials import clock_checks, differing_calls, emission_delays, fused_scans
+from ertis_bench.platform_trials import broken_emitters, clock_checks, differing_calls, emission_delays, fused_scans
 from ertis_bench.platform_trials.rendered_rooms import (
     Face,
     Room,
@@ -181,3 +181,16 @@ def test_rendered_sound_arrives_when_mirror_images_predict(diameter_m):
     direction, place = np.unravel_index(image.amplitude.argmax(), image.amplitude.shape)
     assert image.range_m[place] == pytest.approx(1.3, abs=0.01)
     assert image.azimuth_rad[direction] == pytest.approx(0.0, abs=0.04)
+
+
+def test_emitters_bench_counts_broken_and_wrongly_stated_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr(broken_emitters, "_N_PULSES", 1)
+    target = tmp_path / "page.md"
+    marker = "ertis bench fusion --only emitters"
+    target.write_text(f"<!-- {marker} -->\nold\n<!-- /{marker} -->\n", "utf-8")
+    options = ["--only", "emitters", "--count", "1", "--seed", "1000", "--json", "--quiet", "--update", str(target)]
+    done = CliRunner().invoke(cli, ["bench", "fusion", *options])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    _, row = json.loads(done.stdout)["emitters"]
+    assert (row["platforms"], row["pulses"], row["accused"], row["contradicted"], row["others"]) == (1, 1, 0, 0, 0)
+    assert "| omnidirectional | " in target.read_text("utf-8")

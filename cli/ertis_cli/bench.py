@@ -252,11 +252,11 @@ def calibration(**given: Any) -> None:
 @click.option(
     "--only",
     multiple=True,
-    type=click.Choice(["calls", "clocks", "delays", "scans"]),
+    type=click.Choice(["calls", "clocks", "delays", "emitters", "scans"]),
     metavar="PART",
     help="Run only this part: calls compares sensors with equal and with different calls, clocks checks clocks and "
-    "mountings by direct sound, delays compares delays of sensors that emit in sequence, and scans compares laser "
-    "scans of confirmed reflectors with rays.",
+    "mountings by direct sound, delays compares delays of sensors that emit in sequence, emitters finds broken and "
+    "wrongly stated emitters, and scans compares laser scans of confirmed reflectors with rays.",
 )
 @_update
 @options.quiet

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_bench.platform_trials import clock_checks, differing_calls, emission_delays, fused_scans
+from ertis_bench.platform_trials import broken_emitters, clock_checks, differing_calls, emission_delays, fused_scans
 from ertis_bench.platform_trials.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import Energyscape
@@ -27,7 +27,13 @@ __all__ = ["FORMS", "form", "run"]
 
 Floats = NDArray[np.float64]
 
-_PARTS: Final = {"calls": differing_calls, "clocks": clock_checks, "delays": emission_delays, "scans": fused_scans}
+_PARTS: Final = {
+    "calls": differing_calls,
+    "clocks": clock_checks,
+    "delays": emission_delays,
+    "emitters": broken_emitters,
+    "scans": fused_scans,
+}
 
 _LOUD_DB = -25.0  # Level of foreign echoes that count, relative to the strongest own echo.
 _BEAM_RAD, _PULSE_M = math.radians(25.0), 0.12  # Distance of ghosts from all reflectors.
@@ -62,8 +68,8 @@ def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None], only: 
         Function that reports progress.
     only : sequence of str
         ``calls`` to compare equal calls with different ones instead, ``clocks`` to check clocks and mountings by
-        direct sound, ``delays`` to compare delays of sensors that emit in sequence, or ``scans`` to compare laser
-        scans with rays.
+        direct sound, ``delays`` to compare delays of sensors that emit in sequence, ``emitters`` to find broken and
+        wrongly stated emitters, or ``scans`` to compare laser scans with rays.
     """
     if only:
         report: dict[str, Any] = {}
