@@ -1,15 +1,17 @@
 """Noise of images, and amplitude thresholds above the noise."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import checks
+from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape
 from ertis_numba.settings import Processing
 
-__all__ = ["echo_floor", "medians_of", "noise_of", "threshold_of"]
+__all__ = ["EchoFloor", "echo_floor", "medians_of", "noise_of", "threshold_of"]
 
 _ROUNDING = 10 ** (-140 / 20)  # For one-bit microphones: their noise is at least 40 dB above, arithmetic 10 dB below.
 _SAMPLE = 32_768  # Number of bins from which the noise is estimated, with an accuracy of 1 %.
@@ -17,7 +19,51 @@ _BLOCKS = 16  # Number of blocks of ranges with separate estimates of the noise.
 _LONG_BLOCKS = 4  # The same for the noise of single directions.
 _DENSE = 131_072  # Number of bins from which the noise of all directions is estimated.
 _CAPON = 1.5  # Exponent of the amplitude of noise.
+_LEAST = 8  # Ranges that a click is spread over at least.
+_PER_CALL = 2  # Number of blocks of ranges in the range that the matched filter spreads a click over.
 _QUIET = 1 / 3  # Quantile of these estimates: side lobes raise those near echoes, and chance lowers the lowest.
+
+
+class EchoFloor(NamedTuple):
+    """Amplitude that noise reaches anywhere in an image with a given probability.
+
+    Attributes
+    ----------
+    by_direction : (direction,) float32
+        Threshold for noise that lasts for the whole record.
+    by_range : (range,) float32
+        Threshold for noise that changes within the record. Side lobes of strong echoes raise it, too.
+    n_around : int
+        Number of ranges that the matched filter spreads a click over.
+    ratio : float
+        Threshold relative to the median of the noise.
+    """
+
+    by_direction: NDArray[np.float32]
+    by_range: NDArray[np.float32]
+    n_around: int
+    ratio: float
+
+    @property
+    def lasting(self) -> float:
+        """Highest threshold for noise that lasts for the whole record."""
+        return float(self.by_direction.max())
+
+    def at(
+        self, amplitude: NDArray[np.float32], direction: NDArray[np.intp], place: NDArray[np.intp]
+    ) -> NDArray[np.float32]:
+        """Return the thresholds of some bins of the image, also for clicks from their direction.
+
+        Parameters
+        ----------
+        amplitude : (direction, range) float32
+        direction, place : (bin,) int
+            Indices of directions and ranges.
+        """
+        first = (place - self.n_around // 2).clip(0, max(0, amplitude.shape[1] - self.n_around))
+        columns = (first[:, None] + np.arange(self.n_around)).clip(0, amplitude.shape[1] - 1)
+        around = np.float32(self.ratio) * medians_of(amplitude[direction[:, None], columns])
+        return np.asarray(np.maximum(np.maximum(self.by_direction[direction], self.by_range[place]), around))
 
 
 def noise_of(image: Energyscape) -> float:
@@ -89,12 +135,13 @@ def threshold_of(image: Energyscape, false_alarm: float) -> float:
     return max(smallest, noise_of(image) * math.sqrt(math.log(max(1, image.amplitude.size) / false_alarm)))
 
 
-def echo_floor(image: Energyscape, false_alarm: float) -> NDArray[np.float32]:
-    """Return the amplitude that noise reaches anywhere in an image with a given probability: (direction,) float32.
+def echo_floor(image: Energyscape, false_alarm: float) -> EchoFloor:
+    """Return the amplitude that noise reaches anywhere in an image with a given probability.
 
-    Unlike `threshold_of`, it follows noise that differs between directions, such as that of a machine, and it holds for
-    all beamformers and for cleaned images. The amplitude of others is about a power of that of delay-and-sum. Cleaned
-    images keep the strongest direction of each range, which has the distribution of a single one at the worst.
+    Unlike `threshold_of`, it follows noise that differs between directions, such as that of a machine, or between
+    ranges, such as a click, which the matched filter spreads over the length of the call. It holds for all beamformers
+    and for cleaned images. The amplitude of others is about a power of that of delay-and-sum. Cleaned images keep the
+    strongest direction of each range, which has the distribution of a single one at the worst.
 
     Parameters
     ----------
@@ -115,7 +162,26 @@ def echo_floor(image: Energyscape, false_alarm: float) -> NDArray[np.float32]:
         median = np.maximum(_quiet(medians), _quiet(medians_of(np.ascontiguousarray(medians.T))[None]))
     ratio = (math.log(amplitude.size / false_alarm) / math.log(2)) ** (exponent / 2)
     smallest = 0.0 if settings.recording.encoding == "float32" else _ROUNDING**exponent
-    return np.broadcast_to(np.maximum(smallest, ratio * median).astype(np.float32), n_directions)
+    spread_m = settings.call.duration_s * sound_speed_m_s(settings.air) / 2
+    step_m = (image.range_m[-1] - image.range_m[0]) / max(1, n_ranges - 1)
+    n_around = max(_LEAST, min(n_ranges, round(spread_m / step_m))) if step_m else 1
+    return EchoFloor(
+        np.broadcast_to(np.maximum(smallest, ratio * median).astype(np.float32), n_directions),
+        (ratio * _medians_by_range(amplitude, n_around)).astype(np.float32),
+        n_around,
+        ratio,
+    )
+
+
+def _medians_by_range(amplitude: NDArray[np.float32], n_around: int) -> NDArray[np.float32]:
+    """Return the highest median of the blocks of ranges around each range: (range,) float32."""
+    n_ranges = amplitude.shape[1]
+    n_blocks = max(1, _PER_CALL * n_ranges // n_around)
+    medians = _medians_of_blocks(amplitude[:: max(1, amplitude.size // _SAMPLE)], n_blocks)
+    padded = np.pad(medians, 1, mode="edge")
+    around = np.maximum(medians, np.maximum(padded[:-2], padded[2:]))
+    width, n_longer = divmod(n_ranges, n_blocks)
+    return np.repeat(around, [width + 1] * n_longer + [width] * (n_blocks - n_longer))
 
 
 def _quiet(medians: NDArray[np.float32]) -> NDArray[np.float64]:

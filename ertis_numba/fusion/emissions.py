@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.noise import EchoFloor
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion.association import Reflectors
 from ertis_numba.fusion.overlaps import PredictedEchoes, overlap
@@ -147,7 +148,7 @@ def is_much_better(length: int, other: int) -> bool:
 def expected_echoes(
     reflectors: Reflectors,
     images: Mapping[int, Energyscape],
-    floors: Mapping[int, NDArray[np.float32]],
+    floors: Mapping[int, EchoFloor],
     receivers: Mapping[int, Receiver],
     late_m: Mapping[int, Mapping[int, float]],
     deaf: Mapping[int, Flags],
@@ -160,7 +161,7 @@ def expected_echoes(
     reflectors : Reflectors
     images : mapping of int to Energyscape
         Images by receiver.
-    floors : mapping of int to (direction,) float32
+    floors : mapping of int to EchoFloor
         Detection thresholds.
     receivers : mapping of int to Receiver
     late_m : mapping of int to mapping of int to float
@@ -185,7 +186,7 @@ def expected_echoes(
         shown = shown.reshape(len(path_m), len(image.range_m))
         side = _highest(np.broadcast_to(image.amplitude.max(axis=0), shown.shape), column, beside) ** 2 * _SIDE_LOBES
         counts = (column >= beside) & (column < len(image.range_m) - beside) & ~deaf[number][step]
-        counts &= (power > _VISIBLE * np.maximum(side, float(floors[number].max()) ** 2)) & (other < _DISTURBED)
+        counts &= (power > _VISIBLE * np.maximum(side, floors[number].lasting ** 2)) & (other < _DISTURBED)
         counts &= (cosine > _WITHIN).any(axis=1, keepdims=True)
         is_loud = _highest(shown, column, near) ** 2 > _LOST * (1 - np.sqrt(np.minimum(other, 1.0))) ** 2 * power
         is_heard[:, number, senders], is_missed[:, number, senders] = counts & is_loud, counts & ~is_loud

@@ -93,7 +93,7 @@ class Fused:
     @property
     def noise(self) -> dict[str, float]:
         """Detection threshold of each fused sensor: amplitude that noise exceeds in one of 100,000 images."""
-        return {self._names[number]: float(floor.max()) for number, floor in self._solve().floor.items()}
+        return {self._names[number]: floor.lasting for number, floor in self._solve().floor.items()}
 
     @property
     def is_empty(self) -> bool:

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.noise import echo_floor
+from ertis_numba.analysis.noise import EchoFloor, echo_floor
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.association import Reflectors, SensorEchoes, tangents
@@ -63,23 +63,20 @@ class PointFuser:
             image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP, min_level_db=_MIN_LEVEL_DB
         )
 
-    def floor(self, image: Energyscape) -> NDArray[np.float32]:
-        """Return the detection threshold (`_FALSE_ALARM`): (direction,) float32, infinite in an image of zeros."""
-        return (
-            echo_floor(image, _FALSE_ALARM)
-            if image.amplitude.any()
-            else np.full(len(image.amplitude), np.inf, np.float32)
-        )
+    def floor(self, image: Energyscape) -> EchoFloor:
+        """Return the detection threshold (`_FALSE_ALARM`), infinite in an image of zeros."""
+        if image.amplitude.any():
+            return echo_floor(image, _FALSE_ALARM)
+        by_direction, by_range = (np.full(count, np.inf, np.float32) for count in image.amplitude.shape)
+        return EchoFloor(by_direction, by_range, n_around=1, ratio=1.0)
 
-    def echoes(
-        self, image: Energyscape, floor: NDArray[np.float32], shares: Shares, late_m: Mapping[int, float]
-    ) -> SensorEchoes:
+    def echoes(self, image: Energyscape, floor: EchoFloor, shares: Shares, late_m: Mapping[int, float]) -> SensorEchoes:
         """Return the echoes of an image above its noise, strongest first.
 
         Parameters
         ----------
         image : Energyscape
-        floor : (direction,) float32
+        floor : EchoFloor
             Detection threshold, from `floor`.
         shares : Shares
         late_m : mapping of int to float
@@ -90,9 +87,11 @@ class PointFuser:
         cloud = self._extract(image)
         place_m = cloud.position_m.astype(np.float64)
         row = np.argmax(place_m @ self._receiver.directions.T, axis=1)
-        is_heard = cloud.amplitude > floor[row]
-        place_m, uncertainty_m, row = place_m[is_heard], _uncertainties(cloud)[is_heard], row[is_heard]
         range_m = np.linalg.norm(place_m, axis=1)
+        column = np.rint(np.interp(range_m, image.range_m, np.arange(len(image.range_m)))).astype(np.int64)
+        is_heard = cloud.amplitude > floor.at(image.amplitude, row, column)
+        place_m, uncertainty_m, row = place_m[is_heard], _uncertainties(cloud)[is_heard], row[is_heard]
+        range_m = range_m[is_heard]
         emitters = [emitter for emitter, number in shares if number == self._number]
         direction = place_m / range_m[:, None]
         return SensorEchoes(

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.noise import EchoFloor
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.association import Reflectors, SensorEchoes
 from ertis_numba.fusion.attribution import Attributed, Attribution, Rivalries
@@ -42,7 +43,7 @@ class PulseReflectors(NamedTuple):
     ----------
     attributed : Attributed
     reflectors : Reflectors
-    floor : dict of int to (direction,) float32
+    floor : dict of int to EchoFloor
         Detection thresholds of each sensor, `PointFuser.floor`.
     without_echo : list of int
         Sensors whose images have no echo above it.
@@ -56,7 +57,7 @@ class PulseReflectors(NamedTuple):
 
     attributed: Attributed
     reflectors: Reflectors
-    floor: dict[int, NDArray[np.float32]]
+    floor: dict[int, EchoFloor]
     without_echo: list[int]
     unheard: frozenset[int]
     pulses: tuple[EmissionCounts, ...]
@@ -239,7 +240,7 @@ class FusionTables:
         self,
         group: Mapping[int, Energyscape],
         attributed: Attributed,
-        floor: Mapping[int, NDArray[np.float32]],
+        floor: Mapping[int, EchoFloor],
         unheard: frozenset[int],
     ) -> "_Explained":
         """Return the reflectors that explain the echoes if some emitters are silent."""
@@ -253,7 +254,7 @@ class FusionTables:
         return _Explained(reflectors, counts, without_echo, reflectors.n_unexplained + n_missed)
 
     def _echoes(
-        self, group: Mapping[int, Energyscape], attributed: Attributed, floor: Mapping[int, NDArray[np.float32]]
+        self, group: Mapping[int, Energyscape], attributed: Attributed, floor: Mapping[int, EchoFloor]
     ) -> list[SensorEchoes]:
         return [
             self._points[number].echoes(each, floor[number], attributed.shares, self._late_m[number])

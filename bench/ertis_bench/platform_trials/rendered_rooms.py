@@ -168,9 +168,9 @@ class _Air:
     def __init__(self, settings: Settings, diameter_m: float) -> None:
         frequency_hz = np.fft.rfftfreq(_N_FFT, 1 / RATE_HZ)
         self.inside = (frequency_hz > _BAND_HZ[0]) & (frequency_hz < _BAND_HZ[1])
-        frequency_hz = np.asarray(frequency_hz[self.inside], np.float64)
-        self._wave_1_m = 2 * math.pi * frequency_hz / sound_speed_m_s(settings.air)
-        self._lost_1_m = math.log(10) / 20 * absorption_db_m(settings.air, frequency_hz)
+        inside_hz: Floats = frequency_hz[self.inside].astype(np.float64)
+        self._wave_1_m = 2 * math.pi * inside_hz / sound_speed_m_s(settings.air)
+        self._lost_1_m = math.log(10) / 20 * absorption_db_m(settings.air, inside_hz)
         self._call = _LEVEL * np.fft.rfft(call_at(settings.call, np.arange(_N_FFT) / RATE_HZ))[self.inside]
         self._diameter_m = diameter_m
 
