@@ -253,10 +253,11 @@ class Reflectors:
         apart_m = np.linalg.norm(away_m, axis=2)
         cosine = np.einsum("psi,si->ps", away_m, self._ahead) / np.maximum(apart_m, _NEAREST_M)
         gain = np.zeros((len(place_m), len(self._sensors), len(self._sensors)))
-        for number, model in self._emitters.items():
+        for model in {*self._emitters.values()}:
+            receivers = [number for number, each in self._emitters.items() if each is model]
             radiated = model.powers(cosine)
-            spreading = model.spreading(apart_m, apart_m[:, number, None])
-            gain[:, number] = np.where(radiated > AUDIBLE, radiated, 0) * spreading
+            spreading = model.spreading(apart_m[:, None], apart_m[:, receivers, None])
+            gain[:, receivers] = np.where(radiated > AUDIBLE, radiated, 0)[:, None] * spreading
         return gain
 
     def _fits(self, candidates: _Candidates, extra_m: float) -> tuple[Numbers, Numbers, Numbers, Floats]:

@@ -142,6 +142,8 @@ class Emitters:
         ----------
         cosine : (..., emitter) float64
         """
+        if all(each is self._powers[0] for each in self._powers):
+            return self.power(cosine, 0)
         return np.stack([self.power(cosine[..., number], number) for number in range(len(self._powers))], axis=-1)
 
     def spreading(self, to_point_m: Floats, from_point_m: Floats) -> Floats:

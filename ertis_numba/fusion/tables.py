@@ -25,7 +25,7 @@ from ertis_numba.fusion.points import PointFuser, joined
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import CoarseImage, Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
-from ertis_numba.settings import Settings
+from ertis_numba.settings import Air, Call, Settings
 
 __all__ = ["PLATFORM", "FusionTables", "PulseReflectors"]
 
@@ -112,6 +112,7 @@ class FusionTables:
         self._settings: dict[int, Settings] = {}
         self._late_m: dict[int, dict[int, float]] = {}  # by receiver and emitter
         self._emitters: dict[int, Emitters] = {}
+        self._models: dict[tuple[Call, Air], Emitters] = {}  # Receivers share those of equal sound.
         self._known: dict[tuple[tuple[int, ...], frozenset[int]], Attribution] = {}
         self._rivalries: Rivalries = {}
         self._points: dict[int, PointFuser] = {}
@@ -292,7 +293,9 @@ class FusionTables:
             emitter: (self._start_s[emitter] - self._start_s[number]) * speed_m_s for emitter in self._emitting
         }
         deaf = self._deaf[number] = self._direct_sound(number, receiver, late_m)
-        emitters = self._emitters[number] = Emitters(settings, self._diameters_m)
+        sound = settings.call, settings.air
+        emitters = self._models.setdefault(sound, Emitters(settings, self._diameters_m))
+        self._emitters[number] = emitters
         common = self._sensors, emitters, receiver
         pairs = [
             pair_of(
