@@ -146,9 +146,9 @@ def test_small_shifts_are_not_described(late_s):
         (
             [1.37e-3],
             0.0,
-            "set call.delay_s = 0.00137 in the settings, or import again with a larger --skip, by 0",
+            "set call.delay_s = 0.00137 in the settings, or import again with --skip increased by 0",
         ),
-        ([-5e-4], 2e-3, "set call.delay_s = 0.0015 in the settings, or import again with a smaller --skip, by 0.0005"),
+        ([-5e-4], 2e-3, "set call.delay_s = 0.0015 in the settings, or import again with --skip reduced by 0.0005"),
         ([-5e-4], 0.0, "start recording 0.5 ms earlier, or import again with a smaller --skip"),
         ([0.0, 5e-4], 0.0, "trigger each record by its emission, or import again with --sync-channel, "),
     ],

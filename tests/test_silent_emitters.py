@@ -7,6 +7,8 @@ import pytest
 
 import ertis_numba as ertis
 from ertis_numba.fusion.emissions import EmissionCounts, silent_one, suspect
+from ertis_numba.simulation import load_scene
+from ertis_numba.simulation.render import render
 from tests.small_platforms import HEIGHT_M, images_of, mounted, random_reflectors, rendered, settings_of
 
 PLACES_M = np.array([[1.6, 0.2, HEIGHT_M], [1.2, -1.0, HEIGHT_M], [-1.0, -1.3, HEIGHT_M]])
@@ -110,3 +112,28 @@ def test_silence_that_explains_most_is_named(costs, missed, expected):
 )
 def test_equally_good_explanation_is_a_rival_if_others_do_not_contradict_it(joint, other, expected):
     assert silent_one(0, joint, {0: 2, 1: 2}, {0: counts([0, 3], [8, 0]), 1: other}) == expected
+
+
+def test_emitters_between_two_walls_are_heard(tmp_path):
+    """Sound that walls reflect several times is unexplained, whichever emitter is silent."""
+    sensors = [
+        f'[[sensors]]\nname = "{name}"\nposition_m = {[*place_m]}\nyaw_deg = {yaw_deg}\n'
+        "emitter.diameter_m = 0.012\nemitter.level_db = -24.0\n"
+        'processing.directions = "90"\nprocessing.range_m = [0.6, 4.0]\nprocessing.range_decimation = 2\n'
+        'recording.encoding = "float32"\nrecording.sample_rate_hz = 200000.0\nrecording.n_samples = 6000\n'
+        for (name, (place_m, _)), yaw_deg in zip(mounted(4).items(), (0, 90, 180, -90), strict=True)
+    ]
+    walls = [
+        f"[[walls]]\nposition_m = [0.0, {y}, 0.0]\nfacing_deg = [{-90.0 * y}, 0.0]\nreflection_db = -9.0\n"
+        for y in (1.0, -1.0)
+    ]
+    posts_m = np.array([[1.5, 0.1, HEIGHT_M], [-1.5, 0.3, HEIGHT_M]])
+    points = [f"[[points]]\nposition_m = {place_m.tolist()}\nstrength_db = -3.0\n" for place_m in posts_m]
+    (tmp_path / "corridor.toml").write_text("\n".join([*sensors, *walls, *points]))
+    scene = load_scene(tmp_path / "corridor.toml")
+    measurements = [render(scene, sensor=name) for name in mounted(4)]
+    with ertis.Pipeline(measurements[0].settings, predict=False) as pipeline:
+        fused = ertis.Fuser(mounted(4))([pipeline.process(each) for each in measurements])
+    assert fused.unheard == ()
+    found_m = fused.points.position_m[fused.points.is_certain]
+    assert (np.linalg.norm(found_m[:, None] - posts_m, axis=2).min(axis=0) < 0.03).all()

@@ -13,8 +13,8 @@ from ertis_numba.fusion.emissions import is_much_better
 from ertis_numba.storage import write_recording
 from tests.small_platforms import images_of, mounted, random_reflectors, rendered, settings_of
 
-PISTONS = "emitters that are pistons, but the settings state omnidirectional ones"
-OMNIDIRECTIONAL = "emitters that are omnidirectional ones, but the settings state pistons"
+PISTONS = "those of pistons, but omnidirectional emitters are assumed"
+OMNIDIRECTIONAL = "those of omnidirectional emitters, but pistons are assumed"
 
 
 @functools.cache

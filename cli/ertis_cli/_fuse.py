@@ -86,10 +86,10 @@ def write_fused(
                 unheard.update(fused.unheard)
                 writer.write(_numbered(fused, number))
     _pulses.note_empty(empty, len(groups), quiet=quiet)
-    silent = [_silent(name, count, len(groups)) for name, count in unheard.items()]
-    if contradiction := fuser.emitter_warning():
-        silent.append(contradiction)
-    for text in silent:
+    contradiction = fuser.emitter_warning()  # With wrong emitters, echoes seem to be missing.
+    every = [_unheard(name, count, len(groups)) for name, count in unheard.items()]
+    warnings = [contradiction] if contradiction else every
+    for text in warnings:
         options.warn(text)
     pulses = options.counted(len(groups), "pulse")
     options.say(f"{target}: {pulses} of {', '.join(by_name)}, fused", quiet=quiet)
@@ -103,7 +103,7 @@ def write_fused(
             "left_out": active.n_passive,
             "unheard": dict(unheard),
         }
-        warnings = [*clocks.warnings(), *pipelines.warnings, *silent]
+        warnings = [*clocks.warnings(), *pipelines.warnings, *warnings]
         options.print_json(report | {"direct_sound": _direct_sound(clocks), "warnings": warnings})
 
 
@@ -134,7 +134,7 @@ def _direct_sound(check: "DirectSoundCheck") -> list[dict[str, Any]]:
     ]
 
 
-def _silent(sensor: str, count: int, n_pulses: int) -> str:
+def _unheard(sensor: str, count: int, n_pulses: int) -> str:
     """Return a warning of a sensor whose call is not heard in some pulses."""
     return f"no sensor hears the call of {sensor} in {count} of {n_pulses} pulses; check its emitter and its SYNC line"
 

@@ -44,11 +44,11 @@ _COLUMNS = {  # name: digits in the report, and in the table
 def info(ctx: click.Context, *, paths: tuple[Path, ...], of_health: bool, as_json: bool) -> None:
     """Show the contents of recordings, image files or maps.
 
-    Of several files, or of a folder with the folders in it, show one line per file. The exit code is then 1 if a file
+    For several files or a folder, which includes its subfolders, show one line per file; the exit code is 1 if a file
     cannot be read.
 
     In JSON, "sensors" lists the properties of each sensor. If there is only one sensor, the top level repeats its
-    properties. Of several files, "files" lists these reports.
+    properties. For several files, "files" lists one report per file.
 
     With --health, show the state of each microphone of a recording: ok, dead, stuck, saturated, or with an offset or an
     idle tone. At most 8 measurements, evenly spaced, are examined. The exit code is 0 even if faults are found.

@@ -279,6 +279,8 @@ def _found(
         by_place = {index: find(images[index]) for index in places}
         found = [(index, peak) for index, peaks in by_place.items() for peak in peaks]
         _note_left_out(sensor, sum(_n_left_out(images[index], peaks, find) for index, peaks in by_place.items()))
+        clouds = [images[index].points for index in places] if images.has_points else []
+        _note_unconfirmed(sensor, sum(int((~each.is_certain).sum()) for each in clouds if each is not None))
         options.note_open_edges(sensor, images, (peak.grid_error_deg for _, peak in found))
         return [{"sensor": sensor, "measurement": index, **_rounded(peak)} for index, peak in found]
 
@@ -301,6 +303,16 @@ def _note_left_out(sensor: str, count: int) -> None:
         options.note(
             f"sensor {sensor}: {maxima} near the first or last range left out because {cause} of an echo outside the "
             "range; use a wider range with 'ertis process --range'"
+        )
+
+
+def _note_unconfirmed(sensor: str, count: int) -> None:
+    """Print a note on points of a fusion that are not listed."""
+    if count:
+        points = "1 point" if count == 1 else f"{count} points"
+        options.note(
+            f"sensor {sensor}: {points} left out because too few pairs of emitter and receiver confirm them: they may "
+            "be ghosts, or reflectors that few sensors hear; the file contains them with point_confirmed = 0"
         )
 
 

@@ -72,7 +72,7 @@ class CallMatch:
 
     @property
     def warning(self) -> str:
-        """One-line warning; empty if the echoes match the call."""
+        """Mismatch, or the reason why the match is unknown, in one line; empty if the call matches."""
         if self.sweep is None or self.call is None:
             return self.note
         text = f"echoes do not match the call of the settings: they look like {self.sweep}"

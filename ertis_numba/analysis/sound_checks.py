@@ -24,14 +24,15 @@ class SoundMismatch(NamedTuple):
 class SoundChecks:
     """Checks of the measurements of one sensor, each of which reports at most one mismatch.
 
-    Call and layout are compared until they are known, in at most 8 measurements; a note on a call that may differ is
-    reported before. The start of the record may change later, so that it is compared in measurements 1, 2, 4, 8 and so
+    Call and layout are compared until they are known, in at most 8 measurements. A note is reported once while the call
+    is unknown. The start of the record may change later, so that it is compared in measurements 1, 2, 4, 8 and so
     on. Another call ends all checks, because its filter does not find the times of arrival.
 
     Parameters
     ----------
     thinned : bool
-        Compare the start in ever fewer measurements; False for a caller that checks ever fewer measurements.
+        True to compare the start only in measurements 1, 2, 4, 8 and so on; False if the caller already skips
+        measurements.
     """
 
     def __init__(self, *, thinned: bool = True) -> None:

@@ -47,8 +47,8 @@ class PointCloud(DegreesFromRadians):
         Standard deviations of the position along range and across it, in metres, from `PointExtractor`. None if they
         are unknown: the network does not transmit them.
     confirmed : (point,) bool, optional
-        True if at least 60 % (rounded down) of the pairs of emitter and receiver that should hear the reflector do. The
-        others may be ghosts of sound that two surfaces reflected. None for points that are not fused.
+        True for reflectors that echoes of enough pairs of emitter and receiver confirm. The others may be ghosts of
+        sound that two surfaces reflected. None for points that are not fused.
 
     Raises
     ------

@@ -39,6 +39,7 @@ _MANY_PAIRS: Final = (
 )
 _EXCESS: Final = 4.0  # Reflectivity relative to the bound of a cell, above which missing echoes exclude a candidate.
 _TINY: Final = 1e-30
+_STRONG: Final = 10 ** (-10.0 / 10)  # Reflectivity relative to the median, from which echoes need their own call.
 _ROUNDS: Final = 8
 _RESOLUTION_M: Final = 0.014  # Difference of paths that separates two echoes.
 _OUTLIER: Final = 2.0  # Residual with half weight, in standard deviations.
@@ -161,6 +162,7 @@ class Reflectors:
         Power of its echo at 1 m.
     confirmed : (reflector,) bool
         Reflectors that echoes at enough pairs confirm, as in `ertis_numba.fusion.confirmation`.
+    is_unexplained : (echo,) bool
     n_unexplained : int
         Echoes that no reflector explains together with others.
     """
@@ -216,7 +218,7 @@ class Reflectors:
         self.position_m, self.confirmed = place_m[kept], sure.is_confirmed[kept]
         self.covariance_m2 = np.array([each.covariance_m2 for each in self.located]).reshape(-1, 3, 3)
         self.reflectivity = np.array([each.reflectivity for each in self.located])
-        self.n_unexplained = int(self._is_free.sum())
+        self.is_unexplained, self.n_unexplained = self._is_free, int(self._is_free.sum())
 
     def _candidates(self) -> _Candidates:
         """Return the candidates of all echoes, where their emitter is audible."""
@@ -443,6 +445,28 @@ class Reflectors:
         away_m = place_m[:, None] - self._sensor_m
         cosine = np.einsum("psi,si->ps", away_m, self._ahead) / np.maximum(np.linalg.norm(away_m, axis=2), _NEAREST_M)
         return next(iter(self._emitters.values())).powers(cosine)
+
+    def needs(self, number: int, silent: "Reflectors") -> bool:
+        """Return True if an emitter is needed to explain strong echoes of its own sensor.
+
+        Echoes of sound that walls reflect several times are missed and unexplained in any case, so that their number
+        does not show that an emitter is silent. The image of its sensor then holds only echoes of other calls, which
+        others explain, or which are weak for an own call.
+
+        Parameters
+        ----------
+        number : int
+            Index of the emitter and of its sensor.
+        silent : Reflectors
+            Explanation of the same echoes without this emitter.
+        """
+        least = _STRONG * float(np.median(self.reflectivity)) if len(self.reflectivity) else 0.0
+        own = [
+            each.echo[(each.emitter == number) & (self._receiver[each.echo] == number)]
+            for each in self.located
+            if each.reflectivity > least
+        ]
+        return any(bool(silent.is_unexplained[echo].any()) for echo in own)
 
     def predicted(self) -> PredictedEchoes:
         """Return the echoes that the reflectors should cause if all sensors emit."""

@@ -23,7 +23,7 @@ _COUNTS_FROM: Final = 0.1  # Gain relative to the highest of all pairs, from whi
 _FACING: Final = 0.3  # Cosine from which a sensor may show the surface of a wall.
 _NEAREST_M: Final = 1e-9
 _PART: Final = 0.6
-_MIRROR_M: Final = 0.06  # Least difference of ranges of a ghost and a nearer reflector.
+_MIN_APART_M: Final = 0.06  # Least difference of ranges of a ghost and a nearer reflector.
 _PLANE_M: Final = 0.04  # Largest distance of a located wall from the plane that a ghost implies, …
 _FOOT_M: Final = 0.4  # … and from the foot of the perpendicular to it.
 _SAME_RAD: Final = math.radians(2.5)  # Difference of directions below which a nearer reflector may send the sound.
@@ -130,7 +130,7 @@ def _behind(heard: EchoPaths, away_m: Floats) -> Flags:
     flat = np.isin(np.arange(len(heard.sensor_m)), [*heard.flat])
     toward = toward - 2 * np.where(flat, np.minimum(depth, 0.0), 0.0)[..., None] * heard.ahead
     cosine = np.einsum("psi,qsi->pqs", toward, toward)
-    is_nearer = range_m + _MIRROR_M < range_m[:, None]
+    is_nearer = range_m + _MIN_APART_M < range_m[:, None]
     return np.asarray((is_nearer & (cosine > math.cos(_SAME_RAD))).any(axis=1))
 
 
@@ -155,9 +155,8 @@ def _mirrored(place_m: Floats, sensor_m: Floats, facing: NDArray[np.int64]) -> F
     from_m = np.linalg.norm(place_m[:, None] - heard_m, axis=2)  # (nearer reflector, ghost)
     range_m = np.linalg.norm(place_m - heard_m, axis=1)
     toward = (place_m - heard_m) / np.maximum(range_m, _NEAREST_M)[:, None]
-    is_nearer = from_m + _MIRROR_M < range_m
-    lit_m = np.linalg.norm(place_m - heard_m, axis=1)[:, None]  # by the sensor that faces the nearer reflector
-    images_m = np.broadcast_to(range_m, from_m.shape), 2 * range_m - from_m, 2 * range_m - lit_m
+    is_nearer = from_m + _MIN_APART_M < range_m
+    images_m = np.broadcast_to(range_m, from_m.shape), 2 * range_m - from_m, 2 * range_m - range_m[:, None]
     for image_range_m in images_m:
         image_m = heard_m + image_range_m[..., None] * toward
         offset_m = image_m - place_m[:, None]
@@ -165,7 +164,7 @@ def _mirrored(place_m: Floats, sensor_m: Floats, facing: NDArray[np.int64]) -> F
         normal = offset_m / np.maximum(between_m, _NEAREST_M)[..., None]
         depth_m = np.einsum("pgi,pgi->pg", (image_m + place_m[:, None]) / 2 - heard_m, normal)
         foot_m = heard_m + depth_m[..., None] * normal
-        nearer, ghost = np.nonzero(is_nearer & (between_m > 2 * _MIRROR_M) & (depth_m > _MIRROR_M))
+        nearer, ghost = np.nonzero(is_nearer & (between_m > 2 * _MIN_APART_M) & (depth_m > _MIN_APART_M))
         wall_m = place_m[:, None] - foot_m[nearer, ghost]
         off_m = np.abs(np.einsum("wki,ki->wk", wall_m, normal[nearer, ghost]))
         is_wall = (off_m < _PLANE_M) & (np.linalg.norm(wall_m, axis=2) < _FOOT_M)

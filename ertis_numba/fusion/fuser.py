@@ -92,7 +92,7 @@ class Fused:
 
     @property
     def noise(self) -> dict[str, float]:
-        """Detection threshold of each fused sensor: amplitude that noise exceeds in one of 100,000 images."""
+        """Detection threshold of each fused sensor: amplitude that steady noise exceeds in one of 100,000 images."""
         return {self._names[number]: floor.lasting for number, floor in self._solve().floor.items()}
 
     @property
@@ -222,7 +222,7 @@ class Fuser:
         Returns
         -------
         str or None
-            A line that names the better diameter. None if the other kind does not explain the echoes much better.
+            A line that names the setting. None if the other kind does not explain the echoes much better.
 
         Examples
         --------
@@ -240,12 +240,11 @@ class Fuser:
         better = sum(other(images).description_length for images, _ in self._first)
         if not is_much_better(better, stated):
             return None
-        names = ("pistons", "omnidirectional ones")
+        names = ("pistons", "omnidirectional emitters")
         right, wrong = names if other_m else names[::-1]
         return (
-            f"the echoes are those of emitters that are {right}, but the settings state {wrong}; set "
-            f"array.emitter_diameter_m to their diameter{'' if other_m else ', 0 for omnidirectional ones'}, or use "
-            "--emitter-diameter"
+            f"the echoes are those of {right}, but {wrong} are assumed; set array.emitter_diameter_m, or "
+            f"--emitter-diameter, to {'their diameter' if other_m else '0'}"
         )
 
     def has_tables(self, images: Iterable[Energyscape]) -> bool:

@@ -212,7 +212,11 @@ class FusionTables:
             rivals = {}
             for number in self._judged(group) - unheard:
                 each = self._without(group, unheard | {number})
-                rivals[number] = each, self._explained(group, each, floor, unheard | {number})
+                rival = self._explained(group, each, floor, unheard | {number})
+                if not explained.reflectors.needs(number, rival.reflectors):
+                    rivals[number] = each, rival
+            if suspected not in rivals:
+                break
             found = silent_one(
                 suspected,
                 explained.counts,

@@ -126,7 +126,10 @@ class Mapper:
         return self._n_empty
 
     def emitter_warning(self) -> str | None:
-        """Return a warning if echoes contradict the stated diameter of the emitters, as `Fuser.emitter_warning`."""
+        """Return a warning if echoes contradict the stated diameter of the emitters, as `Fuser.emitter_warning`.
+
+        It is None if fused pulses were added; ask their `Fuser`.
+        """
         return self._fuser.emitter_warning()
 
     def add(self, images: Iterable[Energyscape], pose: Pose, *, fused: Fused | None = None) -> None:

@@ -29,11 +29,8 @@ _SHARED: Final = 0.2
 _MAX_SUPPORT: Final = 0.5
 _MAX_SUPPORT_ONE_LINE: Final = 0.3
 _MIN_MATCHES: Final = 0.3
-_MIN_MATCHES_MIRRORED: Final = 0.15
 _MAX_ACCIDENTAL: Final = 0.02  # Expected number of rivals by accident
-# Displacements that a fit tells apart near its start, and near a mirrored motion, whose echoes do not move exactly so.
-_N_NEAR: Final = 33.0
-_N_MIRRORED: Final = 8 * _N_NEAR
+_N_NEAR: Final = 33.0  # Displacements that a fit tells apart near its start.
 _MIN_PLACES: Final = 3  # of echoes that rule out reflectors behind arrays
 _PARALLEL: Final = 0.98  # Cosine of arrays that face along one line
 

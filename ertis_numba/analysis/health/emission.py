@@ -88,8 +88,8 @@ def describe_shift(late_s: Sequence[float], speed_m_s: float, *, delay_s: float 
 def _remedy(late_s: float, delay_s: float) -> str:
     if delay_s + late_s < 0:
         return f"start recording {-1e3 * late_s:.3g} ms earlier, or import again with a smaller --skip"
-    change = f"a {'larger' if late_s > 0 else 'smaller'} --skip, by {round(abs(late_s), 6):g}"
-    return f"set call.delay_s = {round(delay_s + late_s, 6):g} in the settings, or import again with {change}"
+    change = f"{'increased' if late_s > 0 else 'reduced'} by {round(abs(late_s), 6):g}"
+    return f"set call.delay_s = {round(delay_s + late_s, 6):g} in the settings, or import again with --skip {change}"
 
 
 def _side(late_s: float) -> str:
