@@ -83,7 +83,7 @@ CASES = {
     "info of nothing": (
         "info folder",
         1,
-        "folder is a folder; choose a recording, an energyscape file or a file of acoustic maps",
+        "folder: no file in this folder ends in .h5; choose a folder with recordings or results",
     ),
     # processing
     "no directions": ("process rec.h5 -o out.h5 --directions 2d:0", 2, "count of directions '2d:0' is 0; give a whole"),

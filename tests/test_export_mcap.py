@@ -326,7 +326,7 @@ def test_scans_of_fused_images_have_each_reflector_in_one_beam(tmp_path):
         wanted = np.full(360, np.inf)
         for near_m, toward_rad in sorted(zip(range_m, azimuth_rad, strict=True), reverse=True):
             off = np.cos(angle_rad - toward_rad)
-            wanted[off >= np.cos(np.radians(3.5))] = np.inf  # Farther echoes may be those of several reflections.
+            wanted[off >= np.cos(np.radians(3.48))] = np.inf  # Farther echoes may be those of several reflections.
             wanted[np.argmax(off)] = near_m
         np.testing.assert_allclose(scan.ranges, wanted, atol=1e-4)
         assert scan.header.frame_id == "base_link"

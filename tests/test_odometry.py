@@ -145,7 +145,7 @@ def test_odometry_command_leaves_out_silent_sensors(folder, tmp_path):
 def test_odometry_command_of_a_single_sensor_names_the_option_for_one_that_emits_alone(folder, tmp_path):
     code, _, stderr = run(folder / "alone.h5", "-o", tmp_path / "alone.tum")
     assert code == 1
-    assert "pass --alone if no other sensor emits" in stderr
+    assert "use 'ertis odometry --alone' if no other sensor emits" in stderr
     assert not (tmp_path / "alone.tum").exists()
 
 

@@ -53,7 +53,7 @@ def test_odometry_arrives_in_rclpy():
     with (
         subscribed({"/robot1/odom": ODOMETRY}) as subscriber,
         Participant(domain=DOMAIN) as participant,
-        RosPublisher(participant, namespace="robot1", odometry=True) as ros,
+        RosPublisher(participant, namespace="robot1", odometry=True, alone=True) as ros,
     ):
         await_subscribers([ros.topics["/robot1/odom"]])
         for pulse in range(4):

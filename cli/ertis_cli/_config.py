@@ -9,8 +9,6 @@ from typing import Any, cast
 
 import click
 
-from ertis_numba import checks
-
 __all__ = [
     "add_variables",
     "config",
@@ -132,6 +130,8 @@ def _take(ctx: click.Context, path: Path) -> None:
     try:
         tables = tomllib.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
+        from ertis_numba import checks
+
         reason = checks.reason_unreadable(error) if isinstance(error, OSError | UnicodeDecodeError) else error
         raise click.ClickException(f"{path}: {reason}; give a readable TOML file (--config)") from error
     ctx.default_map = _defaults(ctx, cast("click.Group", ctx.command), tables, f"{path}: ")

@@ -130,12 +130,14 @@ def drive_of(
             f"{ears.path} has no poses; give true ones with --poses TRAJ, or without ground truth the output of "
             "'ertis odometry'"
         )
+    simulated = None if scene is None else load_scene(scene)
+    alone = simulated is not None and len(simulated.sensors) == 1
     return Drive(
         poses=true,
-        odometry=_measured(readers, ears, chosen, known, quiet=quiet)
+        odometry=_measured(readers, ears, chosen, known, alone=alone or None, quiet=quiet)
         if odometry is None
         else _poses.trajectory_of(odometry, quiet=quiet),
-        scene=None if scene is None else load_scene(scene),
+        scene=simulated,
         beam_azimuth_deg=beam_azimuth_deg,
     )
 
@@ -146,6 +148,7 @@ def _measured(
     chosen: "Sequence[int]",
     known: "Mapping[str, Mounting]",
     *,
+    alone: bool | None,
     quiet: bool,
 ) -> "Trajectory":
     """Return the odometry of all sensors at the chosen measurements of the sensor with ears."""
@@ -166,7 +169,7 @@ def _measured(
         pipelines = _pulses.PipelinesBySensor(_as_recorded, stack, quiet=quiet)
         if any(reader.sensor not in known for reader in readers):
             known = _pulses.mountings_of(readers, None)
-        found = odometry_of(readers, groups, pipelines, known, quiet=quiet).trajectory
+        found = odometry_of(readers, groups, pipelines, known, alone=alone, quiet=quiet).trajectory
     # Clocks of sensors may differ, so each pose gets the time of the sensor with ears.
     indices = [number - wanted[0] for number in wanted]
     times_ns = np.array([groups[index][ears.sensor].stamp.timestamp_ns for index in indices])

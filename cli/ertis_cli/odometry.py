@@ -31,8 +31,8 @@ _REFUSALS = {
     "few echoes": "no two successive pulses have enough echoes in common, at most a second apart; record more pulses "
     "per second, or a place with more reflectors",
     "other motion": "no step determines the motion, because standing still, mirrored motion or the motion of objects "
-    "explains the echoes about as well; add the recordings of sensors that face other ways, pass --alone if no other "
-    "sensor emits, or record a place with more reflectors at rest",
+    "explains the echoes about as well; add the recordings of sensors that face other ways, use 'ertis odometry "
+    "--alone' if no other sensor emits, or record a place with more reflectors at rest",
 }
 
 
@@ -46,12 +46,7 @@ _REFUSALS = {
     metavar="TRAJ.tum",
     help="Trajectory to write in the TUM format; REC.odometry.tum beside the first recording by default.",
 )
-@click.option(
-    "--alone",
-    is_flag=True,
-    help="No sensor emits except those of the recordings. Otherwise, the motion of a single sensor along its axis is "
-    "unknown, because it may hear the calls of others from behind.",
-)
+@options.alone
 @_pulses.processing
 @options.force
 @options.quiet

@@ -38,6 +38,7 @@ __all__ = [
     "NAMES",
     "PREPARING",
     "TEXT_PATH",
+    "alone",
     "as_json",
     "as_json_of",
     "cleaning",
@@ -205,6 +206,12 @@ plan: Decorator = click.option(
     show_default=True,
     help="Costs for the choice of the plan: published ones, which give the same images on every machine with the same "
     "instruction set, or those measured on this machine.",
+)
+alone: Decorator = click.option(
+    "--alone",
+    is_flag=True,
+    help="For odometry: no sensor emits except those given. Otherwise, the motion of a single sensor along its axis is "
+    "unknown, because it may hear the calls of others from behind.",
 )
 force: Decorator = click.option("--force", is_flag=True, help="Overwrite existing output.")
 quiet: Decorator = click.option(

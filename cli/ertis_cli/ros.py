@@ -65,6 +65,7 @@ class _MaxRate(click.ParamType[Any]):
     is_flag=True,
     help="Publish the pose and velocity of the platform on odom, and its transform on /tf.",
 )
+@options.alone
 @click.option("--namespace", default="", metavar="NAME", help="Prefix of the topics of sensors, such as robot1.")
 @click.option(
     "--domain",
@@ -151,6 +152,7 @@ def ros(
     sensors: tuple[str, ...],
     topics: tuple[str, ...],
     odometry: bool,
+    alone: bool,
     namespace: str,
     domain: int | None,
     interface: str,
@@ -216,6 +218,7 @@ def ros(
             mounting=given,
             settings=publishing,
             odometry=odometry,
+            alone=alone or None,
             on_note=notes.append,
         ) as publisher,
     ):

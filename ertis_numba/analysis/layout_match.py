@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["LayoutMatch", "first_layout_match", "layout_match"]
 
 _MAX_MEASUREMENTS: Final = 8
+_MIN_MICS: Final = 3  # Fewer show no layout.
 _MAX_MICS: Final = 48
 
 
@@ -82,6 +83,8 @@ def layout_match(measurement: Measurement) -> LayoutMatch | None:
     """
     settings = measurement.settings
     channels = np.flatnonzero(microphones(settings.array).enabled)
+    if len(channels) < _MIN_MICS:
+        return LayoutMatch.of(())
     if len(channels) > _MAX_MICS:  # At random, because every second one could hide an order.
         channels = np.sort(np.random.default_rng(0).choice(channels, _MAX_MICS, replace=False))
     words = sample_format(settings).validated(measurement.data)[:MAX_SAMPLES]

@@ -69,8 +69,7 @@ def some_signals(measurement: Measurement, max_mics: int) -> tuple[NDArray[np.fl
     """
     settings = measurement.settings
     form = sample_format(settings)
-    words, _ = form.normalised(form.validated(measurement.data))
-    words = words[:_MAX_SAMPLES]
+    words, _ = form.normalised(form.validated(measurement.data)[:_MAX_SAMPLES])
     channels = np.flatnonzero(microphones(settings.array).enabled).astype(np.int32)
     channels = np.ascontiguousarray(channels[:: max(1, -(-len(channels) // max_mics))])
     signals = np.empty((len(channels), len(words)), dtype=np.float32)
@@ -113,5 +112,7 @@ def sound_spectra(signals: NDArray[np.float32], rate_hz: float, *, low_hz: float
     at_hz = np.arange(len(of_noise)) * rate_hz / length
     loudest = float(np.interp(frequency_hz, at_hz, power.mean(axis=(0, 1))).max(initial=0.0))
     noise = np.sqrt(np.maximum(np.interp(frequency_hz, at_hz, of_noise), _FLOOR * loudest + 1e-300))
-    spectra = scipy.fft.rfft(signals, n_fft, axis=1)[:, bins] / noise
-    return SoundSpectra(spectra.astype(np.complex64), noise, frequency_hz, n_samples, n_fft, rate_hz)
+    spectra = np.empty((len(signals), len(bins)), np.complex64)
+    for each, signal in zip(spectra, signals, strict=True):  # One by one, because long records need much memory.
+        each[:] = scipy.fft.rfft(signal, n_fft)[bins] / noise
+    return SoundSpectra(spectra, noise, frequency_hz, n_samples, n_fft, rate_hz)

@@ -23,6 +23,7 @@ __all__ = [
     "power_after",
     "refined",
     "sub_band_hz",
+    "sweep_along",
 ]
 
 _SUB_BAND_HZ: Final = 10e3

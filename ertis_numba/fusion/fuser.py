@@ -78,7 +78,8 @@ class Fused:
     @property
     def unheard(self) -> tuple[str, ...]:
         """Sensors whose calls are not heard at reflectors where they should be."""
-        return tuple(self._names[number] for number in sorted(self._solve().unheard))
+        found = self._solve()
+        return tuple(self._names[number] for number in sorted(found.unheard | found.apart))
 
     @property
     def description_length(self) -> int:

@@ -49,6 +49,8 @@ class PulseReflectors(NamedTuple):
         Sensors whose images have no echo above it.
     unheard : frozenset of int
         Emitters whose calls are not heard.
+    apart : frozenset of int
+        Emitters whose calls only their own sensors hear, as on different SYNC chains.
     pulses : tuple of EmissionCounts
         Evidence of this pulse and of the ones before.
     cost : int
@@ -62,6 +64,7 @@ class PulseReflectors(NamedTuple):
     unheard: frozenset[int]
     pulses: tuple[EmissionCounts, ...]
     cost: int
+    apart: frozenset[int] = frozenset()
 
     @property
     def length(self) -> int:
@@ -201,6 +204,14 @@ class FusionTables:
         """
         floor = {number: self._points[number].floor(each) for number, each in group.items()}
         explained = self._explained(group, attributed, floor, unheard)
+        every = frozenset(group)
+        if attributed.suspects == every and len(every) > 1:
+            apart = self._without(group, every)
+            rival = self._explained(group, apart, floor, every, own=True)
+            if is_better(rival.cost, explained.cost):
+                return PulseReflectors(
+                    apart, rival.reflectors, floor, rival.without_echo, frozenset(), (), rival.cost, every
+                )
         for number in unheard:
             others = unheard - {number}
             emitting = self._without(group, others)
@@ -247,9 +258,14 @@ class FusionTables:
         attributed: Attributed,
         floor: Mapping[int, EchoFloor],
         unheard: frozenset[int],
+        *,
+        own: bool = False,
     ) -> "_Explained":
-        """Return the reflectors that explain the echoes if some emitters are silent."""
-        echoes = [each.without(unheard) for each in self._echoes(group, attributed, floor)]
+        """Return the reflectors that explain the echoes if some emitters are silent, or heard by their own sensors."""
+        echoes = [
+            each.without(unheard - {each.receiver} if own else unheard)
+            for each in self._echoes(group, attributed, floor)
+        ]
         reflectors = Reflectors(echoes, self._sensors, self._receivers, self._emitters, self.grid, attributed.bound)
         late_m = {number: self._heard_m(group, number) for number in group}
         expected = expected_echoes(reflectors, group, floor, self._receivers, late_m, self._deaf, silent=unheard)

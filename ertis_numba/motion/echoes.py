@@ -92,13 +92,13 @@ class EchoExtractor:
     sensors : tuple of MountedSensor
         Sensors of the platform.
     alone : bool, optional
-        True if no sensor emits except those of a group; by default, for a single sensor that is the platform itself,
-        with its origin and heading.
+        True if no sensor emits except those of a group, and none radiates backwards to reflectors. By default, this is
+        assumed of a single piston that is the platform itself, with its origin and heading.
     """
 
     def __init__(self, sensors: tuple[MountedSensor, ...], *, alone: bool | None = None) -> None:
         self._mounted = sensors
-        self._is_alone = _is_platform(sensors) if alone is None else alone
+        self._is_ahead, self._is_alone = alone is True, alone is None and _is_platform(sensors)
         self._sensors = {sensor.name: (number, sensor) for number, sensor in enumerate(sensors)}
         self._extractors: dict[str, tuple[tuple[int, ...], PointExtractor]] = {}
 
@@ -152,7 +152,7 @@ class EchoExtractor:
     ) -> NDArray[np.bool_]:
         """Return True for echoes whose reflectors no other sensor would show if they were behind the array: (echo,)."""
         may_be = np.full(len(local_m), _is_flat(item.settings.array))
-        if self._is_alone and emitter_diameter_m(item.settings):
+        if self._is_ahead or (self._is_alone and emitter_diameter_m(item.settings)):
             return may_be & False
         behind_m = (local_m * [-1.0, 1.0, 1.0]) @ mounted.rotation.T + mounted.translation_m
         for name in others:

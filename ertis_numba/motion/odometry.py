@@ -116,8 +116,9 @@ class Odometry:
         Mountings of the sensors, as for `Fuser`.
     alone : bool, optional
         True if no sensor emits except those with images. Then a flat array hears no calls of others from behind, which
-        would appear as if the platform drove backwards. By default, this is assumed only of a single sensor that is
-        the platform itself: at its origin, and with its heading.
+        would appear as if the platform drove backwards, and nothing behind reflects the call of an omnidirectional
+        emitter. By default, this is assumed only of a single piston that is the platform itself: at its origin, and
+        with its heading.
 
     Raises
     ------

@@ -28,15 +28,22 @@ class OdometryPublisher:
         Called by any thread with a line for each sensor without mounting, and for each pulse that cannot be used.
     is_paused : callable
         Returns True while nothing is to be published; the pose is still computed.
-
+    alone : bool, optional
+        As for `Odometry`.
     """
 
     def __init__(
-        self, odometry: Topic, transforms: Topic, *, on_note: Callable[[str], None], is_paused: Callable[[], bool]
+        self,
+        odometry: Topic,
+        transforms: Topic,
+        *,
+        on_note: Callable[[str], None],
+        is_paused: Callable[[], bool],
+        alone: bool | None = None,
     ) -> None:
         self._odometry, self._transforms = odometry, transforms
         self._note, self._is_paused = on_note, is_paused
-        self._live = LiveOdometry(on_note)
+        self._live = LiveOdometry(on_note, alone=alone)
         self._groups: PulseGroups[_Item] = PulseGroups(on_note)
         self._mountings: dict[str, Mounting] = {}
         self._left_out: set[str] = set()

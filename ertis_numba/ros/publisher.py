@@ -64,6 +64,8 @@ class RosPublisher:
     odometry : bool
         Publish the pose and velocity of the platform on ``NAMESPACE/odom``, and the transform from ``odom`` to
         ``base_link`` on ``/tf``. A thread computes them from the images of all sensors with a known mounting.
+    alone : bool, optional
+        True if no sensor emits except those with images, as for `Odometry`.
     on_note : callable, optional
         Called with a line for each sensor or pulse that fusion or odometry leaves out.
 
@@ -105,6 +107,7 @@ class RosPublisher:
         top: int = 256,
         settings: PublishingSettings = PublishingSettings(),  # noqa: B008  it cannot change
         odometry: bool = False,
+        alone: bool | None = None,
         on_note: Callable[[str], None] | None = None,
     ) -> None:
         for topic in topics:
@@ -128,6 +131,7 @@ class RosPublisher:
                 self._topic("/tf", _TRANSFORMS[1]),
                 on_note=on_note,
                 is_paused=lambda: self._settings.paused,
+                alone=alone,
             )
 
     def __enter__(self) -> Self:
