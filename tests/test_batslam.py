@@ -340,7 +340,20 @@ def test_odometry_of_a_file_and_poses_of_the_recording_are_used(folder, tmp_path
 
 def test_measurements_are_chosen_by_index(folder, tmp_path):
     target = tmp_path / "set.mat"
-    run("drive.h5", "-o", target, "--poses", "true.tum", "--scene", "scene.toml", "-m", "1:2", "--beam-azimuth", "0", folder=folder)
+    run(
+        "drive.h5",
+        "-o",
+        target,
+        "--poses",
+        "true.tum",
+        "--scene",
+        "scene.toml",
+        "-m",
+        "1:2",
+        "--beam-azimuth",
+        "0",
+        folder=folder,
+    )
     found = BatslamReader.of(target)
     assert found["echo_left"].shape[0] == 2
     assert found.number("beam_azimuth") == 0.0
