@@ -208,7 +208,7 @@ class FusionTables:
         if attributed.suspects == every and len(every) > 1:
             apart = self._without(group, every)
             rival = self._explained(group, apart, floor, every, own=True)
-            if is_better(rival.cost, explained.cost):
+            if not rival.cost and is_better(rival.cost, explained.cost):  # With a silent one, some are unexplained.
                 return PulseReflectors(
                     apart, rival.reflectors, floor, rival.without_echo, frozenset(), (), rival.cost, every
                 )
