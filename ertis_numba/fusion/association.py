@@ -211,7 +211,7 @@ class Reflectors:
         heard = EchoPaths(self._sensor_m, self._ahead, with_image, flat, self._direction, self._path_m)
         place_m = np.array([each.place_m for each in found]).reshape(-1, 3)
         sure = confirmation(heard, place_m, self._gains(place_m))
-        # Where many pairs should hear a reflector, the only echo of one comes from elsewhere, except that of a wall.
+        # A single echo of a reflector that many pairs should hear comes from elsewhere, unless it is that of a wall.
         n_echoes_of = np.array([len(each.echo) for each in found], np.int64)
         kept = (n_echoes_of > 1) | sure.is_wall | (sure.n_pairs < _MANY_PAIRS)
         self.located = tuple(found[number] for number in np.flatnonzero(kept))

@@ -81,7 +81,7 @@ class EmissionCounts(NamedTuple):
         expected : ExpectedEchoes
         reflectors : Reflectors
         judged : collection of int
-            Emitters to judge. Without the image of its own sensor, nobody can tell.
+            Emitters to judge: those whose own sensors have an image.
         """
         numbers = np.arange(expected.is_heard.shape[2])
         n_others = np.array([(each.emitter[:, None] != numbers).sum(axis=0) for each in reflectors.located])

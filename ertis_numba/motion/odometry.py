@@ -374,7 +374,7 @@ def _significant(fit: FlowFit | None) -> FlowFit | None:
 def _of_change(before: Floats | None, after: Floats, echoes: GroupEchoes) -> Floats:
     """Return the covariance of a displacement by a change of the velocity at an unknown instant: (3, 3) float64.
 
-    Echoes of a group are compensated by the mean velocity before it, which differs from that at the group.
+    Echoes are compensated with the mean velocity before their group, not with the velocity at the group.
     """
     change = np.zeros(3) if before is None else after - before
     return np.asarray(np.diag((change * np.mean(echoes.arrival_s)) ** 2))
