@@ -74,7 +74,8 @@ def test_healthy_recordings_are_fit_for_use(tmp_path):
         assert checked.is_fit
         assert "fault" not in results(checked).values()
     checked = check_recording(stored(tmp_path / "a.h5", real(), real(), real()))
-    assert checked.verdict == f"{tmp_path / 'a.h5'}: fit for use; not known: clock drift, calibration"
+    start = f"{tmp_path / 'a.h5'}: fit for use as far as this recording shows; not known: clock drift, calibration; "
+    assert checked.verdict.startswith(f"{start}not observable: ")
     assert results(checked) == {
         "microphones": "ok",
         "noise floor": "ok",
@@ -107,11 +108,15 @@ def silence():
 def test_recording_without_a_call_is_examined_without_its_echoes(tmp_path):
     path = passive(tmp_path / "a.h5", silence(), silence(), silence())
     checked = check_recording(path)
-    assert checked.verdict == f"{path}: fit for use; not known: clock drift, call, calibration"
+    assert checked.verdict == (
+        f"{path}: fit for use as far as this recording shows; not known: clock drift, call, calibration; "
+        "not observable: polarity of channels, order of channels, delay of channels, scale of the positions, "
+        "shift of the record (record with calls)"
+    )
     details = {item.check: item.detail for item in checked.sensors[0].items}
     assert details["call"] == details["calibration"] == "no call was emitted"
     assert "dead microphones: no sound exceeds the noise" in details["microphones"]
-    assert "not observable: polarity, order and delay of channels" in details["microphones"]
+    assert "not observable: polarity of channels, order of channels, delay of channels" in details["microphones"]
     assert "including the sound of sources; the dynamic range needs a call" in details["noise floor"]
     assert checked.sensors[0].calibration is checked.sensors[0].call is None
     assert "3 measurements, 3 of them without a call, 3 examined" in run(path).stdout

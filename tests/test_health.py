@@ -6,7 +6,7 @@ import functools
 import numpy as np
 import pytest
 
-from ertis_numba.analysis.health import health, merge
+from ertis_numba.analysis.health import ChannelHealth, Health, NotObservable, health, merge
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Recording
 from ertis_numba.simulation import Electronics, Point, Tone
@@ -183,3 +183,27 @@ def test_health_accepts_many_microphones():
     report = health(rendered(sensor, Point(range_m=0.35, strength_db=-20)))
     assert report.verdict() == "stuck at 0: channels 255-257; dead: channel 500"
     assert len(report.channels) == 512
+
+
+# ---- faults that recordings cannot show -----------------------------------------------------------
+
+
+def unseen(**reasons):
+    """A report without faults whose recording does not show the named ones, such as ``order="3 others fit"``."""
+    lines = tuple(
+        NotObservable(faults=(name,), reason=reason, remedy="record again") for name, reason in reasons.items()
+    )
+    return Health(channels=(ChannelHealth(channel=0, offset=0.0),), not_observable=lines)
+
+
+def test_merged_reports_keep_what_no_measurement_shows_for_whatever_reason():
+    merged = merge([unseen(order="3 others fit", scale="far away"), unseen(order="4 others fit")])
+    assert [str(each) for each in merged.not_observable] == ["order: 3 others fit; record again"]
+    assert merged.verdict() == "no fault found; not observable: order (record again)"
+    assert merge([unseen(order="no echo"), unseen(scale="no echo")]).verdict() == "no fault found"
+
+
+def test_verdict_names_unknown_checks():
+    assert Health(channels=(), unknown=("dead microphones: no sound",)).verdict() == (
+        "no fault found; not known: dead microphones: no sound"
+    )

@@ -140,7 +140,7 @@ def _sensor(checked: "SensorCheck") -> dict[str, Any]:
         "missing": stored.missing,
         "damaged": [item.index for item in stored.damaged],
         "implausible_words": checked.words.reasons,
-        "not_observable": () if health is None else health.not_observable,
+        "not_observable": () if health is None else tuple(map(str, health.not_observable)),
         "checks": [asdict(item) for item in checked.items],
         "faulty_channels": {} if health is None else health.faults,
         "noise_dbfs": None if health is None else health.noise_dbfs,

@@ -313,12 +313,13 @@ def _health(report: "Health") -> dict[str, Any]:
     return {
         "examined": report.measurements,
         "has_call": report.has_call,
+        "verdict": report.verdict(),
         "faults": report.faults,
         "noise_dbfs": _rounded(report.noise_dbfs, 2),
         "dynamic_range_db": _rounded(report.dynamic_range_db, 2),
         "tones_hz": [round(tone_hz, 1) for tone_hz in report.tones_hz],
         "unknown": report.unknown,
-        "not_observable": report.not_observable,
+        "not_observable": tuple(map(str, report.not_observable)),
         "findings": [
             {**asdict(item), "measured": _rounded(item.measured, 3), "unit": item.unit, "remedy": item.remedy}
             for item in report.findings
@@ -355,6 +356,7 @@ def _finding_lines(section: dict[str, Any]) -> Iterator[str]:
         limit = f"limit {item['limit']:.3g} {item['unit']}".strip()
         detail = f"; {item['detail']}" if item["detail"] else ""
         yield f"fault          {channels}: {item['fault']}, {figures} ({limit}){detail}; {item['remedy']}"
+    yield f"verdict        {section['verdict']}"
 
 
 def _microphones(section: dict[str, Any]) -> _tables.TextTable:

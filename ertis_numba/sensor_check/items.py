@@ -100,8 +100,7 @@ def of_microphones(report: Health | None) -> CheckResult:
     if report.unknown:
         detail += f"; not known: {report.unknown[0]}"
     if report.not_observable:
-        faults_left = "; ".join(text.partition(":")[0] for text in report.not_observable)
-        detail += f"; not observable: {faults_left}"
+        detail += f"; not observable: {', '.join(fault for each in report.not_observable for fault in each.faults)}"
     return _result_of(faults, detail)
 
 

@@ -113,7 +113,7 @@ def _of_sensor(path: Path, checked: SensorCheck) -> str:
     if checked.health is not None:
         lines.append(f"<h3>Microphones of sensor {_text(checked.sensor)}</h3>{_microphones(checked)}")
         if checked.health.not_observable:
-            items = "".join(f"<li>{_text(line)}</li>" for line in checked.health.not_observable)
+            items = "".join(f"<li>{_text(str(line))}</li>" for line in checked.health.not_observable)
             lines.append(f"<p>Not observable in this recording:</p><ul>{items}</ul>")
     return "\n".join([*lines, *_pictures(path, checked)])
 

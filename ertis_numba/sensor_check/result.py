@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from ertis_numba.analysis.call_match import CallMatch
-from ertis_numba.analysis.health import Health
+from ertis_numba.analysis.health import Health, NotObservable, not_observable_text
 from ertis_numba.sensor_check.clock import ClockCheck
 from ertis_numba.sensor_check.lost_words import LostWords
 from ertis_numba.sensor_check.residuals import CalibrationResiduals
@@ -150,11 +150,18 @@ class RecordingCheck:
         )
 
     @property
+    def not_observable(self) -> tuple[NotObservable, ...]:
+        """Faults that the recording cannot show for some sensor, so that the sensor may have them."""
+        return tuple(dict.fromkeys(item for each in self.sensors if each.health for item in each.health.not_observable))
+
+    @property
     def verdict(self) -> str:
-        """One line with the path, all faults, and their remedies."""
+        """One line with the path, all faults, and their remedies; without faults, those that are not observable."""
         if self.is_fit:
-            unknown = f"; not known: {', '.join(self.not_known)}" if self.not_known else ""
-            return f"{self.path}: fit for use{unknown}"
+            unknown = f"not known: {', '.join(self.not_known)}" if self.not_known else ""
+            hidden = not_observable_text(self.not_observable)
+            found = "fit for use as far as this recording shows" if hidden else "fit for use"
+            return f"{self.path}: {'; '.join(filter(None, (found, unknown, hidden)))}"
         faults = self.faults
         count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
         remedies = "; ".join(dict.fromkeys(fault.remedy for fault in faults))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.health.arrival import Compressed, strongest
+from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, ORDER, SCALE, NotObservable
 from ertis_numba.analysis.health.other_orders import other_orders, spreads_s
 from ertis_numba.analysis.health.report import Finding
 from ertis_numba.analysis.health.wave_shapes import curved_m, places_of
@@ -21,10 +22,9 @@ from ertis_numba.geometry import Layout, layout_names, load_layout
 
 __all__ = ["ARRAY_FAULTS", "SIZE", "find_other_array", "unobservable"]
 
-_ORDER: Final = "order of channels"
 _HALF: Final = "half late"
 SIZE: Final = "size of the array"
-ARRAY_FAULTS: Final = frozenset({_ORDER, _HALF, SIZE})
+ARRAY_FAULTS: Final = frozenset({ORDER, _HALF, SIZE})
 """Faults that `find_other_array` finds."""
 
 _MIN_SPARE: Final = 2  # Channels beyond the unknowns of a fit.
@@ -79,7 +79,7 @@ def unobservable(
     speed_m_s: float,
     *,
     is_direct: bool = False,
-) -> tuple[str, ...]:
+) -> tuple[NotObservable, ...]:
     """Return the faults of an array that an arrival cannot reveal, with the reasons.
 
     Parameters
@@ -97,21 +97,25 @@ def unobservable(
     if n_mics < 2:
         return ()
     few = f"{n_mics} microphones are too few"
-    found = ["mirrored or turned positions: they fit every echo as well"]
+    found = [_hidden("they fit every echo as well", "mirrored or turned positions")]
     if n_spare < _MIN_SPARE:
-        return f"order, unit and timing of the channels: {few}", *found
+        return _hidden(few, ORDER, SCALE, "delay of channels"), *found
     if n_spare < _MIN_SPARE_OF_SIZE:
-        found.insert(0, f"a wrong unit of the positions: {few}")
+        found.insert(0, _hidden(f"{few}, even for a wrong unit", SCALE))
     if n_spare >= _MIN_SPARE_OF_SIZE and not is_direct:
-        found.insert(0, "scale of the positions, up to a factor of about 2: an echo fits such arrays as well")
+        found.insert(0, _hidden("an echo fits arrays up to about twice as large or small as well", SCALE))
     orders = _by_order(times_s)
     if len(orders):
         own_s, *others_s = spreads_s(np.stack([times_s, *orders]), positions_m, path_m, speed_m_s)
         limit_s = max(_MIN_SPREAD_S, _MIN_EXCLUDED * own_s)
         count = int(np.count_nonzero(np.asarray(others_s) < limit_s))
         if count:
-            found.insert(0, f"order of the channels: {count} other orders fit this arrival about as well")
+            found.insert(0, _hidden(f"{count} other orders fit this arrival about as well", ORDER))
     return tuple(found)
+
+
+def _hidden(reason: str, *faults: str) -> NotObservable:
+    return NotObservable(faults=faults, reason=reason, remedy=KNOWN_PLACE)
 
 
 def _by_order(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -187,7 +191,7 @@ def _other_order(
     if fault == SIZE:
         return _of_size(channels, 1 / (_multiple(layout)[1] or 1.0), layout)
     measured_s, detail = match.delay_s, f"{name} by {1e6 * match.delay_s:.1f} µs"
-    if fault == _ORDER:
+    if fault == ORDER:
         residuals = f"{1e6 * spread_s:.2g} instead of {1e6 * own.spread_s:.2g} µs"
         measured_s = own.spread_s
         detail = f"{name} fits far better than that of the settings, with residuals of {residuals}"
@@ -202,14 +206,14 @@ def _alternatives(
     for name, other_m in _orders(layout):
         match = _best(times_s, other_m[channels], path_m, speed_m_s)
         if match is not None:
-            yield SIZE if name == multiple_of else _ORDER, name, match
+            yield SIZE if name == multiple_of else ORDER, name, match
     count = len(channels)
     if count == len(layout.enabled) and len(orders := _by_order(times_s)):
         positions_m = layout.positions_m[channels]
         best = int(np.argmin(spreads_s(orders, positions_m, path_m, speed_m_s)))
         match = _best(orders[best], positions_m, path_m, speed_m_s)
         if match is not None:
-            yield _ORDER, other_orders(count)[best][0], match
+            yield ORDER, other_orders(count)[best][0], match
     for name, late in _halves(len(layout.enabled)):
         match = _best(times_s, layout.positions_m[channels], path_m, speed_m_s, late=late[channels])
         if match is not None:

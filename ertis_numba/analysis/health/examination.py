@@ -25,11 +25,12 @@ from ertis_numba.analysis.health.limits import (
     MIN_LEVEL_DB,
     MIN_SAMPLES,
 )
+from ertis_numba.analysis.health.not_observable import OF_ARRIVAL, NotObservable
 from ertis_numba.analysis.health.pcm_samples import by_numbers, scaled, sounding_part, swapped_bytes
 from ertis_numba.analysis.health.repeats import duplicates, hum, repeated_blocks, stuck_at_times
 from ertis_numba.analysis.health.report import ChannelHealth, Finding, Health
 from ertis_numba.analysis.health.spectra import by_spectra
-from ertis_numba.analysis.health.wavefront import DESCRIPTIONS, by_wavefront
+from ertis_numba.analysis.health.wavefront import by_wavefront
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.sample_format import sample_format
@@ -77,7 +78,7 @@ def health(measurement: Measurement) -> Health:
 
         with ertis.open_recording("data/synthetic/reflectors.h5") as recording:
             report = ertis.health(recording[0])
-        print(report.verdict() or "no faults")
+        print(report.verdict())
     """
     checks.instance("measurement", measurement, Measurement, "a recording holds")
     settings, has_call = measurement.settings, measurement.stamp.behaviour != "passive"
@@ -120,7 +121,7 @@ def health(measurement: Measurement) -> Health:
     findings += _by_words(words, moved, found, settings, half_scale)
     deaf = {finding.channels[0] for finding in findings if finding.fault in _DEAF}
     heard = [item.channel for item in reported if not set(item.faults) & _DEAF and item.channel not in deaf]
-    not_observable: tuple[str, ...] = () if has_call else (f"{DESCRIPTIONS}: no call was emitted",)
+    not_observable = () if has_call else _hidden("no call was emitted", "record with calls")
     if has_call and heard and not any("resolve" in text for text in unknown):
         shown, not_observable = _of_call(measurement, whole, heard, len(record))
         findings += shown
@@ -150,7 +151,7 @@ def health(measurement: Measurement) -> Health:
 
 def _of_call(
     measurement: Measurement, signals: Callable[[int], NDArray[np.float32]], heard: list[int], n_samples: int
-) -> tuple[list[Finding], tuple[str, ...]]:
+) -> tuple[list[Finding], tuple[NotObservable, ...]]:
     """Return the findings from the wavefront of the call, and the faults that it hides: all, if another was emitted."""
     from ertis_numba.analysis.call_match import call_match  # noqa: PLC0415  it uses parts of this package
 
@@ -158,8 +159,12 @@ def _of_call(
     findings, hidden = by_wavefront(signals, heard, settings, n_samples=min(n_samples, MAX_SAMPLES))
     is_complete = n_samples == settings.recording.n_samples
     if findings and is_complete and call_match(measurement).verdict == "differs":
-        return [], (f"{DESCRIPTIONS}: another call was emitted",)
+        return [], _hidden("another call was emitted", "set the call that was emitted (--settings)")
     return findings, hidden
+
+
+def _hidden(reason: str, remedy: str) -> tuple[NotObservable, ...]:
+    return (NotObservable(faults=OF_ARRIVAL, reason=reason, remedy=remedy),)
 
 
 def _by_words(

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from ertis_numba.analysis.health.kinds import kind_of
+from ertis_numba.analysis.health.not_observable import NotObservable, in_all, not_observable_text
 from ertis_numba.errors import ArgumentError
 
 __all__ = ["ChannelHealth", "Finding", "Health", "merge"]
@@ -112,8 +113,9 @@ class Health:
         Checks that no measurement permitted, with the reason.
     findings : tuple of Finding
         All faults of channels and of the record, with measured values and limits.
-    not_observable : tuple of str
-        Faults that the scene cannot reveal, with the reason, such as the order of channels without a compact arrival.
+    not_observable : tuple of NotObservable
+        Faults that the recording cannot show, with reason and remedy, such as the order of channels without a compact
+        arrival.
     has_call : bool
         True if the sensor emitted its call in any examined measurement.
     """
@@ -125,7 +127,7 @@ class Health:
     tones_hz: tuple[float, ...] = ()
     unknown: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
-    not_observable: tuple[str, ...] = ()
+    not_observable: tuple[NotObservable, ...] = ()
     has_call: bool = True
 
     @property
@@ -141,9 +143,16 @@ class Health:
         return of_channels | {finding.fault: finding.channels for finding in self.record_faults}
 
     def verdict(self) -> str:
-        """Return a one-line summary of all faults with their channels; empty if there are no faults."""
+        """Return a one-line summary of all faults with their channels.
+
+        Without faults, it names what the recording does not show.
+        """
         total = len(self.channels)
-        return "; ".join(f"{name}: {_named(channels, total)}" for name, channels in self.faults.items())
+        found = [f"{name}: {_named(channels, total)}" for name, channels in self.faults.items()]
+        if found:
+            return "; ".join(found)
+        unknown = f"not known: {', '.join(self.unknown)}" if self.unknown else ""
+        return "; ".join(filter(None, ("no fault found", unknown, not_observable_text(self.not_observable))))
 
 
 def merge(reports: Sequence[Health]) -> Health:
@@ -178,9 +187,7 @@ def merge(reports: Sequence[Health]) -> Health:
         tones_hz=tuple(sorted({tone_hz for report in reports for tone_hz in report.tones_hz})),
         unknown=tuple(text for text in reports[0].unknown if all(text in report.unknown for report in reports)),
         findings=_worst([finding for report in reports for finding in report.findings]),
-        not_observable=tuple(
-            text for text in reports[0].not_observable if all(text in report.not_observable for report in reports)
-        ),
+        not_observable=in_all([report.not_observable for report in reports]),
         has_call=any(report.has_call for report in reports),
     )
 

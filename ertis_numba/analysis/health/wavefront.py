@@ -13,13 +13,13 @@ from ertis_numba.analysis.health.coherence import aligned, correlate, half_bands
 from ertis_numba.analysis.health.emission import describe_shift, fit_emission
 from ertis_numba.analysis.health.levels import gain_findings
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_SHIFT_S
+from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, OF_ARRIVAL, SINGLE_ECHO, NotObservable
 from ertis_numba.analysis.health.report import Finding
 from ertis_numba.geometry import Layout, microphones
 from ertis_numba.settings import Settings
 
-__all__ = ["DESCRIPTIONS", "by_array", "by_wavefront"]
+__all__ = ["by_array", "by_wavefront"]
 
-DESCRIPTIONS = "polarity, order and delay of channels, scale of the positions, and a shift of the record"
 _COMPACT_SHARE = 0.75  # Minimum share of the microphones that a wavefront must fit.
 _MIN_PATH_M = 0.2  # Minimum path of an echo; shorter paths are indistinguishable from the direct sound.
 _MIN_DEPTH_M = 0.01  # Minimum spread of distances from the emitter. On a ring, its sound equals an echo from ahead.
@@ -38,6 +38,13 @@ _SAME = 0.95  # Minimum coherence of a channel whose delay or level is compared.
 _INVERTED = 0.97
 _OPPOSITE = 1.08  # Minimum ratio of negative to positive correlation; half a period of an octave band has 0.83.
 _MAX_SUSPECTS = 0.25  # Maximum share of microphones; if more disagree, the arrival is the cause.
+
+
+_INCOHERENT = "the channels contain different sounds at the strongest arrival"
+_OF_CHANNELS = OF_ARRIVAL[:3]
+_SHIFT = NotObservable(
+    faults=OF_ARRIVAL[-1:], reason="the strongest arrival is not the direct sound", remedy=KNOWN_PLACE
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,7 +119,7 @@ def by_wavefront(
     settings: Settings,
     *,
     n_samples: int,
-) -> tuple[list[Finding], tuple[str, ...]]:
+) -> tuple[list[Finding], tuple[NotObservable, ...]]:
     """Return the findings from the strongest arrival, and the faults that it cannot reveal.
 
     Parameters
@@ -129,14 +136,14 @@ def by_wavefront(
     positions_m = layout.positions_m[list(channels)]
     arrival = _arrival(signals, channels, settings, n_samples)
     if arrival is None:
-        return [], (f"{DESCRIPTIONS}: no arrival exceeds the background",)
+        return [], _hidden("no arrival exceeds the background")
     if arrival.other is not None:
         return [arrival.other], ()
     times_s, shifts = arrival.times_s, arrival.shifts
     curvatures = (0.0, 1 / arrival.path_m, 2 / arrival.path_m)
     echo = fit_delays(times_s, positions_m, curvatures, speed_m_s)
     if echo is None:
-        return shifts, (f"{DESCRIPTIONS}: {len(channels)} microphones are too few to fit a wavefront",)
+        return shifts, _hidden(f"{len(channels)} microphones are too few to fit a wavefront", KNOWN_PLACE)
     direct = fit_emitter(times_s, positions_m, speed_m_s)
     from_centre_m = np.linalg.norm(positions_m, axis=1)
     is_direct = (
@@ -145,14 +152,19 @@ def by_wavefront(
         and float(np.ptp(from_centre_m)) > _MIN_DEPTH_M
     )
     if not is_direct and arrival.is_near:
-        return shifts, (f"{DESCRIPTIONS}: the strongest arrival is too near to fit a wavefront",)
+        return shifts, _hidden("the strongest arrival is too near to fit a wavefront")
     fit = direct if is_direct else echo
     if fit.share < _COMPACT_SHARE:
-        return shifts, (f"{DESCRIPTIONS}: no single wavefront fits the strongest arrival",)
+        return shifts, _hidden("no single wavefront fits the strongest arrival")
     hidden = unobservable(times_s, positions_m, arrival.path_m, speed_m_s, is_direct=is_direct)
-    findings = [*shifts, *_of_channels(arrival.found, times_s, fit, channels, layout)]
-    shift = () if is_direct else ("a shift of the record: the strongest arrival is not the direct sound",)
-    return findings, (*shift, *hidden)
+    shown, reason = _of_channels(arrival.found, times_s, fit, channels, layout)
+    unclear = (NotObservable(faults=_OF_CHANNELS, reason=reason, remedy=SINGLE_ECHO),) if reason else ()
+    return [*shifts, *shown], (*unclear, *(() if is_direct else (_SHIFT,)), *hidden)
+
+
+def _hidden(reason: str, remedy: str = SINGLE_ECHO) -> tuple[NotObservable, ...]:
+    """Return the faults that no arrival shows."""
+    return (NotObservable(faults=OF_ARRIVAL, reason=reason, remedy=remedy),)
 
 
 def _shifts(emission_s: float, channels: Sequence[int], speed_m_s: float) -> list[Finding]:
@@ -189,8 +201,8 @@ def _loudest(
 
 def _of_channels(
     found: Compressed, times_s: NDArray[np.float64], fit: Fit, channels: Sequence[int], layout: Layout
-) -> list[Finding]:
-    """Return findings for channels with a delay or gain that differs from the wavefront, or with inverted polarity."""
+) -> tuple[list[Finding], str]:
+    """Return findings for channels with another delay, gain or polarity than the wavefront; else the obstacle."""
     picked = list(channels)
     gain, delay_s = layout.gain[picked], layout.delay_s[picked]
     matrix = np.column_stack([np.ones(len(picked)), layout.positions_m[picked]])
@@ -204,11 +216,11 @@ def _of_channels(
         if near.sum() > matrix.shape[1]:
             fitted_s = fitted_s + matrix @ np.linalg.lstsq(matrix[near], here.lag_s[near], rcond=None)[0]
     if np.median(here.coherence) < _COHERENT:
-        return []
+        return [], _INCOHERENT
     # A channel with a lag beyond the gate is aligned to its own peak.
     own = correlate(aligned(found, times_s + delay_s, _LAG_S) / gain[:, None], reference, found, _LAG_S)
     if np.median(own.coherence) < _COMPACT_COHERENCE:
-        return []
+        return [], _INCOHERENT
     beyond = (here.coherence < _COHERENT) & (own.coherence >= _COHERENT)
     offset_s = np.where(beyond, times_s - fitted_s + own.lag_s, here.lag_s)
     coherence = np.maximum(here.coherence, own.coherence)
@@ -217,7 +229,7 @@ def _of_channels(
     is_same = np.maximum(coherence, here.opposite) >= _SAME
     findings = gain_findings(channels, np.where(is_same, 20 * np.log10(strength), np.nan))
     if fit.spread_s > _MAX_SPREAD_S:
-        return findings
+        return findings, f"the times of the strongest arrival deviate from a wavefront by {1e6 * fit.spread_s:.1f} µs"
     inverted = (here.opposite >= _INVERTED) & (here.negative > _OPPOSITE * np.maximum(here.peak, own.peak))
     inverted &= np.abs(times_s - fitted_s) < _HALF_PERIOD_S  # An echo delayed by half a period is not inverted.
     moved = ~inverted & (coherence >= _SAME) & (here.at_zero < _PRESENT * usual)
@@ -228,7 +240,7 @@ def _of_channels(
     if moved.any():
         moved &= _in_half_bands(found, fitted_s + delay_s, offset_s, fit.inliers)
     if np.mean(inverted | moved) > _MAX_SUSPECTS:
-        return findings
+        return findings, "the strongest arrival differs between too many channels"
     findings += [
         Finding(
             fault="inverted polarity",
@@ -238,7 +250,7 @@ def _of_channels(
         )
         for mic in np.flatnonzero(inverted)
     ]
-    return findings + _moved(np.flatnonzero(moved), offset_s, fitted_s, channels, limit_s)
+    return findings + _moved(np.flatnonzero(moved), offset_s, fitted_s, channels, limit_s), ""
 
 
 def _in_half_bands(
