@@ -207,3 +207,23 @@ def test_verdict_names_unknown_checks():
     assert Health(channels=(), unknown=("dead microphones: no sound",)).verdict() == (
         "no fault found; not known: dead microphones: no sound"
     )
+
+
+@pytest.mark.parametrize(
+    ("cases", "left"),
+    [
+        ([{"a", "b"}, {"b", "c"}], ["order: others fit (1, such as b); move"]),
+        ([{"a", "b"}, {"c"}], []),
+        ([{"a", "b"}, set()], ["order: others fit (2, such as a); move"]),
+        ([{"a"}, {"a"}, None], []),
+    ],
+)
+def test_merged_reports_exclude_the_alternatives_of_each_measurement(cases, left):
+    lines = [
+        ()
+        if each is None
+        else (NotObservable(faults=("order",), reason="others fit", remedy="move", cases=frozenset(each)),)
+        for each in cases
+    ]
+    reports = [Health(channels=(ChannelHealth(channel=0),), not_observable=each) for each in lines]
+    assert [str(each) for each in merge(reports).not_observable] == left

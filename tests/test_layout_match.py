@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.analysis.health import health
+from ertis_numba.analysis.health import health, merge
 from ertis_numba.analysis.layout_match import first_layout_match, layout_match
 from ertis_numba.errors import LayoutMismatchWarning
 from ertis_numba.frames import Measurement, Stamp
@@ -280,3 +280,47 @@ def test_workers_report_another_layout():
     (found,) = predictions.drain()
     assert (found.sensor, found.event) == ("left", "layout_mismatch")
     assert "layout eRTIS_v3D1 fits far better" in found.warning
+
+
+def beside(seed, *, is_swapped):
+    """An array beside a loud emitter, with echoes; two neighbouring channels may be swapped."""
+    rng = np.random.default_rng([7, seed])
+    count = int(rng.integers(4, 33))
+    places_m = (disc, ring, line)[seed % 3](rng.uniform(0.04, 0.25), count)
+    turn = rng.uniform(0, 2 * np.pi)
+    emitter_m = rng.uniform(0.05, 0.15) * np.array([0.1, np.cos(turn), np.sin(turn)])
+    direct_m = np.linalg.norm(places_m - emitter_m, axis=1)
+    ways = [(direct_m, 0.02 / np.maximum(direct_m, 0.02))]
+    for _ in range(rng.integers(0, 5)):
+        source_m = rng.uniform((0.4, -0.8, -0.3), (1.2, 0.8, 0.3))
+        way_m = np.linalg.norm(source_m - emitter_m) + np.linalg.norm(places_m - source_m, axis=1)
+        ways.append((way_m, rng.uniform(0.005, 0.1)))
+    time_s = np.arange(SETTINGS.recording.n_samples)[:, None] / SETTINGS.recording.sample_rate_hz
+    words = rng.normal(0, 10, (len(time_s), count))
+    for way_m, amplitude in ways:
+        words += 25e3 * amplitude * call_at(SETTINGS.call, time_s - way_m / SPEED_M_S)
+    one = int(rng.integers(0, count))
+    other = int(np.argsort(np.linalg.norm(places_m - places_m[one], axis=1))[1])
+    if is_swapped:
+        places_m[[one, other]] = places_m[[other, one]]
+    settings = SETTINGS.replace(array=Array(positions_m=places_m))
+    return Measurement(np.clip(words, -32e3, 32e3).astype(np.int16), settings, Stamp(sensor="sensor", sequence=0))
+
+
+@pytest.mark.parametrize("seed", range(15))
+def test_right_arrays_beside_a_loud_emitter_are_not_accused(seed):
+    assert not health(beside(seed, is_swapped=False)).findings
+
+
+@pytest.mark.parametrize("seed", range(15))
+def test_swapped_channels_beside_a_loud_emitter_are_named_or_not_observable(seed):
+    report = health(beside(seed, is_swapped=True))
+    assert report.findings or any("order of channels" in each.faults for each in report.not_observable)
+
+
+def test_moving_reflector_shows_the_order_of_channels():
+    turns = np.linspace(0, 5, 3)
+    places_m = disc(0.2, 32)
+    reports = [health(heard(places_m, source_m=(0.8, 0.6 * np.cos(turn), 0.5 * np.sin(turn)))) for turn in turns]
+    assert any("order of channels" in each.faults for each in reports[0].not_observable)
+    assert not any("order of channels" in each.faults for each in merge(reports).not_observable)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.health.arrival import Compressed, strongest
-from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, ORDER, SCALE, NotObservable
+from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, ORDER, SCALE, SEVERAL_ECHOES, NotObservable
 from ertis_numba.analysis.health.other_orders import other_orders, spreads_s
 from ertis_numba.analysis.health.report import Finding
 from ertis_numba.analysis.health.wave_shapes import curved_m, places_of
@@ -27,6 +27,7 @@ SIZE: Final = "size of the array"
 ARRAY_FAULTS: Final = frozenset({ORDER, _HALF, SIZE})
 """Faults that `find_other_array` finds."""
 
+_MAX_MICS_OF_ORDERS: Final = 16
 _MIN_SPARE: Final = 2  # Channels beyond the unknowns of a fit.
 _CHANCE: Final = 1e-3  # Probability that one of the alternatives fits the errors of few channels.
 _MIN_SPARE_OF_SIZE: Final = 4  # The curvature is one more unknown, whose error must be known, too.
@@ -108,14 +109,21 @@ def unobservable(
     if len(orders):
         own_s, *others_s = spreads_s(np.stack([times_s, *orders]), positions_m, path_m, speed_m_s)
         limit_s = max(_MIN_SPREAD_S, _MIN_EXCLUDED * own_s)
-        count = int(np.count_nonzero(np.asarray(others_s) < limit_s))
-        if count:
-            found.insert(0, _hidden(f"{count} other orders fit this arrival about as well", ORDER))
+        names = [name for name, _ in other_orders(n_mics)]
+        cases = frozenset(name for name, other_s in zip(names, others_s, strict=True) if other_s < limit_s)
+        if cases:
+            reason = "other orders fit this arrival about as well"
+            found.insert(0, NotObservable(faults=(ORDER,), reason=reason, remedy=SEVERAL_ECHOES, cases=cases))
     return tuple(found)
 
 
 def _hidden(reason: str, *faults: str) -> NotObservable:
     return NotObservable(faults=faults, reason=reason, remedy=KNOWN_PLACE)
+
+
+def _named_orders(count: int) -> list[str]:
+    """Return the names of other orders that may fit; none for many channels, as single ones reveal their order."""
+    return [name for name, _ in other_orders(count)] if count <= _MAX_MICS_OF_ORDERS else []
 
 
 def _by_order(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -180,7 +188,7 @@ def _other_order(
     better, count = [], len(channels)
     for fault, name, match in found:
         # Residuals of n spare channels are r times as small in one of r^n cases. Channels left out are more cases.
-        cases = (len(found) + len(other_orders(count))) * math.comb(count, count - _kept(count, 1)) / _CHANCE
+        cases = (len(found) + len(_named_orders(count))) * math.comb(count, count - _kept(count, 1)) / _CHANCE
         limit_s = own.spread_s / max(_MIN_RATIO, cases ** (1 / max(1, match.n_spare)))
         if match.slowness <= _MAX_SLOWNESS and max(match.spread_s, _MIN_RESIDUAL_S) < limit_s:
             better.append((match.spread_s, fault, name, match, limit_s))
@@ -208,12 +216,13 @@ def _alternatives(
         if match is not None:
             yield SIZE if name == multiple_of else ORDER, name, match
     count = len(channels)
-    if count == len(layout.enabled) and len(orders := _by_order(times_s)):
+    if count == len(layout.enabled) and (names := _named_orders(count)):
+        orders = _by_order(times_s)
         positions_m = layout.positions_m[channels]
         best = int(np.argmin(spreads_s(orders, positions_m, path_m, speed_m_s)))
         match = _best(orders[best], positions_m, path_m, speed_m_s)
         if match is not None:
-            yield ORDER, other_orders(count)[best][0], match
+            yield ORDER, names[best], match
     for name, late in _halves(len(layout.enabled)):
         match = _best(times_s, layout.positions_m[channels], path_m, speed_m_s, late=late[channels])
         if match is not None:

@@ -9,6 +9,7 @@ __all__ = [
     "OF_ARRIVAL",
     "ORDER",
     "SCALE",
+    "SEVERAL_ECHOES",
     "SINGLE_ECHO",
     "NotObservable",
     "in_all",
@@ -20,6 +21,7 @@ SCALE: Final = "scale of the positions"
 OF_ARRIVAL: Final = ("polarity of channels", ORDER, "delay of channels", SCALE, "shift of the record")
 """Faults that only a clear arrival of the call reveals."""
 SINGLE_ECHO: Final = "record the single sharp echo of a small reflector 0.5 to 2 m in front of the array"
+SEVERAL_ECHOES: Final = "record a small reflector that moves around the array, or compare the settings with the wiring"
 KNOWN_PLACE: Final = (
     "compare the range and direction of a small reflector at a known place beside the axis with 'ertis peaks'"
 )
@@ -37,26 +39,36 @@ class NotObservable:
         Clause with the reason.
     remedy : str
         Imperative clause; it names a way to observe the faults.
+    cases : frozenset of str
+        Names of the alternatives that are possible; empty (the default) if they are not counted.
     """
 
     faults: tuple[str, ...]
     reason: str
     remedy: str
+    cases: frozenset[str] = frozenset()
 
     def __str__(self) -> str:
-        return f"{', '.join(self.faults)}: {self.reason}; {self.remedy}"
+        count = f" ({len(self.cases)}, such as {min(self.cases)})" if self.cases else ""
+        return f"{', '.join(self.faults)}: {self.reason}{count}; {self.remedy}"
 
 
 def in_all(reports: Sequence[Sequence[NotObservable]]) -> tuple[NotObservable, ...]:
-    """Return the faults that none of several recordings can show, with the first reason for each."""
-    names = [{fault for item in items for fault in item.faults} for items in reports]
-    common = set.intersection(*names) if names else set()
-    kept = (
-        replace(item, faults=tuple(fault for fault in item.faults if fault in common))
-        for items in reports[:1]
-        for item in items
-    )
-    return tuple(item for item in kept if item.faults)
+    """Return the faults that several recordings together cannot show, with the first reason for each.
+
+    Recordings of different echoes exclude different alternatives.
+    """
+    if not reports:
+        return ()
+    left: dict[str, frozenset[str] | None] = {}
+    for fault in (fault for item in reports[0] for fault in item.faults):
+        found = [next((item for item in items if fault in item.faults), None) for items in reports]
+        cases = [item.cases for item in found if item is not None and item.cases]
+        common = frozenset.intersection(*cases) if cases else None
+        if None not in found and common != frozenset():
+            left[fault] = common
+    kept = (replace(item, faults=tuple(fault for fault in item.faults if fault in left)) for item in reports[0])
+    return tuple(replace(item, cases=left[item.faults[0]] or item.cases) for item in kept if item.faults)
 
 
 def not_observable_text(items: Iterable[NotObservable]) -> str:

@@ -1,4 +1,4 @@
-"""Orders of few channels that fit the strongest arrival as well as, or better than, the order of the layout."""
+"""Orders of channels that fit the strongest arrival as well as, or better than, the order of the layout."""
 
 import functools
 import itertools
@@ -11,7 +11,7 @@ from ertis_numba.analysis.health.wave_shapes import curved_m, places_of
 
 __all__ = ["other_orders", "spreads_s"]
 
-_MAX_MICS: Final = 16  # In larger arrays, single channels reveal another order.
+_MAX_MICS: Final = 64  # In larger arrays, only neighbouring channels are swapped.
 _ITERATIONS: Final = 4
 _CURVATURES: Final = (1.0, 2.0)
 
@@ -19,13 +19,13 @@ _CURVATURES: Final = (1.0, 2.0)
 @functools.lru_cache(maxsize=16)
 def other_orders(count: int) -> tuple[tuple[str, tuple[int, ...]], ...]:
     """Return names and orders of channels that wiring and file formats confuse: rotated, reversed, and two swapped."""
-    if not 2 < count <= _MAX_MICS:
+    if count < 3:
         return ()
     straight = tuple(range(count))
     found = {straight[::-1]: "the reversed order"}
     for place in range(1, count):
         found.setdefault(straight[place:] + straight[:place], f"the order rotated by {place}")
-    for one, two in itertools.combinations(straight, 2):
+    for one, two in itertools.combinations(straight, 2) if count <= _MAX_MICS else itertools.pairwise(straight):
         swapped = [*straight]
         swapped[one], swapped[two] = two, one
         found.setdefault(tuple(swapped), f"the order with channels {one} and {two} swapped")
