@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.fusion.confirmation import EchoPaths, confirmation
+from ertis_numba.fusion.confirmation import confirmation
+from ertis_numba.fusion.echo_paths import EchoPaths
 
 YAW_RAD = np.radians([0.0, 90.0, 180.0, -90.0])
 AHEAD = np.stack([np.cos(YAW_RAD), np.sin(YAW_RAD), np.zeros(4)], axis=1)
 HEIGHT_M = 0.4
 SENSOR_M = 0.2 * AHEAD + [0.0, 0.0, HEIGHT_M]
-GAIN = np.ones((1, 4, 4))
 POST_M = np.array([1.2, 0.9, HEIGHT_M])
 WALL_M = np.array([-1.6, 0.0, HEIGHT_M])  # A wall across x.
 
@@ -46,11 +46,24 @@ def echoes_over_wall(place_m):
             yield echo(receiver, mirrored(place_m), path_m)
 
 
-def found(echoes, *places_m, flat=range(4), with_image=range(4)):
+def heard_by(echoes, flat=range(4), with_image=range(4)):
+    """Echoes of equal power, whose paths are known for all emitters."""
     receiver, direction, path_m = zip(*echoes, strict=True)
     rows = {number: np.flatnonzero(np.array(receiver) == number) for number in with_image}
-    heard = EchoPaths(SENSOR_M, AHEAD, rows, flat, np.array(direction), np.repeat(np.array(path_m)[:, None], 4, axis=1))
-    return confirmation(heard, np.array(places_m), np.repeat(GAIN, len(places_m), axis=0)).is_confirmed.tolist()
+    paths_m = np.repeat(np.array(path_m)[:, None], 4, axis=1)
+    return EchoPaths(SENSOR_M, AHEAD, rows, flat, np.array(direction), paths_m, np.ones(len(receiver)))
+
+
+def confirmed(heard, places_m, members=None, strength=100.0):
+    """Confirmation of places that all echoes locate, or some."""
+    n_places, n_sensors = len(places_m), len(heard.sensor_m)
+    located = [np.arange(len(heard.path_m))] * n_places if members is None else members
+    gain = np.ones((n_places, n_sensors, n_sensors))
+    return confirmation(heard, np.array(places_m), gain, np.full(n_places, strength), located).is_confirmed.tolist()
+
+
+def found(echoes, *places_m, flat=range(4), with_image=range(4)):
+    return confirmed(heard_by([*echoes], flat, with_image), places_m)
 
 
 def test_reflectors_are_confirmed_by_echoes_of_all_sensors():
@@ -100,18 +113,26 @@ def test_a_second_place_beside_a_reflector_does_not_make_it_a_mirror_image():
 
 def test_a_lone_echo_confirms_nothing_on_a_platform_with_several_sensors():
     own = echo(0, np.array([2.0, 0.0, HEIGHT_M]), 3.6)
+    place_m = np.array([[2.0, 0.0, HEIGHT_M]])
     rows = {0: np.array([0])}
-    heard = EchoPaths(SENSOR_M, AHEAD, rows, range(4), own[1][None], np.array([[3.6, np.nan, np.nan, np.nan]]))
+    paths_m = np.array([[3.6, np.nan, np.nan, np.nan]])
+    heard = EchoPaths(SENSOR_M, AHEAD, rows, range(4), own[1][None], paths_m, np.ones(1))
     gain = np.zeros((1, 4, 4))
     gain[0, 0, 0] = 1.0
-    assert confirmation(heard, np.array([[2.0, 0.0, HEIGHT_M]]), gain).is_confirmed.tolist() == [False]
-    alone = EchoPaths(SENSOR_M[:1], AHEAD[:1], rows, range(1), own[1][None], np.array([[3.6]]))
-    assert confirmation(alone, np.array([[2.0, 0.0, HEIGHT_M]]), gain[:, :1, :1]).is_confirmed.tolist() == [True]
+    assert confirmation(heard, place_m, gain, np.ones(1), [rows[0]]).is_confirmed.tolist() == [False]
+    alone = EchoPaths(SENSOR_M[:1], AHEAD[:1], rows, range(1), own[1][None], np.array([[3.6]]), np.ones(1))
+    assert confirmed(alone, place_m) == [True]
+
+
+def test_a_point_that_a_single_echo_locates_is_not_confirmed():
+    heard = heard_by(echoes_of_post(POST_M))
+    assert confirmed(heard, [POST_M], [np.arange(2)]) == [True]
+    assert confirmed(heard, [POST_M], [np.arange(1)]) == [False]
 
 
 def test_no_reflectors_are_no_error():
-    none = EchoPaths(SENSOR_M, AHEAD, {}, range(4), np.empty((0, 3)), np.empty((0, 4)))
-    assert confirmation(none, np.empty((0, 3)), np.empty((0, 4, 4))).is_confirmed.tolist() == []
+    none = EchoPaths(SENSOR_M, AHEAD, {}, range(4), np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
+    assert confirmation(none, np.empty((0, 3)), np.empty((0, 4, 4)), np.empty(0), []).is_confirmed.tolist() == []
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -137,12 +158,8 @@ def test_reflectors_behind_a_nearer_one_in_all_directions_are_not_confirmed():
     behind_m = POST_M + 0.8 * (POST_M - SENSOR_M[0])
     echoes = [each for each in echoes_of_post(behind_m) if each[0] == 0]
     near = [each for each in echoes_of_post(POST_M) if each[0] in (0, 1)]
-    receiver, direction, path_m = zip(*sorted([*near, *echoes], key=lambda each: each[0]), strict=True)
-    rows = {number: np.flatnonzero(np.array(receiver) == number) for number in (0, 1)}
-    paths_m = np.repeat(np.array(path_m)[:, None], 4, axis=1)
-    heard = EchoPaths(SENSOR_M, AHEAD, rows, range(4), np.array(direction), paths_m)
-    sure = confirmation(heard, np.array([POST_M, behind_m]), np.repeat(GAIN, 2, axis=0))
-    assert sure.is_confirmed.tolist() == [True, False]
+    heard = heard_by(sorted([*near, *echoes], key=lambda each: each[0]), with_image=(0, 1))
+    assert confirmed(heard, [POST_M, behind_m]) == [True, False]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
-from ertis_numba.fusion.confirmation import EchoPaths, confirmation
+from ertis_numba.fusion.confirmation import confirmation
+from ertis_numba.fusion.echo_paths import EchoPaths
 from ertis_numba.fusion.overlaps import Overlap, PredictedEchoes, overlap
 from ertis_numba.fusion.pairs import AUDIBLE
 from ertis_numba.fusion.polar_grid import PolarGrid
@@ -208,9 +209,10 @@ class Reflectors:
         self._add_lone(candidates, found)
         flat = {number for number, receiver in receivers.items() if receiver.is_flat}
         with_image = {each.receiver: self._rows[each.receiver] for each in echoes}
-        heard = EchoPaths(self._sensor_m, self._ahead, with_image, flat, self._direction, self._path_m)
+        heard = EchoPaths(self._sensor_m, self._ahead, with_image, flat, self._direction, self._path_m, self._power)
         place_m = np.array([each.place_m for each in found]).reshape(-1, 3)
-        sure = confirmation(heard, place_m, self._gains(place_m))
+        reflectivity = np.array([each.reflectivity for each in found])
+        sure = confirmation(heard, place_m, self._gains(place_m), reflectivity, [each.echo for each in found])
         # A single echo of a reflector that many pairs should hear comes from elsewhere, unless it is that of a wall.
         n_echoes_of = np.array([len(each.echo) for each in found], np.int64)
         kept = (n_echoes_of > 1) | sure.is_wall | (sure.n_pairs < _MANY_PAIRS)

@@ -5,23 +5,25 @@ Its echoes at the other pairs do not fit the same place, unlike those of a refle
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Confirmation", "EchoPaths", "confirmation"]
+from ertis_numba.fusion.echo_paths import NEAREST_M, EchoPaths
+from ertis_numba.fusion.reflections import Walls, reflected_twice
+
+__all__ = ["Confirmation", "confirmation"]
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+Numbers = NDArray[np.int64]
 
 _PATH_M: Final = 0.012  # Largest difference between the path of an echo and the predicted one.
 _ANGLE_RAD: Final = math.radians(4.0)  # Largest difference of directions ahead of a receiver.
-_LEAST_COSINE: Final = 0.25  # Directions are less certain beside a flat array, by up to this factor.
 _COUNTS_FROM: Final = 0.1  # Gain relative to the highest of all pairs, from which a pair should hear a reflector.
 _FACING: Final = 0.3  # Cosine from which a sensor may show the surface of a wall.
-_NEAREST_M: Final = 1e-9
 _PART: Final = 0.6
 _MIN_APART_M: Final = 0.06  # Least difference of ranges of a ghost and a nearer reflector.
 _PLANE_M: Final = 0.04  # Largest distance of a located wall from the plane that a ghost implies, …
@@ -29,30 +31,6 @@ _FOOT_M: Final = 0.4  # … and from the foot of the perpendicular to it.
 _SAME_RAD: Final = math.radians(2.5)  # Difference of directions below which a nearer reflector may send the sound.
 _N_LEAST: Final = 2  # Echoes without which an own echo may be that of another sensor's call.
 _N_SURE: Final = 4  # Echoes that two reflections hardly cause at the right paths.
-
-
-class EchoPaths(NamedTuple):
-    """Echoes of all receivers, and the geometry of their sensors.
-
-    Attributes
-    ----------
-    sensor_m, ahead : (sensor, axis) float64
-        Positions and axes of the sensors.
-    rows : mapping of int to (echo,) int64
-        Echoes of each receiver that has an image.
-    flat : collection of int
-        Receivers that do not distinguish front and back.
-    direction : (echo, axis) float64
-    path_m : (echo, emitter) float64
-        Path of each echo if the emitter's call caused it; NaN for emitters that the receiver does not hear.
-    """
-
-    sensor_m: Floats
-    ahead: Floats
-    rows: Mapping[int, NDArray[np.int64]]
-    flat: Collection[int]
-    direction: Floats
-    path_m: Floats
 
 
 class Confirmation(NamedTuple):
@@ -73,11 +51,14 @@ class Confirmation(NamedTuple):
     n_pairs: NDArray[np.int64]
 
 
-def confirmation(heard: EchoPaths, place_m: Floats, gain: Floats) -> Confirmation:
+def confirmation(
+    heard: EchoPaths, place_m: Floats, gain: Floats, reflectivity: Floats, members: Sequence[Numbers]
+) -> Confirmation:
     """Return the confirmation of reflectors, each as a point or as a mirror-like wall.
 
     At least 60 % of the pairs that should hear a reflector must do so, rounded down, and four if there are as many. A
-    platform with several sensors needs two. A reflector that a nearer one and a wall explain is not confirmed.
+    platform with several sensors needs two echoes that no two nearer surfaces explain. Those of a point must have been
+    joined. A reflector that a nearer one and a wall explain is not confirmed.
 
     Parameters
     ----------
@@ -85,37 +66,72 @@ def confirmation(heard: EchoPaths, place_m: Floats, gain: Floats) -> Confirmatio
     place_m : (reflector, axis) float64
     gain : (reflector, receiver, emitter) float64
         Power of its echoes relative to that ahead.
+    reflectivity : (reflector,) float64
+        Power of an echo at 1 m.
+    members : sequence of (member,) int64
+        Echoes that locate each reflector.
     """
+    n_sensors = len(heard.sensor_m)
     counts = gain > _COUNTS_FROM * gain.max(axis=(1, 2), initial=0.0)[:, None, None]
     away_m = place_m[:, None] - heard.sensor_m
-    normal = away_m / np.maximum(np.linalg.norm(away_m, axis=2, keepdims=True), _NEAREST_M)
+    range_m = np.linalg.norm(away_m, axis=2)
+    normal = away_m / np.maximum(range_m, NEAREST_M)[..., None]
     depth = np.einsum("psi,si->ps", normal, heard.ahead)
     is_known = np.isfinite(heard.path_m)
-    for receiver in range(len(heard.sensor_m)):
+    for receiver in range(n_sensors):
         rows = heard.rows.get(receiver)
         is_heard = is_known if rows is None or not len(rows) else is_known[rows]  # Silence shows no emitters.
         counts[:, receiver] &= is_heard.any(axis=0) & (rows is not None)
         if receiver not in heard.flat:
             counts[:, receiver] &= depth[:, receiver, None] > 0
     n_pairs = counts.sum(axis=(1, 2))
-    least = min(_N_LEAST, len(heard.sensor_m))
+    least = min(_N_LEAST, n_sensors)
     needed = np.maximum(np.minimum(n_pairs, _N_SURE), _PART * n_pairs // 1).clip(least)
     is_behind = _behind(heard, away_m)
-    n_confirming = _n_confirming(heard, np.repeat(place_m[:, None], len(heard.sensor_m), axis=1), counts)
-    as_point = _is_enough(n_confirming, needed, is_behind)
-    as_wall = np.zeros_like(as_point)
+    point = _confirming(heard, np.repeat(place_m[:, None], n_sensors, axis=1), range_m, counts)
+    as_point = _is_enough(heard, point, needed, is_behind)
+    as_wall, wall = np.zeros_like(as_point), np.zeros_like(point)
+    toward = np.zeros_like(place_m)
+    near_m = np.ones(len(place_m))
     for facing in heard.rows:  # The normal of a wall is the direction from the sensor that faces it.
-        toward = normal[:, facing]
-        away_m = np.einsum("psi,pi->ps", place_m[:, None] - heard.sensor_m, toward)
-        image_m = heard.sensor_m + 2 * away_m[..., None] * toward[:, None]
-        n_confirming = _n_confirming(heard, image_m, counts, is_image=True)
-        as_wall |= (depth[:, facing] > _FACING) & _is_enough(n_confirming, needed, is_behind)
-    is_ghost = _mirrored(place_m, heard.sensor_m, np.argmax(depth, axis=1))
-    return Confirmation(np.asarray((as_point | as_wall) & ~is_ghost), as_wall, n_pairs)
+        across = normal[:, facing]
+        beyond_m = np.einsum("psi,pi->ps", away_m, across)
+        image_m = heard.sensor_m + 2 * beyond_m[..., None] * across[:, None]
+        found = _confirming(heard, image_m, np.zeros_like(range_m), counts)
+        found &= (depth[:, facing] > _FACING)[:, None, None]
+        as_wall |= _is_enough(heard, found, needed, is_behind)
+        is_better = _n_echoes(found) > _n_echoes(wall)
+        wall[is_better], toward[is_better], near_m[is_better] = (
+            found[is_better],
+            across[is_better],
+            range_m[is_better, facing],
+        )
+    number = np.flatnonzero(_n_echoes(wall) >= np.maximum(least, _n_echoes(point)))
+    walls = Walls(
+        number,
+        toward[number],
+        np.einsum("wi,wi->w", toward[number], place_m[number]),
+        4 * reflectivity[number] / near_m[number] ** 2,
+    )
+    twice = reflected_twice(heard, place_m, walls, reflectivity, members)
+    is_free = ~twice.is_explained[..., None]
+    is_joined = np.array([len(each) >= least for each in members], np.bool_)
+    as_point &= is_joined & (_n_echoes(point & is_free) >= least)
+    is_sure = as_point | (as_wall & (_n_echoes(wall & is_free) >= least))
+    is_ghost = twice.is_ghost | _mirrored(place_m, heard.sensor_m, np.argmax(depth, axis=1))
+    return Confirmation(np.asarray(is_sure & ~is_ghost), as_wall, n_pairs)
 
 
-def _is_enough(n_confirming: NDArray[np.int64], needed: Floats, is_behind: Flags) -> Flags:
+def _n_echoes(confirming: Flags) -> Numbers:
+    """Return the number of echoes that confirm reflectors, each once: (reflector,) int64."""
+    return np.asarray(confirming.any(axis=2).sum(axis=1))
+
+
+def _is_enough(heard: EchoPaths, confirming: Flags, needed: Floats, is_behind: Flags) -> Flags:
     """Return True for reflectors that enough pairs hear, not only from the directions of nearer ones."""
+    n_confirming = np.zeros(is_behind.shape, np.int64)
+    for receiver, rows in heard.rows.items():
+        n_confirming[:, receiver] = confirming[:, rows].any(axis=1).sum(axis=1)
     return np.asarray((n_confirming.sum(axis=1) >= needed) & ((n_confirming > 0) & ~is_behind).any(axis=1))
 
 
@@ -125,7 +141,7 @@ def _behind(heard: EchoPaths, away_m: Floats) -> Flags:
     Sound that a wall and the nearer one reflect arrives from there as well.
     """
     range_m = np.linalg.norm(away_m, axis=2)
-    toward = away_m / np.maximum(range_m, _NEAREST_M)[..., None]
+    toward = away_m / np.maximum(range_m, NEAREST_M)[..., None]
     depth = np.einsum("psi,si->ps", toward, heard.ahead)
     flat = np.isin(np.arange(len(heard.sensor_m)), [*heard.flat])
     toward = toward - 2 * np.where(flat, np.minimum(depth, 0.0), 0.0)[..., None] * heard.ahead
@@ -154,14 +170,14 @@ def _mirrored(place_m: Floats, sensor_m: Floats, facing: NDArray[np.int64]) -> F
     heard_m = sensor_m[facing]
     from_m = np.linalg.norm(place_m[:, None] - heard_m, axis=2)  # (nearer reflector, ghost)
     range_m = np.linalg.norm(place_m - heard_m, axis=1)
-    toward = (place_m - heard_m) / np.maximum(range_m, _NEAREST_M)[:, None]
+    toward = (place_m - heard_m) / np.maximum(range_m, NEAREST_M)[:, None]
     is_nearer = from_m + _MIN_APART_M < range_m
     images_m = np.broadcast_to(range_m, from_m.shape), 2 * range_m - from_m, 2 * range_m - range_m[:, None]
     for image_range_m in images_m:
         image_m = heard_m + image_range_m[..., None] * toward
         offset_m = image_m - place_m[:, None]
         between_m = np.linalg.norm(offset_m, axis=2)
-        normal = offset_m / np.maximum(between_m, _NEAREST_M)[..., None]
+        normal = offset_m / np.maximum(between_m, NEAREST_M)[..., None]
         depth_m = np.einsum("pgi,pgi->pg", (image_m + place_m[:, None]) / 2 - heard_m, normal)
         foot_m = heard_m + depth_m[..., None] * normal
         nearer, ghost = np.nonzero(is_nearer & (between_m > 2 * _MIN_APART_M) & (depth_m > _MIN_APART_M))
@@ -174,28 +190,20 @@ def _mirrored(place_m: Floats, sensor_m: Floats, facing: NDArray[np.int64]) -> F
     return found
 
 
-def _n_confirming(heard: EchoPaths, origin_m: Floats, counts: Flags, *, is_image: bool = False) -> NDArray[np.int64]:
-    """Return the number of pairs that hear each reflector, by receiver: (reflector, receiver) int64.
+def _confirming(heard: EchoPaths, origin_m: Floats, sent_m: Floats, counts: Flags) -> Flags:
+    """Return the echoes that confirm reflectors, and their emitters: (reflector, echo, emitter) bool.
 
     Parameters
     ----------
     heard : EchoPaths
     origin_m : (reflector, emitter, axis) float64
         Place from which the sound of each emitter arrives: that of the reflector, or the mirror image of the emitter.
+    sent_m : (reflector, emitter) float64
+        Path of the sound to this place.
     counts : (reflector, receiver, emitter) bool
-    is_image : bool
-        Sound comes from mirror images, so that its path begins there.
     """
-    found = np.zeros((len(origin_m), len(heard.sensor_m)), np.int64)
-    for receiver, rows in heard.rows.items():
-        to_m = origin_m - heard.sensor_m[receiver]
-        apart_m = np.maximum(np.linalg.norm(to_m, axis=2), _NEAREST_M)
-        path_m = apart_m if is_image else apart_m + np.linalg.norm(origin_m - heard.sensor_m, axis=2)
-        toward = to_m / apart_m[..., None]
-        depth = toward @ heard.ahead[receiver]
-        seen = toward - 2 * np.minimum(depth, 0.0)[..., None] * heard.ahead[receiver]  # A flat array hears no side.
-        turn = np.sqrt(np.maximum(0.0, 2 - 2 * seen @ heard.direction[rows].T))
-        near = turn < (_ANGLE_RAD / np.maximum(np.abs(depth), _LEAST_COSINE))[..., None]
-        near &= np.abs(heard.path_m[rows].T[None] - path_m[..., None]) < _PATH_M  # False for NaN.
-        found[:, receiver] = (near.any(axis=2) & counts[:, receiver]).sum(axis=1)
+    found = np.zeros((len(origin_m), *heard.path_m.shape), np.bool_)
+    for receiver in heard.rows:
+        reflector, emitter, echo = heard.arriving(receiver, origin_m, sent_m, _PATH_M, _ANGLE_RAD)
+        found[reflector, echo, emitter] = counts[reflector, receiver, emitter]
     return found
