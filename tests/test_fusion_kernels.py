@@ -17,7 +17,7 @@ N_DIRECTIONS, N_STEPS, N_RANGES, N_ENTRIES = 12, 31, 90, 200
 N_PIXELS = N_DIRECTIONS * N_STEPS
 CELLS = 1, 20, 25
 N_CELLS = 500
-DOUBLE = "compare_echoes", "locate_reflector"
+DOUBLE = "compare_echoes", "locate_reflector", "match_echoes"
 NAMES = [field.name for field in dataclasses.fields(FusionKernels)]
 
 
@@ -31,6 +31,30 @@ def echoes(draws, count=5):
     axes = np.stack([np.linalg.qr(np.column_stack([each, np.eye(3)[:, :2]]))[0].T for each in to_m])
     deviation = np.tile([0.002, 0.005], (count, 1))
     return emitter_m, receiver_m, path_m, axes, deviation
+
+
+def matches(draws, n_places=6, n_echoes=40, n_sensors=3):
+    """Places, and the echoes of those places with small errors: some are loud, from behind, or of unknown paths."""
+    apart_m = draws.uniform(0.5, 3.0, (n_places, n_sensors))
+    seen = draws.normal(size=(n_places, n_sensors, 3))
+    seen /= np.linalg.norm(seen, axis=2, keepdims=True)
+    places = kernels.PredictedPlaces(
+        apart_m=apart_m,
+        seen=seen,
+        depth=draws.uniform(-0.3, 1.0, (n_places, n_sensors)),
+        slope_m=draws.normal(scale=1e-3, size=(n_places, n_sensors)),
+        across_m2=draws.uniform(1e-5, 1e-4, n_places),
+        expected=draws.uniform(0.5, 1.5, (n_places, n_sensors, n_sensors)),
+        extra_m2=np.full((n_places, n_sensors), 1e-5),
+        is_flat=np.array([True, False, True]),
+    )
+    place, receiver = draws.integers(0, n_places, n_echoes), draws.integers(0, n_sensors, n_echoes)
+    path_m = apart_m[place] + apart_m[place, receiver, None] + draws.normal(scale=4e-3, size=(n_echoes, n_sensors))
+    path_m[draws.random(path_m.shape) < 0.2] = np.nan
+    direction = seen[place, receiver] + draws.normal(scale=5e-3, size=(n_echoes, 3))
+    variances = np.full((2, n_echoes), [[2e-5], [8e-6]])
+    power = draws.choice([0.2, 1.0, 5.0], n_echoes)
+    return places, kernels.HeardEchoes(receiver, direction, path_m, *variances, power), np.arange(3, n_echoes)
 
 
 @functools.cache
@@ -95,6 +119,7 @@ def arguments(seed=3):
         "limit_cells": ((*seen, half), [(N_CELLS,)]),
         "confirm_cells": ((*seen, real(N_CELLS), half, 1), [(3, N_CELLS)]),
         "compare_echoes": ((*seen, real(N_CELLS), half, half), [(2,)]),
+        "match_echoes": ((*matches(draws), 16.0, 4.0), [(3, 60), (60,)]),
         "locate_reflector": ((*echoes(draws), 0.01, 0.05, 2.0, 8), [(3,), (3, 3)]),
     }
 
@@ -103,6 +128,8 @@ def outputs(kernel_set, name, change=lambda values: values, dtype=np.float32):
     """Results of a kernel, with changed arguments of type float32."""
     given, shapes = arguments()[name]
     found = [np.ones(shape, np.float64 if name in DOUBLE else dtype) for shape in shapes]
+    if name == "match_echoes":
+        found[0] = found[0].astype(np.int64)
     getattr(kernel_set, name)(*map(change, given), *found)
     return found
 
@@ -118,6 +145,21 @@ def test_fusion_kernels_equal_numpy_in_double_precision(name):
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
         assert np.ptp(other) > 0
+
+
+@pytest.mark.parametrize("load", [kernels.load_fusion, lambda: _numpy_fusion.KERNELS], ids=["compiled", "numpy"])
+def test_match_echoes_counts_matches_beyond_its_space(load):
+    given, _ = arguments()["match_echoes"]
+    found, distance = np.zeros((3, 200), np.int64), np.zeros(200)
+    n_all = load().match_echoes(*given, found, distance)
+    few, near = np.zeros((3, 5), np.int64), np.zeros(5)
+    assert load().match_echoes(*given, few, near) == n_all > 20
+    np.testing.assert_array_equal(few, found[:, :5])
+    place, echo, emitter = found[:, :n_all]
+    assert len({*zip(place, echo, emitter, strict=True)}) == n_all
+    assert echo.min() >= 3
+    assert np.isfinite(given[1].path_m[echo, emitter]).all()
+    assert distance[:n_all].max() < 16.0
 
 
 @pytest.mark.parametrize("name", ["share_echoes", "add_echoes"])

@@ -76,7 +76,7 @@ def noise_of(image: Energyscape) -> float:
     if processing.is_adaptive or processing.is_cleaned or not image.amplitude.size:
         return 0.0
     some = image.amplitude[:: max(1, image.amplitude.size // _SAMPLE)]
-    level = float(np.quantile(_medians_of_blocks(some, min(_BLOCKS, some.shape[1])), _QUIET))
+    level = float(_quiet(_medians_of_blocks(some, min(_BLOCKS, some.shape[1]))[None])[0])
     return level / math.sqrt(math.log(2))
 
 
@@ -186,7 +186,11 @@ def _medians_by_range(amplitude: NDArray[np.float32], n_around: int) -> NDArray[
 
 def _quiet(medians: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the lower tercile of the medians of blocks: (row,) float64, from (row, block)."""
-    return np.asarray(np.quantile(medians.astype(np.float64), _QUIET, axis=1))
+    place = _QUIET * (medians.shape[1] - 1)
+    before = int(place)
+    ordered = np.sort(medians.astype(np.float64), axis=1)  # `numpy.quantile` takes ten times as long.
+    low, high = ordered[:, before], ordered[:, min(before + 1, medians.shape[1] - 1)]
+    return np.asarray(low + (place - before) * (high - low))
 
 
 def _exponent(processing: Processing) -> float:

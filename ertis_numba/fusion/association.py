@@ -11,10 +11,10 @@ from ertis_numba import kernels
 from ertis_numba.fusion.confirmation import confirmation
 from ertis_numba.fusion.echo_paths import EchoPaths
 from ertis_numba.fusion.overlaps import Overlap, PredictedEchoes, overlap
-from ertis_numba.fusion.pairs import AUDIBLE
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
+from ertis_numba.fusion.sight import Sight, Viewers, mirrored
 
 __all__ = ["LocatedReflector", "Reflectors", "SensorEchoes", "tangents"]
 
@@ -32,8 +32,6 @@ _MIN_SCORE: Final = 0.75  # Sum of the fits of two echoes halfway to the limit o
 _N_CONFIRMING: Final = 3  # Echoes required for a reflector that the attribution of the images does not support.
 _USUAL_DB: Final = 6.0  # Reflectivity relative to the usual one, above which a reflector is a surprise, …
 _SURPRISE_DB: Final = 10.0  # … which counts as much as a missing echo for each so many decibels.
-_BESIDE_DB: Final = (-13.0, -16.0)  # Power of a call to the side from which its path is uncertain, and most uncertain.
-_BESIDE_M: Final = 6e-3
 _DISTURBED: Final = 0.25  # Power of overlapping echoes relative to one that they explain.
 _MANY_PAIRS: Final = (
     9  # Pairs that should hear a reflector, from which a lone echo is none: more than those of one call or two.
@@ -45,6 +43,7 @@ _ROUNDS: Final = 8
 _RESOLUTION_M: Final = 0.014  # Difference of paths that separates two echoes.
 _OUTLIER: Final = 2.0  # Residual with half weight, in standard deviations.
 _NEAREST_M: Final = 0.05
+_FEW: Final = 1024  # Fits that there is space for at first.
 _VERTICAL: Final = 1e-6
 # Between emitter and receiver, the path does not depend on the position, which may then be anywhere within 10 m.
 _LEAST_INFORMATION_1_M2: Final = 1 / 10.0**2
@@ -161,6 +160,8 @@ class Reflectors:
     covariance_m2 : (reflector, axis, axis) float64
     reflectivity : (reflector,) float64
         Power of its echo at 1 m.
+    radiated : (reflector, emitter) float64
+        Power of each call towards it, relative to ahead.
     confirmed : (reflector,) bool
         Reflectors that echoes at enough pairs confirm, as in `ertis_numba.fusion.confirmation`.
     is_unexplained : (echo,) bool
@@ -178,10 +179,10 @@ class Reflectors:
         bound: NDArray[np.float32],
     ) -> None:
         self._grid, self._bound = grid, bound
-        self._locate = kernels.load_fusion().locate_reflector
-        self._sensor_m = np.array([each.translation_m for each in sensors])
-        self._ahead = np.array([each.rotation[:, 0] for each in sensors])
-        self._sensors, self._receivers, self._emitters = sensors, receivers, emitters
+        self._kernels = kernels.load_fusion()
+        flat = {number for number, receiver in receivers.items() if receiver.is_flat}
+        self._viewers = Viewers(sensors, emitters, flat)
+        self._sensor_m, self._ahead = self._viewers.sensor_m, self._viewers.ahead
         self._receiver = np.concatenate([np.full(len(each.power), each.receiver) for each in echoes])
         n_echoes, n_sensors = len(self._receiver), len(sensors)
         self._path_m, self._share = np.full((n_echoes, n_sensors), np.nan), np.zeros((n_echoes, n_sensors))
@@ -190,11 +191,15 @@ class Reflectors:
             rows = slice(begin, begin := begin + len(each.power))
             self._path_m[rows, each.emitters], self._share[rows, each.emitters] = each.path_m, each.share
         self._direction = np.concatenate([each.direction for each in echoes]).reshape(-1, 3)
+        self._axes = np.stack([self._direction, *tangents(self._direction)], axis=1)
         self._path_sd_m = np.concatenate([each.path_sd_m for each in echoes])
         self._angle_sd_rad = np.concatenate([each.angle_sd_rad for each in echoes])
-        self._gate_m = np.hypot(self._path_sd_m, _MOUNTED_M)
         self._gate_rad = np.hypot(self._angle_sd_rad, _MOUNTED_RAD)
         self._power = np.concatenate([each.power for each in echoes])
+        gate_m2 = self._path_sd_m**2 + _MOUNTED_M**2
+        self._heard = kernels.HeardEchoes(
+            self._receiver, self._direction, self._path_m, self._gate_rad**2, gate_m2, self._power
+        )
         self._rows = {number: np.flatnonzero(self._receiver == number) for number in receivers}
         self._is_free = ~np.concatenate([each.is_faint for each in echoes])
         # Only foreign echoes show the calls of sensors without an image.
@@ -203,21 +208,20 @@ class Reflectors:
         self._pulse_m, self._beam = np.ones((2, n_sensors))
         for number, receiver in receivers.items():
             self._pulse_m[number], self._beam[number] = receiver.pulse_m, receiver.width
-        self._is_flat = np.array([number in receivers and receivers[number].is_flat for number in range(n_sensors)])
         candidates = self._candidates()
         found = self._refined(self._confirmed(candidates))
         self._add_lone(candidates, found)
-        flat = {number for number, receiver in receivers.items() if receiver.is_flat}
         with_image = {each.receiver: self._rows[each.receiver] for each in echoes}
         heard = EchoPaths(self._sensor_m, self._ahead, with_image, flat, self._direction, self._path_m, self._power)
         place_m = np.array([each.place_m for each in found]).reshape(-1, 3)
+        sight = self._viewers.sight(place_m)
         reflectivity = np.array([each.reflectivity for each in found])
-        sure = confirmation(heard, place_m, self._gains(place_m), reflectivity, [each.echo for each in found])
+        sure = confirmation(heard, place_m, sight.gain, reflectivity, [each.echo for each in found])
         # A single echo of a reflector that many pairs should hear comes from elsewhere, unless it is that of a wall.
         n_echoes_of = np.array([len(each.echo) for each in found], np.int64)
         kept = (n_echoes_of > 1) | sure.is_wall | (sure.n_pairs < _MANY_PAIRS)
         self.located = tuple(found[number] for number in np.flatnonzero(kept))
-        self.position_m, self.confirmed = place_m[kept], sure.is_confirmed[kept]
+        self.position_m, self.radiated, self.confirmed = place_m[kept], sight.radiated[kept], sure.is_confirmed[kept]
         self.covariance_m2 = np.array([each.covariance_m2 for each in self.located]).reshape(-1, 3, 3)
         self.reflectivity = np.array([each.reflectivity for each in self.located])
         self.is_unexplained, self.n_unexplained = self._is_free, int(self._is_free.sum())
@@ -227,17 +231,16 @@ class Reflectors:
         echo, emitter = np.nonzero(np.isfinite(self._path_m) & self._is_free[:, None])
         direction = self._direction[echo]
         if self._is_incomplete:
-            mirrored = np.flatnonzero(self._is_flat[self._receiver[echo]])
-            ahead = self._ahead[self._receiver[echo[mirrored]]]
-            behind = direction[mirrored] - 2 * np.einsum("ci,ci->c", direction[mirrored], ahead)[:, None] * ahead
-            echo, emitter = np.append(echo, echo[mirrored]), np.append(emitter, emitter[mirrored])
+            twice = np.flatnonzero(self._viewers.is_flat[self._receiver[echo]])
+            behind = mirrored(direction[twice], self._ahead[self._receiver[echo[twice]]])
+            echo, emitter = np.append(echo, echo[twice]), np.append(emitter, emitter[twice])
             direction = np.concatenate([direction, behind])
         receiver, path_m = self._receiver[echo], self._path_m[echo, emitter]
         offset_m = self._sensor_m[emitter] - self._sensor_m[receiver]
         beyond = path_m**2 - np.einsum("ci,ci->c", offset_m, offset_m)
         to_m = beyond / np.maximum(2 * (path_m - np.einsum("ci,ci->c", direction, offset_m)), 1e-6)
         place_m = self._sensor_m[receiver] + to_m[:, None] * direction
-        gain = self._gains(place_m)[np.arange(len(place_m)), receiver, emitter]
+        gain = self._viewers.sight(place_m).gain[np.arange(len(place_m)), receiver, emitter]
         reflectivity = np.divide(self._power[echo], gain, out=np.full(len(gain), np.inf), where=gain > 0)
         is_possible = (gain > 0) & (reflectivity <= self._limit(place_m))
         kept = np.flatnonzero((beyond > 0) & (to_m > _NEAREST_M) & is_possible)
@@ -251,69 +254,34 @@ class Reflectors:
         cell = self._grid.cell_of(place_m)
         return np.where(cell >= 0, _EXCESS * self._bound[cell.clip(0)].astype(np.float64), 0.0)
 
-    def _gains(self, place_m: Floats) -> Floats:
-        """Return the power of echoes relative to 1 m ahead, 0 where they are inaudible: (place, receiver, emitter)."""
-        away_m = place_m[:, None] - self._sensor_m
-        apart_m = np.linalg.norm(away_m, axis=2)
-        cosine = np.einsum("psi,si->ps", away_m, self._ahead) / np.maximum(apart_m, _NEAREST_M)
-        gain = np.zeros((len(place_m), len(self._sensors), len(self._sensors)))
-        for model in {*self._emitters.values()}:
-            receivers = [number for number, each in self._emitters.items() if each is model]
-            radiated = model.powers(cosine)
-            spreading = model.spreading(apart_m[:, None], apart_m[:, receivers, None])
-            gain[:, receivers] = np.where(radiated > AUDIBLE, radiated, 0)[:, None] * spreading
-        return gain
-
-    def _fits(self, candidates: _Candidates, extra_m: float) -> tuple[Numbers, Numbers, Numbers, Floats]:
+    def _fits(self, candidates: _Candidates, sight: Sight, extra_m: float) -> tuple[Numbers, Numbers, Numbers, Floats]:
         """Return the free echoes that candidates predict: candidate, echo, emitter and squared distance."""
-        away_m = candidates.place_m[:, None] - self._sensor_m
-        apart_m = np.maximum(np.linalg.norm(away_m, axis=2), _NEAREST_M)
-        toward = away_m / apart_m[..., None]
-        depth = np.einsum("csi,si->cs", toward, self._ahead)
-        seen = toward - 2 * np.minimum(depth, 0.0)[..., None] * self._ahead
-        across_rad2 = np.einsum("ci,ci->c", candidates.across, candidates.across)[:, None] / apart_m**2
-        which, echo, turned = self._in_direction(seen, depth, across_rad2)
-        receiver = self._receiver[echo]
-        slope = np.einsum("csi,ci->cs", toward, candidates.across)
-        slope = slope[which] + slope[which, receiver][:, None]
-        late_m = self._path_m[echo] - apart_m[which] - apart_m[which, receiver][:, None]
-        beside_m2 = self._beside_m(candidates.place_m)[which] ** 2
-        distance = turned[:, None] + late_m**2 / (slope**2 + self._gate_m[echo, None] ** 2 + extra_m**2 + beside_m2)
+        across = candidates.across
         # Echoes of a reflector show about the same reflectivity; those from behind may be weaker.
-        expected = candidates.reflectivity[which, None] * self._gains(candidates.place_m)[which, receiver]
-        power, is_behind = self._power[echo, None], depth[which, receiver][:, None] < 0
-        is_alike = (power < _ALIKE * expected) & (is_behind | (_ALIKE * power > expected))
-        entry, emitter = np.nonzero((distance < _GATE) & is_alike)  # False for NaN, where there is no path.
-        return which[entry], echo[entry], emitter, distance[entry, emitter]
-
-    def _in_direction(self, seen: Floats, depth: Floats, across_rad2: Floats) -> tuple[Numbers, Numbers, Floats]:
-        """Return the free echoes in the directions of candidates: candidate, echo and squared distance."""
-        found = []
-        for number, rows in self._rows.items():
-            free = rows[self._is_free[rows]]
-            # For small angles, the chord equals the angle.
-            angle_rad2 = np.maximum(0.0, 2 - 2 * seen[:, number] @ self._direction[free].T)
-            angle_rad2 /= across_rad2[:, number, None] + self._gate_rad[free] ** 2
-            is_near = angle_rad2 < _GATE
-            if not self._receivers[number].is_flat:
-                is_near &= depth[:, number, None] >= 0
-            which, echo = np.nonzero(is_near)
-            found.append((which, free[echo], angle_rad2[which, echo]))
-        which, echo, distance = (np.concatenate(each) for each in zip(*found, strict=True))
-        return which, echo, distance
-
-    def _beside_m(self, place_m: Floats) -> Floats:
-        """Return errors of paths from emitters beside their beams: (place, emitter) float64.
-
-        There, what a piston radiates depends on the frequency, and echoes come early or late.
-        """
-        power_db = 10 * np.log10(np.maximum(self.radiated(place_m), _TINY))
-        high_db, low_db = _BESIDE_DB
-        return np.asarray(_BESIDE_M * np.clip((power_db - high_db) / (low_db - high_db), 0.0, 1.0))
+        places = kernels.PredictedPlaces(
+            sight.apart_m,
+            sight.seen,
+            sight.depth,
+            np.einsum("psi,pi->ps", sight.toward, across),
+            np.einsum("pi,pi->p", across, across),
+            candidates.reflectivity[:, None, None] * sight.gain,
+            sight.beside_m**2 + extra_m**2,
+            self._viewers.is_flat,
+        )
+        chosen = np.flatnonzero(self._is_free)
+        count = _FEW
+        while True:
+            found, distance = np.empty((3, count), np.int64), np.empty(count)
+            n_found = self._kernels.match_echoes(places, self._heard, chosen, _GATE, _ALIKE, found, distance)
+            if n_found <= count:
+                which, echo, emitter = found[:, :n_found]
+                return which, echo, emitter, distance[:n_found]
+            count = n_found
 
     def _confirmed(self, candidates: _Candidates) -> list[LocatedReflector]:
         """Return the reflectors that several echoes confirm, and mark these echoes as explained."""
-        which, echo, emitter, distance = self._fits(candidates, 0.0)
+        sight = self._viewers.sight(candidates.place_m)
+        which, echo, emitter, distance = self._fits(candidates, sight, 0.0)
         n_candidates, n_echoes = len(candidates.echo), len(self._receiver)
         # An echo confirms a candidate once, by the emitter that fits best.
         fit = (1 - distance / _GATE) * (1 + self._share[echo, emitter]) / 2
@@ -331,7 +299,7 @@ class Reflectors:
                 break
             taken = np.empty(0, np.int64)
             if self._is_free[candidates.echo[best]]:
-                reflector, taken = self._accepted(candidates, best)
+                reflector, taken = self._accepted(candidates.only(best), sight.only(best))
                 if reflector is not None:
                     found.append(reflector)
             score[best] = -1.0
@@ -355,34 +323,34 @@ class Reflectors:
         excess_db = 10 * np.log10(np.maximum(candidates.reflectivity / max(usual, _TINY), 1.0))
         return np.asarray(np.maximum(0.0, excess_db - _USUAL_DB) / _SURPRISE_DB)
 
-    def _accepted(self, candidates: _Candidates, best: int) -> tuple[LocatedReflector | None, Numbers]:
+    def _accepted(self, here: _Candidates, sight: Sight) -> tuple[LocatedReflector | None, Numbers]:
         """Return the reflector at a candidate if enough echoes confirm it, and all echoes that it explains."""
-        here = candidates.only(best)
         extra_m, covariance_m2, echo = 0.0, np.empty((3, 3)), np.empty(0, np.int64)
         for _ in range(2):
-            _, echo, emitters, distance = self._fits(here, extra_m)
+            _, echo, emitters, distance = self._fits(here, sight, extra_m)
             members, emitter = self._members(echo, emitters, distance)
             is_own = self._receiver[members] == emitter
             is_likely = np.any(is_own & (self._share[members, emitter] > _MIN_SHARE))
             if len(members) < (2 if is_likely else _N_CONFIRMING):
                 return None, np.empty(0, np.int64)
             place_m, covariance_m2 = self._located(members, emitter, here.place_m[0])
-            gain = self._gains(place_m[None])[0, self._receiver[members], emitter]
+            sight = self._viewers.sight(place_m[None])
+            gain = sight.gain[0, self._receiver[members], emitter]
             reflectivity = np.median(self._power[members] / np.maximum(gain, _TINY))
             here = here._replace(place_m=place_m[None], across=np.zeros((1, 3)), reflectivity=np.array([reflectivity]))
             extra_m = _REFINED_M
-        reflectivity = self._reflectivity(place_m, members, emitter)
+        reflectivity = self._reflectivity(sight, members, emitter)
         return LocatedReflector(place_m, covariance_m2, reflectivity, members, emitter), np.unique(echo)
 
-    def _reflectivity(self, place_m: Floats, members: Numbers, emitter: Numbers) -> float:
+    def _reflectivity(self, sight: Sight, members: Numbers, emitter: Numbers) -> float:
         """Return the power at 1 m of a reflector that fits its echoes best, by least squares.
 
         Calls of emitters at about the same distance arrive together, with unknown phases.
         """
-        apart_m = np.linalg.norm(place_m - self._sensor_m, axis=1)
+        apart_m = sight.apart_m[0]
         together = np.exp(-(((apart_m - apart_m[emitter][:, None]) / _RESOLUTION_M) ** 2))
         together[~np.isfinite(self._path_m[members])] = 0.0
-        gain = np.sum(self._gains(place_m[None])[0, self._receiver[members]] * together, axis=1)
+        gain = np.sum(sight.gain[0, self._receiver[members]] * together, axis=1)
         return float(self._power[members] @ gain / max(gain @ gain, _TINY**2))
 
     def _members(self, echo: Numbers, emitter: Numbers, distance: Floats) -> tuple[Numbers, Numbers]:
@@ -405,7 +373,8 @@ class Reflectors:
         echo = np.concatenate([each.echo for each in found])
         emitter = np.concatenate([each.emitter for each in found])
         number = np.repeat(np.arange(len(found)), [len(each.echo) for each in found])
-        overlap = self._overlap(found, echo, number, emitter)
+        sight = self._viewers.sight(np.array([each.place_m for each in found]))
+        overlap, beside_m = self._overlap(found, echo, number, emitter), sight.beside_m
         ends = np.cumsum([len(each.echo) for each in found])
         rows = [slice(end - len(each.echo), end) for end, each in zip(ends, found, strict=True)]
         is_kept = np.zeros(len(found), np.bool_)
@@ -414,7 +383,7 @@ class Reflectors:
         refined = []
         for place in np.flatnonzero(is_kept).tolist():
             each, disturbed = found[place], overlap.only(rows[place], is_kept)
-            place_m, covariance_m2 = self._located(each.echo, each.emitter, each.place_m, disturbed)
+            place_m, covariance_m2 = self._located(each.echo, each.emitter, each.place_m, disturbed, beside_m[place])
             refined.append(each._replace(place_m=place_m, covariance_m2=covariance_m2))
         return refined
 
@@ -441,12 +410,6 @@ class Reflectors:
             pulse_m=self._pulse_m,
             beam=self._beam,
         )
-
-    def radiated(self, place_m: Floats) -> Floats:
-        """Return the power of each call towards places, relative to ahead: (place, emitter) float64."""
-        away_m = place_m[:, None] - self._sensor_m
-        cosine = np.einsum("psi,si->ps", away_m, self._ahead) / np.maximum(np.linalg.norm(away_m, axis=2), _NEAREST_M)
-        return next(iter(self._emitters.values())).powers(cosine)
 
     def needs(self, number: int, silent: "Reflectors") -> bool:
         """Return True if an emitter is needed to explain strong echoes of its own sensor.
@@ -476,15 +439,11 @@ class Reflectors:
 
     def _predicted(self, found: Sequence[LocatedReflector]) -> PredictedEchoes:
         """Return the echoes that reflectors cause."""
-        place_m = np.array([each.place_m for each in found]).reshape(-1, 3)
-        away_m = place_m[:, None] - self._sensor_m
-        apart_m = np.maximum(np.linalg.norm(away_m, axis=2), _NEAREST_M)
-        toward = away_m / apart_m[..., None]
-        behind = np.where(self._is_flat, np.minimum(np.einsum("rsi,si->rs", toward, self._ahead), 0.0), 0.0)
+        sight = self._viewers.sight(np.array([each.place_m for each in found]).reshape(-1, 3))
         return PredictedEchoes(
-            apart_m[:, :, None] + apart_m[:, None],
-            self._gains(place_m) * np.array([each.reflectivity for each in found])[:, None, None],
-            toward - 2 * behind[..., None] * self._ahead,
+            sight.apart_m[:, :, None] + sight.apart_m[:, None],
+            sight.gain * np.array([each.reflectivity for each in found])[:, None, None],
+            sight.seen,
         )
 
     def _add_lone(self, candidates: _Candidates, found: list[LocatedReflector]) -> None:
@@ -500,7 +459,7 @@ class Reflectors:
             sensor_echo = np.array([echo])
             _, covariance_m2 = self._located(sensor_echo, sensor, place_m)
             if _is_apart(place_m, covariance_m2, found):
-                reflectivity = self._reflectivity(place_m, sensor_echo, sensor)
+                reflectivity = self._reflectivity(self._viewers.sight(place_m[None]), sensor_echo, sensor)
                 found.append(LocatedReflector(place_m, covariance_m2, reflectivity, sensor_echo, sensor))
 
     def _is_ambiguous(self, candidates: _Candidates) -> NDArray[np.bool_]:
@@ -521,26 +480,29 @@ class Reflectors:
         return found
 
     def _located(
-        self, members: Numbers, emitter: Numbers, place_m: Floats, disturbed: Overlap | None = None
+        self,
+        members: Numbers,
+        emitter: Numbers,
+        place_m: Floats,
+        disturbed: Overlap | None = None,
+        beside_m: Floats | None = None,
     ) -> tuple[Floats, Floats]:
         """Return the position of a reflector and its covariance: (axis,) and (axis, axis) float64."""
         path_sd_m, angle_sd_rad = self._path_sd_m[members], self._angle_sd_rad[members]
-        if disturbed is not None:
-            beside_m = self._beside_m(place_m[None])[0, emitter]
-            path_sd_m = np.sqrt(path_sd_m**2 + disturbed.path_m2 + beside_m**2)
+        if disturbed is not None and beside_m is not None:
+            path_sd_m = np.sqrt(path_sd_m**2 + disturbed.path_m2 + beside_m[emitter] ** 2)
             angle_sd_rad = np.sqrt(angle_sd_rad**2 + disturbed.angle_rad2)
-        receiver, direction = self._receiver[members], self._direction[members]
+        receiver, axes = self._receiver[members], self._axes[members]
         ahead = self._ahead[receiver]
-        depth = np.einsum("ei,ei->e", place_m - self._sensor_m[receiver], ahead)
-        back = 2 * np.where(depth < 0, np.einsum("ei,ei->e", direction, ahead), 0.0)
-        direction = direction - back[:, None] * ahead
+        is_behind = np.einsum("ei,ei->e", place_m - self._sensor_m[receiver], ahead) < 0
+        axes = np.where(is_behind[:, None, None], mirrored(axes, ahead[:, None]), axes)
         position_m, covariance_m2 = place_m.copy(), np.empty((3, 3))
         is_alone = len(members) == 1
-        self._locate(
+        self._kernels.locate_reflector(
             self._sensor_m[emitter],
             self._sensor_m[receiver],
             self._path_m[members, emitter],
-            np.array([[each, *tangents(each)] for each in direction]),
+            axes,
             np.stack([path_sd_m, angle_sd_rad], axis=1),
             _LEAST_INFORMATION_1_M2,
             _NEAREST_M,
@@ -565,11 +527,13 @@ def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[LocatedReflect
     return bool(distance.min() >= _GATE)
 
 
-def tangents(direction: Floats) -> Floats:
-    """Return two unit vectors across a direction: (2, axis) float64."""
-    x, y, z = direction.tolist()
-    level = math.hypot(x, y)
+def tangents(direction: Floats) -> tuple[Floats, Floats]:
+    """Return unit vectors to the left and upwards, across directions: two of (..., axis) float64."""
+    x, y, z = np.moveaxis(direction, -1, 0)
+    level = np.hypot(x, y)
     # Straight up, any horizontal direction will do.
-    left = np.array([-y / level, x / level, 0.0]) if level > _VERTICAL else np.array([0.0, 1.0, 0.0])
-    up = np.array([-z * left[1], z * left[0], x * left[1] - y * left[0]])
-    return np.stack([left, up])
+    is_level = level > _VERTICAL
+    safe = np.where(is_level, level, 1.0)
+    left_x, left_y = np.where(is_level, -y / safe, 0.0), np.where(is_level, x / safe, 1.0)
+    left = np.stack([left_x, left_y, np.zeros_like(x)], axis=-1)
+    return left, np.stack([-z * left_y, z * left_x, x * left_y - y * left_x], axis=-1)

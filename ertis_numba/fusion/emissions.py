@@ -86,7 +86,7 @@ class EmissionCounts(NamedTuple):
         numbers = np.arange(expected.is_heard.shape[2])
         n_others = np.array([(each.emitter[:, None] != numbers).sum(axis=0) for each in reflectors.located])
         counts = (n_others.reshape(-1, len(numbers)) >= _N_OTHERS) & np.isin(numbers, [*judged])
-        counts &= reflectors.radiated(reflectors.position_m) > _RADIATED
+        counts &= reflectors.radiated > _RADIATED
         return cls(*((each & counts[:, None]).sum(axis=(0, 1)) for each in expected))
 
 
@@ -198,24 +198,24 @@ def _disturbance(
 ) -> Floats:
     """Return the power of other echoes at expected ones of a receiver, relative to these: (reflector, emitter)."""
     emitters, delay_m = [*late_m], np.array([*late_m.values()])
-    path_m, power = predicted.path_m[:, [number]][..., emitters], predicted.power[:, [number]][..., emitters]
-    here = PredictedEchoes(path_m, np.where(np.isin(emitters, [*silent]), 0.0, power), predicted.direction[:, [number]])
-    found = np.zeros((len(path_m), len(emitters)))
-    for column in range(len(emitters)):
-        is_other = np.ones((len(path_m), *power[:, 0].shape), np.bool_)
-        is_other[np.arange(len(path_m)), np.arange(len(path_m)), column] = False
-        found[:, column] = overlap(
-            here,
-            np.zeros(len(path_m), np.int64),
-            path_m[:, 0, column, None] + delay_m[column] - delay_m,
-            here.direction[:, 0],
-            np.maximum(power[:, 0, column], _TINY),
-            is_other,
-            ahead=receiver.mounting.rotation[None, :, 0],
-            pulse_m=np.array([receiver.pulse_m]),
-            beam=np.array([receiver.width]),
-        ).power.sum(axis=1)
-    return found
+    path_m, power = predicted.path_m[:, number, emitters], predicted.power[:, number, emitters]
+    heard = np.where(np.isin(emitters, [*silent]), 0.0, power)
+    here = PredictedEchoes(path_m[:, None], heard[:, None], predicted.direction[:, [number]])
+    of, emitter = (each.ravel() for each in np.indices(path_m.shape))
+    is_other = np.ones((len(of), *path_m.shape), np.bool_)
+    is_other[np.arange(len(of)), of, emitter] = False
+    disturbed = overlap(
+        here,
+        np.zeros(len(of), np.int64),
+        path_m.reshape(-1, 1) + delay_m[emitter, None] - delay_m,
+        here.direction[of, 0],
+        np.maximum(power.ravel(), _TINY),
+        is_other,
+        ahead=receiver.mounting.rotation[None, :, 0],
+        pulse_m=np.array([receiver.pulse_m]),
+        beam=np.array([receiver.width]),
+    )
+    return np.asarray(disturbed.power.sum(axis=1).reshape(path_m.shape))
 
 
 def _highest(rows: NDArray[np.float32], columns: NDArray[np.int64], margin: int) -> Floats:

@@ -5,7 +5,7 @@
 """
 
 from ertis_numba.kernels._compile_notice import on_compiling
-from ertis_numba.kernels._contract.fusion import FusionKernels
+from ertis_numba.kernels._contract.fusion import FusionKernels, HeardEchoes, PredictedPlaces
 from ertis_numba.kernels._contract.mapping import MappingKernels
 from ertis_numba.kernels._contract.steering import SteeringKernels
 from ertis_numba.kernels._device_protocols import Lane, Memory
@@ -15,10 +15,12 @@ from ertis_numba.kernels._kernel_set import KernelSet
 __all__ = [
     "DEVICES",
     "FusionKernels",
+    "HeardEchoes",
     "KernelSet",
     "Lane",
     "MappingKernels",
     "Memory",
+    "PredictedPlaces",
     "SteeringKernels",
     "load",
     "load_fusion",

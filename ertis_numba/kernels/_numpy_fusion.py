@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.kernels._contract.arrays import Real, Turns
-from ertis_numba.kernels._contract.fusion import Doubles, FusionKernels, Truths
+from ertis_numba.kernels._contract.fusion import Doubles, FusionKernels, HeardEchoes, Places, PredictedPlaces, Truths
 
 __all__ = ["KERNELS"]
 
@@ -190,6 +190,33 @@ def locate_reflector(
         position_m += out @ weighted.T @ residual
 
 
+def match_echoes(
+    places: PredictedPlaces,
+    echoes: HeardEchoes,
+    chosen: Places,
+    gate: float,
+    alike: float,
+    found: Places,
+    out: Doubles,
+) -> int:
+    """Find the echoes that reflectors at given places explain, by path, direction and power."""
+    here, to_m = echoes.receiver[chosen], places.apart_m[:, echoes.receiver[chosen]]
+    turned = np.maximum(0.0, 2 - 2 * np.einsum("pei,ei->pe", places.seen[:, here], echoes.direction[chosen]))
+    turned /= places.across_m2[:, None] / to_m**2 + echoes.gate_rad2[chosen]
+    place, one = np.nonzero((turned < gate) & (places.is_flat[here] | (places.depth[:, here] >= 0)))
+    turned, echo, here = turned[place, one, None], chosen[one], here[one]
+    late_m = echoes.path_m[echo] - places.apart_m[place] - places.apart_m[place, here, None]
+    along_m = places.slope_m[place] + places.slope_m[place, here, None]
+    distance = turned + late_m**2 / (along_m**2 + echoes.gate_m2[echo, None] + places.extra_m2[place])
+    expected, power = places.expected[place, here], echoes.power[echo, None]
+    is_alike = (power < alike * expected) & ((places.depth[place, here, None] < 0) | (alike * power > expected))
+    entry, emitter = np.nonzero((distance < gate) & is_alike)
+    n_kept = min(len(entry), len(out))
+    found[:, :n_kept] = np.stack([place[entry], echo[entry], emitter])[:, :n_kept]
+    out[:n_kept] = distance[entry, emitter][:n_kept]
+    return len(entry)
+
+
 def _highest(values: NDArray[Any], near: Turns, out: NDArray[Any]) -> None:
     out[:] = values[near[:, 0]]
     for column in near.T[1:]:
@@ -213,4 +240,5 @@ KERNELS = FusionKernels(
     confirm_cells=confirm_cells,
     compare_echoes=compare_echoes,
     locate_reflector=locate_reflector,
+    match_echoes=match_echoes,
 )

@@ -6,17 +6,18 @@ twice. Other indices may repeat.
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.kernels._contract.arrays import Real, Turns
 
-__all__ = ["FusionKernels"]
+__all__ = ["FusionKernels", "HeardEchoes", "PredictedPlaces"]
 
 Truths = NDArray[np.bool_]
 Doubles = NDArray[np.float64]
+Places = NDArray[np.int64]
 
 
 class CoarsenImage(Protocol):
@@ -323,6 +324,97 @@ class LocateReflector(Protocol):
     ) -> None: ...
 
 
+class PredictedPlaces(NamedTuple):
+    """Possible reflectors as the sensors see them.
+
+    Attributes
+    ----------
+    apart_m : (place, sensor) float64
+        Distances.
+    seen : (place, sensor, axis) float64
+        Directions in which the echoes appear.
+    depth : (place, sensor) float64
+        Cosines of the angles to the axes of the sensors; those behind are negative.
+    slope_m : (place, sensor) float64
+        Change of the distances over one standard deviation of the place, …
+    across_m2 : (place,) float64
+        … and its square, across the direction.
+    expected : (place, receiver, emitter) float64
+        Expected powers.
+    extra_m2 : (place, emitter) float64
+        Variances of paths in addition to those of the echoes.
+    is_flat : (sensor,) bool
+        Receivers that hear echoes from behind.
+    """
+
+    apart_m: Doubles
+    seen: Doubles
+    depth: Doubles
+    slope_m: Doubles
+    across_m2: Doubles
+    expected: Doubles
+    extra_m2: Doubles
+    is_flat: Truths
+
+
+class HeardEchoes(NamedTuple):
+    """Echoes in the images of all receivers.
+
+    Attributes
+    ----------
+    receiver : (echo,) int64
+    direction : (echo, axis) float64
+    path_m : (echo, emitter) float64
+        Length of the path if the emitter's call caused the echo; NaN if it did not.
+    gate_rad2, gate_m2 : (echo,) float64
+        Variances of directions and of paths.
+    power : (echo,) float64
+    """
+
+    receiver: Places
+    direction: Doubles
+    path_m: Doubles
+    gate_rad2: Doubles
+    gate_m2: Doubles
+    power: Doubles
+
+
+class MatchEchoes(Protocol):
+    """Find the echoes that reflectors at given places explain, by path, direction and power.
+
+    Parameters
+    ----------
+    places : PredictedPlaces
+    echoes : HeardEchoes
+    chosen : (some,) int64
+        Echoes to match.
+    gate : float
+        Largest sum of squares, in units of variances.
+    alike : float
+        Largest ratio of the power to the expected one. Echoes from behind may be weaker.
+    found : (3, count) int64
+        Output: place, echo and emitter of the first matches.
+    out : (count,) float64
+        Output: their sums of squares.
+
+    Returns
+    -------
+    int
+        Number of all matches, which may exceed the space for them.
+    """
+
+    def __call__(
+        self,
+        places: PredictedPlaces,
+        echoes: HeardEchoes,
+        chosen: Places,
+        gate: float,
+        alike: float,
+        found: Places,
+        out: Doubles,
+    ) -> int: ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FusionKernels:
     """Kernels of fusion of one device, all for one thread."""
@@ -337,3 +429,4 @@ class FusionKernels:
     confirm_cells: ConfirmCells
     compare_echoes: CompareEchoes
     locate_reflector: LocateReflector
+    match_echoes: MatchEchoes

@@ -233,6 +233,36 @@ def _invert(a, out):
     out[1, 2] = out[2, 1] = i21 * i22
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def match_echoes(places, echoes, chosen, gate, alike, found, out):
+    """Find the echoes that reflectors at given places explain, by path, direction and power."""
+    count = 0
+    for place in range(len(places.apart_m)):
+        apart_m, slope_m, depth = places.apart_m[place], places.slope_m[place], places.depth[place]
+        for echo in chosen:
+            here, power = echoes.receiver[echo], echoes.power[echo]
+            is_behind, to_m = depth[here] < 0.0, apart_m[here]
+            if is_behind and not places.is_flat[here]:
+                continue
+            # For small angles, the chord equals the angle.
+            turned = max(0.0, 2.0 - 2.0 * _product(places.seen[place, here], echoes.direction[echo]))
+            turned /= places.across_m2[place] / (to_m * to_m) + echoes.gate_rad2[echo]
+            if not turned < gate:
+                continue
+            for emitter in range(len(apart_m)):
+                late_m = echoes.path_m[echo, emitter] - apart_m[emitter] - to_m
+                along_m = slope_m[emitter] + slope_m[here]
+                sum_m2 = along_m * along_m + echoes.gate_m2[echo] + places.extra_m2[place, emitter]
+                distance, expected = turned + late_m * late_m / sum_m2, places.expected[place, here, emitter]
+                is_alike = power < alike * expected and (is_behind or alike * power > expected)
+                if distance < gate and is_alike:  # False for NaN, where there is no path.
+                    if count < len(out):
+                        found[0, count], found[1, count], found[2, count] = place, echo, emitter
+                        out[count] = distance
+                    count += 1
+    return count
+
+
 KERNELS = FusionKernels(
     coarsen_image=coarsen_image,
     spread_cells=spread_cells,
@@ -244,4 +274,5 @@ KERNELS = FusionKernels(
     confirm_cells=confirm_cells,
     compare_echoes=compare_echoes,
     locate_reflector=locate_reflector,
+    match_echoes=match_echoes,
 )
