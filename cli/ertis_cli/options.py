@@ -529,12 +529,12 @@ def note_unknown_angles(
 def note_open_edges(
     sensor: str, grid: "DegreesFromRadians", grid_errors: "Iterable[float]", *, quiet: bool = False
 ) -> None:
-    """Print a note on listed directions at an edge of the grid whose sources may lie beyond, if there are any."""
+    """Print a note on listed directions whose sources may lie beyond the edges of the grid, if there are any."""
     count = sum(map(math.isinf, grid_errors))
     if count and len(grid.azimuth_rad) > 1:
         note(
-            f"sensor {sensor}: {counted(count, 'listed direction')} at an edge of the grid, whose source may lie "
-            "beyond the edge, so grid_error_deg is unknown; use 'ertis process' with a wider --azimuth or --elevation",
+            f"sensor {sensor}: {counted(count, 'listed direction')} whose source may lie beyond the edges of the grid, "
+            "so grid_error_deg is unknown; use 'ertis process' with a wider --azimuth or --elevation",
             quiet=quiet,
         )
 

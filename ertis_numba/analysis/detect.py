@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.analysis.noise import threshold_of
+from ertis_numba.analysis.outside_echo import outside_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.side_lobes import EdgeFloor, SideLobes
@@ -140,8 +141,17 @@ def peaks_of_grid(
             continue
         tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1])
         found.append((tops.direction[0], float(tops.range_m[0]), float(tops.amplitude[0])))
-        errors_rad.append(float(tops.width_rad[0]) / math.sqrt(12))
-        side_lobes.add(*found[-1])
+        outside = outside_of(image, directions, found[-1][1])
+        is_beside_open = any(
+            math.isinf(error_rad) and abs(found[-1][1] - other[1]) < side_lobes.reach_m
+            for other, error_rad in zip(found[:-1], errors_rad, strict=True)
+        )
+        is_open = outside is not None or is_beside_open  # Side lobes of reflectors beyond the grid are not predicted.
+        errors_rad.append(math.inf if is_open else float(tops.width_rad[0]) / math.sqrt(12))
+        if outside is not None:  # Its side lobes are in the image.
+            side_lobes.add(outside.direction, found[-1][1], max(math.sqrt(outside.power), found[-1][2]))
+        else:
+            side_lobes.add(*found[-1])
     levels = listed(np.array([level for *_, level in found]), image)
     return [
         Peak(

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.analysis.detect import neighbours_of
-from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
+from ertis_numba.analysis.outside_echo import outside_of
+from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.side_lobes import EdgeFloor, side_lobe_floor
 from ertis_numba.analysis.uncertainty import PositionUncertainty
@@ -79,7 +80,8 @@ class PointExtractor:
         self._directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         self._neighbours = neighbours_of(self._directions)
         self._interpolator = PeakInterpolator(settings, self._directions, self._neighbours)
-        self._edges = EdgeFloor(self._directions, PointSpread(settings))
+        spread = PointSpread(settings)
+        self._edges, self._reach_m = EdgeFloor(self._directions, spread), spread.reach_m
         self._uncertainty = PositionUncertainty(settings, is_planar=bool(np.ptp(self._directions[:, 2]) == 0))
 
     def __call__(self, image: Energyscape) -> PointCloud:
@@ -100,10 +102,20 @@ class PointExtractor:
             listed(tops.amplitude, image).astype(np.float32),
         )
         order = np.argsort(-levels, kind="stable")
-        uncertainty_m = self._uncertainty(image, position_m, levels, np.minimum(tops.width_rad, math.pi))
+        width_rad = np.where(self._are_open(image, tops), math.pi, tops.width_rad)
+        uncertainty_m = self._uncertainty(image, position_m, levels, width_rad)
         return PointCloud(
             position_m[order], levels[order], image.settings, image.stamp, uncertainty_m=uncertainty_m[order]
         )
+
+    def _are_open(self, image: Energyscape, tops: Tops) -> NDArray[np.bool_]:
+        """Return True for points that may be echoes from beyond the grid, or side lobes of such echoes: (point,)."""
+        is_open = np.isinf(tops.width_rad)
+        for place in np.flatnonzero(~is_open):
+            is_open[place] = outside_of(image, self._directions, float(tops.range_m[place])) is not None
+        is_near = np.abs(tops.range_m - tops.range_m[:, None]) < self._reach_m
+        is_stronger = tops.amplitude > tops.amplitude[:, None]
+        return np.asarray(is_open | (is_near & is_stronger & is_open).any(axis=1))
 
     def _maxima(self, image: Energyscape) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the direction and range indices of all maxima.

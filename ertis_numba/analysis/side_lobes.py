@@ -79,6 +79,11 @@ class SideLobes:
         self._deviations: dict[int, float] = {}  # The keys are range bins.
         self._doubt = self._doubt_of(directions, candidates)
 
+    @property
+    def reach_m(self) -> float:
+        """Range offset in metres beyond which reflectors have no side lobes."""
+        return self._spread.reach_m
+
     def add(self, direction: NDArray[np.float64], range_m: float, amplitude: float) -> None:
         """Add a reflector. Reflectors must be added in descending order of amplitude.
 

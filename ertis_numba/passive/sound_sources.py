@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.analysis.detect import neighbours_of
+from ertis_numba.analysis.outside_grid import OutsidePatterns, OutsideSource
 from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.frames import AcousticMap, SoundDirection
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
 from ertis_numba.passive.components import COMPONENT_METHODS, strongest_first
 from ertis_numba.passive.wave_delays import WaveDelays
-from ertis_numba.settings import Passive
+from ertis_numba.settings import Passive, Settings
 
 __all__ = ["find_sound_sources", "sources_of_grid"]
 
@@ -32,6 +33,8 @@ _NARROWER: Final = 3.0  # Main lobe of Capon and MUSIC in decibels, relative to 
 _EDGE_OF_LOBE: Final = 1e-3  # Power of delay-and-sum relative to a maximum, below which it is not of the main lobe.
 _LEAST_LOSS: Final = 0.25  # Power relative to a maximum at the edge of a cell; grids with less do not resolve it.
 _NOISE: Final = 10**0.05  # Noise may raise a maximum above a main lobe through its strongest sample.
+_FREQUENCIES_OF_PATTERN: Final = 3
+_DEEPEST: Final = 1e-6  # Power relative to the maximum of a map that counts in patterns.
 _TINY: Final = 1e-300
 
 
@@ -137,7 +140,8 @@ def sources_of_grid(
         min_level_db = _MIN_COMPONENT_DB if method in COMPONENT_METHODS else _MIN_LEVEL_DB
     least = 10 ** (checks.between("min_level_db", min_level_db, -1000.0, 0.0) / 10)
     grid = _Grid.of(unit_vectors(found.azimuth_rad, found.elevation_rad))
-    search = _components if method in COMPONENT_METHODS else _maxima
+    is_of_components = method in COMPONENT_METHODS
+    search = _components if is_of_components else _maxima
     delays, out = WaveDelays(found.settings), []
     for band, power in enumerate(found.power.T.astype(np.float64)):
         if found.is_silent[band]:
@@ -146,8 +150,11 @@ def sources_of_grid(
         loss_of = functools.partial(_loss, delays, found.band_hz[band])
         tops = sorted(search(power, grid, passive, loss_of), key=lambda each: -each.power)
         tops = [each for each in tops if each.power >= least * tops[0].power]
+        outside = None if is_of_components else _outside(power, grid.directions, found.settings, found.band_hz[band])
+        if is_of_components or outside is not None:
+            tops = _of_doubtful_direction(tops, is_beyond=outside is not None)
         if method == "delay_and_sum":
-            tops = _without_side_lobes(tops, delays, found.band_hz[band], top=top)
+            tops = _without_side_lobes(tops, delays, found.band_hz[band], top=top, outside=outside)
         for each in tops[:top]:
             x, y, z = each.direction.tolist()
             angles_rad = math.atan2(y, x), math.asin(max(-1.0, min(1.0, z)))
@@ -169,19 +176,64 @@ def _omega(band_hz: Floats) -> Floats:
     return 2 * np.pi * np.linspace(band_hz[0], band_hz[1], _FREQUENCIES)[:, None, None]
 
 
-def _without_side_lobes(tops: list[_Top], delays: WaveDelays, band_hz: Floats, *, top: int) -> list[_Top]:
-    """Return the maxima that exceed the side lobes of the stronger ones, up to a number, the strongest first."""
+def _outside(power: Floats, directions: Floats, settings: Settings, band_hz: Floats) -> OutsideSource | None:
+    """Return the source outside of a grid that explains the map of a band; None if a source inside may do."""
+    low_hz, high_hz = band_hz.tolist()
+    highest = float(power.max(initial=0.0))
+    patterns = _patterns(settings, directions.tobytes(), low_hz, high_hz) if highest > 0 else None
+    if patterns is None:
+        return None
+    values = np.maximum(power[patterns.samples] / highest, _DEEPEST)
+    passive = settings.passive  # These numbers are linear in the beam pattern of a single source in noise.
+    if passive.method == "functional":
+        values = values ** (1 / passive.functional_order)
+    found = patterns.source_of(-1 / values if passive.method in _INVERSE else values)
+    return None if found is None else found._replace(power=highest * found.power)
+
+
+@functools.lru_cache(maxsize=16)
+def _patterns(settings: Settings, grid: bytes, low_hz: float, high_hz: float) -> OutsidePatterns | None:
+    """Return the patterns of sources in a band."""
+    frequency_hz = np.linspace(low_hz, high_hz, _FREQUENCIES_OF_PATTERN)
+    return OutsidePatterns.of(np.frombuffer(grid).reshape(-1, 3), WaveDelays(settings), frequency_hz)
+
+
+def _of_doubtful_direction(tops: list[_Top], *, is_beyond: bool) -> list[_Top]:
+    """Return sources with an infinite width from the first one on that may lie beyond the grid.
+
+    Weaker sources may be remains or side lobes of that one.
+    """
+    out, is_doubtful = [], is_beyond
+    for each in tops:
+        is_doubtful |= math.isinf(each.width_rad)
+        out.append(each._replace(width_rad=math.inf) if is_doubtful else each)
+    return out
+
+
+def _without_side_lobes(
+    tops: list[_Top], delays: WaveDelays, band_hz: Floats, *, top: int, outside: OutsideSource | None
+) -> list[_Top]:
+    """Return the maxima that exceed the side lobes of the stronger ones, up to a number, the strongest first.
+
+    The strongest maximum is always kept. Side lobes of a source outside of the grid count.
+    """
     delay_s = delays(np.array([each.direction for each in tops]))
     omega = _omega(band_hz)
     kept: list[int] = []
     explained = np.zeros(len(tops))
+
+    def side_lobes(of_s: Floats, power: float) -> Floats:
+        beams = np.exp(1j * omega * (delay_s - of_s)).mean(axis=2)
+        return np.asarray(power * (np.abs(beams) ** 2).mean(axis=0))
+
+    if outside is not None:
+        explained += side_lobes(delays(outside.direction[None])[0], outside.power)
     for place, each in enumerate(tops):
         if len(kept) == top:
             break
-        if each.power >= _SIDE_LOBES * explained[place]:
+        if not place or each.power >= _SIDE_LOBES * explained[place]:
             kept.append(place)
-            beams = np.exp(1j * omega * (delay_s - delay_s[place])).mean(axis=2)
-            explained += each.power * (np.abs(beams) ** 2).mean(axis=0)
+            explained += side_lobes(delay_s[place], each.power)
     return [tops[place] for place in kept]
 
 

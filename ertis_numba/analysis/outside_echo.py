@@ -1,0 +1,56 @@
+"""Echoes from directions that the grid of an image does not contain."""
+
+import functools
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.air import sound_speed_m_s
+from ertis_numba.analysis.outside_grid import OutsidePatterns, OutsideSource
+from ertis_numba.analysis.point_spread import PULSE_M
+from ertis_numba.frames import Energyscape
+from ertis_numba.geometry import far_field_delays, microphones
+from ertis_numba.settings import Settings
+
+__all__ = ["outside_of"]
+
+_FREQUENCIES: Final = 5
+
+
+def outside_of(image: Energyscape, directions: NDArray[np.float64], range_m: float) -> OutsideSource | None:
+    """Return the reflector outside of a grid that explains an image around a range; None if one inside may do.
+
+    The microphones receive an echo at ranges that differ by up to the radius of the array. The powers at all of them
+    add up to the sum of the powers at the frequencies of the call.
+
+    Parameters
+    ----------
+    image : Energyscape
+    directions : (direction, axis) float64
+        Unit vectors.
+    range_m : float
+    """
+    patterns = _patterns(image.settings, directions.tobytes())
+    if patterns is None:
+        return None
+    radius_m = np.linalg.norm(microphones(image.settings.array).enabled_positions_m, axis=1).max() + PULSE_M
+    near = np.abs(image.range_m - range_m) < radius_m
+    values = (image.amplitude[patterns.samples][:, near].astype(np.float64) ** 2).sum(axis=1)
+    source = patterns.source_of(values)
+    if source is None:
+        return None
+    at_range = image.amplitude[:, np.argmin(np.abs(image.range_m - range_m))].max()
+    return source._replace(power=float(at_range) ** 2 * source.power / float(values.max()))
+
+
+@functools.lru_cache(maxsize=8)
+def _patterns(settings: Settings, grid: bytes) -> OutsidePatterns | None:
+    """Return the patterns of echoes of the call."""
+    positions_m, speed_m_s = microphones(settings.array).enabled_positions_m, sound_speed_m_s(settings.air)
+    frequency_hz = np.linspace(settings.call.low_frequency_hz, settings.call.high_frequency_hz, _FREQUENCIES)
+    return OutsidePatterns.of(
+        np.frombuffer(grid).reshape(-1, 3),
+        functools.partial(far_field_delays, positions_m, sound_speed_m_s=speed_m_s),
+        frequency_hz,
+    )
