@@ -65,7 +65,7 @@ class Peak(RadiansFromDegrees):
     grid_error_deg : float, default NaN
         Standard deviation of the direction that the grid causes, in degrees: 0 if the direction is interpolated. At the
         edge of a grid, one or both angles are those of the grid, and it is the spacing divided by √12. It is infinite
-        for a single direction, and where the reflector may lie beyond the edge, and NaN if it is unknown.
+        for a single direction, and where the reflector may lie beyond the grid, and NaN if it is unknown.
 
     Examples
     --------
