@@ -81,9 +81,9 @@ def find_sound_sources(
 
     An interpolated maximum stays within half of the way to each neighbour, and within the main lobe through its
     direction. It exceeds the maximum of the map by less than 1 dB. At the edge of a grid, it is interpolated along the
-    edge only, and in a corner not at all; `SoundDirection.grid_error_rad` states the error. It is infinite if the source
-    may lie beyond the grid: at its edge, or if the pattern of the map fits a source outside about as well. Angles that the array cannot observe are NaN: see
-    `ertis_numba.geometry.observable_angles`.
+    edge only, and in a corner not at all; `SoundDirection.grid_error_rad` states the error. It is infinite if the
+    source may lie beyond the grid: at its edge, or if the map fits a source outside about as well. Angles that the
+    array cannot observe are NaN: see `ertis_numba.geometry.observable_angles`.
 
     Errors are small if the main lobe is at least two spacings of the grid wide. The peaks of Capon are often narrower;
     their levels are then too low.
