@@ -130,6 +130,17 @@ def test_a_point_that_a_single_echo_locates_is_not_confirmed():
     assert confirmed(heard, [POST_M], [np.arange(1)]) == [False]
 
 
+@pytest.mark.parametrize(("with_image", "is_confirmed"), [((0,), False), ((0, 1), True), ((0, 1, 2, 3), True)])
+def test_two_images_confirm_a_reflector_if_another_one_is_missing(with_image, is_confirmed):
+    assert found(echoes_of_post(POST_M), POST_M, with_image=with_image) == [is_confirmed]
+
+
+@pytest.mark.parametrize(("n_echoes", "is_confirmed"), [(8, True), (6, True), (5, False)])
+def test_most_pairs_confirm_a_reflector_if_an_image_is_missing(n_echoes, is_confirmed):
+    echoes = [each for each in echoes_of_post(POST_M) if each[0] in (0, 1)][:n_echoes]
+    assert found(echoes, POST_M, with_image=(0, 1)) == [is_confirmed]
+
+
 def test_no_reflectors_are_no_error():
     none = EchoPaths(SENSOR_M, AHEAD, {}, range(4), np.empty((0, 3)), np.empty((0, 4)), np.empty(0))
     assert confirmation(none, np.empty((0, 3)), np.empty((0, 4, 4)), np.empty(0), []).is_confirmed.tolist() == []

@@ -1,9 +1,10 @@
-"""Echoes over two surfaces, compared with paths by mirror images: a post and two walls around a platform."""
+"""Echoes over two surfaces, compared with paths by mirror images: posts and walls around a platform."""
 
 import numpy as np
 import pytest
 
 from ertis_numba.fusion.echo_paths import EchoPaths
+from ertis_numba.fusion.hidden_walls import over_hidden_walls
 from ertis_numba.fusion.reflections import Walls, reflected_twice
 
 YAW_RAD = np.radians([0.0, 90.0, 180.0, -90.0])
@@ -78,3 +79,41 @@ def test_sound_over_two_surfaces_shows_a_ghost(way):
 @pytest.mark.parametrize("way", WAYS)
 def test_echoes_that_are_stronger_than_the_surfaces_allow_show_reflectors(way):
     assert not judged(0, way, strength=0.01).is_explained.any()
+
+
+LEFT = 1  # The sensor without an image.
+POST_M = np.array([1.1, 0.2, 0.0])
+WALL_ON_THE_LEFT, WALL_ON_THE_RIGHT = (np.array([0.0, 1.0, 0.0]), 1.3), (np.array([0.0, -1.0, 0.0]), 1.0)
+
+
+def is_over_a_hidden_wall(origin_m, emitter, sent_m=None, *, sensor, walls=()):
+    """Return True if a hidden wall explains the echoes of a call that a sensor takes for those of its own."""
+    groups = [echo for number, echo in enumerate(echoes_from(origin_m, sent_m)) if number % 4 == emitter]
+    receiver, direction, path_m = (np.array(each) for each in zip(*groups, strict=True))
+    rows = {number: np.flatnonzero(receiver == number) for number in (0, 2, 3)}
+    paths_m = np.repeat(path_m[:, None], 4, axis=1)
+    heard = EchoPaths(SENSOR_M, AHEAD, rows, range(4), direction, paths_m, 1 / path_m**4)
+    (own,) = np.flatnonzero(receiver == sensor)
+    toward = origin_m[emitter] - SENSOR_M[sensor]
+    place_m = SENSOR_M[sensor] + path_m[own] / 2 * toward / np.linalg.norm(toward)
+    confirming = np.zeros((2 + len(walls), len(groups), 4), np.bool_)
+    confirming[1, receiver != LEFT, sensor] = True
+    places_m = np.array([POST_M, place_m, *(depth_m * normal for normal, depth_m in walls)])
+    normal, depth_m = np.array([each for each, _ in walls]).reshape(-1, 3), np.array([each for _, each in walls])
+    planes = Walls(np.arange(len(walls)) + 2, normal, depth_m, np.ones(len(walls)))
+    none = np.zeros(len(places_m), np.bool_)
+    return bool(over_hidden_walls(heard, places_m, planes, confirming, np.array([LEFT]), none)[1])
+
+
+def test_sound_over_a_post_and_a_wall_that_no_image_shows_confirms_nothing():
+    straight_m = np.linalg.norm(POST_M - SENSOR_M, axis=1)
+    for wall, is_hidden in ((WALL_ON_THE_LEFT, True), (WALL_ON_THE_RIGHT, False)):
+        behind_m = np.repeat(mirrored(POST_M[None], wall), 4, axis=0)
+        assert is_over_a_hidden_wall(behind_m, 0, straight_m, sensor=0) == is_hidden
+
+
+def test_the_call_of_a_sensor_without_an_image_over_two_walls_confirms_nothing():
+    """The sensor on the right takes it for the echo of its own call from twice the distance."""
+    origin_m = mirrored(mirrored(SENSOR_M, WALL_ON_THE_LEFT), WALL_ON_THE_RIGHT)
+    assert is_over_a_hidden_wall(origin_m, LEFT, sensor=3, walls=[WALL_ON_THE_RIGHT])
+    assert not is_over_a_hidden_wall(origin_m, LEFT, sensor=3)

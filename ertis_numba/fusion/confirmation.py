@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.fusion.echo_paths import NEAREST_M, EchoPaths
+from ertis_numba.fusion.hidden_walls import over_hidden_walls
 from ertis_numba.fusion.reflections import Walls, reflected_twice
 
 __all__ = ["Confirmation", "confirmation"]
@@ -30,6 +31,8 @@ _PLANE_M: Final = 0.04  # Largest distance of a located wall from the plane that
 _FOOT_M: Final = 0.4  # … and from the foot of the perpendicular to it.
 _SAME_RAD: Final = math.radians(2.5)  # Difference of directions below which a nearer reflector may send the sound.
 _N_LEAST: Final = 2  # Echoes without which an own echo may be that of another sensor's call.
+_N_IMAGES: Final = 2  # Images that must show a reflector if that of an emitting sensor is missing, …
+_AGREED: Final = 0.7  # … and share of pairs with an echo of their own.
 _N_SURE: Final = 4  # Echoes that two reflections hardly cause at the right paths.
 
 
@@ -59,6 +62,9 @@ def confirmation(
     At least 60 % of the pairs that should hear a reflector must do so, rounded down, and four if there are as many. A
     platform with several sensors needs two echoes that no two nearer surfaces explain. Those of a point must have been
     joined. A reflector that a nearer one and a wall explain is not confirmed.
+
+    If the image of an emitting sensor is missing, two images must show a reflector, by an echo of its own for 70 % of
+    the pairs. Sound over a nearer reflector and a wall that only that sensor faces must not explain all of them.
 
     Parameters
     ----------
@@ -119,7 +125,19 @@ def confirmation(
     as_point &= is_joined & (_n_echoes(point & is_free) >= least)
     is_sure = as_point | (as_wall & (_n_echoes(wall & is_free) >= least))
     is_ghost = twice.is_ghost | _mirrored(place_m, heard.sensor_m, np.argmax(depth, axis=1))
+    hidden = np.flatnonzero(np.isfinite(heard.path_m).any(axis=0) & ~np.isin(np.arange(n_sensors), [*heard.rows]))
+    if len(hidden):
+        best = np.where((as_point & (_n_echoes(point) >= _n_echoes(wall)))[:, None, None], point, wall)
+        is_sure &= _is_agreed(heard, best, best & is_free, n_pairs)
+        best &= is_sure[:, None, None]
+        is_ghost |= over_hidden_walls(heard, place_m, walls, best, hidden, is_ghost)
     return Confirmation(np.asarray(is_sure & ~is_ghost), as_wall, n_pairs)
+
+
+def _is_agreed(heard: EchoPaths, confirming: Flags, free: Flags, n_pairs: Numbers) -> Flags:
+    """Return True for reflectors that two images show, and most pairs: (reflector,) bool."""
+    n_receivers = sum(free[:, rows].any(axis=(1, 2)).astype(np.int64) for rows in heard.rows.values())
+    return np.asarray((n_receivers >= _N_IMAGES) & (_n_echoes(confirming) >= _AGREED * n_pairs))
 
 
 def _n_echoes(confirming: Flags) -> Numbers:

@@ -41,6 +41,10 @@ class Walls(NamedTuple):
     depth_m: Floats
     strength: Floats
 
+    def only(self, kept: Flags) -> "Walls":
+        """Return some of the walls."""
+        return Walls._make(each[kept] for each in self)
+
     def images(self, place_m: Floats) -> Floats:
         """Return the mirror images of places: (wall, …, axis) float64."""
         normal = self.normal.reshape(-1, *[1] * (place_m.ndim - 1), 3)
