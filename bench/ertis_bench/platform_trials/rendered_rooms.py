@@ -28,7 +28,6 @@ Mountings = Mapping[str, tuple[tuple[float, float, float], tuple[float, float, f
 HEIGHT_M: Final = 0.4
 RATE_HZ: Final = 200_000.0
 N_SAMPLES: Final = 6400
-N_MICS: Final = 32
 _NOISE: Final = 2.5e-4
 _LEVEL: Final = 10 ** (-24 / 20)
 _N_FFT: Final = 8192
