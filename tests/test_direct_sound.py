@@ -1,5 +1,6 @@
 """Direct sound between sensors shows wrong clocks and mountings, and accuses no others."""
 
+import dataclasses
 import functools
 import json
 
@@ -195,6 +196,35 @@ def test_sound_that_is_heard_one_way_is_reported():
     (warning,) = check.warnings()
     assert warning.startswith("direct sound of left arrives at front ")
     assert " earlier than predicted, ± " in warning
+
+
+def as_active(measurement):
+    """The measurement of a sensor whose emitter is broken, which the sensor does not know."""
+    return ertis.Measurement(
+        measurement.data, measurement.settings, dataclasses.replace(measurement.stamp, behaviour="active")
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "diameter_m", "direct_sound_db", "expected"),
+    [
+        (("front", "left"), 0.0, None, ("left",)),
+        (SENSORS, 0.0, None, ("left",)),
+        (SENSORS, 0.012, -20.0, ("left",)),  # Neighbours do not hear it, but the others hear themselves.
+        (("front", "left"), 0.012, -20.0, ("left",)),
+        (SENSORS, 0.012, None, ()),  # Nothing shows it.
+    ],
+)
+def test_direct_sound_shows_a_broken_emitter(names, diameter_m, direct_sound_db, expected):
+    made = scene(names=names, diameter_m=diameter_m, direct_sound_db=direct_sound_db)
+    assert checked(made).silent == ()
+    sensors = tuple(each.replace(emitter=each.emitter.replace(silent=each.name == "left")) for each in made.sensors)
+    check = DirectSoundCheck(mountings(made))
+    check.add(map(as_active, heard(made.replace(sensors=sensors))))
+    assert check.silent == expected
+    assert check.warnings() == tuple(
+        f"{name} emits no sound, unlike the other sensors; check its emitter" for name in expected
+    )
 
 
 def test_measurement_without_a_mounting_is_refused():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.fusion.emissions import EmissionCounts, silent_one, suspect
+from ertis_numba.fusion.emissions import EmissionCounts, cheapest, doubted, silent_one, suspect
 from ertis_numba.simulation import load_scene
 from ertis_numba.simulation.render import render
 from tests.small_platforms import HEIGHT_M, images_of, mounted, random_reflectors, rendered, settings_of
@@ -52,6 +52,37 @@ def test_dead_emitter_is_named_within_three_pulses_until_it_recovers(seed, diame
 @pytest.mark.parametrize("diameter_m", [0.0, 0.012])
 def test_sensor_with_nothing_before_it_is_not_dead(diameter_m):
     assert set(named([images(None, number, diameter_m) for number in range(3)], diameter_m)) == {()}
+
+
+def test_sector_that_no_emission_reaches_is_stated_and_not_free():
+    """Echoes of neighbours cannot show whether there is nothing on the left, or whether its emitter is dead."""
+    nothing_m = np.append(PLACES_M, [[-1.5, 0.1, HEIGHT_M]], axis=0)
+    for case, each in {"nothing": nothing_m, "dead": np.append(nothing_m, [[0.1, 1.7, HEIGHT_M]], axis=0)}.items():
+        mapper = ertis.Mapper(mounted(), emitter_diameter_m=0.012)
+        fuser = ertis.Fuser(mounted(), emitter_diameter_m=0.012)
+        for number in range(3):
+            signals = rendered(
+                mounted(),
+                settings_of(),
+                each,
+                np.zeros(len(each)),
+                diameter_m=0.012,
+                random=np.random.default_rng(number),
+                dead=("left",) if case == "dead" else (),
+            )
+            group = [*images_of(signals, settings_of(), number).values()]
+            fused = fuser(group)
+            assert fused.unheard == ()
+            assert fused.without_own_echo == ("left",)
+            mapper.add(group, ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), fused=fused)
+        assert mapper.without_own_echo == {"left": 3}
+        assert mapper.map.log_odds_at((0.0, 0.8)) == 0.0
+        assert mapper.map.log_odds_at((0.8, 0.05)) < 0.0
+
+
+def test_emitters_that_echoes_show_are_not_stated():
+    fuser = ertis.Fuser(mounted(), emitter_diameter_m=0.0)
+    assert {fuser(images(506, number, 0.0)).without_own_echo for number in range(2)} == {()}
 
 
 @pytest.mark.parametrize(("count", "expected"), [(3, {("left",)}), (2, {(), ("left",)})])
@@ -112,6 +143,27 @@ def test_silence_that_explains_most_is_named(costs, missed, expected):
 )
 def test_equally_good_explanation_is_a_rival_if_others_do_not_contradict_it(joint, other, expected):
     assert silent_one(0, joint, {0: 2, 1: 2}, {0: counts([0, 3], [8, 0]), 1: other}) == expected
+
+
+@pytest.mark.parametrize(
+    ("counted", "cost", "expected"),
+    [
+        (counts([9, 3, 0], [0, 0, 0]), 20, {1, 2}),
+        (counts([9, 9, 9], [0, 0, 4]), 20, {2}),
+        (counts([9, 3, 0], [0, 0, 0]), 3, set()),  # There is little to explain better.
+        (counts([0, 0], [0, 0]), 20, set()),  # of two, either one may be silent
+    ],
+)
+def test_emitters_that_no_echo_shows_are_doubted(counted, cost, expected):
+    assert doubted(range(len(counted.heard)), counted, cost) == expected
+
+
+@pytest.mark.parametrize(
+    ("joint", "costs", "expected"),
+    [(20, {0: 18, 2: 5}, 2), (20, {0: 6, 2: 5}, None), (100, {1: 95}, None), (6, {1: 5}, None), (20, {}, None)],
+)
+def test_silence_must_explain_echoes_clearly_better(joint, costs, expected):
+    assert cheapest(joint, costs) == expected
 
 
 def test_emitters_between_two_walls_are_heard(tmp_path):

@@ -72,7 +72,7 @@ def write_fused(
         for text in clocks.warnings():
             options.warn(text)
         incomplete = empty = 0
-        unheard: Counter[str] = Counter()
+        unheard, unshown = Counter[str](), Counter[str]()
         writer = stack.enter_context(
             EnergyscapeWriter(target, overwrite=force, mounting={PLATFORM: ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})
         )
@@ -84,6 +84,7 @@ def write_fused(
                     options.note(f"pulse {number} has no image of {', '.join(fused.missing)}", quiet=quiet)
                 empty += fused.is_empty
                 unheard.update(fused.unheard)
+                unshown.update(fused.without_own_echo)
                 writer.write(_numbered(fused, number))
     _pulses.note_empty(empty, len(groups), quiet=quiet)
     contradiction = fuser.emitter_warning()  # With wrong emitters, echoes seem to be missing.
@@ -91,6 +92,9 @@ def write_fused(
     warnings = [contradiction] if contradiction else every
     for text in warnings:
         options.warn(text)
+    if empty < len(groups) and not contradiction:
+        others = {name: count for name, count in unshown.items() if name not in unheard}
+        _pulses.note_without_own_echo(others, len(groups), quiet=quiet)
     pulses = options.counted(len(groups), "pulse")
     options.say(f"{target}: {pulses} of {', '.join(by_name)}, fused", quiet=quiet)
     if as_json:
@@ -102,6 +106,7 @@ def write_fused(
             "empty": empty,
             "left_out": active.n_passive,
             "unheard": dict(unheard),
+            "without_own_echo": dict(unshown),
         }
         warnings = [*clocks.warnings(), *pipelines.warnings, *warnings]
         options.print_json(report | {"direct_sound": _direct_sound(clocks), "warnings": warnings})

@@ -70,6 +70,7 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
                 "missing": list(fused.missing),
                 "unheard": list(fused.unheard),
                 "without_echo": list(fused.without_echo),
+                "without_own_echo": list(fused.without_own_echo),
             }
         )
         return
@@ -79,6 +80,8 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
         place = f"{range_m[nearest]:.3f} m at {math.degrees(math.atan2(y, x)):+.1f}°"
     absent = f", without {' '.join(fused.missing)}" if fused.missing else ""
     absent += f", {' '.join(fused.unheard)} not heard" if fused.unheard else ""
+    unshown = [name for name in fused.without_own_echo if name not in fused.unheard]
+    absent += f", no echo of {' '.join(unshown)} known" if unshown and not fused.is_empty else ""
     age = "-" if age_ms is None else f"{age_ms:.1f} ms"
     row = (
         f"{fused.image.stamp.sync_count:8d}  {age:>8}  {len(range_m):6d}  {place:24}  {' '.join(fused.sensors)}{absent}"

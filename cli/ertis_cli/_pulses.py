@@ -11,7 +11,7 @@ from ertis_cli import _mountings, _presets, _results, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from ertis_cli._mountings import Mounting
@@ -51,6 +51,17 @@ def note_empty(n_empty: int, n_pulses: int, *, quiet: bool) -> None:
     if n_empty:
         pulses = options.counted(n_pulses, "pulse")
         options.note(f"{n_empty} of {pulses} carried no echo above the noise", quiet=quiet)
+
+
+def note_without_own_echo(counts: "Mapping[str, int]", n_pulses: int, *, quiet: bool) -> None:
+    """State which sensors no echo shows to emit, so that nobody takes the space ahead of them for empty."""
+    for sensor, count in counts.items():
+        pulses = options.counted(n_pulses, "pulse")
+        options.note(
+            f"no echo of the call of {sensor} is known in {count} of {pulses}: either nothing ahead of it reflects, or "
+            "its emitter is silent; obstacles ahead of it may be missing",
+            quiet=quiet,
+        )
 
 
 def open_sensors(paths: "Sequence[Path]", stack: ExitStack, *, images: bool = False) -> "list[Any]":

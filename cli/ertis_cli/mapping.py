@@ -135,6 +135,8 @@ def mapping(
     if contradiction := mapper.emitter_warning():
         options.warn(contradiction)
     _pulses.note_empty(mapper.n_empty, len(located), quiet=quiet)
+    if mapper.n_empty < len(located) and not contradiction:
+        _pulses.note_without_own_echo(mapper.without_own_echo, len(located), quiet=quiet)
     if height_m is not None and not mapper.n_points and mapper.n_empty < len(located):
         _report_heights(occupancy, height_m, quiet=quiet)
     written = write_map(target, occupancy, overwrite=force, probabilities=probabilities)
@@ -144,6 +146,7 @@ def mapping(
     report = _report(written, readers, occupancy) | {
         "left_out": active.n_passive + len(groups) - len(located),
         "empty": mapper.n_empty,
+        "without_own_echo": mapper.without_own_echo,
         "notes": list(trajectory.notes),
         "warnings": [] if contradiction is None else [contradiction],
     }

@@ -35,6 +35,7 @@ _OVERSAMPLING: Final = 8
 _MOUNTING_SD_M: Final = 1e-3  # of the position of a sensor along the way to another one
 _SIGMAS: Final = 3.0
 _NEAREST_M: Final = 0.05
+_CLEAR: Final = 2.0  # Level relative to the threshold from which the way back would be heard as well.
 
 
 class DirectSound(NamedTuple):
@@ -62,6 +63,7 @@ class DirectSound(NamedTuple):
 class _Arrival:
     difference_s: float
     noise_s: float
+    excess: float  # Level relative to the threshold.
 
 
 class DirectSoundCheck:
@@ -70,6 +72,10 @@ class DirectSoundCheck:
     Sound from sensor a to sensor b arrives early or late if their clocks differ, and late if they are farther apart
     than their mountings state. The way back tells both apart: a difference of clocks has the opposite sign there.
     Emitters are assumed to be at the origins of the sensors, as in images.
+
+    The sound also shows silent emitters. Sound between two sensors is equally loud both ways. A sensor that clearly
+    hears others, but that no other one hears, does not emit. The same holds for a sensor that does not hear its own
+    call, if all others clearly hear theirs.
 
     Noise alone passes for a direct sound in at most one of 1000 checks. Each of the n (n − 1) pairs of n sensors has an
     equal share of this rate in a single pulse. Of several pulses, more than half must contain the sound, which is less
@@ -97,7 +103,8 @@ class DirectSoundCheck:
 
     def __init__(self, mountings: Mountings) -> None:
         self._mountings = {sensor.name: sensor for sensor in mounted_sensors(mountings)}
-        self._found: dict[tuple[str, str], list[_Arrival | None]] = {}
+        self._found: dict[tuple[str, str], list[_Arrival | None]] = {}  # by emitter and receiver
+        self._own: dict[str, list[_Arrival | None]] = {}
         self._sample_s = 0.0
         self._speed_m_s = 0.0
 
@@ -136,6 +143,8 @@ class DirectSoundCheck:
             arrivals = _arrivals(each, self._mountings, starts_s, _FALSE_ALARMS / self._n_pairs)
             for other, arrival in arrivals.items():
                 self._found.setdefault((other, name), []).append(arrival)
+            if each.stamp.behaviour != "passive":
+                self._add_own(each, [self._distance_m(name, other) for other in group if other != name])
             self._sample_s = max(self._sample_s, 1 / each.settings.signal_rate_hz)
             self._speed_m_s = sound_speed_m_s(each.settings.air)
 
@@ -143,8 +152,10 @@ class DirectSoundCheck:
     def sounds(self) -> tuple[DirectSound, ...]:
         """Direct sound of each pair of emitter and receiver, where it is audible in more than half of the pulses."""
         chain_s = SYNC_STEP_S * (len(self._mountings) - 1)
-        found = []
+        found, silent = [], self.silent
         for (emitter, receiver), searched in self._found.items():
+            if emitter in silent:
+                continue
             arrivals = [each for each in searched if each is not None]
             if 2 * len(arrivals) <= len(searched):
                 continue
@@ -156,14 +167,42 @@ class DirectSoundCheck:
             )
         return tuple(found)
 
-    def warnings(self) -> tuple[str, ...]:
-        """Return one line for each clock and each distance that differs by more than its uncertainty allows.
+    @property
+    def silent(self) -> tuple[str, ...]:
+        """Sensors that emit no sound, as that of others shows."""
+        found = []
+        for name in self._mountings:
+            searched = {receiver: each for (emitter, receiver), each in self._found.items() if emitter == name}
+            unheard = [receiver for receiver, each in searched.items() if not any(each)]
+            # Sound of others may arrive at a receiver at nearly the same time.
+            is_one_way = any(_is_clear(self._found.get((receiver, name), ())) for receiver in unheard)
+            if is_one_way and 2 * len(unheard) > len(searched):
+                found.append(name)
+        clear = [name for name, each in self._own.items() if _is_clear(each)]
+        deaf = [name for name, each in self._own.items() if not any(each)]
+        if clear and len(deaf) <= max(1, len(clear) - 1) and len(clear) + len(deaf) == len(self._own):
+            found += deaf
+        return tuple(dict.fromkeys(found))
 
-        The limit is three standard deviations and one sample of the signals.
+    def _add_own(self, measurement: Measurement, distances_m: Sequence[float]) -> None:
+        """Add the direct sound of a sensor at its own microphones, unless that of a neighbour is too close."""
+        nearest_s = min(distances_m, default=math.inf) / sound_speed_m_s(measurement.settings.air)
+        window_s = min(_WINDOW_S, nearest_s - _PULSE_S / 2)
+        if window_s >= _MIN_WINDOW_S:
+            name = measurement.stamp.sensor
+            self._own.setdefault(name, []).append(
+                _own_arrival(measurement, window_s, _FALSE_ALARMS / len(self._mountings))
+            )
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return one line for each silent emitter, and for each clock and distance that differs by more than allowed.
+
+        The limit of differences is three standard deviations and one sample of the signals.
         """
         sounds = {(each.emitter, each.receiver): each for each in self.sounds}
         clocks_s, distances_s = _both_ways(sounds, SYNC_STEP_S * (len(self._mountings) - 1))
-        found = [*self._of_clocks(clocks_s)]
+        found = [f"{name} emits no sound, unlike the other sensors; check its emitter" for name in self.silent]
+        found += self._of_clocks(clocks_s)
         for (one, other), (late_s, sd_s) in distances_s.items():
             if self._is_wrong(late_s, sd_s):
                 found.append(
@@ -274,13 +313,8 @@ def _arrivals(
 ) -> dict[str, _Arrival | None]:
     """Return the arrivals of direct sound at a sensor, by emitter, and None for those that are not audible."""
     settings = measurement.settings
-    # Without its own delay, the matched filter yields times since the start of the record.
-    settings = settings.replace(call=settings.call.replace(delay_s=0.0))
-    layout, sensor, speed_m_s = (
-        microphones(settings.array),
-        mountings[measurement.stamp.sensor],
-        sound_speed_m_s(settings.air),
-    )
+    layout, sensor = microphones(settings.array), mountings[measurement.stamp.sensor]
+    speed_m_s = sound_speed_m_s(settings.air)
     places_m = sensor.translation_m + layout.enabled_positions_m @ sensor.rotation.T
     late_s = {
         name: start_s
@@ -290,24 +324,50 @@ def _arrivals(
     }
     if not late_s:
         return {}
-    last_s = max(float(each.max()) for each in late_s.values()) + 2 * _WINDOW_S
-    needed = math.ceil(
-        (last_s + settings.call.end_s + 2 * matched_guard_s(settings)) * settings.recording.sample_rate_hz
-    )
-    signals = matched(signals_of(measurement, settings=settings, max_samples=needed), settings)
-    spectra = np.fft.fft(signals.astype(np.complex128), axis=1)
-    frequency_hz = np.fft.fftfreq(signals.shape[1], 1 / settings.signal_rate_hz)
+    sound = _Sound(measurement, max(float(each.max()) for each in late_s.values()))
     # Direct sound from the sensor itself is far louder, and hides that of neighbours.
-    own_s = measurement.settings.call.start_s
+    own_s = settings.call.start_s
     own_end_s = own_s + float(np.linalg.norm(layout.enabled_positions_m, axis=1).max()) / speed_m_s + _PULSE_S / 2
     found: dict[str, _Arrival | None] = {}
     for name, each in late_s.items():
         middle_s = float(each.mean())
         window_s = min(_WINDOW_S, max(own_s - _PULSE_S / 2 - middle_s, middle_s - own_end_s))
         if window_s >= _MIN_WINDOW_S:
-            beam = np.mean(spectra * np.exp(2j * math.pi * frequency_hz * each[:, None]), axis=0)
-            found[name] = _strongest(beam, settings, window_s, false_alarms)
+            found[name] = sound.arrival(each, window_s, false_alarms)
     return found
+
+
+def _own_arrival(measurement: Measurement, window_s: float, false_alarms: float) -> _Arrival | None:
+    """Return the arrival of a sensor's own direct sound, None if it is not audible."""
+    settings = measurement.settings
+    layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
+    away_m = np.linalg.norm(layout.enabled_positions_m, axis=1)
+    late_s = settings.call.start_s + away_m / speed_m_s + layout.delay_s[layout.enabled]
+    return _Sound(measurement, float(late_s.max())).arrival(late_s, window_s, false_alarms)
+
+
+class _Sound:
+    """Spectra of the signals of a measurement after the matched filter, up to a time."""
+
+    def __init__(self, measurement: Measurement, last_s: float) -> None:
+        settings = measurement.settings
+        # Without its own delay, the matched filter yields times since the start of the record.
+        self._settings = settings = settings.replace(call=settings.call.replace(delay_s=0.0))
+        needed_s = last_s + 2 * _WINDOW_S + settings.call.end_s + 2 * matched_guard_s(settings)
+        needed = math.ceil(needed_s * settings.recording.sample_rate_hz)
+        signals = matched(signals_of(measurement, settings=settings, max_samples=needed), settings)
+        self._spectra = np.fft.fft(signals.astype(np.complex128), axis=1)
+        self._frequency_hz = np.fft.fftfreq(signals.shape[1], 1 / settings.signal_rate_hz)
+
+    def arrival(self, late_s: Floats, window_s: float, false_alarms: float) -> _Arrival | None:
+        """Return the strongest pulse around predicted times of the microphones, None if it is not audible."""
+        beam = np.mean(self._spectra * np.exp(2j * math.pi * self._frequency_hz * late_s[:, None]), axis=0)
+        return _strongest(beam, self._settings, window_s, false_alarms)
+
+
+def _is_clear(found: Sequence[_Arrival | None]) -> bool:
+    """Return True for a sound that clearly exceeds the threshold in more than half of the pulses."""
+    return 2 * sum(each is not None and each.excess >= _CLEAR for each in found) > len(found)
 
 
 def _strongest(
@@ -335,7 +395,8 @@ def _strongest(
     before, here, after = level[peak - 1 : peak + 2].tolist()
     offset = 0.5 * (before - after) / (before - 2 * here + after)
     noise_s = background / (here * math.sqrt(2) * 2 * math.pi * _bandwidth_hz(settings))
-    return _Arrival((peak - half + offset) * step_s, noise_s)
+    excess = level[peak] / (audible * max(background, 1e-30))
+    return _Arrival((peak - half + offset) * step_s, noise_s, float(excess))
 
 
 def _bandwidth_hz(settings: Settings) -> float:

@@ -16,8 +16,11 @@ from ertis_numba.fusion.receivers import Receiver
 __all__ = [
     "EmissionCounts",
     "ExpectedEchoes",
+    "cheapest",
+    "doubted",
     "expected_echoes",
     "is_better",
+    "is_heard",
     "is_much_better",
     "silence_ratios",
     "silent_one",
@@ -33,9 +36,12 @@ _MISSED: Final = math.log(0.67 / 0.02)
 _HEARD: Final = math.log(0.33 / 0.98)
 _DEPENDENT: Final = 0.5  # Independent echoes per echo, as several sensors hear one reflector.
 _CERTAIN: Final = math.log(1e3)
+_PROVEN: Final = 2 * _DEPENDENT * _HEARD * 2  # Four echoes that other calls predict, and none that is missed.
 _ALIKE: Final = 3  # Difference of unexplained and missed echoes within which explanations are equally good.
 _TIMES: Final = 1.25  # Ratio of the lengths of two descriptions, of which the longer one is wrong, …
 _MORE: Final = 9  # … and their difference.
+_CHEAP: Final = 0.9  # Ratio of costs below which the silence of an emitter explains echoes clearly better.
+_N_SENSORS: Final = 3  # Emitters of which one can be told from the others.
 _N_OTHERS: Final = 2  # Echoes of other calls that locate a reflector.
 _RADIATED: Final = 10 ** (-16.5 / 10)  # Power to the side, below which models of emitters are uncertain.
 _VISIBLE: Final = 10 ** (8.0 / 10)  # Power of an expected echo relative to noise and side lobes.
@@ -133,6 +139,49 @@ def silent_one(
     least = min((costs[each] for each in likely), default=0)
     best = [each for each in likely if not is_better(least, costs[each])]
     return best[0] if len(best) == 1 else None
+
+
+def doubted(emitters: Collection[int], counts: EmissionCounts, cost: int) -> frozenset[int]:
+    """Return emitters that no echo shows to work, if the explanation of the echoes leaves room for a better one.
+
+    Parameters
+    ----------
+    emitters : collection of int
+        Emitters that are not known to be silent. One of two cannot be told from the other.
+    counts : EmissionCounts
+        Evidence if these emit.
+    cost : int
+        Unexplained and missed echoes if they emit.
+    """
+    if len(emitters) < _N_SENSORS or cost <= _ALIKE:
+        return frozenset()
+    return frozenset(number for number in emitters if not is_heard(counts, number))
+
+
+def cheapest(joint: int, costs: Mapping[int, int]) -> int | None:
+    """Return the emitter whose silence explains the echoes clearly better than anything else, or None.
+
+    If all are assumed to emit, the echoes may explain so few reflectors that none of them shows the silent one. This
+    applies to omnidirectional emitters. The calls of pistons reach few reflectors in common, so that a wrong one may
+    explain their echoes as well.
+
+    Parameters
+    ----------
+    joint : int
+        Unexplained and missed echoes if all emit.
+    costs : mapping of int to int
+        The same if an emitter is silent.
+    """
+    ascending = sorted(costs, key=lambda number: costs[number])
+    if not ascending:
+        return None
+    least, others = costs[ascending[0]], [joint, *(costs[each] for each in ascending[1:])]
+    return ascending[0] if all(is_better(least, each) and least < _CHEAP * each for each in others) else None
+
+
+def is_heard(counts: EmissionCounts, number: int) -> bool:
+    """Return True if echoes at reflectors that other calls locate show that an emitter works."""
+    return bool(silence_ratios([counts])[number] <= _PROVEN)
 
 
 def is_better(cost: int, other: int) -> bool:

@@ -1,7 +1,7 @@
 """Fusion of the images of sensors that emit together."""
 
 import functools
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -22,6 +22,7 @@ __all__ = ["Fused", "Fuser", "fuse"]
 _SPACING_DEG: Final = 1.0, 4.0  # of planar and of three-dimensional images
 _STEP_M: Final = 0.015, 0.03
 _N_COMPARED: Final = 3  # Pulses that other emitters are tried for.
+_N_SHOWN: Final = 3  # Pulses in which no echo shows that an emitter works.
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,10 @@ class Fused:
     without_echo : tuple of str
         Fused sensors whose images hold no echo above their noise. If it names all, the pulse returned no echo. Computed
         with the points.
+    without_own_echo : tuple of str
+        Fused sensors of whose calls no echo is known, in this pulse and the two before: their silence explains the
+        echoes as well. Either nothing reflects their calls, or their emitters are broken. Nothing is known of what is
+        ahead of them. Computed at the first access, which takes up to a few times as long as the points.
     noise : dict of str to float
         Detection threshold of each fused sensor: noise exceeds it anywhere in the image with a probability of 10⁻⁵.
         Infinite if the image consists of zeros.
@@ -68,6 +73,7 @@ class Fused:
     missing: tuple[str, ...]
     _solve: Callable[[], PulseReflectors] = field(repr=False)
     _locate: Callable[[PulseReflectors, Energyscape], PointCloud] = field(repr=False)
+    _unshown: Callable[[], frozenset[int]] = field(repr=False)
     _names: tuple[str, ...] = field(repr=False)
 
     @functools.cached_property
@@ -90,6 +96,11 @@ class Fused:
     def without_echo(self) -> tuple[str, ...]:
         """Fused sensors whose images hold no echo above their noise."""
         return tuple(self._names[number] for number in self._solve().without_echo)
+
+    @property
+    def without_own_echo(self) -> tuple[str, ...]:
+        """Fused sensors of whose calls no echo is known, in this pulse and the two before."""
+        return tuple(self._names[number] for number in sorted(self._unshown()))
 
     @property
     def noise(self) -> dict[str, float]:
@@ -164,6 +175,7 @@ class Fuser:
         self._tables: FusionTables | None = None
         self._last: Callable[[], PulseReflectors] | None = None  # of the pulse before
         self._first: list[tuple[tuple[Energyscape, ...], Callable[[], PulseReflectors]]] = []
+        self._shown: list[Callable[[], frozenset[int]]] = []  # of the pulse and those before
         self._options = {"spacing_deg": spacing_deg, "range_step_m": range_step_m, "silent": tuple(silent)}
 
     @property
@@ -195,13 +207,15 @@ class Fuser:
         self._start_s |= {number: image.settings.call.start_s for number, image in group.items()}
         self._diameter_m |= self._diameters_m(group)
         if self._tables is None or not self._tables.fit(group, self._diameter_m):
-            self._tables, self._last = self._new_tables(group), None
+            self._tables, self._last, self._shown = self._new_tables(group), None, []
         tables = self._tables
         before = None if self._last is None else self._last()
         unheard, pulses = (frozenset[int](), ()) if before is None else (before.unheard, before.pulses)
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
         found = tables.attribution(group).without(unheard)(coarse)
         solve = self._last = functools.cache(lambda: tables.pulse_reflectors(group, found, unheard, pulses))
+        shown = functools.cache(lambda: tables.shown_emitters(group, solve()))
+        self._shown = recent = [*self._shown, shown][-_N_SHOWN:]
         if len(self._first) < _N_COMPARED:
             self._first.append((tuple(group.values()), solve))
         image = tables.image((solve().attributed if unheard or found.suspects else found).reflectivity, group)
@@ -211,6 +225,7 @@ class Fuser:
             missing=tuple(sensor.name for number, sensor in enumerate(self._mountings) if number not in group),
             _solve=solve,
             _locate=tables.points,
+            _unshown=functools.cache(lambda: _unshown(tables.emitters(group), recent)),
             _names=self.sensors,
         )
 
@@ -335,6 +350,14 @@ class Fuser:
             [known.get(number, known[first]) for number in numbers] for known in (self._start_s, self._diameter_m)
         )
         return FusionTables(grid, self._mountings, self._emitting, start_s, diameters_m)
+
+
+def _unshown(emitters: frozenset[int], recent: Sequence[Callable[[], frozenset[int]]]) -> frozenset[int]:
+    """Return the emitters that echoes of no recent pulse show to work."""
+    for shown in reversed(recent):
+        if emitters:
+            emitters -= shown()
+    return emitters
 
 
 def fuse(images: Iterable[Energyscape], mountings: Mountings, *, emitter_diameter_m: float | None = None) -> Fused:

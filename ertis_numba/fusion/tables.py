@@ -14,8 +14,11 @@ from ertis_numba.fusion.association import Reflectors, SensorEchoes
 from ertis_numba.fusion.attribution import Attributed, Attribution, Rivalries
 from ertis_numba.fusion.emissions import (
     EmissionCounts,
+    cheapest,
+    doubted,
     expected_echoes,
     is_better,
+    is_heard,
     silence_ratios,
     silent_one,
     suspect,
@@ -219,29 +222,70 @@ class FusionTables:
             is_shown = silence_ratios([rival.counts])[number] < 0 and not is_better(explained.cost, rival.cost)
             if is_shown or is_better(rival.cost, explained.cost):
                 unheard, attributed, explained, pulses = others, emitting, rival, ()
-        while (suspected := suspect((*pulses, explained.counts)[-_N_PULSES:], unheard)) is not None:
-            rivals = {}
-            for number in self._judged(group) - unheard:
-                each = self._without(group, unheard | {number})
-                rival = self._explained(group, each, floor, unheard | {number})
-                if not explained.reflectors.needs(number, rival.reflectors):
-                    rivals[number] = each, rival
-            if suspected not in rivals:
-                break
-            found = silent_one(
-                suspected,
-                explained.counts,
-                {number: each.cost for number, (_, each) in rivals.items()},
-                {number: each.counts for number, (_, each) in rivals.items()},
-            )
-            if found is None:
-                break
-            unheard, (attributed, explained) = unheard | {found}, rivals[found]
+        while (silenced := self._silenced(group, explained, floor, unheard, pulses)) is not None:
+            number, attributed, explained = silenced
+            unheard |= {number}
         evidence = (*pulses, explained.counts)[-_N_PULSES:]
         still = frozenset(number for number in unheard if silence_ratios(evidence)[number] > 0)
         return PulseReflectors(
             attributed, explained.reflectors, floor, explained.without_echo, still, evidence, explained.cost
         )
+
+    def _silenced(
+        self,
+        group: Mapping[int, Energyscape],
+        explained: _Explained,
+        floor: Mapping[int, EchoFloor],
+        unheard: frozenset[int],
+        pulses: Sequence[EmissionCounts],
+    ) -> tuple[int, Attributed, _Explained] | None:
+        """Return another emitter that is silent, and the explanation of the echoes without it, or None."""
+        suspected = suspect((*pulses, explained.counts)[-_N_PULSES:], unheard)
+        numbers = self._judged(group) - unheard
+        doubts = doubted(numbers, explained.counts, explained.cost) if self._is_omnidirectional else frozenset[int]()
+        rivals = {}
+        for number in doubts if suspected is None else numbers:
+            each = self._without(group, unheard | {number})
+            rivals[number] = each, self._explained(group, each, floor, unheard | {number})
+        found = cheapest(explained.cost, {number: rivals[number][1].cost for number in doubts})
+        if found is None:
+            likely = {
+                number: each
+                for number, (_, each) in rivals.items()
+                if not explained.reflectors.needs(number, each.reflectors)
+            }
+            if suspected in likely:
+                costs = {number: each.cost for number, each in likely.items()}
+                counts = {number: each.counts for number, each in likely.items()}
+                found = silent_one(suspected, explained.counts, costs, counts)
+        return None if found is None else (found, *rivals[found])
+
+    def emitters(self, group: Mapping[int, Energyscape]) -> frozenset[int]:
+        """Return the sensors of a group that emitted."""
+        return frozenset({*self._emitting} & group.keys() - _key(group)[1])
+
+    def shown_emitters(self, group: Mapping[int, Energyscape], found: PulseReflectors) -> frozenset[int]:
+        """Return the emitters of a group that echoes show to work: their silence explains the echoes less well.
+
+        Parameters
+        ----------
+        group : mapping of int to Energyscape
+        found : PulseReflectors
+            Reflectors of the group.
+        """
+        return frozenset(number for number in self.emitters(group) if self._is_shown(group, found, number))
+
+    def _is_shown(self, group: Mapping[int, Energyscape], found: PulseReflectors, number: int) -> bool:
+        """Return True if echoes show that an emitter works."""
+        if number in found.unheard | found.apart:
+            return number in found.apart
+        if found.pulses and is_heard(found.pulses[-1], number):
+            return True
+        if number in found.without_echo or len(self._emitting) == 1:
+            return number not in found.without_echo
+        silent = found.unheard | {number}
+        rival = self._explained(group, self._without(group, silent), found.floor, silent)
+        return rival.cost > found.cost and found.reflectors.needs(number, rival.reflectors)
 
     def _without(self, group: Mapping[int, Energyscape], unheard: frozenset[int]) -> Attributed:
         """Return the attribution of a group whose sensors do not hear some emitters."""
@@ -290,6 +334,11 @@ class FusionTables:
             for emitter, delay_m in self._late_m[number].items()
             if emitter not in passive and self._same_call(emitter, number)
         }
+
+    @property
+    def _is_omnidirectional(self) -> bool:
+        """True if the call of each emitter reaches the surroundings of all others."""
+        return not any(self._diameters_m)
 
     def _judged(self, group: Mapping[int, Energyscape]) -> frozenset[int]:
         """Return the emitters that a group may show to be silent.

@@ -1,6 +1,7 @@
 """Occupancy mapping from the images of a platform at known poses."""
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Final
 
@@ -43,7 +44,9 @@ class Mapper:
     Cells in front of the first clear echo of a direction become free, but less so at larger distances. A smooth wall
     that the sound meets obliquely returns no echo, so silence alone shows free space near the platform only, and only
     as far as a clear echo would exceed the noise. Noise is no echo: without any echo so far, only the place of the
-    platform is free. Uncertain poses spread the evidence of echoes, and shorten free space.
+    platform is free. The silence of a sensor of whose calls no echo is known shows no free space either, because its
+    emitter may be broken (`Fused.without_own_echo`). Uncertain poses spread the evidence of echoes, and shorten free
+    space.
 
     Parameters
     ----------
@@ -107,6 +110,7 @@ class Mapper:
         self._coverages: dict[tuple[tuple[str, float, float, float, float], ...], Coverage] = {}
         self._emitters: dict[tuple[Call, Air], Emitters] = {}
         self._n_groups, self._time_ns, self._n_points, self._n_empty = 0, 0, 0, 0
+        self._without_own_echo: Counter[str] = Counter()
         self._attitude = AttitudeCheck()
 
     @property
@@ -124,6 +128,11 @@ class Mapper:
     def n_empty(self) -> int:
         """Number of groups so far whose images hold no echo above their noise."""
         return self._n_empty
+
+    @property
+    def without_own_echo(self) -> dict[str, int]:
+        """Number of groups so far for each sensor of whose calls no echo is known (`Fused.without_own_echo`)."""
+        return dict(self._without_own_echo)
 
     def emitter_warning(self) -> str | None:
         """Return a warning if echoes contradict the stated diameter of the emitters, as `Fuser.emitter_warning`.
@@ -180,6 +189,7 @@ class Mapper:
         add_evidence(window, view, echoes, coverage, near_m=self._near_m)
         self._n_groups += 1
         self._n_empty += fused.is_empty
+        self._without_own_echo.update(fused.without_own_echo)
         self._time_ns = max(time_ns, self._time_ns)
 
     def _view(self, translation_m: Floats, rotation: Floats, covariance: Floats) -> View:
@@ -236,7 +246,7 @@ class Mapper:
     def _heard_m(self, image: Energyscape, fused: Fused) -> float:
         """Return the distance up to which a clear echo of a sensor's call exceeds the noise of its image."""
         sensor, settings = image.stamp.sensor, image.settings
-        if sensor in fused.unheard:
+        if sensor in fused.unheard or sensor in fused.without_own_echo:
             return 0.0
         key = settings.call, settings.air
         if key not in self._emitters:

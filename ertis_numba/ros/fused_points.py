@@ -17,6 +17,8 @@ __all__ = ["LOCAL_FRAME", "FusedImages", "FusedPoints", "PulseImages", "joined"]
 PLATFORM_FRAME: Final = "base_link"
 LOCAL_FRAME: Final = "base_link_local"
 """Frame of fused points near the sensors, if these are far from the origin of their platform."""
+_N_EVIDENCE: Final = 3  # Pulses that show whether an emitter works, …
+_CHECKED_EVERY: Final = 10  # … checked once in so many.
 _FAR_M: Final = 1000.0  # Distance from which float32 rounds by more than 30 µm.
 
 
@@ -49,6 +51,7 @@ class FusedImages:
         self._groups: PulseGroups[Energyscape] = PulseGroups(on_note)
         self._fuser: tuple[dict[str, Mounting], Fuser] | None = None
         self._n_empty = 0
+        self._n_fused, self._unshown = 0, frozenset[str]()
 
     def add(self, image: Energyscape, mountings: Mapping[str, Mounting]) -> list[PulseImages]:
         """Add an image, and return the pulses that are complete now.
@@ -85,6 +88,7 @@ class FusedImages:
         images = [*group.values()]
         fused = self._fuser[1](image for image in images if image.is_planar == images[0].is_planar)
         self._note_empty(fused)
+        self._note_emitters(fused)
         stamp = replace(fused.image.stamp, sensor=LOCAL_FRAME if any(origin_m) else PLATFORM_FRAME)
         points = fused.points.replace(stamp=stamp, translation_m=origin_m)
         return fused.image.replace(stamp=stamp, points=points)
@@ -100,6 +104,19 @@ class FusedImages:
         if not self._n_empty:
             self._note(f"SYNC pulse {count} carried no echo above the noise")
         self._n_empty += 1
+
+    def _note_emitters(self, fused: Fused) -> None:
+        """State which sensors no echo shows to emit; checked now and then, because it takes longer than the points."""
+        self._n_fused += 1
+        if fused.is_empty or self._n_fused % _CHECKED_EVERY != _N_EVIDENCE:
+            return
+        unshown, count = frozenset(fused.without_own_echo), fused.image.stamp.sync_count
+        if unshown - self._unshown:
+            self._note(
+                f"SYNC pulse {count}: no echo of the call of {', '.join(sorted(unshown))} is known; either nothing "
+                "ahead reflects, or the emitter is silent, and obstacles ahead may be missing"
+            )
+        self._unshown = unshown
 
 
 def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:

@@ -1,18 +1,13 @@
-"""Emitters that are broken or stated wrongly, on random platforms."""
+"""Emitters that are broken or stated wrongly, on platforms in random surroundings."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Callable
 from typing import Any, Final
 
-import numpy as np
-
 from ertis_bench.markdown import table
-from ertis_bench.platform_trials.platform_scenes import EMITTERS_M, platform_scene, random_reflectors
-from ertis_numba.frames import Energyscape
-from ertis_numba.fusion import Fuser
-from ertis_numba.pipeline import Pipeline
-from ertis_numba.simulation import Scene
-from ertis_numba.simulation.render import Simulator
+from ertis_bench.platform_trials.emitter_rooms import EmitterRoom
+from ertis_bench.platform_trials.platform_scenes import EMITTERS_M
+from ertis_numba.fusion import Fused, Fuser
 
 __all__ = ["form", "run"]
 
@@ -29,68 +24,74 @@ def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
     say : callable
         Function that reports progress.
     """
-    rows = []
+    rows: dict[tuple[float, int], Counter[str]] = {}
     for diameter_m, other_m in zip(EMITTERS_M, EMITTERS_M[::-1], strict=True):
-        row = {"diameter_m": diameter_m, "platforms": count, "pulses": count * _N_PULSES}
-        row |= dict.fromkeys(("named", "others", "accused", "contradicted", "found"), 0)
         for number in range(seed, seed + count):
-            scene = platform_scene(number, random_reflectors(number), diameter_m)
-            broken = str(np.random.default_rng([number, 42]).choice([each.name for each in scene.sensors]))
-            pulses = [_images(scene, pulse) for pulse in range(_N_PULSES)]
-            fuser, names = _fused(scene, pulses, diameter_m)
-            row["accused"] += sum(map(bool, names))
-            row["contradicted"] += fuser.emitter_warning() is not None
-            row["found"] += _fused(scene, pulses, other_m)[0].emitter_warning() is not None
-            silent = [_images(scene, pulse, broken) for pulse in range(_N_PULSES)]
-            found = {name for each in _fused(scene, silent, diameter_m)[1] for name in each}
-            row["named"] += broken in found
-            row["others"] += bool(found - {broken})
-            say(f"platform {number}, emitters of {1000 * diameter_m:g} mm: {broken} broken, {sorted(found)} named")
-        rows.append(row)
-    return {"count": count, "seed": seed, "emitters": rows}
+            drawn = EmitterRoom.drawn(number)
+            row = rows.setdefault((diameter_m, len(drawn.mountings)), Counter())
+            row.update(platforms=1)
+            row.update(_healthy(drawn, diameter_m, other_m))
+            row.update(_broken(drawn, diameter_m))
+            say(f"platform {number}, {drawn.kind}, emitters of {1000 * diameter_m:g} mm: {dict(row)}")
+    each = [{"diameter_m": diameter_m, "sensors": n, **row} for (diameter_m, n), row in sorted(rows.items())]
+    return {"count": count, "seed": seed, "emitters": each}
+
+
+def _healthy(drawn: EmitterRoom, diameter_m: float, other_m: float) -> dict[str, int]:
+    """Return numbers of pulses, of those with a name, of sensors without an own echo, and of warnings of the kind."""
+    pulses = [drawn.images(pulse, diameter_m, is_broken=False) for pulse in range(_N_PULSES)]
+    fuser, other = (Fuser(drawn.mountings, emitter_diameter_m=each) for each in (diameter_m, other_m))
+    every = [fuser(images) for images in pulses]
+    other(pulses[0])
+    return {
+        "pulses": len(every),
+        "accused": sum(bool(each.unheard) for each in every),
+        "doubted": len(every[-1].without_own_echo),
+        "contradicted": fuser.emitter_warning() is not None,
+        "found": other.emitter_warning() is not None,
+    }
+
+
+def _broken(drawn: EmitterRoom, diameter_m: float) -> dict[str, int]:
+    """Return whether the broken emitter is named, or stated as one without echo, and whether others are named."""
+    fuser = Fuser(drawn.mountings, emitter_diameter_m=diameter_m)
+    every: list[Fused] = [fuser(drawn.images(pulse, diameter_m, is_broken=True)) for pulse in range(_N_PULSES)]
+    names = {name for each in every for name in each.unheard}
+    is_named = drawn.broken in names
+    return {
+        "named": is_named,
+        "stated": is_named or drawn.broken in every[-1].without_own_echo,
+        "others": bool(names - {drawn.broken}),
+    }
 
 
 def form(report: dict[str, Any]) -> str:
     """Return the report as Markdown."""
     head = [
         "emitters",
+        "sensors",
         "broken ones named",
+        "named, or no own echo known",
         "others named then",
         "pulses of working emitters with a name",
+        "working ones without a known echo",
         "warnings if stated rightly",
         "warnings if stated wrongly",
     ]
     rows = [
         [
             f"{1000 * row['diameter_m']:g} mm" if row["diameter_m"] else "omnidirectional",
-            *(f"{row[key]} of {row['platforms']}" for key in ("named", "others")),
+            f"{row['sensors']}",
+            *(f"{row[key]} of {row['platforms']}" for key in ("named", "stated", "others")),
             f"{row['accused']} of {row['pulses']}",
+            f"{row['doubted']} of {row['sensors'] * row['platforms']}",
             *(f"{row[key]} of {row['platforms']}" for key in ("contradicted", "found")),
         ]
         for row in report["emitters"]
     ]
     return (
-        f"{table(head, rows)}\n\n{report['count']} platforms at rest with four sensors, among ten random reflectors, "
-        f"from seed {report['seed']}, {_N_PULSES} SYNC pulses each. Echoes show that a piston is broken only if a "
-        "reflector stands in its beam and in that of a neighbour."
+        f"{table(head, rows)}\n\n{report['count']} platforms with two to four sensors for each kind of emitter, from "
+        f"seed {report['seed']}, {_N_PULSES} SYNC pulses each: among four to eight posts, with one or two walls, in a "
+        "corridor or in a corner, or among two to four posts. Platforms move by up to 4 cm from pulse to pulse. A "
+        "separate program renders the sound by sums of delayed calls, without sound that more than two walls reflect."
     )
-
-
-def _fused(scene: Scene, pulses: list[list[Energyscape]], diameter_m: float) -> tuple[Fuser, list[tuple[str, ...]]]:
-    """Return the fuser of pulses, and the sensors that it names in each of them."""
-    mountings: Mapping[str, Any] = {
-        each.name: (each.position_m or (), each.quaternion().tolist()) for each in scene.sensors
-    }
-    fuser = Fuser(mountings, emitter_diameter_m=diameter_m)
-    return fuser, [fuser(images).unheard for images in pulses]
-
-
-def _images(scene: Scene, pulse: int, broken: str = "") -> list[Energyscape]:
-    """Return the images of a pulse, with an emitter that is silent although its sensor believes that it emits."""
-    sensors = tuple(each.replace(emitter=each.emitter.replace(silent=each.name == broken)) for each in scene.sensors)
-    scene, found = scene.replace(sensors=sensors), []
-    for sensor in sensors:
-        with Pipeline(sensor.settings(), predict=False) as pipeline:
-            image = pipeline.process(Simulator(scene, sensor=sensor.name).render(pulse))
-        found.append(image.replace(stamp=replace(image.stamp, behaviour="active")))
-    return found

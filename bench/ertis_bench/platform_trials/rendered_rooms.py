@@ -205,23 +205,28 @@ def rendered(
     diameter_m: float,
     random: np.random.Generator,
     noise: float = _NOISE,
+    dead: str = "",
 ) -> dict[str, NDArray[np.float32]]:
-    """Return the signals of all sensors, by name: (sample, mic) float32."""
+    """Return the signals of all sensors, by name: (sample, mic) float32. The emitter of a dead sensor is silent."""
     air = _Air(settings, diameter_m)
     scatterers_m = np.concatenate([room.posts_m, room.edges_m])
     strength = 10 ** (np.append(room.strength_db, np.full(len(room.edges_m), _EDGE_DB)) / 20)
-    sensors = [(np.array(place_m[:2]), _unit(2 * math.atan2(turn[2], turn[3]))) for place_m, turn in mountings.values()]
+    placed = {
+        name: (np.array(place_m[:2]), _unit(2 * math.atan2(turn[2], turn[3])))
+        for name, (place_m, turn) in mountings.items()
+    }
+    emitting = [sensor for name, sensor in placed.items() if name != dead]
     lit = [
         sum(
             air.arrived(air.radiated(*sensor, leg), float(np.linalg.norm(leg.from_m - scatterer_m)))
-            for sensor in sensors
+            for sensor in emitting
             for leg in _legs(room, sensor[0], scatterer_m)
         )
         for scatterer_m in scatterers_m
     ]
     mics_m = np.asarray(microphones(settings.array).positions_m, np.float64)
     found = {}
-    for name, sensor in zip(mountings, sensors, strict=True):
+    for name, sensor in placed.items():
         sensor_m, ahead = sensor
         left = np.array([-ahead[1], ahead[0]])
         heard_m = np.column_stack([sensor_m + mics_m[:, :1] * ahead + mics_m[:, 1:2] * left, HEIGHT_M + mics_m[:, 2]])
@@ -231,7 +236,7 @@ def rendered(
             for leg in _legs(room, scatterer_m, sensor_m)
             if not isinstance(spectrum, int)
         ]
-        for other in sensors:
+        for other in emitting:
             with_direct = other is not sensor and not diameter_m
             sources += [
                 (leg.from_m, air.radiated(*other, leg))
