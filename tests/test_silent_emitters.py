@@ -1,14 +1,19 @@
 """Sensors whose emitters are broken, in scenes that are rendered without the simulator."""
 
 import functools
+import json
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba.fusion.emissions import EmissionCounts, cheapest, doubted, silent_one, suspect
+from ertis_numba.ros.fused_points import FusedImages
 from ertis_numba.simulation import load_scene
 from ertis_numba.simulation.render import render
+from ertis_numba.storage import write_recording
 from tests.small_platforms import HEIGHT_M, images_of, mounted, random_reflectors, rendered, settings_of
 
 PLACES_M = np.array([[1.6, 0.2, HEIGHT_M], [1.2, -1.0, HEIGHT_M], [-1.0, -1.3, HEIGHT_M]])
@@ -78,6 +83,43 @@ def test_sector_that_no_emission_reaches_is_stated_and_not_free():
         assert mapper.without_own_echo == {"left": 3}
         assert mapper.map.log_odds_at((0.0, 0.8)) == 0.0
         assert mapper.map.log_odds_at((0.8, 0.05)) < 0.0
+
+
+@pytest.mark.parametrize(
+    "line", ["process FILE --fuse --json -o fused.h5", "map FILE --poses still.tum --json -o map.h5"]
+)
+def test_commands_state_sensors_without_an_echo_of_their_own(tmp_path, monkeypatch, line):
+    """There is nothing on the left."""
+    monkeypatch.chdir(tmp_path)
+    settings, places_m = settings_of(diameter_m=0.012), np.append(PLACES_M, [[-1.5, 0.1, HEIGHT_M]], axis=0)
+    signals = rendered(mounted(), settings, places_m, np.zeros(4), diameter_m=0.012, random=np.random.default_rng(0))
+    stamps = {name: ertis.Stamp(sensor=name, sequence=0, sync_count=0, timestamp_ns=10**18) for name in signals}
+    measurements = [ertis.Measurement(signal, settings, stamps[name]) for name, signal in signals.items()]
+    write_recording(tmp_path / "rec.h5", measurements, mounting=mounted())
+    (tmp_path / "still.tum").write_text("999999999.9 0 0 0 0 0 0 1\n1000000000.5 0 0 0 0 0 0 1\n")
+    done = CliRunner().invoke(cli, line.replace("FILE", "rec.h5").split())
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["without_own_echo"] == {"left": 1}
+    assert "note: no echo of the call of left is known in 1 of 1 pulse: either nothing ahead" in done.stderr
+
+
+def test_ros_states_sensors_without_an_echo_of_their_own():
+    notes = []
+    fused = FusedImages(notes.append)
+    places_m = np.append(PLACES_M, [[-1.5, 0.1, HEIGHT_M]], axis=0)
+    for number in range(4):
+        signals = rendered(
+            mounted(),
+            settings_of(diameter_m=0.012),
+            places_m,
+            np.zeros(4),
+            diameter_m=0.012,
+            random=np.random.default_rng(number),
+        )
+        for image in images_of(signals, settings_of(diameter_m=0.012), number).values():
+            fused.add(image, mounted())
+    (note,) = notes
+    assert note.startswith("SYNC pulse 2: no echo of the call of left is known; either nothing ahead reflects")
 
 
 def test_emitters_that_echoes_show_are_not_stated():

@@ -35,6 +35,7 @@ _OVERSAMPLING: Final = 8
 _MOUNTING_SD_M: Final = 1e-3  # of the position of a sensor along the way to another one
 _SIGMAS: Final = 3.0
 _NEAREST_M: Final = 0.05
+_BESIDE_S: Final = 150e-6  # Largest difference of a sensor's own direct sound: its emitter is near its microphones.
 _CLEAR: Final = 2.0  # Level relative to the threshold from which the way back would be heard as well.
 
 
@@ -343,7 +344,8 @@ def _own_arrival(measurement: Measurement, window_s: float, false_alarms: float)
     layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
     away_m = np.linalg.norm(layout.enabled_positions_m, axis=1)
     late_s = settings.call.start_s + away_m / speed_m_s + layout.delay_s[layout.enabled]
-    return _Sound(measurement, float(late_s.max())).arrival(late_s, window_s, false_alarms)
+    found = _Sound(measurement, float(late_s.max())).arrival(late_s, window_s, false_alarms)
+    return found if found is not None and abs(found.difference_s) < _BESIDE_S else None
 
 
 class _Sound:
