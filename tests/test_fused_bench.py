@@ -188,9 +188,10 @@ def test_emitters_bench_counts_broken_and_wrongly_stated_ones(tmp_path, monkeypa
     target = tmp_path / "page.md"
     marker = "ertis bench fusion --only emitters"
     target.write_text(f"<!-- {marker} -->\nold\n<!-- /{marker} -->\n", "utf-8")
-    options = ["--only", "emitters", "--count", "1", "--seed", "1000", "--json", "--quiet", "--update", str(target)]
+    options = ["--only", "emitters", "--count", "1", "--seed", "104", "--json", "--quiet", "--update", str(target)]
     done = CliRunner().invoke(cli, ["bench", "fusion", *options])
     assert done.exit_code == 0, (done.stderr, done.exception)
-    _, row = json.loads(done.stdout)["emitters"]
+    row, _ = json.loads(done.stdout)["emitters"]
     assert (row["platforms"], row["pulses"], row["accused"], row["contradicted"], row["others"]) == (1, 1, 0, 0, 0)
+    assert (row["diameter_m"], row["sensors"], row["named"], row["stated"]) == (0.0, 3, 1, 1)
     assert "| omnidirectional | " in target.read_text("utf-8")

@@ -214,8 +214,8 @@ class Fuser:
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
         found = tables.attribution(group).without(unheard)(coarse)
         solve = self._last = functools.cache(lambda: tables.pulse_reflectors(group, found, unheard, pulses))
-        shown = functools.cache(lambda: tables.shown_emitters(group, solve()))
-        self._shown = recent = [*self._shown, shown][-_N_SHOWN:]
+        shown: Callable[[], frozenset[int]] = functools.cache(lambda: tables.shown_emitters(group, solve()))
+        recent = self._shown = [*self._shown, shown][-_N_SHOWN:]
         if len(self._first) < _N_COMPARED:
             self._first.append((tuple(group.values()), solve))
         image = tables.image((solve().attributed if unheard or found.suspects else found).reflectivity, group)
