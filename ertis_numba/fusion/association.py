@@ -433,6 +433,11 @@ class Reflectors:
         ]
         return any(bool(silent.is_unexplained[echo].any()) for echo in own)
 
+    def own_emitters(self) -> frozenset[int]:
+        """Return the emitters to whose calls the echoes of their own sensors are attributed."""
+        own = [each.emitter[each.emitter == self._receiver[each.echo]].tolist() for each in self.located]
+        return frozenset(number for each in own for number in each)
+
     def predicted(self) -> PredictedEchoes:
         """Return the echoes that the reflectors should cause if all sensors emit."""
         return self._predicted(self.located)

@@ -49,9 +49,10 @@ class Fused:
         Fused sensors whose images hold no echo above their noise. If it names all, the pulse returned no echo. Computed
         with the points.
     without_own_echo : tuple of str
-        Fused sensors of whose calls no echo is known, in this pulse and the two before: their silence explains the
-        echoes as well. Either nothing reflects their calls, or their emitters are broken. Nothing is known of what is
-        ahead of them. Computed at the first access, which takes up to a few times as long as the points.
+        Fused sensors of whose calls no echo is known, in this pulse and the two before: no reflector is located by an
+        echo of their own call, or their silence explains the echoes better. Either nothing reflects their calls, or
+        their emitters are broken. Nothing is known of what is ahead of them. Computed at the first access, which may
+        take a few times as long as the points.
     noise : dict of str to float
         Detection threshold of each fused sensor: noise exceeds it anywhere in the image with a probability of 10⁻⁵.
         Infinite if the image consists of zeros.

@@ -265,7 +265,7 @@ class FusionTables:
         return frozenset({*self._emitting} & group.keys() - _key(group)[1])
 
     def shown_emitters(self, group: Mapping[int, Energyscape], found: PulseReflectors) -> frozenset[int]:
-        """Return the emitters of a group that echoes show to work: their silence explains the echoes less well.
+        """Return the emitters of a group that echoes show to work.
 
         Parameters
         ----------
@@ -281,11 +281,11 @@ class FusionTables:
             return number in found.apart
         if found.pulses and is_heard(found.pulses[-1], number):
             return True
-        if number in found.without_echo or len(self._emitting) == 1:
-            return number not in found.without_echo
+        if number not in found.reflectors.own_emitters() or not found.cost:
+            return number in found.reflectors.own_emitters()
         silent = found.unheard | {number}
         rival = self._explained(group, self._without(group, silent), found.floor, silent)
-        return rival.cost > found.cost and found.reflectors.needs(number, rival.reflectors)
+        return rival.cost >= found.cost or found.reflectors.needs(number, rival.reflectors)
 
     def _without(self, group: Mapping[int, Energyscape], unheard: frozenset[int]) -> Attributed:
         """Return the attribution of a group whose sensors do not hear some emitters."""
