@@ -148,15 +148,17 @@ def _match(sound: SoundSpectra, call: Call) -> CallMatch:
     is_heard, curve = _is_heard(sound, call), curve_of(call)
     if is_heard and curve is None:
         return CallMatch("matches")
+    judged = SILENT
     if is_heard and curve is not None:
         arrival = arrival_of(sound, curve, call.low_frequency_hz, call.high_frequency_hz)
         better, gain = refined(arrival, curve)
+        judged = _judged(sound, arrival, (curve, better), call)
         if gain < _MIN_RATIO or _differs_by_motion(better, curve):
-            return _judged(sound, arrival, better, call)
+            return judged
     found = find_sweep(sound)
     if found is not None and found.sweep.high_hz <= _MAX_SWEEP_HZ:
         return _compared(sound, found, call)
-    return _judged(sound, arrival, better, call) if is_heard else SILENT
+    return judged
 
 
 def _filter_rad(call: Call, sound: SoundSpectra, part: slice) -> NDArray[np.float64]:
@@ -208,15 +210,17 @@ def _compared(sound: SoundSpectra, found: FoundSweep, call: Call) -> CallMatch:
     if own_curve is None:
         return CallMatch("matches", loss_db)
     arrival = arrival_of(sound, own_curve, call.low_frequency_hz, call.high_frequency_hz)
-    return _judged(sound, arrival, found.curve, call, loss_db)
+    return _judged(sound, arrival, (own_curve, found.curve), call, loss_db)
 
 
-def _judged(sound: SoundSpectra, arrival: GatedArrival, better: Curve, call: Call, loss_db: float = 0.0) -> CallMatch:
+def _judged(
+    sound: SoundSpectra, arrival: GatedArrival, curves: tuple[Curve, Curve], call: Call, loss_db: float = 0.0
+) -> CallMatch:
     """Return the match of a call whose curve is nearly that of the sound, by the start of the emission."""
-    start = start_match(sound, call, better, arrival)
+    start = start_match(sound, call, curves, arrival)
     if start == "same":
         return CallMatch("matches", loss_db)
-    sweep = sweep_along(sound, better, call.low_frequency_hz / WIDER, call.high_frequency_hz * WIDER)
+    sweep = sweep_along(sound, curves[1], call.low_frequency_hz / WIDER, call.high_frequency_hz * WIDER)
     if start == "before":
         return CallMatch("differs", loss_db, sweep, call)
     reason = f"echoes contain only about {sweep.band} of the call; if its emitter has no such band"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.analysis.sound_spectra import SoundSpectra, sound_spectra
 from ertis_numba.analysis.sweep_search import GatedArrival, arrival_of
-from ertis_numba.analysis.sweeps import Curve, curve_of
+from ertis_numba.analysis.sweeps import Curve
 from ertis_numba.settings import Call
 from ertis_numba.waveform import call_at
 
@@ -45,7 +45,7 @@ _PADDING_S: Final = 2e-3
 _MIN_POWER: Final = 1e-3  # Power that counts in the comparison of curves, relative to the highest.
 
 
-def start_match(sound: SoundSpectra, call: Call, better: Curve, arrival: GatedArrival) -> StartMatch:
+def start_match(sound: SoundSpectra, call: Call, curves: tuple[Curve, Curve], arrival: GatedArrival) -> StartMatch:
     """Compare the first frequency of the strongest arrival with that of a call.
 
     Parameters
@@ -53,8 +53,8 @@ def start_match(sound: SoundSpectra, call: Call, better: Curve, arrival: GatedAr
     sound : SoundSpectra
     call : Call
         Call with a curve near that of the sound.
-    better : Curve
-        Curve that compresses the arrival best.
+    curves : (Curve, Curve)
+        Curve of the call, and the one that compresses the arrival best.
     arrival : GatedArrival
         Strongest arrival after the filter of the call, in its band.
 
@@ -66,9 +66,7 @@ def start_match(sound: SoundSpectra, call: Call, better: Curve, arrival: GatedAr
         the call are missing: they may be absorbed, or not emitted. ``unknown`` if noise hides the start, or a ramp may
         explain the difference.
     """
-    curve = curve_of(call)
-    if curve is None:
-        return "same"
+    curve, better = curves
     slope_s_hz = abs(float(curve.slopes_s_hz(np.array(call.start_frequency_hz))))
     later_s = max(_FIRST * call.duration_s, _FIRST_HZ * slope_s_hz)
     power, background = _density(sound, curve, call)

@@ -17,7 +17,7 @@ from ertis_numba.analysis.health.arrival import Compressed, strongest
 from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, ORDER, SCALE, SEVERAL_ECHOES, NotObservable
 from ertis_numba.analysis.health.other_orders import other_orders, spreads_s
 from ertis_numba.analysis.health.report import Finding
-from ertis_numba.analysis.health.wave_shapes import curved_m, places_of
+from ertis_numba.analysis.health.wave_shapes import CURVATURES, curved_m, fit_curved, places_of
 from ertis_numba.geometry import Layout, layout_names, load_layout
 
 __all__ = ["ARRAY_FAULTS", "SIZE", "find_other_array", "unobservable"]
@@ -43,7 +43,6 @@ _MAX_SLOWNESS: Final = 1.1  # Slowness across the array relative to that of soun
 _MIN_EXCLUDED: Final = 4.0  # Residuals of an order that an arrival excludes, relative to those of the given one.
 _CLEAR: Final = 0.05  # Residuals of a clear arrival relative to its delays across the array.
 _DEVIATIONS: Final = 8.0
-_CURVATURES: Final = (1.0, 2.0)  # A wall and a point at the same path, times the path.
 # Limits of the size relative to the given one; a record that begins before the emission explains a larger one, too.
 _MAX_GROWTH: Final = 2.5
 _MIN_SHRINKAGE: Final = 0.67
@@ -299,13 +298,15 @@ def _best(
     n_spare = _kept(len(positions_m), n_unknowns) - n_unknowns
     columns = [np.ones(len(places_m)), *places_m.T] + ([] if late is None else [late.astype(np.float64)])
     matrix, matches = np.column_stack(columns), []
-    for curvature in _CURVATURES:
-        curved_s = np.zeros(len(places_m))
-        for _ in range(_ITERATIONS):
-            solution, spread_s = _solve(times_s - curved_s, matrix)
-            slope_m = places_m @ solution[1 : 1 + n_axes] * speed_m_s
-            curved_s = curved_m(positions_m, slope_m, curvature / path_m) / speed_m_s
-        solution, spread_s = _solve(times_s - curved_s, matrix)
+    for curvature in CURVATURES:
+        flat_s = fit_curved(
+            times_s,
+            positions_m,
+            curvature / path_m,
+            speed_m_s,
+            lambda flat_s: _solve(flat_s, matrix)[0][1 : 1 + n_axes],
+        )
+        solution, spread_s = _solve(flat_s, matrix)
         slowness = float(np.linalg.norm(solution[1 : 1 + n_axes])) * speed_m_s
         matches.append(_Match(spread_s, slowness, 0.0 if late is None else float(solution[-1]), n_spare))
     travel_s = np.linalg.norm(positions_m, axis=1) / speed_m_s
@@ -354,7 +355,7 @@ def _scales(
             max(estimate, _LEAST_CURVATURE / path_m), 0.5 / float(np.linalg.norm(positions_m, axis=1).max())
         )
     low, high = max(0.0, estimate - error), max(0.0, estimate + error)
-    return float(np.sqrt(low * path_m / _CURVATURES[1])), float(np.sqrt(high * path_m / _CURVATURES[0])), spread_s
+    return float(np.sqrt(low * path_m / CURVATURES[1])), float(np.sqrt(high * path_m / CURVATURES[0])), spread_s
 
 
 def _orders(layout: Layout) -> Iterator[tuple[str, NDArray[np.float64]]]:

@@ -7,13 +7,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.health.wave_shapes import curved_m, places_of
+from ertis_numba.analysis.health.wave_shapes import CURVATURES, fit_curved, places_of
 
 __all__ = ["other_orders", "spreads_s"]
 
 _MAX_MICS: Final = 64  # In larger arrays, only neighbouring channels are swapped.
-_ITERATIONS: Final = 4
-_CURVATURES: Final = (1.0, 2.0)
 
 
 @functools.lru_cache(maxsize=16)
@@ -49,14 +47,11 @@ def spreads_s(
     matrix = np.column_stack([np.ones(len(places_m)), places_m])
     spare = max(1, len(places_m) - matrix.shape[1])
     inverse, found = np.linalg.pinv(matrix), []
-    for curvature in _CURVATURES:
-        curved_s = np.zeros_like(times_s)
-        for _ in range(_ITERATIONS):
-            solution = (times_s - curved_s) @ inverse.T
-            slope_m = solution[:, 1:] @ places_m.T * speed_m_s
-            curved_s = curved_m(positions_m, slope_m, curvature / path_m) / speed_m_s
-        flat_s = times_s - curved_s
-        flat_s -= flat_s @ inverse.T @ matrix.T
+    for curvature in CURVATURES:
+        flat_s = fit_curved(
+            times_s, positions_m, curvature / path_m, speed_m_s, lambda flat_s: (flat_s @ inverse.T)[:, 1:]
+        )
+        flat_s = flat_s - flat_s @ inverse.T @ matrix.T
         found.append(np.sum(flat_s**2, axis=1) / spare)
     direct_s = times_s - np.linalg.norm(positions_m, axis=1) / speed_m_s
     found.append(np.var(direct_s, axis=1, ddof=1))
