@@ -65,6 +65,7 @@ def echoes_of(places_m, pairs=None, share=0.0, draws=None, *, is_flat=True):
                 angle_sd_rad=np.full(count, ANGLE_SD_RAD),
                 power=np.array(power),
                 share=np.full((count, N_SENSORS), share),
+                is_clear=np.ones(count, bool),
                 is_faint=np.zeros(count, bool),
             )
         )

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
@@ -36,15 +37,26 @@ def white(random):
 TIME_S = np.arange(N_SAMPLES)[:, None] / RATE_HZ
 
 
-def click(random, places):
+def click(random, places, first=2000):
     """Noise that is loud for 0.5 ms in some microphones."""
     loud = np.zeros((N_SAMPLES, N_MICS))
-    loud[2000:2100, places] = 0.05 * random.standard_normal((100, 1))
+    loud[first : first + 100, places] = 0.05 * random.standard_normal((100, 1))
     return white(random) + loud
+
+
+def fading(random):
+    """Noise ahead, in all microphones alike, whose level changes with time constants of a millisecond."""
+    slow = scipy.signal.lfilter(*scipy.signal.butter(2, 500 / (RATE_HZ / 2)), random.standard_normal(2 * N_SAMPLES))
+    level = np.abs(slow[N_SAMPLES:]) / np.std(slow)
+    return 0.1 * white(random) + 1e-3 * (random.standard_normal(N_SAMPLES) * level)[:, None]
 
 
 CHANGING = {
     "a click ahead": lambda random: click(random, slice(None)),
+    "a click at the end of the range": lambda random: click(random, slice(None), 4500),
+    "a click at the start of the range": lambda random: click(random, slice(None), 300),
+    "fading ahead": fading,
+    "steps of the supply": lambda random: white(random) + (0.3 * (TIME_S > 0.005) - 0.3 * (TIME_S > 0.0035)),
     "a click in one microphone": lambda random: click(random, slice(7, 8)),
     "20 dB louder towards the end": lambda random: white(random) * (1 + 9 * (TIME_S / TIME_S[-1]) ** 2),
     "modulated at 100 Hz": lambda random: white(random) * (1 + 0.9 * np.sin(2 * np.pi * 100 * TIME_S)),
@@ -100,10 +112,11 @@ def test_noise_is_neither_occupied_nor_free(kind, count):
     assert np.hypot(*free_m.T).max() < 0.25
 
 
-def test_noise_is_neither_occupied_nor_free_in_space():
+@pytest.mark.parametrize("kind", ["white", "fading ahead", "a click ahead"])
+def test_noise_is_neither_occupied_nor_free_in_space(kind):
     mapper = ertis.Mapper(mounted(2), dimensions=3, cell_m=0.1)
     for number in range(2):
-        mapper.add(noise_images("white", 6, 2, "3d:100", number=number), POSE)
+        mapper.add(noise_images(kind, 6, 2, "3d:100", number=number), POSE)
     assert not mapper.map.is_occupied.any()
     assert mapper.map.is_free.sum() < 200
     assert mapper.n_empty == 2

@@ -37,12 +37,15 @@ class EchoFloor(NamedTuple):
         Number of ranges that the matched filter spreads a click over.
     ratio : float
         Threshold relative to the median of the noise.
+    exponent : float
+        Power of the amplitude of Rayleigh-distributed noise that the image shows.
     """
 
     by_direction: NDArray[np.float32]
     by_range: NDArray[np.float32]
     n_around: int
     ratio: float
+    exponent: float
 
     @property
     def lasting(self) -> float:
@@ -50,7 +53,12 @@ class EchoFloor(NamedTuple):
         return float(self.by_direction.max())
 
     def at(
-        self, amplitude: NDArray[np.float32], direction: NDArray[np.intp], place: NDArray[np.intp]
+        self,
+        amplitude: NDArray[np.float32],
+        direction: NDArray[np.intp],
+        place: NDArray[np.intp],
+        *,
+        quantile: float = 0.5,
     ) -> NDArray[np.float32]:
         """Return the thresholds of some bins of the image, also for clicks from their direction.
 
@@ -59,11 +67,20 @@ class EchoFloor(NamedTuple):
         amplitude : (direction, range) float32
         direction, place : (bin,) int
             Indices of directions and ranges.
+        quantile : float
+            Part of the ranges around a bin that noise exceeds at most. Higher ones follow noise that swells and fades,
+            but also dense echoes.
         """
-        first = (place - self.n_around // 2).clip(0, max(0, amplitude.shape[1] - self.n_around))
-        columns = (first[:, None] + np.arange(self.n_around)).clip(0, amplitude.shape[1] - 1)
-        around = np.float32(self.ratio) * medians_of(amplitude[direction[:, None], columns])
-        return np.asarray(np.maximum(np.maximum(self.by_direction[direction], self.by_range[place]), around))
+        last, n_around = amplitude.shape[1] - 1, self.n_around
+        rank = int(quantile * (n_around - 1))
+        ratio = self.ratio * (math.log(2) / -math.log1p(-quantile)) ** (self.exponent / 2)
+        thresholds = [self.by_direction[direction], self.by_range[place]]
+        for first in (1 - n_around, -n_around // 2, 0):  # A click may begin or end at the bin.
+            columns = np.abs(place[:, None] + first + np.arange(n_around))
+            columns = (last - np.abs(last - columns)).clip(0)  # Ends of the image mirror it.
+            around = np.partition(amplitude[direction[:, None], columns], rank, axis=1)[:, rank]
+            thresholds.append(around * np.float32(ratio))
+        return np.asarray(np.max(thresholds, axis=0))
 
 
 def noise_of(image: Energyscape) -> float:
@@ -170,6 +187,7 @@ def echo_floor(image: Energyscape, false_alarm: float) -> EchoFloor:
         (ratio * _medians_by_range(amplitude, n_around)).astype(np.float32),
         n_around,
         ratio,
+        exponent,
     )
 
 

@@ -66,6 +66,8 @@ class SensorEchoes(NamedTuple):
     power : (echo,) float64
     share : (echo, emitter) float64
         Share of each emitter according to the attribution of the images.
+    is_clear : (echo,) bool
+        Echoes that noise hardly causes, even if its level changes within a record.
     is_faint : (echo,) bool
         Echoes that only confirm reflectors that others show.
     """
@@ -78,6 +80,7 @@ class SensorEchoes(NamedTuple):
     angle_sd_rad: Floats
     power: Floats
     share: Floats
+    is_clear: NDArray[np.bool_]
     is_faint: NDArray[np.bool_]
 
     def without(self, emitters: Collection[int]) -> "SensorEchoes":
@@ -202,6 +205,7 @@ class Reflectors:
         )
         self._rows = {number: np.flatnonzero(self._receiver == number) for number in receivers}
         self._is_free = ~np.concatenate([each.is_faint for each in echoes])
+        self._is_clear = np.concatenate([each.is_clear for each in echoes])
         # Only foreign echoes show the calls of sensors without an image.
         self._has_image = np.isin(np.arange(n_sensors), [each.receiver for each in echoes])
         self._is_incomplete = bool(np.isfinite(self._path_m[:, ~self._has_image]).any())
@@ -455,7 +459,7 @@ class Reflectors:
         """Add reflectors that a single own echo shows, unless the attribution explains it otherwise."""
         own = self._share[np.arange(len(self._receiver)), self._receiver]
         kept = self._is_free & (self._share.sum(axis=1) > _MIN_SHARE) & (own >= self._share.max(axis=1)) & (own > 0)
-        kept &= ~self._is_ambiguous(candidates)
+        kept &= self._is_clear & ~self._is_ambiguous(candidates)
         if found:
             kept[kept] = self._overlap(found, np.flatnonzero(kept)).power.sum(axis=1) < _DISTURBED
         for echo in np.flatnonzero(kept)[np.argsort(-self._power[kept], kind="stable")]:

@@ -27,11 +27,13 @@ _FAINTEST: Final = 10 ** (-22.0 / 20)  # Amplitude in the fused image relative t
 _MIN_LEVEL_DB: Final = -26.0  # Lowest level of echoes relative to the strongest of an image.
 _FAINT: Final = 10 ** (-20.0 / 20)  # Amplitude relative to it, below which echoes only confirm reflectors.
 _FALSE_ALARM: Final = 1e-5  # Probability that noise alone yields a point of an image.
+_CLEAR: Final = 0.8  # Quantile of the ranges around a lone echo from which it must differ.
 _RANGE_SD_M: Final = 0.5e-3  # Errors that noise does not explain, such as those of the array and of interpolation.
 _ANGLE_SD_RAD: Final = math.radians(0.125)
 _UNKNOWN_RANGE_SD_M: Final = 5e-3
 _UNKNOWN_ANGLE_SD_RAD: Final = math.radians(1.0)
 _NEAREST_M: Final = 0.05
+_BESIDE: Final = np.arange(-1, 2)
 
 
 class PointFuser:
@@ -68,7 +70,7 @@ class PointFuser:
         if image.amplitude.any():
             return echo_floor(image, _FALSE_ALARM)
         by_direction, by_range = (np.full(count, np.inf, np.float32) for count in image.amplitude.shape)
-        return EchoFloor(by_direction, by_range, n_around=1, ratio=1.0)
+        return EchoFloor(by_direction, by_range, n_around=1, ratio=1.0, exponent=1.0)
 
     def echoes(self, image: Energyscape, floor: EchoFloor, shares: Shares, late_m: Mapping[int, float]) -> SensorEchoes:
         """Return the echoes of an image above its noise, strongest first.
@@ -89,7 +91,12 @@ class PointFuser:
         row = np.argmax(place_m @ self._receiver.directions.T, axis=1)
         range_m = np.linalg.norm(place_m, axis=1)
         column = np.rint(np.interp(range_m, image.range_m, np.arange(len(image.range_m)))).astype(np.int64)
-        is_heard = cloud.amplitude > floor.at(image.amplitude, row, column)
+        # Between directions of a coarse grid, interpolation may exceed all bins, but noise does so as well.
+        near = image.amplitude[row[:, None], (column[:, None] + _BESIDE).clip(0, len(image.range_m) - 1)].max(axis=1)
+        shown = np.minimum(near, cloud.amplitude)
+        is_heard = shown > floor.by_direction[row]
+        is_free = (shown > floor.at(image.amplitude, row, column))[is_heard]
+        is_clear = (shown > floor.at(image.amplitude, row, column, quantile=_CLEAR))[is_heard]
         place_m, uncertainty_m, row = place_m[is_heard], _uncertainties(cloud)[is_heard], row[is_heard]
         range_m = range_m[is_heard]
         emitters = [emitter for emitter, number in shares if number == self._number]
@@ -103,7 +110,8 @@ class PointFuser:
             angle_sd_rad=np.hypot(uncertainty_m[:, 1] / range_m, _ANGLE_SD_RAD),
             power=cloud.amplitude[is_heard].astype(np.float64) ** 2,
             share=self._shares(row, range_m, [shares[emitter, self._number] for emitter in emitters]),
-            is_faint=cloud.amplitude[is_heard] < _FAINT * cloud.amplitude.max(initial=0.0),
+            is_clear=is_clear,
+            is_faint=~is_free | (cloud.amplitude[is_heard] < _FAINT * cloud.amplitude.max(initial=0.0)),
         )
 
     def _shares(self, row: NDArray[np.int64], range_m: Floats, shares: Sequence[NDArray[np.float32]]) -> Floats:

@@ -315,7 +315,9 @@ class FusionTables:
         expected = expected_echoes(reflectors, group, floor, self._receivers, late_m, self._deaf, silent=unheard)
         counts = EmissionCounts.of(expected, reflectors, self._judged(group))
         n_missed = int(np.delete(expected.is_missed, [*unheard], axis=2).sum())
-        without_echo = [each.receiver for each in echoes if not len(each.power)]
+        # Dense echoes of one reflector are not clear, but pulses of noise without a reflector have no echo.
+        is_any = bool(reflectors.located)
+        without_echo = [each.receiver for each in echoes if (each.is_faint | ~(each.is_clear | is_any)).all()]
         return _Explained(reflectors, counts, without_echo, reflectors.n_unexplained + n_missed)
 
     def _echoes(
