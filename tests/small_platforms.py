@@ -15,7 +15,7 @@ from ertis_numba.geometry import microphones
 from ertis_numba.settings import Processing, Recording, Settings
 from ertis_numba.waveform import call_at
 
-__all__ = ["HEIGHT_M", "images_of", "mounted", "random_reflectors", "rendered", "settings_of"]
+__all__ = ["HEIGHT_M", "LEVEL", "RATE_HZ", "images_of", "mounted", "random_reflectors", "rendered", "settings_of"]
 
 RATE_HZ = 200_000.0
 HEIGHT_M = 0.4
@@ -23,7 +23,7 @@ NOISE = 2.5e-4
 _N_SAMPLES = 6400
 _N_FFT = 8192
 _BAND_HZ = 22e3, 55e3
-_LEVEL = 10 ** (-24 / 20)
+LEVEL = 10 ** (-24 / 20)
 _YAWS_DEG = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
 _RADIUS_M = 0.2
 
@@ -77,7 +77,7 @@ def rendered(mountings, settings, places_m, strength_db, *, diameter_m, random, 
         cosine = (offset_m @ _rotation(turn)[:, 0])[:, None] / range_m
         if name not in dead:
             lit += _radiated(diameter_m, wave_1_m, cosine) * np.exp(-(lost_1_m + 1j * wave_1_m) * range_m) / range_m
-    lit *= _LEVEL * call * 10 ** (np.reshape(strength_db, (-1, 1)) / 20)
+    lit *= LEVEL * call * 10 ** (np.reshape(strength_db, (-1, 1)) / 20)
     mics_m = np.asarray(microphones(settings.array).positions_m, np.float64)
     return {
         name: _heard(lit, places_m, np.asarray(place_m) + mics_m @ _rotation(turn).T, inside, wave_1_m, lost_1_m)

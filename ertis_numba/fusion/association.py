@@ -354,7 +354,7 @@ class Reflectors:
         apart_m = sight.apart_m[0]
         together = np.exp(-(((apart_m - apart_m[emitter][:, None]) / _RESOLUTION_M) ** 2))
         together[~np.isfinite(self._path_m[members])] = 0.0
-        gain = np.sum(sight.gain[0, self._receiver[members]] * together, axis=1)
+        gain = np.sum(self._viewers.echo_powers(sight, self._receiver[members]) * together, axis=1)
         return float(self._power[members] @ gain / max(gain @ gain, _TINY**2))
 
     def _members(self, echo: Numbers, emitter: Numbers, distance: Floats) -> tuple[Numbers, Numbers]:

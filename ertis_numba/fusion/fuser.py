@@ -79,7 +79,11 @@ class Fused:
 
     @functools.cached_property
     def points(self) -> PointCloud:
-        """Reflectors in the frame of the platform."""
+        """Reflectors in the frame of the platform.
+
+        Amplitudes are those that a single sensor would measure if the reflector were at 1 m on the axis of its emitter.
+        Where the calls of two sensors arrive together, with unknown phases, they may be off by 3 dB.
+        """
         return self._locate(self._solve(), self.image)
 
     @property

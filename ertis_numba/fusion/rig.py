@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from ertis_numba.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones, mounting
-from ertis_numba.settings import Array, Settings
+from ertis_numba.settings import Array, Call, Settings
+from ertis_numba.waveform import call_at
 
 __all__ = ["USUAL_DIAMETER_M", "Emitters", "MountedSensor", "Mountings", "emitter_diameter_m", "mounted_sensors"]
 
@@ -27,6 +28,7 @@ _N_FREQUENCIES = 12  # of the band, over which the power of an emitter is averag
 _NEAREST_M = 0.05  # Distance below which spreading does not increase.
 _STRAY_DB = -20.0  # Power that an emitter radiates at least to its front, which no piston model predicts.
 _BEHIND_DB = -30.0
+_PATHS_M = np.linspace(0.0, 256.0, 1025)  # of sound, for which the absorption is tabulated
 
 
 class MountedSensor(NamedTuple):
@@ -107,21 +109,24 @@ class Emitters:
 
     def __init__(self, settings: Settings, diameters_m: Sequence[float]) -> None:
         call = settings.call
-        low_hz, high_hz = sorted((call.start_frequency_hz, call.stop_frequency_hz))
-        frequency_hz = np.linspace(low_hz, high_hz, _N_FREQUENCIES)
-        self._absorption_db_m = float(absorption_db_m(settings.air, np.array([(low_hz + high_hz) / 2]))[0])
+        frequency_hz = _frequencies_of(call)
+        self._loss_1_m = math.log(10) / 20 * absorption_db_m(settings.air, frequency_hz)
+        self._lost = self._echo(np.ones(_N_FREQUENCIES), _PATHS_M[:, None])
         # The pattern is tabulated over the cosine, because a Bessel function of each cell takes long.
         self._cosine = np.linspace(-1.0, 1.0, 2049)
         sine = np.sqrt(1 - self._cosine**2)
         speed_m_s = sound_speed_m_s(settings.air)
+        self._radiated: dict[float, Floats] = {}
         patterns = {}
         for diameter_m in {*diameters_m}:
             argument = np.maximum(1e-9, math.pi * diameter_m / speed_m_s * sine[:, None] * frequency_hz)
-            power = np.mean((2 * scipy.special.j1(argument) / argument) ** 2, axis=1)
+            self._radiated[diameter_m] = 2 * scipy.special.j1(argument) / argument
+            power = np.mean(self._radiated[diameter_m] ** 2, axis=1)
             if diameter_m:
                 power = np.where(self._cosine > 0, np.maximum(power, 10 ** (_STRAY_DB / 10)), 10 ** (_BEHIND_DB / 10))
             patterns[diameter_m] = power
         self._powers = [patterns[diameter_m] for diameter_m in diameters_m]
+        self._diameters_m = tuple(diameters_m)
 
     def power(self, cosine: Floats, emitter: int) -> Floats:
         """Return the power that an emitter radiates, relative to that ahead.
@@ -149,5 +154,47 @@ class Emitters:
     def spreading(self, to_point_m: Floats, from_point_m: Floats) -> Floats:
         """Return the power of an echo relative to that at 1 m: spherical spreading of both paths, and absorption."""
         there, back = np.maximum(to_point_m, _NEAREST_M), np.maximum(from_point_m, _NEAREST_M)
-        lost_db = self._absorption_db_m * (there + back - 2.0)
-        return np.asarray(10 ** (-lost_db / 10) / (there * back) ** 2)
+        return np.asarray(np.exp(np.interp(there + back, _PATHS_M, self._lost)) / (there * back) ** 2)
+
+    def echo_powers(self, cosine: Floats, to_point_m: Floats, from_point_m: Floats) -> Floats:
+        """Return the power of echoes in images, relative to that at 1 m ahead: (echo, emitter) float64.
+
+        Unlike `powers`, it follows the matched filter, which adds the amplitudes of all frequencies: an emitter
+        radiates low frequencies to its side, which air absorbs less.
+
+        Parameters
+        ----------
+        cosine, to_point_m : (emitter,) float64
+            Cosine of the angle to the axis of each emitter, and its distance from the reflector.
+        from_point_m : (echo,) float64
+            Distance of the receiver of each echo.
+        """
+        there, back = np.maximum(to_point_m, _NEAREST_M), np.maximum(from_point_m, _NEAREST_M)[:, None]
+        place = np.rint((cosine + 1) / 2 * (len(self._cosine) - 1)).astype(np.int64)
+        radiated = np.stack([self._radiated[each][at] for each, at in zip(self._diameters_m, place, strict=True)])
+        exact = np.exp(self._echo(radiated, (there + back)[..., None]))
+        least = np.exp(np.interp(there + back, _PATHS_M, self._lost)) * 10 ** (_STRAY_DB / 10)
+        behind = (cosine <= 0) & (np.array(self._diameters_m) > 0)
+        found = np.where(behind, least * 10 ** ((_BEHIND_DB - _STRAY_DB) / 10), np.maximum(exact, least))
+        return np.asarray(found / (there * back) ** 2)
+
+    def _echo(self, radiated: Floats, path_m: Floats) -> Floats:
+        """Return the logarithm of the power of echoes after the matched filter, without spreading: (...,) float64.
+
+        Parameters
+        ----------
+        radiated : (..., frequency) float64
+            Amplitude that the emitter radiates.
+        path_m : (..., 1) float64
+        """
+        amplitude = np.mean(radiated * np.exp(-self._loss_1_m * (path_m - 2.0)), axis=-1)
+        return np.asarray(2 * np.log(np.maximum(np.abs(amplitude), np.finfo(np.float64).tiny)))
+
+
+def _frequencies_of(call: Call) -> Floats:
+    """Return frequencies that divide the energy of a call equally: (`_N_FREQUENCIES`,) float64."""
+    rate_hz = 4 * max(call.start_frequency_hz, call.stop_frequency_hz)
+    samples = call_at(call, np.arange(math.ceil(call.duration_s * rate_hz)) / rate_hz + call.start_s)
+    power = np.cumsum(np.abs(np.fft.rfft(samples)) ** 2)
+    parts = (np.arange(_N_FREQUENCIES) + 0.5) / _N_FREQUENCIES
+    return np.asarray(np.interp(parts, power / power[-1], np.fft.rfftfreq(len(samples), 1 / rate_hz)))
