@@ -1,6 +1,5 @@
 """Random surroundings of two to four sensors, rendered without the simulator, for trials of broken emitters."""
 
-import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -15,6 +14,8 @@ from ertis_bench.platform_trials.rendered_rooms import (
     random_room,
     rendered,
     settings_of,
+    toward,
+    wall,
 )
 from ertis_numba.frames import Energyscape
 
@@ -32,7 +33,6 @@ _PLACES: Final = {
 _FASTEST_M: Final = 0.03  # Motion of the platform from pulse to pulse along each axis.
 _CLEAR_M: Final = 0.2  # Distance of posts from walls.
 _APART_M: Final = 0.4
-_HALF_WALL_M: Final = 9.0
 
 
 class EmitterRoom(NamedTuple):
@@ -95,21 +95,12 @@ def _few(random: np.random.Generator, kind: str) -> Room:
         walls = [(turn_rad + side * np.pi / 2, float(random.uniform(0.8, 1.5))) for side in (1, -1)]
     elif kind == "corner":
         walls = [(turn_rad + quarter * np.pi / 2, float(random.uniform(1.0, 2.5))) for quarter in (0, 1)]
-    faces = tuple(_wall(turn_rad, away_m, float(random.uniform(-9, -2))) for turn_rad, away_m in walls)
+    faces = tuple(wall(turn_rad, away_m, float(random.uniform(-9, -2))) for turn_rad, away_m in walls)
     count, places = int(random.integers(2, 7 if walls else 5)), list[Floats]()
     while len(places) < count:
-        place_m = random.uniform(0.9, 3.2) * _unit(random.uniform(-np.pi, np.pi))
-        is_inside = all(place_m @ _unit(turn_rad) < away_m - _CLEAR_M for turn_rad, away_m in walls)
+        place_m = random.uniform(0.9, 3.2) * toward(random.uniform(-np.pi, np.pi))
+        is_inside = all(place_m @ toward(turn_rad) < away_m - _CLEAR_M for turn_rad, away_m in walls)
         if is_inside and all(np.linalg.norm(place_m - other) > _APART_M for other in places):
             places.append(place_m)
     range_m = np.maximum(1.0, np.linalg.norm(places, axis=1))
     return Room(np.array(places), random.uniform(-8, 0, count) + 6 * np.log2(range_m), faces)
-
-
-def _wall(turn_rad: float, away_m: float, level_db: float) -> Face:
-    foot_m, along_m = away_m * _unit(turn_rad), _HALF_WALL_M * _unit(turn_rad + math.pi / 2)
-    return Face(foot_m + along_m, foot_m - along_m, 10 ** (level_db / 20))
-
-
-def _unit(turn_rad: float) -> Floats:
-    return np.array([math.cos(turn_rad), math.sin(turn_rad)])

@@ -5,6 +5,7 @@ all directions. It spreads spherically, and the air absorbs it. Emitters are cir
 omnidirectional. Samples are PCM.
 """
 
+import itertools
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Final, NamedTuple
@@ -19,7 +20,20 @@ from ertis_numba.geometry import microphones
 from ertis_numba.settings import Processing, Recording, Settings
 from ertis_numba.waveform import call_at
 
-__all__ = ["HEIGHT_M", "Face", "Room", "images_of", "mounted", "nearest_m", "random_room", "rendered", "settings_of"]
+__all__ = [
+    "HEIGHT_M",
+    "Face",
+    "Mountings",
+    "Room",
+    "images_of",
+    "mounted",
+    "nearest_m",
+    "random_room",
+    "rendered",
+    "settings_of",
+    "toward",
+    "wall",
+]
 
 Floats = NDArray[np.float64]
 Spectrum = NDArray[np.complex128]
@@ -30,11 +44,12 @@ RATE_HZ: Final = 200_000.0
 N_SAMPLES: Final = 6400
 _NOISE: Final = 2.5e-4
 _LEVEL: Final = 10 ** (-24 / 20)
-_N_FFT: Final = 8192
+_N_FFT: Final = 12_288  # Sound that arrives after the recording is not wrapped to its beginning.
 _BAND_HZ: Final = 22e3, 55e3
 _EDGE_DB: Final = -16.0  # Strength of the edges of boxes.
 _POST_M: Final = 0.05  # Radius of posts in the truth.
-_RANGE_M: Final = 0.6, 4.0
+_HALF_WALL_M: Final = 9.0
+_ASIDE_M: Final = 1e-3  # A corner returns sound to its source over one wall first, not over both or neither.
 
 
 class Face(NamedTuple):
@@ -65,7 +80,7 @@ class Room(NamedTuple):
 
 
 class _Leg(NamedTuple):
-    """Way of sound between two places: that of its source, mirrored by a face or not, and the factor of reflection.
+    """Way of sound between two places: that of its source, mirrored by faces or not, and the factor of reflection.
 
     ``first_m`` is the place that the sound meets first, which determines what an emitter radiates.
     """
@@ -75,11 +90,11 @@ class _Leg(NamedTuple):
     factor: float
 
 
-def settings_of(directions: str = "90", **processing: object) -> Settings:
+def settings_of(range_m: tuple[float, float] = (0.6, 4.0)) -> Settings:
     """Return the settings of a PCM sensor."""
     return Settings(
         recording=Recording(sample_rate_hz=RATE_HZ, n_samples=N_SAMPLES, encoding="float32"),
-        processing=Processing(directions=directions, range_m=_RANGE_M, range_decimation=4, **processing),  # type: ignore[arg-type]
+        processing=Processing(directions="90", range_m=range_m, range_decimation=4),
     )
 
 
@@ -89,6 +104,17 @@ def mounted(places: Mapping[str, tuple[float, float, float]]) -> Mountings:
         name: ((x, y, HEIGHT_M), (0.0, 0.0, math.sin(math.radians(yaw) / 2), math.cos(math.radians(yaw) / 2)))
         for name, (x, y, yaw) in places.items()
     }
+
+
+def toward(turn_rad: float) -> Floats:
+    """Return the unit vector at an azimuth: (2,) float64."""
+    return np.array([math.cos(turn_rad), math.sin(turn_rad)])
+
+
+def wall(turn_rad: float, away_m: float, level_db: float) -> Face:
+    """Return a wall of 18 m, from the azimuth and the distance of its middle, and the level of reflected sound."""
+    middle_m, along_m = away_m * toward(turn_rad), _HALF_WALL_M * toward(turn_rad + math.pi / 2)
+    return Face(middle_m + along_m, middle_m - along_m, 10 ** (level_db / 20))
 
 
 def random_room(seed: int, kind: str) -> Room:
@@ -107,16 +133,14 @@ def random_room(seed: int, kind: str) -> Room:
         turn_rad, away_m = random.uniform(-np.pi, np.pi), random.uniform(1.4, 3.0)
         if all(abs(_turned(turn_rad - other)) > math.radians(50) for other, _ in walls):
             walls.append((turn_rad, away_m))
-            foot_m, along = away_m * _unit(turn_rad), _unit(turn_rad + math.pi / 2)
-            level_db = random.uniform(-12, -3)
-            faces.append(Face(foot_m + 9 * along, foot_m - 9 * along, 10 ** (level_db / 20)))
+            faces.append(wall(turn_rad, away_m, random.uniform(-12, -3)))
     places: list[Floats] = []
     edges: list[Floats] = []
 
     def free(clear_m: float, apart_m: tuple[float, float], first_m: float) -> Floats:
         while True:
-            place_m = random.uniform(first_m, 3.3) * _unit(random.uniform(-np.pi, np.pi))
-            is_inside = all(place_m @ _unit(turn_rad) < away_m - clear_m for turn_rad, away_m in walls)
+            place_m = random.uniform(first_m, 3.3) * toward(random.uniform(-np.pi, np.pi))
+            is_inside = all(place_m @ toward(turn_rad) < away_m - clear_m for turn_rad, away_m in walls)
             n_boxes = len(edges) // 4
             if is_inside and all(
                 np.linalg.norm(place_m - other) > apart_m[number < n_boxes] for number, other in enumerate(places)
@@ -128,7 +152,7 @@ def random_room(seed: int, kind: str) -> Room:
         places.append(centre_m)
         size_m, turn_rad = random.uniform(0.2, 0.6, 2) / 2, random.uniform(0, np.pi / 2)
         corners = [
-            centre_m + a * size_m[0] * _unit(turn_rad) + b * size_m[1] * _unit(turn_rad + math.pi / 2)
+            centre_m + a * size_m[0] * toward(turn_rad) + b * size_m[1] * toward(turn_rad + math.pi / 2)
             for a, b in ((1, 1), (-1, 1), (-1, -1), (1, -1))
         ]
         faces += [Face(corners[n], corners[(n + 1) % 4], 10 ** (-6 / 20)) for n in range(4)]
@@ -175,8 +199,8 @@ class _Air:
 
     def radiated(self, sensor_m: Floats, ahead: Floats, leg: _Leg) -> Spectrum:
         """Return the spectrum that an emitter sends on a way; 0 behind the baffle of a piston."""
-        toward = leg.first_m - sensor_m
-        cosine = float(toward @ ahead) / max(1e-9, float(np.linalg.norm(toward)))
+        way_m = leg.first_m - sensor_m
+        cosine = float(way_m @ ahead) / max(1e-9, float(np.linalg.norm(way_m)))
         if not self._diameter_m:
             return self._call * leg.factor
         argument = self._wave_1_m * self._diameter_m / 2 * math.sqrt(max(1e-12, 1 - cosine**2))
@@ -206,13 +230,18 @@ def rendered(
     random: np.random.Generator,
     noise: float = _NOISE,
     dead: str = "",
+    reflections: int = 2,
 ) -> dict[str, NDArray[np.float32]]:
-    """Return the signals of all sensors, by name: (sample, mic) float32. The emitter of a dead sensor is silent."""
+    """Return the signals of all sensors, by name: (sample, mic) float32. The emitter of a dead sensor is silent.
+
+    At most so many faces in turn reflect sound from sensor to sensor. One may reflect it on its way to a post or an
+    edge, and one on its way back.
+    """
     air = _Air(settings, diameter_m)
     scatterers_m = np.concatenate([room.posts_m, room.edges_m])
     strength = 10 ** (np.append(room.strength_db, np.full(len(room.edges_m), _EDGE_DB)) / 20)
     placed = {
-        name: (np.array(place_m[:2]), _unit(2 * math.atan2(turn[2], turn[3])))
+        name: (np.array(place_m[:2]), toward(2 * math.atan2(turn[2], turn[3])))
         for name, (place_m, turn) in mountings.items()
     }
     emitting = [sensor for name, sensor in placed.items() if name != dead]
@@ -220,7 +249,7 @@ def rendered(
         sum(
             air.arrived(air.radiated(*sensor, leg), float(np.linalg.norm(leg.from_m - scatterer_m)))
             for sensor in emitting
-            for leg in _legs(room, sensor[0], scatterer_m)
+            for leg in _ways(room, sensor[0], scatterer_m, 1)
         )
         for scatterer_m in scatterers_m
     ]
@@ -233,14 +262,16 @@ def rendered(
         sources: list[tuple[Floats, Spectrum]] = [
             (leg.from_m, factor * leg.factor * spectrum)
             for scatterer_m, factor, spectrum in zip(scatterers_m, strength, lit, strict=True)
-            for leg in _legs(room, scatterer_m, sensor_m)
+            for leg in _ways(room, scatterer_m, sensor_m, 1)
             if not isinstance(spectrum, int)
         ]
         for other in emitting:
             with_direct = other is not sensor and not diameter_m
+            at_m = sensor_m + _ASIDE_M * left if other is sensor else sensor_m
             sources += [
                 (leg.from_m, air.radiated(*other, leg))
-                for leg in _specular(room, other[0], sensor_m, with_direct=with_direct)
+                for leg in _ways(room, other[0], at_m, reflections)
+                if with_direct or leg.from_m is not other[0]
             ]
         signal = air.heard(sources, heard_m)
         found[name] = signal + noise * random.standard_normal(signal.shape).astype(np.float32)
@@ -261,33 +292,22 @@ def images_of(
     return found
 
 
-def _legs(room: Room, from_m: Floats, to_m: Floats) -> Iterator[_Leg]:
-    """Yield the ways of sound between two places: the straight one, and that over each face."""
-    if not _is_blocked(room, from_m, to_m):
-        yield _Leg(from_m, to_m, 1.0)
-    for face in room.faces:
-        met_m = _met(face, from_m, to_m)
-        if met_m is not None and not (_is_blocked(room, from_m, met_m) or _is_blocked(room, met_m, to_m)):
-            yield _Leg(_mirrored(face, from_m), met_m, face.reflection)
-
-
-def _specular(room: Room, from_m: Floats, to_m: Floats, *, with_direct: bool) -> Iterator[_Leg]:
-    """Yield the ways of sound over one or two faces, and the straight one if wanted."""
-    if with_direct:
-        yield _Leg(from_m, to_m, 1.0)
-    for face in room.faces:
-        met_m = _met(face, from_m, to_m)
-        image_m = _mirrored(face, from_m)
-        if met_m is not None and not (_is_blocked(room, from_m, met_m) or _is_blocked(room, met_m, to_m)):
-            yield _Leg(image_m, met_m, face.reflection)
-        for second in room.faces:
-            last_m = None if second is face else _met(second, image_m, to_m)
-            first_m = None if last_m is None else _met(face, from_m, last_m)
-            if last_m is None or first_m is None:
-                continue
-            ways = (from_m, first_m), (first_m, last_m), (last_m, to_m)
-            if not any(_is_blocked(room, *way) for way in ways):
-                yield _Leg(_mirrored(second, image_m), first_m, face.reflection * second.reflection)
+def _ways(room: Room, from_m: Floats, to_m: Floats, most: int, over: tuple[Face, ...] = ()) -> Iterator[_Leg]:
+    """Yield the way of sound between two places over faces in turn, and those over more faces, at most so many."""
+    images_m, met_m = [from_m], [to_m]
+    for face in over:
+        images_m.append(_mirrored(face, images_m[-1]))
+    for face, image_m in zip(over[::-1], images_m[-2::-1], strict=False):
+        place_m = _met(face, image_m, met_m[-1])
+        if place_m is None:
+            break
+        met_m.append(place_m)
+    else:
+        if not any(_is_blocked(room, *way) for way in itertools.pairwise([from_m, *met_m[::-1]])):
+            yield _Leg(images_m[-1], met_m[-1], math.prod((face.reflection for face in over), start=1.0))
+    for face in room.faces if len(over) < most else ():
+        if not over or face is not over[-1]:
+            yield from _ways(room, from_m, to_m, most, (*over, face))
 
 
 def _mirrored(face: Face, place_m: Floats) -> Floats:
@@ -323,10 +343,6 @@ def _is_blocked(room: Room, from_m: Floats, to_m: Floats) -> bool:
         if 1e-6 < part < 1 - 1e-6 and 1e-6 < share < 1 - 1e-6:
             return True
     return False
-
-
-def _unit(turn_rad: float) -> Floats:
-    return np.array([math.cos(turn_rad), math.sin(turn_rad)])
 
 
 def _turned(turn_rad: float) -> float:
