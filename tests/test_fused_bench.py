@@ -9,7 +9,15 @@ from ertis_bench.network.sender import SETTINGS
 from ertis_bench.network_trials import fused_receiver, live_fusion, live_maps
 from ertis_bench.network_trials.fused_receiver import FusedReceiverJob
 from ertis_bench.network_trials.map_viewer import MapViewerJob, n_wrong
-from ertis_bench.platform_trials import broken_emitters, clock_checks, differing_calls, emission_delays, fused_scans
+from ertis_bench.platform_trials import (
+    broken_emitters,
+    clock_checks,
+    differing_calls,
+    emission_delays,
+    fused_scans,
+    wall_reflections,
+)
+from ertis_bench.platform_trials.reflecting_scenes import ReflectingScene
 from ertis_bench.platform_trials.rendered_rooms import (
     Face,
     Room,
@@ -18,10 +26,11 @@ from ertis_bench.platform_trials.rendered_rooms import (
     nearest_m,
     rendered,
     settings_of,
+    wall,
 )
 from ertis_cli.main import cli
 
-from ertis_numba.frames import Measurement
+from ertis_numba.frames import Measurement, PointCloud
 from ertis_numba.fusion import Fuser
 from ertis_numba.network.fused_subscriber import FusedArrival
 from ertis_numba.passive import AcousticCamera
@@ -181,6 +190,71 @@ def test_rendered_sound_arrives_when_mirror_images_predict(diameter_m):
     direction, place = np.unravel_index(image.amplitude.argmax(), image.amplitude.shape)
     assert image.range_m[place] == pytest.approx(1.3, abs=0.01)
     assert image.azimuth_rad[direction] == pytest.approx(0.0, abs=0.04)
+
+
+@pytest.mark.parametrize("reflections", [1, 2, 3])
+def test_rendered_sound_meets_at_most_so_many_walls(reflections):
+    """Sound between walls 1 m ahead and 0.8 m behind arrives over 2, 3.6 and 5.6 m."""
+    settings = settings_of((0.3, 4.5))
+    room = Room(np.empty((0, 2)), np.empty(0), (wall(0.0, 1.0, -1.0), wall(np.pi, 0.8, -1.0)))
+    signals = rendered(
+        mounted({"front": (0.0, 0.0, 0.0)}),
+        settings,
+        room,
+        diameter_m=0.0,
+        random=np.random.default_rng(0),
+        reflections=reflections,
+    )
+    image = images_of(signals, settings)["front"]
+    level = [image.select(range_m=(way_m / 2 - 0.02, way_m / 2 + 0.02)).amplitude.max() for way_m in (2.0, 3.6, 5.6)]
+    is_heard = np.array(level) > 0.01 * level[0]
+    assert is_heard.tolist() == [number < reflections for number in range(3)]
+
+
+def test_rendered_corners_return_sound_equally_at_every_azimuth():
+    """A corner of 90° returns sound to its source over both walls once, whatever the rounding errors."""
+    signals = [
+        rendered(
+            mounted({"front": (0.0, 0.0, np.degrees(turn_rad))}),
+            settings_of(),
+            Room(np.empty((0, 2)), np.empty(0), (wall(turn_rad, 1.0, -1.0), wall(turn_rad + np.pi / 2, 1.3, -1.0))),
+            diameter_m=0.0,
+            random=np.random.default_rng(0),
+        )["front"]
+        for turn_rad in np.linspace(0, 6, 13)
+    ]
+    np.testing.assert_allclose(signals, np.broadcast_to(signals[0], np.shape(signals)), atol=1e-5)
+
+
+def test_points_are_compared_with_posts_and_walls():
+    room = Room(np.array([[1.0, 0.0], [0.0, -2.0]]), np.zeros(2), (wall(np.pi / 2, 1.5, -1.0),))
+    place_m = np.array([[1.02, 0.01, 0], [0.03, 1.45, 0], [2.0, 0.5, 0], [0.0, -2.0, 0]], np.float32)
+    uncertainty_m = np.full((4, 2), [0.01, 0.02], np.float32)
+    confirmed = np.array([True, True, True, False])
+    points = PointCloud(
+        place_m, np.ones(4, np.float32), settings_of(), uncertainty_m=uncertainty_m, confirmed=confirmed
+    )
+    found, errors_m = wall_reflections.compared(points, ReflectingScene(1, "wall", 0, 0.0, room))
+    assert found == {"pulses": 1, "beside": 1, "confirmed": 1, "posts": 2}
+    np.testing.assert_allclose(errors_m, [[[0.0201, 0.0098], [0.01, 0.02]]], atol=1e-4)
+
+
+def test_reflections_bench_counts_points_beside_all_surfaces(tmp_path, monkeypatch):
+    monkeypatch.setattr(wall_reflections, "KINDS", ("wall",))
+    target = tmp_path / "page.md"
+    marker = "ertis bench fusion --only reflections"
+    target.write_text(f"<!-- {marker} -->\nold\n<!-- /{marker} -->\n", "utf-8")
+    options = ["--only", "reflections", "--count", "1", "--seed", "7", "--json", "--quiet", "--update", str(target)]
+    done = CliRunner().invoke(cli, ["bench", "fusion", *options])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    whole, missing = json.loads(done.stdout)["reflections"]
+    assert (whole["pulses"], missing["pulses"]) == (1, 3)
+    assert (whole["beside"], missing["beside"], whole["posts"], missing["posts"]) == (0, 0, 2, 6)
+    assert whole["confirmed"] > 0
+    assert whole["rms_m"] <= whole["largest_m"] < 0.02
+    text = target.read_text("utf-8")
+    assert f"| all | 1 | 0 | {whole['confirmed']} of 2 | " in text
+    assert "{" not in text
 
 
 def test_emitters_bench_counts_broken_and_wrongly_stated_ones(tmp_path, monkeypatch):

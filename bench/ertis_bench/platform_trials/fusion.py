@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_bench.platform_trials import broken_emitters, clock_checks, differing_calls, emission_delays, fused_scans
+from ertis_bench.platform_trials import (
+    broken_emitters,
+    clock_checks,
+    differing_calls,
+    emission_delays,
+    fused_scans,
+    wall_reflections,
+)
 from ertis_bench.platform_trials.platform_scenes import EMITTERS_M, N_REFLECTORS, platform_scene, random_reflectors
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import Energyscape
@@ -32,6 +39,7 @@ _PARTS: Final = {
     "clocks": clock_checks,
     "delays": emission_delays,
     "emitters": broken_emitters,
+    "reflections": wall_reflections,
     "scans": fused_scans,
 }
 
@@ -69,7 +77,8 @@ def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None], only: 
     only : sequence of str
         ``calls`` to compare equal calls with different ones instead, ``clocks`` to check clocks and mountings by
         direct sound, ``delays`` to compare delays of sensors that emit in sequence, ``emitters`` to find broken and
-        wrongly stated emitters, or ``scans`` to compare laser scans with rays.
+        wrongly stated emitters, ``reflections`` to count wrongly confirmed points where walls reflect sound several
+        times, or ``scans`` to compare laser scans with rays.
     """
     if only:
         report: dict[str, Any] = {}
