@@ -274,7 +274,7 @@ def test_map_notes_poses_of_a_camera_and_converts_them(folder):
         assert done.stderr.count(note) == 1
         assert "PoseWarning" not in done.stderr
         done = run(folder, f"{line} -o converted{number}.h5 --pose-axes camera")
-        assert "note" not in done.stderr
+        assert "axis" not in done.stderr
         maps = [ertis.read_map(folder / name) for name in ("level.h5", f"converted{number}.h5")]
         assert maps[0].log_odds.shape == maps[1].log_odds.shape
         assert maps[0].log_odds == pytest.approx(maps[1].log_odds, abs=1e-4)

@@ -100,7 +100,7 @@ def test_commands_state_sensors_without_an_echo_of_their_own(tmp_path, monkeypat
     done = CliRunner().invoke(cli, line.replace("FILE", "rec.h5").split())
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["without_own_echo"] == {"left": 1}
-    assert "note: no echo of the call of left is known in 1 of 1 pulse: either nothing ahead" in done.stderr
+    assert "note: no echo shows that these sensors emit, left in 1 of 1 pulse: either nothing ahead" in done.stderr
 
 
 def test_ros_states_sensors_without_an_echo_of_their_own():
@@ -119,7 +119,21 @@ def test_ros_states_sensors_without_an_echo_of_their_own():
         for image in images_of(signals, settings_of(diameter_m=0.012), number).values():
             fused.add(image, mounted())
     (note,) = notes
-    assert note.startswith("SYNC pulse 2: no echo of the call of left is known; either nothing ahead reflects")
+    assert note.startswith("SYNC pulse 2: no echo shows that left emits; either nothing ahead reflects")
+
+
+def test_undecided_emitters_are_stated_but_their_echoes_end_free_space():
+    """Of two sensors and one post, the call of either one explains all echoes."""
+    both = mounted(2)
+    signals = rendered(both, settings_of(), PLACES_M[:1], np.zeros(1), diameter_m=0.0, random=np.random.default_rng(0))
+    group = [*images_of(signals, settings_of(), 0).values()]
+    fused = ertis.fuse(group, both, emitter_diameter_m=0.0)
+    assert fused.unheard == ()
+    assert set(fused.undecided) <= set(fused.without_own_echo)
+    assert "front" in fused.undecided
+    mapper = ertis.Mapper(both, emitter_diameter_m=0.0)
+    mapper.add(group, ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), fused=fused)
+    assert mapper.map.log_odds_at((0.8, 0.1)) < 0.0
 
 
 def test_emitters_that_echoes_show_are_not_stated():

@@ -55,11 +55,11 @@ def note_empty(n_empty: int, n_pulses: int, *, quiet: bool) -> None:
 
 def note_without_own_echo(counts: "Mapping[str, int]", n_pulses: int, *, quiet: bool) -> None:
     """State which sensors no echo shows to emit, so that nobody takes the space ahead of them for empty."""
-    for sensor, count in counts.items():
-        pulses = options.counted(n_pulses, "pulse")
+    if counts:
+        each = ", ".join(f"{sensor} in {count}" for sensor, count in counts.items())
         options.note(
-            f"no echo of the call of {sensor} is known in {count} of {pulses}: either nothing ahead of it reflects, or "
-            "its emitter is silent; obstacles ahead of it may be missing",
+            f"no echo shows that these sensors emit, {each} of {options.counted(n_pulses, 'pulse')}: either nothing "
+            "ahead reflects, or the emitter is silent; obstacles ahead of them may be missing",
             quiet=quiet,
         )
 

@@ -1,6 +1,7 @@
 """Fusion of the images of sensors that emit together."""
 
 import functools
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -49,10 +50,12 @@ class Fused:
         Fused sensors whose images hold no echo above their noise. If it names all, the pulse returned no echo. Computed
         with the points.
     without_own_echo : tuple of str
-        Fused sensors of whose calls no echo is known, in this pulse and the two before: no reflector is located by an
-        echo of their own call, or their silence explains the echoes better. Either nothing reflects their calls, or
-        their emitters are broken. Nothing is known of what is ahead of them. Computed at the first access, which may
-        take a few times as long as the points.
+        Fused sensors that no echo shows to emit, in this pulse and the two before: no reflector is located by an echo
+        of their own call, or their silence explains the echoes as well. Either nothing reflects their calls, or their
+        emitters are broken. Obstacles ahead of them may be missing. Computed at the first access, which may take a few
+        times as long as the points.
+    undecided : tuple of str
+        Those of them whose emission explains the echoes as well as their silence.
     noise : dict of str to float
         Detection threshold of each fused sensor: noise exceeds it anywhere in the image with a probability of 10⁻⁵.
         Infinite if the image consists of zeros.
@@ -74,7 +77,7 @@ class Fused:
     missing: tuple[str, ...]
     _solve: Callable[[], PulseReflectors] = field(repr=False)
     _locate: Callable[[PulseReflectors, Energyscape], PointCloud] = field(repr=False)
-    _unshown: Callable[[], frozenset[int]] = field(repr=False)
+    _evidence: Callable[[], dict[int, float]] = field(repr=False)
     _names: tuple[str, ...] = field(repr=False)
 
     @functools.cached_property
@@ -104,8 +107,13 @@ class Fused:
 
     @property
     def without_own_echo(self) -> tuple[str, ...]:
-        """Fused sensors of whose calls no echo is known, in this pulse and the two before."""
-        return tuple(self._names[number] for number in sorted(self._unshown()))
+        """Fused sensors that no echo shows to emit, in this pulse and the two before."""
+        return tuple(self._names[number] for number, better in sorted(self._evidence().items()) if better <= 0)
+
+    @property
+    def undecided(self) -> tuple[str, ...]:
+        """Those of them whose emission explains the echoes as well as their silence."""
+        return tuple(self._names[number] for number, better in sorted(self._evidence().items()) if better == 0)
 
     @property
     def noise(self) -> dict[str, float]:
@@ -180,7 +188,7 @@ class Fuser:
         self._tables: FusionTables | None = None
         self._last: Callable[[], PulseReflectors] | None = None  # of the pulse before
         self._first: list[tuple[tuple[Energyscape, ...], Callable[[], PulseReflectors]]] = []
-        self._shown: list[Callable[[], frozenset[int]]] = []  # of the pulse and those before
+        self._evidence: list[Callable[[], dict[int, float]]] = []  # of the pulse and those before
         self._options = {"spacing_deg": spacing_deg, "range_step_m": range_step_m, "silent": tuple(silent)}
 
     @property
@@ -212,15 +220,15 @@ class Fuser:
         self._start_s |= {number: image.settings.call.start_s for number, image in group.items()}
         self._diameter_m |= self._diameters_m(group)
         if self._tables is None or not self._tables.fit(group, self._diameter_m):
-            self._tables, self._last, self._shown = self._new_tables(group), None, []
+            self._tables, self._last, self._evidence = self._new_tables(group), None, []
         tables = self._tables
         before = None if self._last is None else self._last()
         unheard, pulses = (frozenset[int](), ()) if before is None else (before.unheard, before.pulses)
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
         found = tables.attribution(group).without(unheard)(coarse)
         solve = self._last = functools.cache(lambda: tables.pulse_reflectors(group, found, unheard, pulses))
-        shown: Callable[[], frozenset[int]] = functools.cache(lambda: tables.shown_emitters(group, solve()))
-        recent = self._shown = [*self._shown, shown][-_N_SHOWN:]
+        evidence: Callable[[], dict[int, float]] = functools.cache(lambda: tables.evidence(group, solve()))
+        recent = self._evidence = [*self._evidence, evidence][-_N_SHOWN:]
         if len(self._first) < _N_COMPARED:
             self._first.append((tuple(group.values()), solve))
         image = tables.image((solve().attributed if unheard or found.suspects else found).reflectivity, group)
@@ -230,7 +238,7 @@ class Fuser:
             missing=tuple(sensor.name for number, sensor in enumerate(self._mountings) if number not in group),
             _solve=solve,
             _locate=tables.points,
-            _unshown=functools.cache(lambda: _unshown(tables.emitters(group), recent)),
+            _evidence=functools.cache(lambda: _best(recent)),
             _names=self.sensors,
         )
 
@@ -357,12 +365,15 @@ class Fuser:
         return FusionTables(grid, self._mountings, self._emitting, start_s, diameters_m)
 
 
-def _unshown(emitters: frozenset[int], recent: Sequence[Callable[[], frozenset[int]]]) -> frozenset[int]:
-    """Return the emitters that echoes of no recent pulse show to work."""
-    for shown in reversed(recent):
-        if emitters:
-            emitters -= shown()
-    return emitters
+def _best(recent: Sequence[Callable[[], dict[int, float]]]) -> dict[int, float]:
+    """Return the best evidence of recent pulses for each emitter of the last one."""
+    found = recent[-1]()
+    for earlier in reversed(recent[:-1]):
+        if min(found.values(), default=math.inf) > 0:
+            break
+        before = earlier()
+        found = {number: max(better, before.get(number, better)) for number, better in found.items()}
+    return found
 
 
 def fuse(images: Iterable[Energyscape], mountings: Mountings, *, emitter_diameter_m: float | None = None) -> Fused:

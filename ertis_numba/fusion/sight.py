@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.fusion.pairs import AUDIBLE
 from ertis_numba.fusion.rig import Emitters, MountedSensor
 
-__all__ = ["Sight", "Viewers", "mirrored"]
+__all__ = ["SeenPlaces", "Viewers", "mirrored"]
 
 Floats = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ _BESIDE_DB: Final = (-13.0, -16.0)  # Power of a call to the side from which its
 _BESIDE_M: Final = 6e-3
 
 
-class Sight(NamedTuple):
+class SeenPlaces(NamedTuple):
     """Places seen from all sensors.
 
     Attributes
@@ -45,9 +45,9 @@ class Sight(NamedTuple):
     radiated: Floats
     gain: Floats
 
-    def only(self, number: int) -> "Sight":
+    def only(self, number: int) -> "SeenPlaces":
         """Return one of the places."""
-        return Sight._make(each[number : number + 1] for each in self)
+        return SeenPlaces._make(each[number : number + 1] for each in self)
 
     @property
     def beside_m(self) -> Floats:
@@ -88,7 +88,7 @@ class Viewers:
             (model, [number for number, each in emitters.items() if each is model]) for model in {*emitters.values()}
         ]
 
-    def sight(self, place_m: Floats) -> Sight:
+    def sight(self, place_m: Floats) -> SeenPlaces:
         """Return how the sensors see places: (place, axis) float64."""
         away_m = place_m[:, None] - self.sensor_m
         apart_m = np.maximum(np.sqrt(np.einsum("psi,psi->ps", away_m, away_m)), _NEAREST_M)
@@ -100,7 +100,7 @@ class Viewers:
         for radiated, (model, receivers) in zip(powers, self._models, strict=True):
             spreading = model.spreading(apart_m[:, None], apart_m[:, receivers, None])
             gain[:, receivers] = np.where(radiated > AUDIBLE, radiated, 0)[:, None] * spreading
-        return Sight(apart_m, toward, depth, seen, powers[0], gain)
+        return SeenPlaces(apart_m, toward, depth, seen, powers[0], gain)
 
     def echo_powers(self, sight: Sight, receiver: NDArray[np.int64]) -> Floats:
         """Return the power of echoes of one place after the matched filter: (echo, emitter), by receiver (echo,)."""

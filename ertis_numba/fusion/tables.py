@@ -1,5 +1,6 @@
 """Tables of fusion: receivers, pairs and hypotheses of all sensors of a platform."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
@@ -264,8 +265,10 @@ class FusionTables:
         """Return the sensors of a group that emitted."""
         return frozenset({*self._emitting} & group.keys() - _key(group)[1])
 
-    def shown_emitters(self, group: Mapping[int, Energyscape], found: PulseReflectors) -> frozenset[int]:
-        """Return the emitters of a group that echoes show to work.
+    def evidence(self, group: Mapping[int, Energyscape], found: PulseReflectors) -> dict[int, float]:
+        """Return how much better emission of each sensor explains the echoes than its silence; 0 if equally well.
+
+        Infinite without a comparison: for emitters that echoes show to work, or that no echo of their own needs.
 
         Parameters
         ----------
@@ -273,19 +276,18 @@ class FusionTables:
         found : PulseReflectors
             Reflectors of the group.
         """
-        return frozenset(number for number in self.emitters(group) if self._is_shown(group, found, number))
+        return {number: self._evidence(group, found, number) for number in self.emitters(group)}
 
-    def _is_shown(self, group: Mapping[int, Energyscape], found: PulseReflectors, number: int) -> bool:
-        """Return True if echoes show that an emitter works."""
-        if number in found.unheard | found.apart:
-            return number in found.apart
-        if found.pulses and is_heard(found.pulses[-1], number):
-            return True
-        if number not in found.reflectors.own_emitters() or not found.cost:
-            return number in found.reflectors.own_emitters()
+    def _evidence(self, group: Mapping[int, Energyscape], found: PulseReflectors, number: int) -> float:
+        """Return how much better emission of one sensor explains the echoes."""
+        is_unheard = number in found.unheard
+        if number in found.apart or (not is_unheard and found.pulses and is_heard(found.pulses[-1], number)):
+            return math.inf
+        if is_unheard or number not in found.reflectors.own_emitters():
+            return -math.inf
         silent = found.unheard | {number}
         rival = self._explained(group, self._without(group, silent), found.floor, silent)
-        return rival.cost >= found.cost or found.reflectors.needs(number, rival.reflectors)
+        return math.inf if found.reflectors.needs(number, rival.reflectors) else rival.cost - found.cost
 
     def _without(self, group: Mapping[int, Energyscape], unheard: frozenset[int]) -> Attributed:
         """Return the attribution of a group whose sensors do not hear some emitters."""

@@ -44,7 +44,7 @@ class Mapper:
     Cells in front of the first clear echo of a direction become free, but less so at larger distances. A smooth wall
     that the sound meets obliquely returns no echo, so silence alone shows free space near the platform only, and only
     as far as a clear echo would exceed the noise. Noise is no echo: without any echo so far, only the place of the
-    platform is free. The silence of a sensor of whose calls no echo is known shows no free space either, because its
+    platform is free. The silence of a sensor that no echo shows to emit shows no free space either, because its
     emitter may be broken (`Fused.without_own_echo`). Uncertain poses spread the evidence of echoes, and shorten free
     space.
 
@@ -131,7 +131,7 @@ class Mapper:
 
     @property
     def without_own_echo(self) -> dict[str, int]:
-        """Number of groups so far for each sensor of whose calls no echo is known (`Fused.without_own_echo`)."""
+        """Number of groups so far for each sensor that no echo shows to emit (`Fused.without_own_echo`)."""
         return dict(self._without_own_echo)
 
     def emitter_warning(self) -> str | None:
@@ -246,7 +246,7 @@ class Mapper:
     def _heard_m(self, image: Energyscape, fused: Fused) -> float:
         """Return the distance up to which a clear echo of a sensor's call exceeds the noise of its image."""
         sensor, settings = image.stamp.sensor, image.settings
-        if sensor in fused.unheard or sensor in fused.without_own_echo:
+        if sensor in fused.unheard or (sensor in fused.without_own_echo and sensor not in fused.undecided):
             return 0.0
         key = settings.call, settings.air
         if key not in self._emitters:

@@ -113,8 +113,8 @@ class FusedImages:
         unshown, count = frozenset(fused.without_own_echo), fused.image.stamp.sync_count
         if unshown - self._unshown:
             self._note(
-                f"SYNC pulse {count}: no echo of the call of {', '.join(sorted(unshown))} is known; either nothing "
-                "ahead reflects, or the emitter is silent, and obstacles ahead may be missing"
+                f"SYNC pulse {count}: no echo shows that {', '.join(sorted(unshown))} emits; either nothing ahead "
+                "reflects, or the emitter is silent, and obstacles ahead may be missing"
             )
         self._unshown = unshown
 
