@@ -122,20 +122,6 @@ def test_ros_states_sensors_without_an_echo_of_their_own():
     assert note.startswith("SYNC pulse 2: no echo shows that left emits; either nothing ahead reflects")
 
 
-def test_undecided_emitters_are_stated_but_their_echoes_end_free_space():
-    """Of two sensors and one post, the call of either one explains all echoes."""
-    both = mounted(2)
-    signals = rendered(both, settings_of(), PLACES_M[:1], np.zeros(1), diameter_m=0.0, random=np.random.default_rng(0))
-    group = [*images_of(signals, settings_of(), 0).values()]
-    fused = ertis.fuse(group, both, emitter_diameter_m=0.0)
-    assert fused.unheard == ()
-    assert set(fused.undecided) <= set(fused.without_own_echo)
-    assert "front" in fused.undecided
-    mapper = ertis.Mapper(both, emitter_diameter_m=0.0)
-    mapper.add(group, ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), fused=fused)
-    assert mapper.map.log_odds_at((0.8, 0.1)) < 0.0
-
-
 def test_emitters_that_echoes_show_are_not_stated():
     fuser = ertis.Fuser(mounted(), emitter_diameter_m=0.0)
     assert {fuser(images(506, number, 0.0)).without_own_echo for number in range(2)} == {()}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.analysis.noise import threshold_of
-from ertis_numba.analysis.outside_echo import outside_of
+from ertis_numba.analysis.outside_echo import has_outside, outside_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.side_lobes import EdgeFloor, SideLobes
@@ -142,7 +142,7 @@ def peaks_of_grid(
         tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1])
         found.append((tops.direction[0], float(tops.range_m[0]), float(tops.amplitude[0])))
         outside = outside_of(image, directions, found[-1][1])
-        is_beside_open = any(
+        is_beside_open = has_outside(image.settings, directions) and any(
             math.isinf(error_rad) and abs(found[-1][1] - other[1]) < side_lobes.reach_m
             for other, error_rad in zip(found[:-1], errors_rad, strict=True)
         )

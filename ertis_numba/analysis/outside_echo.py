@@ -13,9 +13,21 @@ from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import far_field_delays, microphones
 from ertis_numba.settings import Settings
 
-__all__ = ["outside_of"]
+__all__ = ["has_outside", "outside_of"]
 
 _FREQUENCIES: Final = 5
+
+
+def has_outside(settings: Settings, directions: NDArray[np.float64]) -> bool:
+    """Return True if an array distinguishes directions that a grid does not contain, unlike those behind a plane array.
+
+    Parameters
+    ----------
+    settings : Settings
+    directions : (direction, axis) float64
+        Unit vectors of the grid.
+    """
+    return _patterns(settings, directions.tobytes()) is not None
 
 
 def outside_of(image: Energyscape, directions: NDArray[np.float64], range_m: float) -> OutsideSource | None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.analysis.detect import neighbours_of
-from ertis_numba.analysis.outside_echo import outside_of
+from ertis_numba.analysis.outside_echo import has_outside, outside_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.side_lobes import EdgeFloor, side_lobe_floor
@@ -111,6 +111,8 @@ class PointExtractor:
     def _are_open(self, image: Energyscape, tops: Tops) -> NDArray[np.bool_]:
         """Return True for points that may be echoes from beyond the grid, or side lobes of such echoes: (point,)."""
         is_open = np.isinf(tops.width_rad)
+        if not has_outside(image.settings, self._directions):
+            return is_open
         for place in np.flatnonzero(~is_open):
             is_open[place] = outside_of(image, self._directions, float(tops.range_m[place])) is not None
         is_near = np.abs(tops.range_m - tops.range_m[:, None]) < self._reach_m

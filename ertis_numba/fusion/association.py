@@ -36,7 +36,7 @@ _DISTURBED: Final = 0.25  # Power of overlapping echoes relative to one that the
 _MANY_PAIRS: Final = (
     9  # Pairs that should hear a reflector, from which a lone echo is none: more than those of one call or two.
 )
-_N_UNCLEAR: Final = 4  # Echoes of a reflector that need not be clear of noise that changes.
+_N_UNCLEAR: Final = 4  # Echoes of a reflector in space that need not be clear of noise that changes.
 _EXCESS: Final = 4.0  # Reflectivity relative to the bound of a cell, above which missing echoes exclude a candidate.
 _TINY: Final = 1e-30
 _STRONG: Final = 10 ** (-10.0 / 10)  # Reflectivity relative to the median, from which echoes need their own call.
@@ -226,7 +226,7 @@ class Reflectors:
         n_echoes_of = np.array([len(each.echo) for each in found], np.int64)
         kept = (n_echoes_of > 1) | sure.is_wall | (sure.n_pairs < _MANY_PAIRS)
         is_clear = np.array([self._is_clear[each.echo].any() for each in found], np.bool_)
-        kept &= is_clear | (n_echoes_of >= _N_UNCLEAR)
+        kept &= is_clear | (n_echoes_of >= _N_UNCLEAR) | grid.is_planar
         self.located = tuple(found[number] for number in np.flatnonzero(kept))
         self.position_m, self.radiated, self.confirmed = place_m[kept], sight.radiated[kept], sure.is_confirmed[kept]
         self.covariance_m2 = np.array([each.covariance_m2 for each in self.located]).reshape(-1, 3, 3)

@@ -102,7 +102,7 @@ class Viewers:
             gain[:, receivers] = np.where(radiated > AUDIBLE, radiated, 0)[:, None] * spreading
         return SeenPlaces(apart_m, toward, depth, seen, powers[0], gain)
 
-    def echo_powers(self, sight: Sight, receiver: NDArray[np.int64]) -> Floats:
+    def echo_powers(self, sight: SeenPlaces, receiver: NDArray[np.int64]) -> Floats:
         """Return the power of echoes of one place after the matched filter: (echo, emitter), by receiver (echo,)."""
         model = next(model for model, numbers in self._models if receiver[0] in numbers)
         return model.echo_powers(sight.depth[0], sight.apart_m[0], sight.apart_m[0, receiver])
