@@ -142,8 +142,8 @@ def test_scaled_layouts_are_named_by_their_unit(factor):
 @pytest.mark.parametrize(
     ("count", "named"),
     [
-        (16, "scale of the positions: an echo fits arrays up to about twice as large or small as well"),
-        (7, "scale of the positions: 7 microphones are too few, even for a wrong unit"),
+        (16, "scale of the positions: an echo fits arrays of about half to twice the size equally well"),
+        (7, "scale of the positions: 7 microphones are too few to detect even a wrong unit"),
         (5, "order of channels, delay of channels, scale of the positions, shift of the record: 5 microphones are too"),
     ],
 )

@@ -74,7 +74,7 @@ def test_map_of_a_recording_shows_the_post_in_the_world(folder):
     assert "first.h5: 3 pulses" in done.stderr
     # The call of either sensor explains all echoes, so that each could be silent; they still end free space.
     assert report["without_own_echo"] == {"left": 3, "right": 3}
-    assert "no echo shows that these sensors emit, left in 3, right in 3 of 3 pulses" in done.stderr
+    assert "no echo proves that these sensors emit: left in 3 of 3 pulses, right in 3 of 3 pulses" in done.stderr
     found = ertis.read_map(folder / "first.h5")
     assert report["occupied"] == found.is_occupied.sum() == len(found.occupied_m) > 0
     assert np.hypot(*(found.occupied_m - [POST_M[0] + 10.0, POST_M[1]]).T).max() < 0.1

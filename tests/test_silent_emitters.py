@@ -100,7 +100,7 @@ def test_commands_state_sensors_without_an_echo_of_their_own(tmp_path, monkeypat
     done = CliRunner().invoke(cli, line.replace("FILE", "rec.h5").split())
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["without_own_echo"] == {"left": 1}
-    assert "note: no echo shows that these sensors emit, left in 1 of 1 pulse: either nothing ahead" in done.stderr
+    assert "note: no echo proves that these sensors emit: left in 1 of 1 pulse; if an emitter is broken" in done.stderr
 
 
 def test_ros_states_sensors_without_an_echo_of_their_own():
@@ -119,7 +119,7 @@ def test_ros_states_sensors_without_an_echo_of_their_own():
         for image in images_of(signals, settings_of(diameter_m=0.012), number).values():
             fused.add(image, mounted())
     (note,) = notes
-    assert note.startswith("SYNC pulse 2: no echo shows that left emits; either nothing ahead reflects")
+    assert note.startswith("SYNC pulse 2: no echo proves that these sensors emit: left; if an emitter is broken")
 
 
 def test_emitters_that_echoes_show_are_not_stated():

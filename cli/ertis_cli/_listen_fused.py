@@ -81,7 +81,7 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
     absent = f", without {' '.join(fused.missing)}" if fused.missing else ""
     absent += f", {' '.join(fused.unheard)} not heard" if fused.unheard else ""
     unshown = [name for name in fused.without_own_echo if name not in fused.unheard]
-    absent += f", no echo shows that {' '.join(unshown)} emits" if unshown and not fused.is_empty else ""
+    absent += f", emission of {' '.join(unshown)} not proven" if unshown and not fused.is_empty else ""
     age = "-" if age_ms is None else f"{age_ms:.1f} ms"
     row = (
         f"{fused.image.stamp.sync_count:8d}  {age:>8}  {len(range_m):6d}  {place:24}  {' '.join(fused.sensors)}{absent}"

@@ -54,12 +54,13 @@ def note_empty(n_empty: int, n_pulses: int, *, quiet: bool) -> None:
 
 
 def note_without_own_echo(counts: "Mapping[str, int]", n_pulses: int, *, quiet: bool) -> None:
-    """State which sensors no echo shows to emit, so that nobody takes the space ahead of them for empty."""
+    """Print a note on sensors whose emission no echo proves, because the space ahead of them may not be empty."""
     if counts:
-        each = ", ".join(f"{sensor} in {count}" for sensor, count in counts.items())
+        pulses = options.counted(n_pulses, "pulse")
+        each = ", ".join(f"{sensor} in {count} of {pulses}" for sensor, count in counts.items())
         options.note(
-            f"no echo shows that these sensors emit, {each} of {options.counted(n_pulses, 'pulse')}: either nothing "
-            "ahead reflects, or the emitter is silent; obstacles ahead of them may be missing",
+            f"no echo proves that these sensors emit: {each}; if an emitter is broken, obstacles ahead of it may be "
+            "missing",
             quiet=quiet,
         )
 

@@ -256,8 +256,8 @@ def calibration(**given: Any) -> None:
     metavar="PART",
     help="Run only this part: calls compares sensors with equal and with different calls, clocks checks clocks and "
     "mountings by direct sound, delays compares delays of sensors that emit in sequence, emitters finds broken and "
-    "wrongly stated emitters, reflections counts wrongly confirmed points where walls reflect sound several times, and "
-    "scans compares laser scans of confirmed reflectors with rays.",
+    "wrongly stated emitters, reflections counts spurious confirmed points where walls reflect sound several times, "
+    "and scans compares laser scans of confirmed reflectors with rays.",
 )
 @_update
 @options.quiet

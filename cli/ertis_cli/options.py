@@ -533,7 +533,7 @@ def note_open_edges(
     count = sum(map(math.isinf, grid_errors))
     if count and len(grid.azimuth_rad) > 1:
         note(
-            f"sensor {sensor}: {counted(count, 'listed direction')} whose source may lie beyond the edges of the grid, "
+            f"sensor {sensor}: {counted(count, 'listed direction')} may have a source beyond the edges of the grid, "
             "so grid_error_deg is unknown; use 'ertis process' with a wider --azimuth or --elevation",
             quiet=quiet,
         )

@@ -38,7 +38,7 @@ class EchoFloor(NamedTuple):
     ratio : float
         Threshold relative to the median of the noise.
     exponent : float
-        Power of the amplitude of Rayleigh-distributed noise that the image shows.
+        Exponent of the image's noise: it is distributed as a Rayleigh variable to this power.
     """
 
     by_direction: NDArray[np.float32]
@@ -68,8 +68,8 @@ class EchoFloor(NamedTuple):
         direction, place : (bin,) int
             Indices of directions and ranges.
         quantile : float
-            Part of the ranges around a bin that noise exceeds at most. Higher ones follow noise that swells and fades,
-            but also dense echoes.
+            Quantile of the amplitudes around a bin from which its noise is estimated. Higher ones follow noise that
+            swells and fades, but also dense echoes.
         """
         last, n_around = amplitude.shape[1] - 1, self.n_around
         rank = int(quantile * (n_around - 1))
@@ -77,7 +77,7 @@ class EchoFloor(NamedTuple):
         thresholds = [self.by_direction[direction], self.by_range[place]]
         for first in (1 - n_around, -n_around // 2, 0):  # A click may begin or end at the bin.
             columns = np.abs(place[:, None] + first + np.arange(n_around))
-            columns = (last - np.abs(last - columns)).clip(0)  # Ends of the image mirror it.
+            columns = (last - np.abs(last - columns)).clip(0)  # The image is mirrored at its ends.
             around = np.partition(amplitude[direction[:, None], columns], rank, axis=1)[:, rank]
             thresholds.append(around * np.float32(ratio))
         return np.asarray(np.max(thresholds, axis=0))

@@ -1,8 +1,8 @@
 """Sound from directions that a grid does not contain, found by the pattern of its side lobes.
 
 The powers of a single source over a grid are the pattern of its beam. Side lobes of a source beyond the limits of a
-grid form maxima within it, at wrong directions. The pattern over the grid then fits a source outside far better than
-one inside.
+grid form maxima within it, at wrong directions. The pattern over the grid then fits a source outside clearly better
+than any inside.
 """
 
 import math
@@ -60,7 +60,10 @@ class OutsidePatterns:
     def of(
         cls, directions: Floats, delays: Callable[[Floats], Floats], frequency_hz: Floats
     ) -> "OutsidePatterns | None":
-        """Return the patterns of an array; None if the grid lacks no direction that the array can distinguish.
+        """Return the patterns of an array, or None if there are none to compare.
+
+        This is so if the grid contains all directions that the array distinguishes, if it has fewer than eight
+        directions, or if the beams of the array are too narrow (`_MAX_PLACES`).
 
         Parameters
         ----------
@@ -101,7 +104,7 @@ class OutsidePatterns:
         return cls(samples, places, outside.astype(np.float32), inside.astype(np.float32), norms)
 
     def source_of(self, values: Floats) -> OutsideSource | None:
-        """Return the source outside of the grid that explains values; None if a source inside may do.
+        """Return the source outside of the grid that explains values; None if a source inside may explain them.
 
         Parameters
         ----------

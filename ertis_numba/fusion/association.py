@@ -33,10 +33,8 @@ _N_CONFIRMING: Final = 3  # Echoes required for a reflector that the attribution
 _USUAL_DB: Final = 6.0  # Reflectivity relative to the usual one, above which a reflector is a surprise, …
 _SURPRISE_DB: Final = 10.0  # … which counts as much as a missing echo for each so many decibels.
 _DISTURBED: Final = 0.25  # Power of overlapping echoes relative to one that they explain.
-_MANY_PAIRS: Final = (
-    9  # Pairs that should hear a reflector, from which a lone echo is none: more than those of one call or two.
-)
-_N_UNCLEAR: Final = 4  # Echoes of a reflector in space that need not be clear of noise that changes.
+_MANY_PAIRS: Final = 9  # If so many pairs should hear a reflector, more than those of two calls, one echo shows none.
+_N_UNCLEAR: Final = 4  # Echoes of a reflector in space from which none needs to be clear (`SensorEchoes.is_clear`).
 _EXCESS: Final = 4.0  # Reflectivity relative to the bound of a cell, above which missing echoes exclude a candidate.
 _TINY: Final = 1e-30
 _STRONG: Final = 10 ** (-10.0 / 10)  # Reflectivity relative to the median, from which echoes need their own call.

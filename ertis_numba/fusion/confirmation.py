@@ -30,9 +30,9 @@ _MIN_APART_M: Final = 0.06  # Least difference of ranges of a ghost and a nearer
 _PLANE_M: Final = 0.04  # Largest distance of a located wall from the plane that a ghost implies, …
 _FOOT_M: Final = 0.4  # … and from the foot of the perpendicular to it.
 _SAME_RAD: Final = math.radians(2.5)  # Difference of directions below which a nearer reflector may send the sound.
-_N_LEAST: Final = 2  # Echoes without which an own echo may be that of another sensor's call.
+_N_LEAST: Final = 2  # Least number of echoes: a single one may be that of another sensor's call.
 _N_IMAGES: Final = 2  # Images that must show a reflector if that of an emitting sensor is missing, …
-_AGREED: Final = 0.7  # … and share of pairs with an echo of their own.
+_AGREED: Final = 0.7  # … and share of pairs that must each have a different echo.
 _N_SURE: Final = 4  # Echoes that two reflections hardly cause at the right paths.
 
 
@@ -59,12 +59,13 @@ def confirmation(
 ) -> Confirmation:
     """Return the confirmation of reflectors, each as a point or as a mirror-like wall.
 
-    At least 60 % of the pairs that should hear a reflector must do so, rounded down, and four if there are as many. A
-    platform with several sensors needs two echoes that no two nearer surfaces explain. Those of a point must have been
-    joined. A reflector that a nearer one and a wall explain is not confirmed.
+    At least 60 % of the pairs that should hear a reflector must do so, rounded down, and four if there are as many. On
+    a platform with several sensors, at least two echoes must remain that no two nearer surfaces explain, and at least
+    two must locate a point. A reflector that a nearer one and a wall explain is not confirmed.
 
-    If the image of an emitting sensor is missing, two images must show a reflector, by an echo of its own for 70 % of
-    the pairs. Sound over a nearer reflector and a wall that only that sensor faces must not explain all of them.
+    If the image of an emitting sensor is missing, two images must show a reflector, and 70 % of the pairs must each
+    have a different echo. Sound over a nearer surface and a wall that only that sensor faces must not explain all of
+    these echoes.
 
     Parameters
     ----------

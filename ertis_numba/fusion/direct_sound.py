@@ -35,7 +35,7 @@ _OVERSAMPLING: Final = 8
 _MOUNTING_SD_M: Final = 1e-3  # of the position of a sensor along the way to another one
 _SIGMAS: Final = 3.0
 _NEAREST_M: Final = 0.05
-_BESIDE_S: Final = 150e-6  # Largest difference of a sensor's own direct sound: its emitter is near its microphones.
+_BESIDE_S: Final = 150e-6  # Largest difference of a sensor's own direct sound, whose emitter may be beside the origin.
 _CLEAR: Final = 2.0  # Level relative to the threshold from which the way back would be heard as well.
 
 
@@ -74,9 +74,9 @@ class DirectSoundCheck:
     than their mountings state. The way back tells both apart: a difference of clocks has the opposite sign there.
     Emitters are assumed to be at the origins of the sensors, as in images.
 
-    The sound also shows silent emitters. Sound between two sensors is equally loud both ways. A sensor that clearly
-    hears others, but that no other one hears, does not emit. The same holds for a sensor that does not hear its own
-    call, if all others clearly hear theirs.
+    The sound also shows silent emitters. Sound between two sensors is equally loud both ways. A sensor that most others
+    do not hear, although it clearly hears one of them, does not emit. The same holds for a sensor that does not hear
+    its own call, if all others clearly hear theirs.
 
     Noise alone passes for a direct sound in at most one of 1000 checks. Each of the n (n − 1) pairs of n sensors has an
     equal share of this rate in a single pulse. Of several pulses, more than half must contain the sound, which is less
@@ -170,7 +170,7 @@ class DirectSoundCheck:
 
     @property
     def silent(self) -> tuple[str, ...]:
-        """Sensors that emit no sound, as that of others shows."""
+        """Sensors that emit no sound, in contrast to others."""
         found = []
         for name in self._mountings:
             searched = {receiver: each for (emitter, receiver), each in self._found.items() if emitter == name}

@@ -43,7 +43,7 @@ class EchoPaths(NamedTuple):
     def arriving(
         self, receiver: int, origin_m: Floats, sent_m: Floats, within_m: float, within_rad: float
     ) -> tuple[Numbers, Numbers, Numbers]:
-        """Return the echoes of a receiver that sound from predicted places explains: source, emitter and echo.
+        """Return source, emitter and number of the echoes of a receiver that fit sound from predicted places.
 
         Parameters
         ----------
@@ -62,7 +62,7 @@ class EchoPaths(NamedTuple):
         source, emitter, echo = np.nonzero(np.abs(late_m) < within_m)  # False for NaN.
         toward = to_m[source, emitter] / apart_m[source, emitter, None]
         depth = toward @ self.ahead[receiver]
-        seen = toward - 2 * np.minimum(depth, 0.0)[:, None] * self.ahead[receiver]  # A flat array hears no side.
+        seen = toward - 2 * np.minimum(depth, 0.0)[:, None] * self.ahead[receiver]  # See `SeenPlaces.seen`.
         turn = np.linalg.norm(seen - self.direction[rows[echo]], axis=1)  # For small angles, the chord is the angle.
         is_near = turn < within_rad / np.maximum(np.abs(depth), _LEAST_COSINE)
         if receiver not in self.flat:

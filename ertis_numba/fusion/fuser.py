@@ -23,7 +23,7 @@ __all__ = ["Fused", "Fuser", "fuse"]
 _SPACING_DEG: Final = 1.0, 4.0  # of planar and of three-dimensional images
 _STEP_M: Final = 0.015, 0.03
 _N_COMPARED: Final = 3  # Pulses that other emitters are tried for.
-_N_SHOWN: Final = 3  # Pulses in which no echo shows that an emitter works.
+_N_SHOWN: Final = 3  # Pulses whose echoes may prove that an emitter works.
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +50,13 @@ class Fused:
         Fused sensors whose images hold no echo above their noise. If it names all, the pulse returned no echo. Computed
         with the points.
     without_own_echo : tuple of str
-        Fused sensors that no echo shows to emit, in this pulse and the two before: no reflector is located by an echo
-        of their own call, or their silence explains the echoes as well. Either nothing reflects their calls, or their
-        emitters are broken. Obstacles ahead of them may be missing. Computed at the first access, which may take a few
-        times as long as the points.
+        Fused sensors whose emission no echo proves, in this pulse and the two before: no echo of their own call locates
+        a reflector, or silence of their emitters explains the echoes at least as well. Nothing may reflect their calls,
+        or their emitters may be broken, so that obstacles ahead of them may be missing. Computed at the first access,
+        which may take a few times as long as the points.
     undecided : tuple of str
-        Those of them whose emission explains the echoes as well as their silence.
+        Sensors in ``without_own_echo`` whose emission and silence explain the echoes equally well. Maps treat them as
+        working.
     noise : dict of str to float
         Detection threshold of each fused sensor: noise exceeds it anywhere in the image with a probability of 10⁻⁵.
         Infinite if the image consists of zeros.
@@ -107,12 +108,12 @@ class Fused:
 
     @property
     def without_own_echo(self) -> tuple[str, ...]:
-        """Fused sensors that no echo shows to emit, in this pulse and the two before."""
+        """Fused sensors whose emission no echo proves, in this pulse and the two before."""
         return tuple(self._names[number] for number, better in sorted(self._evidence().items()) if better <= 0)
 
     @property
     def undecided(self) -> tuple[str, ...]:
-        """Those of them whose emission explains the echoes as well as their silence."""
+        """Sensors in `without_own_echo` whose emission and silence explain the echoes equally well."""
         return tuple(self._names[number] for number, better in sorted(self._evidence().items()) if better == 0)
 
     @property

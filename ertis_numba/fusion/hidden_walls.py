@@ -1,4 +1,4 @@
-"""Reflectors that sound over a wall may show which only sensors without an image face."""
+"""Ghosts by sound over hidden walls, which only sensors without an image face."""
 
 import math
 from typing import Final
@@ -15,16 +15,16 @@ Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
-_PATH_M: Final = 0.03  # Largest difference of a path over a wall that the path of another echo implies, …
+_PATH_M: Final = 0.03  # Largest difference of the path of an echo from that over a wall that another one implies, …
 _ANGLE_RAD: Final = math.radians(4.0)  # … and of its direction.
 _FACING: Final = math.cos(math.radians(65.0))  # Cosine from which a sensor faces a wall.
-_APART_M: Final = 0.2  # Least difference of a place and its mirror image.
+_APART_M: Final = 0.2  # Least distance between a place and its mirror image.
 
 
 def over_hidden_walls(
     heard: EchoPaths, place_m: Floats, walls: Walls, confirming: Flags, hidden: Numbers, is_ghost: Flags
 ) -> Flags:
-    """Return True for reflectors all of whose echoes sound over a nearer one and a hidden wall explains.
+    """Return True for reflectors whose echoes sound over a nearer surface and a hidden wall explains: (reflector,).
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def over_hidden_walls(
     hidden : (sensor,) int64
         Sensors that emit, but have no image.
     is_ghost : (reflector,) bool
-        Reflectors that reflect nothing.
+        Reflectors that do not exist, and hence reflect no sound to others.
     """
     range_m = np.linalg.norm(place_m[:, None] - heard.sensor_m, axis=2).min(axis=1)
     found = np.zeros(len(place_m), np.bool_)

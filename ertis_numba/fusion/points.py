@@ -27,7 +27,7 @@ _FAINTEST: Final = 10 ** (-22.0 / 20)  # Amplitude in the fused image relative t
 _MIN_LEVEL_DB: Final = -26.0  # Lowest level of echoes relative to the strongest of an image.
 _FAINT: Final = 10 ** (-20.0 / 20)  # Amplitude relative to it, below which echoes only confirm reflectors.
 _FALSE_ALARM: Final = 1e-5  # Probability that noise alone yields a point of an image.
-_CLEAR: Final = 0.8  # Quantile of the ranges around a lone echo from which it must differ.
+_CLEAR: Final = 0.8  # Quantile of amplitudes around a lone echo that implies the noise, which the echo must exceed.
 _RANGE_SD_M: Final = 0.5e-3  # Errors that noise does not explain, such as those of the array and of interpolation.
 _ANGLE_SD_RAD: Final = math.radians(0.125)
 _UNKNOWN_RANGE_SD_M: Final = 5e-3
@@ -91,7 +91,7 @@ class PointFuser:
         row = np.argmax(place_m @ self._receiver.directions.T, axis=1)
         range_m = np.linalg.norm(place_m, axis=1)
         column = np.rint(np.interp(range_m, image.range_m, np.arange(len(image.range_m)))).astype(np.int64)
-        # Between directions of a coarse grid, interpolation may exceed all bins, but noise does so as well.
+        # Between directions of a coarse grid, interpolation may exceed all bins, also for noise. Bins are compared.
         near = image.amplitude[row[:, None], (column[:, None] + _BESIDE).clip(0, len(image.range_m) - 1)].max(axis=1)
         shown = np.minimum(near, cloud.amplitude)
         is_heard = shown > floor.by_direction[row]

@@ -53,7 +53,7 @@ class Walls(NamedTuple):
 
 
 class _Sources(NamedTuple):
-    """Places from which sound arrives that two surfaces reflect, and its paths to them.
+    """Apparent origins of sound that two surfaces reflect, and the paths of the sound to them.
 
     Attributes
     ----------
@@ -79,7 +79,7 @@ class _Sources(NamedTuple):
 
 
 class Reflected(NamedTuple):
-    """Echoes that sound over two nearer surfaces explains.
+    """Echoes that are explained by sound over two nearer surfaces.
 
     Attributes
     ----------
@@ -96,9 +96,9 @@ class Reflected(NamedTuple):
 def reflected_twice(
     heard: EchoPaths, place_m: Floats, walls: Walls, reflectivity: Floats, members: Sequence[Numbers]
 ) -> Reflected:
-    """Return the echoes that sound over two nearer surfaces explains, a wall and another surface.
+    """Return the echoes that are explained by sound over two nearer surfaces, one of them a wall.
 
-    Reflectors all of whose echoes are explained reflect no sound to others.
+    A reflector without other echoes is a ghost, which reflects no sound to others.
 
     Parameters
     ----------

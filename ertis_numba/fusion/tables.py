@@ -240,7 +240,7 @@ class FusionTables:
         unheard: frozenset[int],
         pulses: Sequence[EmissionCounts],
     ) -> tuple[int, Attributed, _Explained] | None:
-        """Return another emitter that is silent, and the explanation of the echoes without it, or None."""
+        """Return another emitter that is silent, with attribution and explanation of the echoes without it, or None."""
         suspected = suspect((*pulses, explained.counts)[-_N_PULSES:], unheard)
         numbers = self._judged(group) - unheard
         doubts = doubted(numbers, explained.counts, explained.cost) if self._is_omnidirectional else frozenset[int]()
@@ -268,7 +268,8 @@ class FusionTables:
     def evidence(self, group: Mapping[int, Energyscape], found: PulseReflectors) -> dict[int, float]:
         """Return how much better emission of each sensor explains the echoes than its silence; 0 if equally well.
 
-        Infinite without a comparison: for emitters that echoes show to work, or that no echo of their own needs.
+        Infinite for emitters that echoes prove to work; negatively infinite for unheard ones, and for those without a
+        located echo of their own call.
 
         Parameters
         ----------
@@ -317,7 +318,7 @@ class FusionTables:
         expected = expected_echoes(reflectors, group, floor, self._receivers, late_m, self._deaf, silent=unheard)
         counts = EmissionCounts.of(expected, reflectors, self._judged(group))
         n_missed = int(np.delete(expected.is_missed, [*unheard], axis=2).sum())
-        # Dense echoes of one reflector are not clear, but pulses of noise without a reflector have no echo.
+        # Dense echoes of reflectors may be unclear, too. Unclear echoes are noise only if no reflector is located.
         is_any = bool(reflectors.located)
         without_echo = [each.receiver for each in echoes if (each.is_faint | ~(each.is_clear | is_any)).all()]
         return _Explained(reflectors, counts, without_echo, reflectors.n_unexplained + n_missed)

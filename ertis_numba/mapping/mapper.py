@@ -44,9 +44,9 @@ class Mapper:
     Cells in front of the first clear echo of a direction become free, but less so at larger distances. A smooth wall
     that the sound meets obliquely returns no echo, so silence alone shows free space near the platform only, and only
     as far as a clear echo would exceed the noise. Noise is no echo: without any echo so far, only the place of the
-    platform is free. The silence of a sensor that no echo shows to emit shows no free space either, because its
-    emitter may be broken (`Fused.without_own_echo`). Uncertain poses spread the evidence of echoes, and shorten free
-    space.
+    platform is free. If no echo proves that a sensor emits (`Fused.without_own_echo`), its silence shows no free space
+    either, because its emitter may be broken; sensors in `Fused.undecided` count as working. Uncertain poses spread the
+    evidence of echoes, and shorten free space.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class Mapper:
 
     @property
     def without_own_echo(self) -> dict[str, int]:
-        """Number of groups so far for each sensor that no echo shows to emit (`Fused.without_own_echo`)."""
+        """Number of groups so far in which no echo proves that a sensor emits, by sensor (`Fused.without_own_echo`)."""
         return dict(self._without_own_echo)
 
     def emitter_warning(self) -> str | None:

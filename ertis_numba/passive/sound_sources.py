@@ -82,8 +82,8 @@ def find_sound_sources(
     An interpolated maximum stays within half of the way to each neighbour, and within the main lobe through its
     direction. It exceeds the maximum of the map by less than 1 dB. At the edge of a grid, it is interpolated along the
     edge only, and in a corner not at all; `SoundDirection.grid_error_rad` states the error. It is infinite if the
-    source may lie beyond the grid: at its edge, or if the map fits a source outside about as well. Angles that the
-    array cannot observe are NaN: see `ertis_numba.geometry.observable_angles`.
+    source may lie beyond the grid: at its edge, or if a source outside fits the map clearly better than any inside.
+    Angles that the array cannot observe are NaN: see `ertis_numba.geometry.observable_angles`.
 
     Errors are small if the main lobe is at least two spacings of the grid wide. The peaks of Capon are often narrower;
     their levels are then too low.
@@ -177,7 +177,7 @@ def _omega(band_hz: Floats) -> Floats:
 
 
 def _outside(power: Floats, directions: Floats, settings: Settings, band_hz: Floats) -> OutsideSource | None:
-    """Return the source outside of a grid that explains the map of a band; None if a source inside may do."""
+    """Return the source outside of a grid that explains the map of a band; None if one inside may."""
     low_hz, high_hz = band_hz.tolist()
     highest = float(power.max(initial=0.0))
     patterns = _patterns(settings, directions.tobytes(), low_hz, high_hz) if highest > 0 else None

@@ -106,15 +106,15 @@ class FusedImages:
         self._n_empty += 1
 
     def _note_emitters(self, fused: Fused) -> None:
-        """State which sensors no echo shows to emit; checked now and then, because it takes longer than the points."""
+        """Note sensors whose emission no echo proves; checked now and then, because it takes longer than the points."""
         self._n_fused += 1
         if fused.is_empty or self._n_fused % _CHECKED_EVERY != _N_EVIDENCE:
             return
         unshown, count = frozenset(fused.without_own_echo), fused.image.stamp.sync_count
         if unshown - self._unshown:
             self._note(
-                f"SYNC pulse {count}: no echo shows that {', '.join(sorted(unshown))} emits; either nothing ahead "
-                "reflects, or the emitter is silent, and obstacles ahead may be missing"
+                f"SYNC pulse {count}: no echo proves that these sensors emit: {', '.join(sorted(unshown))}; if an "
+                "emitter is broken, obstacles ahead of it may be missing"
             )
         self._unshown = unshown
 

@@ -39,7 +39,7 @@ def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
 
 
 def _healthy(drawn: EmitterRoom, diameter_m: float, other_m: float | None) -> dict[str, int]:
-    """Return numbers of pulses, of those with a name, of sensors without an own echo, and of warnings of the kind."""
+    """Return counts for working emitters: pulses, those that name a sensor, sensors without own echo, and warnings."""
     pulses = [drawn.images(pulse, diameter_m, is_broken=False) for pulse in range(_N_PULSES)]
     fuser = Fuser(drawn.mountings, emitter_diameter_m=diameter_m)
     every = [fuser(images) for images in pulses]
@@ -75,10 +75,10 @@ def form(report: dict[str, Any]) -> str:
         "emitters",
         "sensors",
         "broken ones named",
-        "named, or no own echo known",
+        "named, or without own echo",
         "others named then",
         "pulses of working emitters with a name",
-        "working ones without a known echo",
+        "working ones without own echo",
         "warnings if stated rightly",
         "warnings if stated wrongly",
     ]
@@ -95,7 +95,8 @@ def form(report: dict[str, Any]) -> str:
     ]
     return (
         f"{table(head, rows)}\n\n{report['count']} platforms with two to four sensors for each kind of emitter, from "
-        f"seed {report['seed']}, {_N_PULSES} SYNC pulses each: among four to eight posts, with one or two walls, in a "
-        "corridor or in a corner, or among two to four posts. Platforms move by up to 4 cm from pulse to pulse. A "
-        "separate program renders the sound by sums of delayed calls, without sound that more than two walls reflect."
+        f"seed {report['seed']}, {_N_PULSES} SYNC pulses each. The surroundings are four to eight posts, alone or with "
+        "one or two walls, a corridor or a corner with posts, or two to four posts. Platforms move by up to 4 cm from "
+        "pulse to pulse. A separate program renders the sound by sums of delayed calls, over at most two walls. "
+        "Sensors without own echo are those of `Fused.without_own_echo` after the last pulse."
     )

@@ -77,7 +77,7 @@ def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None], only: 
     only : sequence of str
         ``calls`` to compare equal calls with different ones instead, ``clocks`` to check clocks and mountings by
         direct sound, ``delays`` to compare delays of sensors that emit in sequence, ``emitters`` to find broken and
-        wrongly stated emitters, ``reflections`` to count wrongly confirmed points where walls reflect sound several
+        wrongly stated emitters, ``reflections`` to count spurious confirmed points where walls reflect sound several
         times, or ``scans`` to compare laser scans with rays.
     """
     if only:

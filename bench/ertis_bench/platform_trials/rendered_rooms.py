@@ -44,12 +44,12 @@ RATE_HZ: Final = 200_000.0
 N_SAMPLES: Final = 6400
 _NOISE: Final = 2.5e-4
 _LEVEL: Final = 10 ** (-24 / 20)
-_N_FFT: Final = 12_288  # Sound that arrives after the recording is not wrapped to its beginning.
+_N_FFT: Final = 12_288  # Long enough that sound after the recording does not wrap to its beginning.
 _BAND_HZ: Final = 22e3, 55e3
 _EDGE_DB: Final = -16.0  # Strength of the edges of boxes.
 _POST_M: Final = 0.05  # Radius of posts in the truth.
 _HALF_WALL_M: Final = 9.0
-_ASIDE_M: Final = 1e-3  # A corner returns sound to its source over one wall first, not over both or neither.
+_ASIDE_M: Final = 1e-3  # Offset of a sensor's receiver, without which rounding errors decide how corners reflect.
 
 
 class Face(NamedTuple):
@@ -293,7 +293,7 @@ def images_of(
 
 
 def _ways(room: Room, from_m: Floats, to_m: Floats, most: int, over: tuple[Face, ...] = ()) -> Iterator[_Leg]:
-    """Yield the way of sound between two places over faces in turn, and those over more faces, at most so many."""
+    """Yield the ways of sound between two places over given faces in turn, and over further ones, at most so many."""
     images_m, met_m = [from_m], [to_m]
     for face in over:
         images_m.append(_mirrored(face, images_m[-1]))

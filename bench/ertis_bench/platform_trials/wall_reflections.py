@@ -1,4 +1,4 @@
-"""Confirmed points beside all surfaces, and errors of confirmed posts, where walls reflect sound several times."""
+"""Spurious confirmed points, and errors of confirmed posts, where walls reflect sound several times."""
 
 import itertools
 import math
@@ -45,7 +45,7 @@ def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
                 counts[which].update(found)
                 errors[which].append(errors_m)
             beside = ", ".join(f"{each}: {counts[each]['beside']}" for each in _IMAGES)
-            say(f"scene {scene.seed}, {scene.kind}: confirmed points beside all surfaces so far, {beside}")
+            say(f"scene {scene.seed}, {scene.kind}: spurious confirmed points so far, {beside}")
     rows = [{"images": each, **counts[each], **_statistics(np.concatenate(errors[each]))} for each in _IMAGES]
     return {"machine": machine.describe(), "count": count, "seed": seed, "reflections": rows}
 
@@ -73,7 +73,7 @@ def compared(points: PointCloud, scene: ReflectingScene) -> tuple[dict[str, int]
     Returns
     -------
     found : dict of str to int
-        Numbers of pulses, of points beside all surfaces, of confirmed posts, and of all posts.
+        Numbers of pulses, of spurious points, of confirmed posts, and of all posts.
     errors_m : (point, 2, 2) float64
         Error and uncertainty, along and across the range, of each point near a post.
     """
@@ -109,7 +109,7 @@ def form(report: dict[str, Any]) -> str:
     head = [
         "images",
         "pulses",
-        "confirmed points beside all surfaces",
+        "spurious confirmed points",
         "confirmed posts",
         "position RMS",
         "error / uncertainty (RMS)",
@@ -130,10 +130,11 @@ def form(report: dict[str, Any]) -> str:
         "corridors of 1.2 to 3 m, corners and a single wall, each with and without posts, four walls with posts, and "
         "posts alone. Platforms have two to four sensors in six arrangements, with omnidirectional emitters or pistons "
         "of 12 mm. Up to three walls in turn reflect sound from sensor to sensor, and one on each way to or from a "
-        "post. A separate program renders the sound by sums of delayed calls. A point is beside all surfaces if it is "
-        f"more than {100 * _NEAR_M:g} cm from each. A post is confirmed if a confirmed point lies within "
-        f"{100 * _NEAR_M:g} cm; errors are those of such points, along and across the range. Each image is left out in "
-        f"turn if two others remain, because a single one confirms no reflector. {machine.sentence(report['machine'])}"
+        "post. A separate program renders the sound by sums of delayed calls. A confirmed point is spurious if it "
+        f"is more than {100 * _NEAR_M:g} cm from all posts and walls. A post is confirmed if a confirmed point lies "
+        f"within {100 * _NEAR_M:g} cm; errors are those of such points, along and across the range. Each image is left "
+        "out in turn if two others remain, because a single one confirms no reflector. "
+        f"{machine.sentence(report['machine'])}"
     )
 
 

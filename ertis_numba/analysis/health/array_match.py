@@ -101,9 +101,9 @@ def unobservable(
     if n_spare < _MIN_SPARE:
         return _hidden(few, ORDER, SCALE, "delay of channels"), *found
     if n_spare < _MIN_SPARE_OF_SIZE:
-        found.insert(0, _hidden(f"{few}, even for a wrong unit", SCALE))
+        found.insert(0, _hidden(f"{few} to detect even a wrong unit", SCALE))
     if n_spare >= _MIN_SPARE_OF_SIZE and not is_direct:
-        found.insert(0, _hidden("an echo fits arrays up to about twice as large or small as well", SCALE))
+        found.insert(0, _hidden("an echo fits arrays of about half to twice the size equally well", SCALE))
     orders = _by_order(times_s)
     if len(orders):
         own_s, *others_s = spreads_s(np.stack([times_s, *orders]), positions_m, path_m, speed_m_s)

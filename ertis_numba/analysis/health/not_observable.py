@@ -23,7 +23,8 @@ OF_ARRIVAL: Final = ("polarity of channels", ORDER, "delay of channels", SCALE, 
 SINGLE_ECHO: Final = "record the single sharp echo of a small reflector 0.5 to 2 m in front of the array"
 SEVERAL_ECHOES: Final = "record a small reflector that moves around the array, or compare the settings with the wiring"
 KNOWN_PLACE: Final = (
-    "compare the range and direction of a small reflector at a known place beside the axis with 'ertis peaks'"
+    "place a small reflector at a known position beside the axis, and compare its range and direction with the output "
+    "of 'ertis peaks'"
 )
 
 
