@@ -303,7 +303,7 @@ def test_map_reads_poses_of_kitti_with_their_times(folder):
     run(folder, "both.h5 --poses kitti.txt -o k.h5 --times times.txt --pose-axes camera-world")
     (folder / "ms.tum").write_text("0 10 0 0 0 0 0 1\n1000 10 0 0 0 0 0 1\n")
     assert "times from 0 to 1000 are read as seconds" in run(folder, "both.h5 --poses ms.tum -o m.h5").stderr
-    assert "pulses left out" not in run(folder, "both.h5 --poses ms.tum -o s.h5 --time-unit ms").stderr
+    assert "are read as" not in run(folder, "both.h5 --poses ms.tum -o s.h5 --time-unit ms").stderr
 
 
 def test_map_states_pulses_between_distant_poses(folder):

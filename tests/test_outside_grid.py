@@ -79,6 +79,7 @@ def test_sources_inside_have_a_known_direction(method, place):
 @pytest.mark.parametrize(("azimuth_deg", "is_known"), [(10.0, True), (45.0, False), (-60.0, False)])
 def test_planar_grids_are_examined_along_their_circle(azimuth_deg, is_known):
     sources = sources_of_grid(tone_map("delay_and_sum", azimuth_deg, 0.0, "2d:60"))
+    assert sources
     assert all(math.isfinite(each.grid_error_rad) == is_known for each in sources)
 
 
@@ -94,7 +95,9 @@ def test_reflectors_beyond_the_limits_have_an_unknown_direction(place):
         assert math.isfinite(peaks[0].grid_error_deg)
         assert across_rad[0] < 0.1
     else:
+        assert peaks
         assert all(math.isinf(peak.grid_error_deg) for peak in peaks)
+        assert len(across_rad)
         assert (across_rad > 0.5).all()
 
 

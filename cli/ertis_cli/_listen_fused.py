@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["listen_fused"]
 
+_CHECKED_EVERY = 10  # SYNC pulses: whether echoes prove emission takes longer than the points.
 _HEAD = f"{'SYNC':>8}  {'age':>8}  {'points':>6}  {'nearest':24}  sensors"
 
 
@@ -56,6 +57,8 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
     range_m = np.linalg.norm(fused.points.position_m, axis=1)
     nearest = int(np.argmin(range_m)) if len(range_m) else None
     age_ms = None if arrival.age_s is None else round(1e3 * arrival.age_s, 3)
+    is_checked = fused.image.stamp.sync_count % _CHECKED_EVERY == 0
+    without_own = list(fused.without_own_echo) if is_checked else None
     if as_json:
         position_m = None if nearest is None else [round(each, 4) for each in fused.points.position_m[nearest].tolist()]
         options.print_json(
@@ -70,7 +73,7 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
                 "missing": list(fused.missing),
                 "unheard": list(fused.unheard),
                 "without_echo": list(fused.without_echo),
-                "without_own_echo": list(fused.without_own_echo),
+                "without_own_echo": without_own,
             }
         )
         return
@@ -80,8 +83,8 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
         place = f"{range_m[nearest]:.3f} m at {math.degrees(math.atan2(y, x)):+.1f}°"
     absent = f", without {' '.join(fused.missing)}" if fused.missing else ""
     absent += f", {' '.join(fused.unheard)} not heard" if fused.unheard else ""
-    unshown = [name for name in fused.without_own_echo if name not in fused.unheard]
-    absent += f", emission of {' '.join(unshown)} not proven" if unshown and not fused.is_empty else ""
+    unproven = [name for name in without_own or () if name not in fused.unheard]
+    absent += f", emission of {' '.join(unproven)} not proven" if unproven and not fused.is_empty else ""
     age = "-" if age_ms is None else f"{age_ms:.1f} ms"
     row = (
         f"{fused.image.stamp.sync_count:8d}  {age:>8}  {len(range_m):6d}  {place:24}  {' '.join(fused.sensors)}{absent}"

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,19 @@ _NEAREST_M: Final = 0.05
 _BESIDE: Final = np.arange(-1, 2)
 
 
+class _Heard(NamedTuple):
+    """Echoes in an image, each field (echo,) but for ``direction``, (echo, axis), in the frame of the platform."""
+
+    row: NDArray[np.int64]
+    range_m: Floats
+    direction: Floats
+    path_sd_m: Floats
+    angle_sd_rad: Floats
+    power: Floats
+    is_clear: NDArray[np.bool_]
+    is_faint: NDArray[np.bool_]
+
+
 class PointFuser:
     """Extractor of the points of one sensor, attributed to the emitters of their echoes.
 
@@ -61,6 +74,7 @@ class PointFuser:
     ) -> None:
         self._number, self._mounting, self._receiver = number, sensors[number], receiver
         self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
+        self._last: tuple[Energyscape, _Heard] | None = None
         self._extract = PointExtractor(
             image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP, min_level_db=_MIN_LEVEL_DB
         )
@@ -84,6 +98,25 @@ class PointFuser:
         late_m : mapping of int to float
             Path of sound between the emission of this sensor and that of each emitter.
         """
+        if self._last is None or self._last[0] is not image:  # Explanations of one pulse share its echoes.
+            self._last = image, self._heard(image, floor)
+        heard = self._last[1]
+        emitters = [emitter for emitter, number in shares if number == self._number]
+        return SensorEchoes(
+            receiver=self._number,
+            emitters=np.array(emitters, dtype=np.int64),
+            direction=heard.direction,
+            path_m=2 * heard.range_m[:, None] - np.array([late_m[emitter] for emitter in emitters]),
+            path_sd_m=heard.path_sd_m,
+            angle_sd_rad=heard.angle_sd_rad,
+            power=heard.power,
+            share=self._shares(heard.row, heard.range_m, [shares[emitter, self._number] for emitter in emitters]),
+            is_clear=heard.is_clear,
+            is_faint=heard.is_faint,
+        )
+
+    def _heard(self, image: Energyscape, floor: EchoFloor) -> _Heard:
+        """Return the echoes of an image above its noise, strongest first, whatever call caused them."""
         if self._is_deaf.any():  # Points are found relative to the strongest one, which direct sound would be.
             image = image.replace(amplitude=np.where(self._is_deaf, np.float32(0), image.amplitude))
         cloud = self._extract(image)
@@ -94,25 +127,19 @@ class PointFuser:
         # Between directions of a coarse grid, interpolation may exceed all bins, also for noise. Bins are compared.
         near = image.amplitude[row[:, None], (column[:, None] + _BESIDE).clip(0, len(image.range_m) - 1)].max(axis=1)
         shown = np.minimum(near, cloud.amplitude)
-        is_heard = shown > floor.by_direction[row]
-        is_free = (shown > floor.at(image.amplitude, row, column))[is_heard]
-        is_clear = (shown > floor.at(image.amplitude, row, column, quantile=_CLEAR))[is_heard]
-        place_m, uncertainty_m, row = place_m[is_heard], _uncertainties(cloud)[is_heard], row[is_heard]
-        range_m = range_m[is_heard]
-        emitters = [emitter for emitter, number in shares if number == self._number]
-        direction = place_m / range_m[:, None]
-        return SensorEchoes(
-            receiver=self._number,
-            emitters=np.array(emitters, dtype=np.int64),
-            direction=direction @ self._mounting.rotation.T,
-            path_m=2 * range_m[:, None] - np.array([late_m[emitter] for emitter in emitters]),
+        is_free = shown > floor.at(image.amplitude, row, column)
+        uncertainty_m = _uncertainties(cloud)
+        every = _Heard(
+            row=row,
+            range_m=range_m,
+            direction=place_m / range_m[:, None] @ self._mounting.rotation.T,
             path_sd_m=2 * np.hypot(uncertainty_m[:, 0], _RANGE_SD_M),
             angle_sd_rad=np.hypot(uncertainty_m[:, 1] / range_m, _ANGLE_SD_RAD),
-            power=cloud.amplitude[is_heard].astype(np.float64) ** 2,
-            share=self._shares(row, range_m, [shares[emitter, self._number] for emitter in emitters]),
-            is_clear=is_clear,
-            is_faint=~is_free | (cloud.amplitude[is_heard] < _FAINT * cloud.amplitude.max(initial=0.0)),
+            power=cloud.amplitude.astype(np.float64) ** 2,
+            is_clear=shown > floor.at(image.amplitude, row, column, quantile=_CLEAR),
+            is_faint=~is_free | (cloud.amplitude < _FAINT * cloud.amplitude.max(initial=0.0)),
         )
+        return _Heard._make(each[shown > floor.by_direction[row]] for each in every)
 
     def _shares(self, row: NDArray[np.int64], range_m: Floats, shares: Sequence[NDArray[np.float32]]) -> Floats:
         """Return the highest share of each emitter within one step of each echo: (echo, emitter)."""
