@@ -8,14 +8,15 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.outside_grid import OutsidePatterns, OutsideSource
-from ertis_numba.analysis.point_spread import PULSE_M
+from ertis_numba.analysis.point_spread import PULSE_M, PointSpread
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import far_field_delays, microphones
 from ertis_numba.settings import Settings
 
 __all__ = ["has_outside", "outside_of"]
 
-_FREQUENCIES: Final = 5
+_BANDS: Final = 16  # Parts of the spectrum: a beam changes little within a sixteenth of the band.
+_LEAST: Final = 0.01  # Power relative to the strongest part, from which a part counts.
 
 
 def has_outside(settings: Settings, directions: NDArray[np.float64]) -> bool:
@@ -60,9 +61,13 @@ def outside_of(image: Energyscape, directions: NDArray[np.float64], range_m: flo
 def _patterns(settings: Settings, grid: bytes) -> OutsidePatterns | None:
     """Return the patterns of echoes of the call."""
     positions_m, speed_m_s = microphones(settings.array).enabled_positions_m, sound_speed_m_s(settings.air)
-    frequency_hz = np.linspace(settings.call.low_frequency_hz, settings.call.high_frequency_hz, _FREQUENCIES)
+    bands = [np.array_split(each, _BANDS) for each in PointSpread(settings).spectrum]
+    power = np.array([np.sum(share**2) for share in bands[1]])
+    frequency_hz = np.array([np.average(hz, weights=share**2) for hz, share in zip(*bands, strict=True)])
+    is_heard = power > _LEAST * power.max()
     return OutsidePatterns.of(
         np.frombuffer(grid).reshape(-1, 3),
         functools.partial(far_field_delays, positions_m, sound_speed_m_s=speed_m_s),
-        frequency_hz,
+        frequency_hz[is_heard],
+        power[is_heard],
     )

@@ -19,7 +19,7 @@ __all__ = ["OutsidePatterns", "OutsideSource"]
 Floats = NDArray[np.float64]
 
 _SAMPLES: Final = 128  # Directions of the grid at which patterns are compared.
-_MAX_PLACES: Final = 6000  # Directions all around; arrays with narrower beams need more, and are not examined.
+_MAX_PLACES: Final = 30_000  # Directions all around; arrays with narrower beams need more, and are not examined.
 _PER_BEAM: Final = 2.5  # Steps of these directions within a wavelength divided by the size of the array.
 _FLAT: Final = 0.05  # Extent of an array in periods, as a standard deviation, along an axis that it does not resolve.
 _MIN_MATCH: Final = 0.6  # Share of the variance that the pattern of the source outside must explain.
@@ -58,7 +58,11 @@ class OutsidePatterns:
 
     @classmethod
     def of(
-        cls, directions: Floats, delays: Callable[[Floats], Floats], frequency_hz: Floats
+        cls,
+        directions: Floats,
+        delays: Callable[[Floats], Floats],
+        frequency_hz: Floats,
+        weights: Floats | None = None,
     ) -> "OutsidePatterns | None":
         """Return the patterns of an array, or None if there are none to compare.
 
@@ -73,6 +77,8 @@ class OutsidePatterns:
             Function that returns the delays of sound from directions at the microphones: (direction, mic) float64.
         frequency_hz : (frequency,) float64
             Frequencies whose powers add up.
+        weights : (frequency,) float64, optional
+            Their shares; equal ones by default.
         """
         if len(directions) < _MIN_DIRECTIONS:
             return None
@@ -85,6 +91,9 @@ class OutsidePatterns:
         if not axes.size or count > _MAX_PLACES:
             return None
         every = _circle(count, float(directions[0, 2])) if is_planar else _sphere(count)
+        if axes.shape[1] == 2:  # Directions behind a plane array equal those ahead.
+            across = np.cross(axes[:, 0], axes[:, 1])
+            every = every[every @ across * math.copysign(1.0, directions.mean(axis=0) @ across) >= 0]
         away, _ = KDTree(directions @ axes).query(every @ axes)
         is_outside = away > max(spacing_rad, step_rad / 2)
         places = every[is_outside]
@@ -93,7 +102,7 @@ class OutsidePatterns:
         samples = np.unique(np.linspace(0, len(directions) - 1, min(len(directions), _SAMPLES)).astype(np.int64))
         towards_s = delays(directions[samples])
         inside, outside = (
-            _patterns(delays(each), towards_s, frequency_hz)
+            _patterns(delays(each), towards_s, frequency_hz, weights)
             for each in (np.concatenate([directions[samples], every[~is_outside]]), places)
         )
         inside, outside = (each - each.mean(axis=1, keepdims=True) for each in (inside, outside))
@@ -133,13 +142,16 @@ def _axes(delays: Callable[[Floats], Floats], highest_hz: float) -> tuple[Floats
     return axes[:, is_used], 2 * float(np.linalg.norm(along_s, axis=0).max())
 
 
-def _patterns(of_sources_s: Floats, towards_s: Floats, frequency_hz: Floats) -> Floats:
+def _patterns(of_sources_s: Floats, towards_s: Floats, frequency_hz: Floats, weights: Floats | None) -> Floats:
     """Return the powers of sources in directions: (source, direction) float64."""
     total = np.zeros((len(of_sources_s), len(towards_s)))
-    for hz in frequency_hz.tolist():
-        sources, towards = (np.exp(2j * np.pi * hz * delay_s) for delay_s in (of_sources_s, towards_s))
-        total += np.abs(sources @ towards.conj().T / towards_s.shape[1]) ** 2
-    return total / len(frequency_hz)
+    shares = np.ones(len(frequency_hz)) if weights is None else weights
+    for hz, share in zip(frequency_hz.tolist(), shares.tolist(), strict=True):
+        sources, towards = (
+            np.exp(2j * np.pi * hz * delay_s).astype(np.complex64) for delay_s in (of_sources_s, towards_s)
+        )
+        total += share * np.abs(sources @ towards.conj().T / towards_s.shape[1]) ** 2
+    return total / shares.sum()
 
 
 def _circle(count: int, height: float) -> Floats:

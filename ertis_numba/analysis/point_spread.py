@@ -66,6 +66,11 @@ class PointSpread:
         self._shares, self._wave_1_m, self._count = shares, wave_1_m, count
         self._pulse = np.fft.ifft(shares, count) * count * self._turn
 
+    @property
+    def spectrum(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Frequencies in Hz, evenly spaced, and their shares of the amplitude of an echo: (frequency,) each."""
+        return self._wave_1_m * self._speed_m_s / (2 * math.pi), self._shares
+
     def __call__(
         self,
         direction_offset: NDArray[np.float64],
