@@ -88,6 +88,23 @@ def test_map_leaves_out_pulses_without_a_call(folder):
     assert "note: 1 of 3 pulses left out, because no sensor emitted its call" in done.stderr
 
 
+def test_sensors_of_the_mounting_file_without_a_recording_are_noted(folder):
+    """They emit, so that the others hear their calls."""
+    sensors = [("left", 0.15, 90), ("right", -0.15, -90), ("front", 0.0, 0)]
+    text = "".join(
+        f'[[sensors]]\nname = "{name}"\nposition_m = [0.0, {y}, 0.4]\nyaw_deg = {yaw}\n' for name, y, yaw in sensors
+    )
+    (folder / "all.toml").write_text(text)
+    note = "all.toml contains front, without a recording here; echoes may be of such a sensor's call"
+    done = run(folder, f"both.h5 --poses poses.tum -o three.h5 --mounting {folder / 'all.toml'}")
+    assert done.stderr.count(note) == 1
+    line = f"{folder / 'both.h5'} --fuse --mounting {folder / 'all.toml'} -o {folder / 'fused3.h5'}"
+    done = CliRunner().invoke(cli, ["process", *line.split()])
+    assert done.exit_code == 0, done.output
+    assert done.stderr.count(note) == 1
+    assert "has no image" not in done.stderr
+
+
 def test_map_of_space_shows_the_height_of_the_post(folder):
     sensor = Sensor(
         name="only",

@@ -5,13 +5,15 @@ import math
 import numpy as np
 import pytest
 
+import ertis_numba as ertis
 from ertis_numba.analysis.detect import peaks_of_grid
 from ertis_numba.analysis.outside_grid import OutsidePatterns
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import AcousticMap, Energyscape
 from ertis_numba.geometry import Grid, direction_grid, unit_vectors
 from ertis_numba.passive.sound_sources import sources_of_grid
-from ertis_numba.settings import Call
+from ertis_numba.settings import Call, Processing
+from ertis_numba.simulation import Point, Scene, Sensor
 from tests.random_sounds import C_M_S, map_power, settings_of
 
 METHODS = ("delay_and_sum", "functional", "capon", "music")
@@ -45,7 +47,10 @@ def tone_map(method, azimuth_deg, elevation_deg, directions="3d:400", frequency_
 
 
 def echo_image(azimuth_deg, elevation_deg, range_m=0.8):
-    """Image of an echo as a plane wave: the sum over the band in closed form, with a Hann spectrum."""
+    """Image of an echo as a plane wave: the sum over the band in closed form.
+
+    The power of a hyperbolic call is inversely proportional to the square of the frequency; its ends are faded.
+    """
     settings = settings_of(places(), {"directions": "3d:400", "range_m": (0.4, 1.2), **LIMITS})
     settings = settings.replace(call=Call(start_frequency_hz=16e3, stop_frequency_hz=8e3))
     grid = direction_grid(settings.processing)
@@ -53,7 +58,8 @@ def echo_image(azimuth_deg, elevation_deg, range_m=0.8):
     ranges_m = np.arange(0.4, 1.2, 0.005)
     away = unit_vectors(grid.azimuth_rad, grid.elevation_rad) - towards_of(azimuth_deg, elevation_deg)
     wave_1_m = 2 * np.pi * np.linspace(8e3, 16e3, 81) / C_M_S
-    shares = np.hanning(83)[1:-1] / np.hanning(83).sum()
+    shares = np.hanning(83)[1:-1] ** 0.5 / wave_1_m**2
+    shares /= shares.sum()
     beams = np.exp(1j * (away @ places_m.T)[..., None] * wave_1_m).mean(axis=1)
     amplitude = np.abs((beams * shares) @ np.exp(-2j * wave_1_m[:, None] * (ranges_m - range_m)))
     return Energyscape(amplitude.astype(np.float32), grid.azimuth_rad, grid.elevation_rad, ranges_m, settings)
@@ -114,3 +120,25 @@ def test_grids_of_all_distinguishable_directions_have_no_outside():
     found = OutsidePatterns.of(half[half[:, 1] < 0], delays, np.array([12e3]))
     assert (found.places[:, 1] > -0.2).all()  # Between the last elevation and the pole, azimuths meet.
     assert found.source_of(np.ones(len(found.samples))) is None
+
+
+@pytest.mark.parametrize(
+    ("azimuth_deg", "elevation_deg", "directions"),
+    [(50.0, 0.0, "2d:61"), (70.0, 0.0, "2d:61"), (14.2, -27.5, "3d:600")],
+)
+def test_side_lobes_of_simulated_reflectors_beyond_the_limits_have_an_unknown_direction(
+    azimuth_deg, elevation_deg, directions
+):
+    """Beams of eRTIS are narrow, and its call has most power at low frequencies."""
+    processing = Processing(
+        directions=directions,
+        azimuth_limits_deg=(-30.0, 30.0),
+        elevation_limits_deg=(-15.0, 15.0),
+        range_m=(0.5, 2.0),
+    )
+    point = Point(azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, range_m=1.5, strength_db=-10.0)
+    measurement = ertis.render(Scene(seed=3, sensors=(Sensor(processing=processing),), points=(point,)), 0)
+    with ertis.Pipeline(measurement.settings) as pipeline:
+        peaks = peaks_of_grid(pipeline.process(measurement))
+    assert peaks
+    assert all(math.isinf(peak.grid_error_deg) for peak in peaks)

@@ -62,7 +62,7 @@ def write_fused(
     with ExitStack() as stack:
         readers = _pulses.open_sensors(paths, stack)
         _require_several(readers)
-        mountings = _pulses.mountings_of(readers, mounting)
+        mountings = _pulses.platform_mountings(readers, mounting, quiet=quiet)
         fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
         pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, **device)
         active = _pulses.active_groups(readers, changed, quiet=quiet)
@@ -79,9 +79,10 @@ def write_fused(
         with options.progress(groups, length=len(groups), label="fusing", quiet=quiet) as shown:
             for number, group in enumerate(shown):
                 fused = fuser(pipelines.image(by_name[name][place.index]) for name, place in group.items())
-                incomplete += bool(fused.missing)
-                if fused.missing:
-                    options.note(f"pulse {number} has no image of {', '.join(fused.missing)}", quiet=quiet)
+                missing = [name for name in fused.missing if name in by_name]
+                incomplete += bool(missing)
+                if missing:
+                    options.note(f"pulse {number} has no image of {', '.join(missing)}", quiet=quiet)
                 empty += fused.is_empty
                 unheard.update(fused.unheard)
                 unshown.update(fused.without_own_echo)

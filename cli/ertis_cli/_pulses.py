@@ -26,7 +26,9 @@ __all__ = [
     "image_settings",
     "mountings_of",
     "note_empty",
+    "note_missing",
     "open_sensors",
+    "platform_mountings",
     "processing",
     "pulse_groups",
 ]
@@ -105,6 +107,36 @@ def mountings_of(readers: "Sequence[RecordingReader]", file: "Path | None") -> "
     """
     given = _mountings.mountings(file, [reader.sensor for reader in readers])
     return {reader.sensor: _mounting(reader) for reader in readers} if given is None else given
+
+
+def platform_mountings(
+    readers: "Sequence[RecordingReader]", file: "Path | None", *, quiet: bool
+) -> "dict[str, Mounting]":
+    """Return the mountings of sensors as `mountings_of` does, and of those that the file has in addition.
+
+    These emit as well, so that the others hear their calls.
+    """
+    found = mountings_of(readers, file)
+    others = {name: each for name, each in (_mountings.mountings(file, None) or {}).items() if name not in found}
+    if others:
+        options.note(
+            f"{file} contains {', '.join(others)}, without a recording here; echoes may be of such a sensor's call, "
+            "and confirm fewer reflectors. Remove sensors that do not emit from the file",
+            quiet=quiet,
+        )
+    return found | others
+
+
+def note_missing(groups: "Sequence[Mapping[str, StampedIndex]]", sensors: "Sequence[str]", *, quiet: bool) -> None:
+    """State in how many pulses a measurement of each sensor is missing."""
+    counts = {name: sum(name not in group for group in groups) for name in sensors}
+    if any(counts.values()):
+        each = ", ".join(f"{name} in {count}" for name, count in counts.items() if count)
+        options.note(
+            f"measurements are missing, of {each} of {options.counted(len(groups), 'pulse')}; reflectors are confirmed "
+            "by at least two other sensors there",
+            quiet=quiet,
+        )
 
 
 def _mounting(reader: "RecordingReader") -> "Mounting":

@@ -113,7 +113,7 @@ def mapping(
         changed = _pulses.image_settings(settings_file, preset)
         pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
         mapper = Mapper(
-            _pulses.mountings_of(readers, mounting),
+            _pulses.platform_mountings(readers, mounting, quiet=quiet),
             dimensions=dimensions,
             cell_m=cell_m,
             half_life_s=half_life_s,
@@ -125,6 +125,7 @@ def mapping(
         located = _located(groups, trajectory)
         _note_gaps(located, trajectory, quiet=quiet)
         by_name = {reader.sensor: reader for reader in readers}
+        _pulses.note_missing(located, [*by_name], quiet=quiet)
         with (
             options.progress(located, length=len(located), label="mapping", quiet=quiet) as shown,
             warnings.catch_warnings(category=PoseWarning, action="ignore"),  # A note says the same.
