@@ -111,7 +111,7 @@ def test_recording_without_a_call_is_examined_without_its_echoes(tmp_path):
     assert checked.verdict == (
         f"{path}: fit for use as far as this recording shows; not known: clock drift, call, calibration; "
         "not observable: polarity of channels, order of channels, delay of channels, scale of the positions, "
-        "shift of the record (record with calls)"
+        "mirrored or turned positions, shift of the record (record with calls)"
     )
     details = {item.check: item.detail for item in checked.sensors[0].items}
     assert details["call"] == details["calibration"] == "no call was emitted"

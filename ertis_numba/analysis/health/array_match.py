@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.health.arrival import Compressed, strongest
-from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, ORDER, SCALE, SEVERAL_ECHOES, NotObservable
+from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, ORDER, SCALE, SEVERAL_ECHOES, TURNED, NotObservable
 from ertis_numba.analysis.health.other_orders import other_orders, spreads_s
 from ertis_numba.analysis.health.report import Finding
 from ertis_numba.analysis.health.wave_shapes import CURVATURES, curved_m, fit_curved, places_of
@@ -97,7 +97,7 @@ def unobservable(
     if n_mics < 2:
         return ()
     few = f"{n_mics} microphones are too few"
-    found = [_hidden("they fit every echo as well", "mirrored or turned positions")]
+    found = [_hidden("they fit every echo as well", TURNED)]
     if n_spare < _MIN_SPARE:
         return _hidden(few, ORDER, SCALE, "delay of channels"), *found
     if n_spare < _MIN_SPARE_OF_SIZE:

@@ -11,6 +11,7 @@ __all__ = [
     "SCALE",
     "SEVERAL_ECHOES",
     "SINGLE_ECHO",
+    "TURNED",
     "NotObservable",
     "in_all",
     "not_observable_text",
@@ -18,7 +19,8 @@ __all__ = [
 
 ORDER: Final = "order of channels"
 SCALE: Final = "scale of the positions"
-OF_ARRIVAL: Final = ("polarity of channels", ORDER, "delay of channels", SCALE, "shift of the record")
+TURNED: Final = "mirrored or turned positions"
+OF_ARRIVAL: Final = ("polarity of channels", ORDER, "delay of channels", SCALE, TURNED, "shift of the record")
 """Faults that only a clear arrival of the call reveals."""
 SINGLE_ECHO: Final = "record the single sharp echo of a small reflector 0.5 to 2 m in front of the array"
 SEVERAL_ECHOES: Final = "record a small reflector that moves around the array, or compare the settings with the wiring"
