@@ -222,7 +222,7 @@ def test_merged_reports_exclude_the_alternatives_of_each_measurement(cases, left
     lines = [
         ()
         if each is None
-        else (NotObservable(faults=("order",), reason="others fit", remedy="move", cases=frozenset(each)),)
+        else (NotObservable(faults=("order",), reason="others fit", remedy="move", cases=tuple(each)),)
         for each in cases
     ]
     reports = [Health(channels=(ChannelHealth(channel=0),), not_observable=each) for each in lines]

@@ -68,19 +68,33 @@ class EchoFloor(NamedTuple):
         direction, place : (bin,) int
             Indices of directions and ranges.
         quantile : float
-            Quantile of the amplitudes around a bin from which its noise is estimated. Higher ones follow noise that
-            swells and fades, but also dense echoes.
+            Quantile of the amplitudes around a bin from which its noise is estimated. Higher ones than the median
+            follow noise that swells and fades, but also dense echoes. They exclude the slopes of the bin's own echo.
         """
         last, n_around = amplitude.shape[1] - 1, self.n_around
-        rank = int(quantile * (n_around - 1))
         ratio = self.ratio * (math.log(2) / -math.log1p(-quantile)) ** (self.exponent / 2)
         thresholds = [self.by_direction[direction], self.by_range[place]]
         for first in (1 - n_around, -n_around // 2, 0):  # A click may begin or end at the bin.
             columns = np.abs(place[:, None] + first + np.arange(n_around))
             columns = (last - np.abs(last - columns)).clip(0)  # The image is mirrored at its ends.
-            around = np.partition(amplitude[direction[:, None], columns], rank, axis=1)[:, rank]
-            thresholds.append(around * np.float32(ratio))
+            around = amplitude[direction[:, None], columns]
+            n_own = np.zeros(len(around), np.int64)
+            if quantile > 0.5:
+                is_own = _slopes(around, -first)
+                around, n_own = np.where(is_own, -np.inf, around), is_own.sum(axis=1)
+            rank = np.minimum(n_own + (quantile * (n_around - n_own - 1)).astype(np.int64), n_around - 1)
+            found = np.take_along_axis(np.sort(around, axis=1), rank[:, None], axis=1)[:, 0]
+            thresholds.append(np.maximum(found, 0) * np.float32(ratio))
         return np.asarray(np.max(thresholds, axis=0))
+
+
+def _slopes(around: NDArray[np.float32], middle: int) -> NDArray[np.bool_]:
+    """Return True for the middle column of rows, and for those beside it up to which amplitudes fall: (row, column)."""
+    found = np.zeros(around.shape, np.bool_)
+    found[:, middle] = True
+    found[:, middle + 1 :] = np.logical_and.accumulate(np.diff(around[:, middle:]) <= 0, axis=1)
+    found[:, :middle] = np.logical_and.accumulate(np.diff(around[:, middle::-1]) <= 0, axis=1)[:, ::-1]
+    return found
 
 
 def noise_of(image: Energyscape) -> float:

@@ -109,7 +109,7 @@ def unobservable(
         own_s, *others_s = spreads_s(np.stack([times_s, *orders]), positions_m, path_m, speed_m_s)
         limit_s = max(_MIN_SPREAD_S, _MIN_EXCLUDED * own_s)
         names = [name for name, _ in other_orders(n_mics)]
-        cases = frozenset(name for name, other_s in zip(names, others_s, strict=True) if other_s < limit_s)
+        cases = tuple(name for name, other_s in zip(names, others_s, strict=True) if other_s < limit_s)
         if cases:
             reason = "other orders fit this arrival about as well"
             found.insert(0, NotObservable(faults=(ORDER,), reason=reason, remedy=SEVERAL_ECHOES, cases=cases))

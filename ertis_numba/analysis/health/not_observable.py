@@ -42,14 +42,14 @@ class NotObservable:
         Clause with the reason.
     remedy : str
         Imperative clause; it names a way to observe the faults.
-    cases : frozenset of str
+    cases : tuple of str
         Names of the alternatives that are possible; empty (the default) if they are not counted.
     """
 
     faults: tuple[str, ...]
     reason: str
     remedy: str
-    cases: frozenset[str] = frozenset()
+    cases: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         count = f" ({len(self.cases)}, such as {min(self.cases)})" if self.cases else ""
@@ -63,12 +63,12 @@ def in_all(reports: Sequence[Sequence[NotObservable]]) -> tuple[NotObservable, .
     """
     if not reports:
         return ()
-    left: dict[str, frozenset[str] | None] = {}
+    left: dict[str, tuple[str, ...] | None] = {}
     for fault in (fault for item in reports[0] for fault in item.faults):
         found = [next((item for item in items if fault in item.faults), None) for items in reports]
         cases = [item.cases for item in found if item is not None and item.cases]
-        common = frozenset.intersection(*cases) if cases else None
-        if None not in found and common != frozenset():
+        common = tuple(case for case in cases[0] if all(case in each for each in cases)) if cases else None
+        if None not in found and common != ():
             left[fault] = common
     kept = (replace(item, faults=tuple(fault for fault in item.faults if fault in left)) for item in reports[0])
     return tuple(replace(item, cases=left[item.faults[0]] or item.cases) for item in kept if item.faults)
