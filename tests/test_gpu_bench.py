@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench import gpu, rival_mach, rivals, tables
+from ertis_bench.gpu_trials import gpu, gpu_tables, rival_mach, rivals
 from ertis_cli.main import cli
 
 from ertis_numba import kernels, verification
@@ -213,7 +213,7 @@ def _is_printed(leaf, numbers):
 
 @pytest.mark.parametrize("part", [name for name, found in NEWEST["parts"].items() if "rows" in found])
 def test_no_measured_figure_is_left_out_of_the_tables(part):
-    text = tables.gpu(NEWEST).replace(",", "")
+    text = gpu_tables.gpu(NEWEST).replace(",", "")
     numbers = re.findall(r"(?<![\w.])-?\d+(?:\.\d+)?", text)
     for leaf in (leaf for row in NEWEST["parts"][part]["rows"] for leaf in _leaves(row)):
         is_printed = leaf.replace(",", "") in text if isinstance(leaf, str) else _is_printed(leaf, numbers)
@@ -225,7 +225,7 @@ def test_tables_without_results_state_not_measured(tmp_path):
     assert done.stdout.count("not measured") == 7 * 3
     assert "| the paper's GTX 1080 Ti | 5.93 | 51.58 | 77.02 |" in done.stdout
     assert "No GPU has run these kernels yet" in done.stdout
-    assert tables.gpu_short({}).startswith("No GPU has run the kernels yet")
+    assert gpu_tables.gpu_short({}).startswith("No GPU has run the kernels yet")
 
 
 @pytest.mark.parametrize(
@@ -235,7 +235,7 @@ def test_tables_show_all_existing_parts(report, results):
     found = report[0] | results if results else report[0]
     for part in found["parts"].values():
         part.setdefault("wall_s", 9.0)
-    assert tables.gpu(found).startswith("| ms per measurement, median |")
+    assert gpu_tables.gpu(found).startswith("| ms per measurement, median |")
 
 
 @pytest.mark.alone

@@ -5,14 +5,13 @@ from typing import Any
 
 from ertis_bench import timing
 from ertis_bench.accuracy import PAPER, TURN
-from ertis_bench.gpu_tables import gpu, gpu_short
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import or_dash, table
 from ertis_bench.network.latency import latency
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RESTRICTED
 from ertis_numba.verification import PEAKS
 
-__all__ = ["FORMS", "accuracy", "accuracy_front", "gpu", "gpu_short", "latency", "paper"]
+__all__ = ["FORMS", "accuracy", "accuracy_front", "latency", "paper"]
 
 _MEANING = {
     "scipy": "`scipy`: the paper's algorithm, NumPy and SciPy",
@@ -154,7 +153,6 @@ def _accuracy_conditions(report: dict[str, Any]) -> str:
 FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "paper": {"paper": paper},
     "latency": {"latency": latency},
-    "gpu": {"gpu": gpu, "gpu short": gpu_short},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
 }
 """Forms of the table of each command in the wheel, by the name in its markers. A file's markers select the form."""

@@ -63,7 +63,7 @@ _update = click.option(
 def bench() -> None:
     """Run benchmarks of speed and accuracy.
 
-    The wheel contains paper, accuracy, gpu and latency. The others exist only in the source folder.
+    The wheel contains paper, accuracy and latency. The others exist only in the source folder.
     """
 
 
@@ -575,9 +575,7 @@ def gpu(*, newest: bool, **given: Any) -> None:
 
     Takes less than ten minutes, and compares with other libraries and limits.
     """
-    from ertis_bench import gpu as benchmark
-
-    _run("gpu", benchmark, measure=not newest, **given)
+    _run("gpu", _in_source_folder("gpu", "gpu_trials.gpu"), measure=not newest, **given)
 
 
 def _in_source_folder(name: str, package: str | None = None) -> ModuleType:

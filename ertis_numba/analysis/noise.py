@@ -21,6 +21,7 @@ _DENSE = 131_072  # Number of bins from which the noise of all directions is est
 _CAPON = 1.5  # Exponent of the amplitude of noise.
 _LEAST = 8  # Ranges that a click is spread over at least.
 _PER_CALL = 2  # Number of blocks of ranges in the range that the matched filter spreads a click over.
+_FALLEN = 10 ** (-40.0 / 20)  # Amplitude relative to that of an echo to which its slopes fall at least.
 _QUIET = 1 / 3  # Quantile of these estimates: side lobes raise those near echoes, and chance lowers the lowest.
 
 
@@ -80,7 +81,7 @@ class EchoFloor(NamedTuple):
             around = amplitude[direction[:, None], columns]
             n_own = np.zeros(len(around), np.int64)
             if quantile > 0.5:
-                is_own = _slopes(around, -first)
+                is_own = _slopes(around, min(-first, n_around - 1))
                 around, n_own = np.where(is_own, -np.inf, around), is_own.sum(axis=1)
             rank = np.minimum(n_own + (quantile * (n_around - n_own - 1)).astype(np.int64), n_around - 1)
             found = np.take_along_axis(np.sort(around, axis=1), rank[:, None], axis=1)[:, 0]
@@ -89,11 +90,15 @@ class EchoFloor(NamedTuple):
 
 
 def _slopes(around: NDArray[np.float32], middle: int) -> NDArray[np.bool_]:
-    """Return True for the middle column of rows, and for those beside it up to which amplitudes fall: (row, column)."""
+    """Return True for the middle column of rows, and for those beside it up to which amplitudes fall: (row, column).
+
+    Slopes of noise do not fall as deep as those of an echo.
+    """
     found = np.zeros(around.shape, np.bool_)
     found[:, middle] = True
     found[:, middle + 1 :] = np.logical_and.accumulate(np.diff(around[:, middle:]) <= 0, axis=1)
     found[:, :middle] = np.logical_and.accumulate(np.diff(around[:, middle::-1]) <= 0, axis=1)[:, ::-1]
+    found[np.where(found, around, np.inf).min(axis=1) > _FALLEN * around[:, middle]] = False
     return found
 
 

@@ -4,7 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-from ertis_bench import gpu_parts, gpu_stages, rivals, timing
+from ertis_bench import timing
+from ertis_bench.gpu_trials import gpu_parts, gpu_stages, rivals
 from numba import cuda
 
 from ertis_numba import kernels

@@ -1,4 +1,4 @@
-"""Parts of the GPU benchmark, each in a separate process: ``python -m ertis_bench.gpu_parts NAME FILE``.
+"""Parts of the GPU benchmark, each in a separate process: ``python -m ertis_bench.gpu_trials.gpu_parts NAME FILE``.
 
 A part yields rows. Each row is written to the file at once as a line of JSON, so that a later failure loses no results.
 """
@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench import checks, input_measurements, rivals, timing
-from ertis_bench.gpu import REFUSED
-from ertis_bench.gpu_stages import stages
+from ertis_bench import checks, input_measurements, timing
+from ertis_bench.gpu_trials import rivals
+from ertis_bench.gpu_trials.gpu import REFUSED
+from ertis_bench.gpu_trials.gpu_stages import stages
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RANGE_M
 from ertis_bench.plans import in_words
 from ertis_bench.sound_signals import OWN_RMS, SOURCES, listening, noise

@@ -22,10 +22,12 @@ from pathlib import Path
 from typing import Any
 
 from ertis_bench import input_measurements, machine
+from ertis_bench.gpu_trials import gpu_tables
 from ertis_numba.errors import DeviceError
 
 __all__ = [
     "BUDGETS_S",
+    "FORMS",
     "REFUSED",
     "FinishedProcess",
     "execute",
@@ -37,6 +39,7 @@ __all__ = [
     "tested",
 ]
 
+FORMS = {"gpu": gpu_tables.gpu, "gpu short": gpu_tables.gpu_short}
 REFUSED = 3
 """Exit code of a process without a GPU. Its output states the reason."""
 
@@ -52,7 +55,7 @@ BUDGETS_S = {
 }
 """Time limit of each part in seconds. The sum is less than ten minutes."""
 
-_ROOT = Path(__file__).parents[2]
+_ROOT = Path(__file__).parents[3]
 _TESTED = (
     "tests/test_kernels.py",
     "tests/test_interpolated_beams.py",
@@ -171,7 +174,7 @@ def part(name: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rows"
         file.touch()
-        done = execute([sys.executable, "-m", "ertis_bench.gpu_parts", name, str(file)], BUDGETS_S[name])
+        done = execute([sys.executable, "-m", "ertis_bench.gpu_trials.gpu_parts", name, str(file)], BUDGETS_S[name])
         lines = file.read_text("utf-8").split("\n")[:-1]  # The last element is empty or truncated.
     status = "done" if done.code == 0 else _failed(name, done)
     return {"status": done.last_line if done.code == REFUSED else status, "rows": [json.loads(line) for line in lines]}

@@ -14,7 +14,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ertis_bench import rival_mach, timing
+from ertis_bench import timing
+from ertis_bench.gpu_trials import rival_mach
 from ertis_bench.plans import in_words
 from ertis_numba import kernels, verification
 from ertis_numba.errors import DataError

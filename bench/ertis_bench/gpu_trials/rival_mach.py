@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_bench import timing
-from ertis_bench.gpu_stages import stages
+from ertis_bench.gpu_trials.gpu_stages import stages
 from ertis_bench.plans import in_words
 from ertis_numba import kernels, verification
 from ertis_numba.air import sound_speed_m_s

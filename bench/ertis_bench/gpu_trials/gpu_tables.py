@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
-from ertis_bench import rival_mach
+from ertis_bench.gpu_trials import rival_mach
 from ertis_bench.markdown import table
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 
