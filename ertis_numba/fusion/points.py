@@ -36,7 +36,7 @@ _NEAREST_M: Final = 0.05
 _BESIDE: Final = np.arange(-1, 2)
 
 
-class _Heard(NamedTuple):
+class _ImageEchoes(NamedTuple):
     """Echoes in an image, each field (echo,) but for ``direction``, (echo, axis), in the frame of the platform."""
 
     row: NDArray[np.int64]
@@ -74,7 +74,7 @@ class PointFuser:
     ) -> None:
         self._number, self._mounting, self._receiver = number, sensors[number], receiver
         self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
-        self._last: tuple[Energyscape, _Heard] | None = None
+        self._last: tuple[Energyscape, _ImageEchoes] | None = None
         self._extract = PointExtractor(
             image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP, min_level_db=_MIN_LEVEL_DB
         )
@@ -115,7 +115,7 @@ class PointFuser:
             is_faint=heard.is_faint,
         )
 
-    def _heard(self, image: Energyscape, floor: EchoFloor) -> _Heard:
+    def _heard(self, image: Energyscape, floor: EchoFloor) -> _ImageEchoes:
         """Return the echoes of an image above its noise, strongest first, whatever call caused them."""
         if self._is_deaf.any():  # Points are found relative to the strongest one, which direct sound would be.
             image = image.replace(amplitude=np.where(self._is_deaf, np.float32(0), image.amplitude))
@@ -129,7 +129,7 @@ class PointFuser:
         shown = np.minimum(near, cloud.amplitude)
         is_free = shown > floor.at(image.amplitude, row, column)
         uncertainty_m = _uncertainties(cloud)
-        every = _Heard(
+        every = _ImageEchoes(
             row=row,
             range_m=range_m,
             direction=place_m / range_m[:, None] @ self._mounting.rotation.T,
@@ -139,7 +139,7 @@ class PointFuser:
             is_clear=shown > floor.at(image.amplitude, row, column, quantile=_CLEAR),
             is_faint=~is_free | (cloud.amplitude < _FAINT * cloud.amplitude.max(initial=0.0)),
         )
-        return _Heard._make(each[shown > floor.by_direction[row]] for each in every)
+        return _ImageEchoes._make(each[shown > floor.by_direction[row]] for each in every)
 
     def _shares(self, row: NDArray[np.int64], range_m: Floats, shares: Sequence[NDArray[np.float32]]) -> Floats:
         """Return the highest share of each emitter within one step of each echo: (echo, emitter)."""
