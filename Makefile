@@ -80,7 +80,7 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 	$(BIN)/ertis bench fusion --only clocks --update docs/how-to/fusion.md
 	$(BIN)/ertis bench fusion --only delays --count 6 --seed 1000 --update docs/how-to/fusion.md
 	$(BIN)/ertis bench fusion --only scans --count 24 --seed 1000 --update docs/how-to/fusion.md
-	$(BIN)/ertis bench fusion --only emitters --count 40 --seed 9000
+	$(BIN)/ertis bench fusion --only emitters --count 24 --seed 9500 --update docs/how-to/fusion.md
 	$(BIN)/ertis bench fusion --only reflections --count 50 --seed 9000 --update docs/how-to/fusion.md
 	$(BIN)/ertis bench network --only fusion --update docs/how-to/fusion.md
 	$(BIN)/ertis bench network --only maps --update docs/how-to/passive.md
