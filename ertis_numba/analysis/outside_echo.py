@@ -61,9 +61,10 @@ def outside_of(image: Energyscape, directions: NDArray[np.float64], range_m: flo
 def _patterns(settings: Settings, grid: bytes) -> OutsidePatterns | None:
     """Return the patterns of echoes of the call."""
     positions_m, speed_m_s = microphones(settings.array).enabled_positions_m, sound_speed_m_s(settings.air)
-    bands = [np.array_split(each, _BANDS) for each in PointSpread(settings).spectrum]
-    power = np.array([np.sum(share**2) for share in bands[1]])
-    frequency_hz = np.array([np.average(hz, weights=share**2) for hz, share in zip(*bands, strict=True)])
+    every_hz, shares = PointSpread(settings).spectrum
+    bands = [each for each in np.array_split(np.arange(len(shares)), _BANDS) if (shares[each] > 0).any()]
+    power = np.array([np.sum(shares[each] ** 2) for each in bands])
+    frequency_hz = np.array([np.average(every_hz[each], weights=shares[each]) for each in bands])
     is_heard = power > _LEAST * power.max()
     return OutsidePatterns.of(
         np.frombuffer(grid).reshape(-1, 3),
