@@ -151,7 +151,7 @@ def _patterns(of_sources_s: Floats, towards_s: Floats, frequency_hz: Floats, wei
             np.exp(2j * np.pi * hz * delay_s).astype(np.complex64) for delay_s in (of_sources_s, towards_s)
         )
         total += share * np.abs(sources @ towards.conj().T / towards_s.shape[1]) ** 2
-    return total / shares.sum()
+    return np.asarray(total / shares.sum())
 
 
 def _circle(count: int, height: float) -> Floats:
