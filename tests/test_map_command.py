@@ -67,6 +67,11 @@ def run(folder, line, *, code=0):
     return done
 
 
+def other_notes(done):
+    """Notes of a command except the one that either of two sensors before one post may be silent."""
+    return [line for line in done.stderr.splitlines() if "note" in line and "no echo proves" not in line]
+
+
 def test_map_of_a_recording_shows_the_post_in_the_world(folder):
     done = run(folder, "both.h5 --poses poses.tum --json -o first.h5")
     report = json.loads(done.stdout)
@@ -294,7 +299,7 @@ def test_map_notes_poses_of_a_camera_and_converts_them(folder):
         assert done.stderr.count(note) == 1
         assert "PoseWarning" not in done.stderr
         done = run(folder, f"{line} -o converted{number}.h5 --pose-axes camera")
-        assert "axis" not in done.stderr
+        assert other_notes(done) == []
         maps = [ertis.read_map(folder / name) for name in ("level.h5", f"converted{number}.h5")]
         assert maps[0].log_odds.shape == maps[1].log_odds.shape
         assert maps[0].log_odds == pytest.approx(maps[1].log_odds, abs=1e-4)
@@ -320,7 +325,7 @@ def test_map_reads_poses_of_kitti_with_their_times(folder):
     run(folder, "both.h5 --poses kitti.txt -o k.h5 --times times.txt --pose-axes camera-world")
     (folder / "ms.tum").write_text("0 10 0 0 0 0 0 1\n1000 10 0 0 0 0 0 1\n")
     assert "times from 0 to 1000 are read as seconds" in run(folder, "both.h5 --poses ms.tum -o m.h5").stderr
-    assert "are read as" not in run(folder, "both.h5 --poses ms.tum -o s.h5 --time-unit ms").stderr
+    assert other_notes(run(folder, "both.h5 --poses ms.tum -o s.h5 --time-unit ms")) == []
 
 
 def test_map_states_pulses_between_distant_poses(folder):
@@ -328,7 +333,7 @@ def test_map_states_pulses_between_distant_poses(folder):
     ertis.write_tum(folder / "few.tum", few.replace(time_ns=2 * few.time_ns))
     done = run(folder, "both.h5 --poses few.tum -o few.h5")
     assert "note: 2 of 3 pulses between poses more than a second apart, which are interpolated" in done.stderr
-    assert "poses" not in run(folder, "both.h5 --poses poses.tum -o near.h5").stderr
+    assert other_notes(run(folder, "both.h5 --poses poses.tum -o near.h5")) == []
 
 
 def test_map_refuses_poses_at_other_times(folder):
