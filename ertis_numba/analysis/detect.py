@@ -132,6 +132,7 @@ def peaks_of_grid(
     interpolate = PeakInterpolator(image.settings, directions, neighbours, only=places[:, 0])
     found: list[tuple[NDArray[np.float64], float, float]] = []
     errors_rad: list[float] = []
+    is_limited = has_outside(image.settings, directions)
     for k in order:
         if len(found) == top:
             break
@@ -141,8 +142,8 @@ def peaks_of_grid(
             continue
         tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1])
         found.append((tops.direction[0], float(tops.range_m[0]), float(tops.amplitude[0])))
-        outside = outside_of(image, directions, found[-1][1])
-        is_beside_open = has_outside(image.settings, directions) and any(
+        outside = outside_of(image, directions, found[-1][1]) if is_limited else None
+        is_beside_open = is_limited and any(
             math.isinf(error_rad) and abs(found[-1][1] - other[1]) < side_lobes.reach_m
             for other, error_rad in zip(found[:-1], errors_rad, strict=True)
         )

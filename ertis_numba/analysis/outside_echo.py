@@ -63,6 +63,8 @@ def _patterns(settings: Settings, grid: bytes) -> OutsidePatterns | None:
     positions_m, speed_m_s = microphones(settings.array).enabled_positions_m, sound_speed_m_s(settings.air)
     every_hz, shares = PointSpread(settings).spectrum
     bands = [each for each in np.array_split(np.arange(len(shares)), _BANDS) if (shares[each] > 0).any()]
+    if not bands:  # The filters leave nothing of the call.
+        return None
     power = np.array([np.sum(shares[each] ** 2) for each in bands])
     frequency_hz = np.array([np.average(every_hz[each], weights=shares[each]) for each in bands])
     is_heard = power > _LEAST * power.max()
