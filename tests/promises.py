@@ -3,7 +3,6 @@
 Processor time is nearly independent of other programs, unlike the time by the clock.
 """
 
-import functools
 import subprocess
 import sys
 from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
@@ -16,7 +15,8 @@ IMPORTS = [sys.executable, "-c", "import numba, scipy.fft, h5py"]
 def best_ratio(once, *, times, promised):
     """Processor time of the cheapest run relative to the imports; stop after the first run within the promise.
 
-    One measurement of the imports suffices if even half of that time would keep the promise.
+    The imports run right after each run, because other programs and the clock of a processor change both. One
+    measurement suffices if even half of its time would keep the promise.
     """
     best = np.inf
     for _ in range(times):
@@ -35,7 +35,6 @@ def cpu_s(once):
     return _used_s() - start_s
 
 
-@functools.cache
 def imports_s(times):
     """Least processor time of some interpreters that import the libraries of all commands."""
     return min(cpu_s(lambda: subprocess.run(IMPORTS, check=True)) for _ in range(times))

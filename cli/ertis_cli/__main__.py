@@ -1,6 +1,7 @@
 """Entry point of the ``ertis`` command, also as ``python -m ertis_cli``."""
 
 import gc
+import os
 import sys
 
 _INTERRUPTED = 130
@@ -19,6 +20,8 @@ def main() -> None:
 def _run() -> str | int | None:
     import signal
 
+    # NumPy's idle threads wait for 2^26 cycles in a loop, which takes 0.3 s of a short command, or a core from others.
+    os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "16")
     gc.set_threshold(50_000)  # imports create many permanent objects; scanning them takes 60 ms
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the handlers are installed, after some imports
