@@ -144,8 +144,23 @@ def test_held_link_waits_for_a_short_shared_lock(tmp_path):
     timer.join()
 
 
-def test_emulated_folder_follows_the_environment_variable(monkeypatch, tmp_path):
+def test_emulated_folder_follows_its_environment_variable_only(monkeypatch, tmp_path):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
     assert emulated_folder() == tmp_path
     monkeypatch.delenv("ERTIS_EMULATED_DIR")
-    assert emulated_folder().parts[-2:] == ("ertis", "emulated")
+    usual = emulated_folder()
+    assert usual.parts[-2:] == ("ertis", "emulated")
+    for name in ("TMPDIR", "XDG_RUNTIME_DIR"):
+        monkeypatch.setenv(name, str(tmp_path))
+    assert emulated_folder() == usual
+
+
+def test_emulated_folder_that_others_may_change_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
+    tmp_path.chmod(0o777)
+    with pytest.raises(ArgumentError, match="others may write to it; set ERTIS_EMULATED_DIR"):
+        emulated_folder()
+    tmp_path.chmod(0o700)
+    monkeypatch.setattr("os.getuid", lambda: 12345)
+    with pytest.raises(ArgumentError, match="belongs to another user"):
+        emulated_folder()

@@ -6,6 +6,7 @@ import itertools
 import math
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from ertis_bench.platform_trials import mapping
@@ -603,6 +604,15 @@ def test_damaged_map_file_is_refused(tmp_path):
     path.write_bytes(content)
     with pytest.raises(DamagedError, match="SHA-256"):
         ertis.read_map(path)
+
+
+@pytest.mark.parametrize("name", ["cell_m", "origin_x_m", "origin_y_m", "n_groups", "time_ns"])
+def test_map_file_with_another_place_or_count_is_refused(tmp_path, name):
+    ertis.write_map(tmp_path / "m.h5", small())
+    with h5py.File(tmp_path / "m.h5", "r+") as file:
+        file.attrs.modify(name, file.attrs[name] + type(file.attrs[name])(1))
+    with pytest.raises(DamagedError, match="SHA-256"):
+        ertis.read_map(tmp_path / "m.h5")
 
 
 def test_map_and_recording_are_told_apart(tmp_path):

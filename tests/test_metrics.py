@@ -4,7 +4,9 @@ import http.client
 import io
 import json
 import logging
+import socket
 import sys
+import time
 import urllib.request
 
 import pytest
@@ -12,6 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ertis_numba.errors import ArgumentError, NetworkError
 from ertis_numba.network import log
+from ertis_numba.network._metrics_server import Handler
 from ertis_numba.network.metrics import Metrics
 from ertis_numba.network.status import Status
 from tests.test_status import BUSY
@@ -61,6 +64,37 @@ def test_metrics_server_ends():
     metrics.close()
     with pytest.raises(OSError, match="refused"):
         _scraped(metrics.address)
+
+
+def test_metrics_close_connections_beyond_a_limit(monkeypatch):
+    monkeypatch.setattr(Handler, "timeout", 60.0)  # Silent connections stay open for the length of the test.
+    with Metrics("127.0.0.1:0", lambda: BUSY) as metrics:
+        place = ("127.0.0.1", int(metrics.address.rpartition(":")[2]))
+        silent = [socket.create_connection(place, timeout=60) for _ in range(16)]
+        with socket.create_connection(place, timeout=60) as further:
+            assert further.recv(1) == b""
+        for each in silent:
+            each.close()
+        assert _eventually(lambda: _scraped(metrics.address))
+
+
+def test_metrics_close_silent_connections(monkeypatch):
+    monkeypatch.setattr(Handler, "timeout", 0.05)
+    with Metrics("127.0.0.1:0", lambda: BUSY) as metrics:
+        with socket.create_connection(("127.0.0.1", int(metrics.address.rpartition(":")[2])), timeout=60) as silent:
+            assert silent.recv(1) == b""
+        assert _scraped(metrics.address)
+
+
+def _eventually(scrape):
+    """Return what an attempt returns once the server has seen that connections are closed."""
+    until_s = time.monotonic() + 60
+    while True:
+        try:
+            return scrape()
+        except OSError:
+            if time.monotonic() > until_s:
+                raise
 
 
 @pytest.mark.parametrize("address", ["0.0.0.0:9101", "*:9101", "example.org:9101", "192.0.2.1:9101"])

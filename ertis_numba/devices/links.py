@@ -1,8 +1,8 @@
 """Stable links to the ports of emulated devices, like those of ``/dev/serial/by-id``."""
 
 import os
+import stat
 import time
-import warnings
 from contextlib import suppress
 from pathlib import Path
 
@@ -36,16 +36,24 @@ def require_terminals() -> None:
 
 
 def emulated_folder() -> Path:
-    """Return the folder of links to emulated devices: ``$ERTIS_EMULATED_DIR``, or one in the user's runtime folder.
+    """Return the folder of links to emulated devices: ``$ERTIS_EMULATED_DIR``, or one in the user's cache folder.
 
-    It need not exist.
+    It need not exist, and does not depend on ``TMPDIR``, which may differ between terminals.
+
+    Raises
+    ------
+    ArgumentError
+        Others may change the folder, and so choose the ports that a name leads to.
     """
-    given = os.environ.get("ERTIS_EMULATED_DIR")
-    if given:
-        return Path(given)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # The library warns if this machine has no such folder and another one is used.
-        return Path(platformdirs.user_runtime_dir("ertis")) / "emulated"
+    folder = Path(os.environ.get("ERTIS_EMULATED_DIR") or Path(platformdirs.user_cache_dir("ertis"), "emulated"))
+    with suppress(FileNotFoundError):
+        found = folder.stat()
+        if _HAS_TERMINALS and (found.st_uid != os.getuid() or found.st_mode & stat.S_IWOTH):
+            raise ArgumentError(
+                f"folder {folder} of emulated devices belongs to another user, or others may write to it; set "
+                "ERTIS_EMULATED_DIR to a folder of your own"
+            )
+    return folder
 
 
 class HeldLink:

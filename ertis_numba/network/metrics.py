@@ -1,5 +1,6 @@
 """Prometheus metrics of a central node."""
 
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -10,7 +11,6 @@ from ertis_numba.network import addresses
 from ertis_numba.network.status import Percentiles, Status
 
 if TYPE_CHECKING:
-    import threading
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
     from prometheus_client.core import Metric
@@ -85,15 +85,19 @@ class Metrics:
         NetworkError
             The address is in use.
         """
-        from prometheus_client import CollectorRegistry, start_http_server  # noqa: PLC0415  an extra
+        from prometheus_client import CollectorRegistry, make_wsgi_app  # noqa: PLC0415  an extra
+
+        from ertis_numba.network._metrics_server import Handler, Server  # noqa: PLC0415  only metrics need HTTP
 
         registry = CollectorRegistry(auto_describe=False)
         registry.register(self)
         try:
-            self._server, self._thread = start_http_server(int(self._port), addr=self._host, registry=registry)
-            self._server.set_app(_of_own_hosts(self._server.get_app(), self._host))
+            self._server = Server((self._host, int(self._port)), Handler)
         except OSError as error:
             raise NetworkError(f"cannot listen at {self.address} ({error.strerror}); give another address") from error
+        self._server.set_app(_of_own_hosts(make_wsgi_app(registry), self._host))
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
         self.address = f"{self.address.rpartition(':')[0]}:{self._server.server_port}"
 
     def close(self) -> None:

@@ -1,5 +1,7 @@
 """Files of occupancy maps."""
 
+import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -32,6 +34,7 @@ __all__ = ["is_map", "read_map", "write_map_file"]
 _KIND: Final = "occupancy_map"
 _NAME: Final = "an occupancy map"
 _AXES: Final = ("x", "y", "z")
+_COUNTS: Final = ("n_groups", "time_ns")
 
 
 def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = False) -> Path:
@@ -68,7 +71,9 @@ def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool
             for name, edge_m in zip(axes, occupancy.origin_m, strict=True):
                 file[name][:] = edge_m + (np.arange(sizes[name]) + 0.5) * occupancy.cell_m
             file["log_odds"][:] = occupancy.log_odds
-            content = content_sha256(file, table)
+            numbers = (occupancy.cell_m, *occupancy.origin_m, occupancy.n_groups, occupancy.time_ns)
+            set_attributes(file, dict(zip(_numbers(axes), numbers, strict=True)))
+            content = _content(file, axes)
             set_attributes(
                 file,
                 {
@@ -78,10 +83,6 @@ def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool
                     "date_created": date_created(),
                     "uuid": content_uuid({"": content}),
                     "content_sha256": content,
-                    "cell_m": occupancy.cell_m,
-                    **{f"origin_{name}_m": edge_m for name, edge_m in zip(axes, occupancy.origin_m, strict=True)},
-                    "n_groups": occupancy.n_groups,
-                    "time_ns": occupancy.time_ns,
                     **{f"{name.replace('-', '_')}_version": version for name, version in software_versions().items()},
                 },
             )
@@ -135,8 +136,7 @@ def read_map(path: str | Path) -> OccupancyMap:
         _require_kind(file, path)
         axes = _AXES[: 3 if "z" in file else 2]
         require_variables(file, _table(len(axes)))
-        stated = content_sha256(file, _table(len(axes)))
-        if stated != to_python(file.attrs["content_sha256"]):
+        if _content(file, axes) != to_python(file.attrs["content_sha256"]):
             raise DamagedError(f"{path}: the SHA-256 of the content differs from the stated one; copy it again")
         try:
             found = OccupancyMap(
@@ -159,6 +159,19 @@ def read_map(path: str | Path) -> OccupancyMap:
 
 def _table(n_dimensions: int) -> tuple[Variable, ...]:
     return OCCUPANCY_MAP if n_dimensions == 2 else VOXEL_MAP
+
+
+def _numbers(axes: Sequence[str]) -> tuple[str, ...]:
+    """Return the attributes that place the cells, and count what the map contains."""
+    return "cell_m", *(f"origin_{name}_m" for name in axes), *_COUNTS
+
+
+def _content(file: h5py.File, axes: Sequence[str]) -> str:
+    """Return the SHA-256 over the variables' SHA-256 and the numbers of a map, in hexadecimal."""
+    digest = hashlib.sha256(bytes.fromhex(content_sha256(file, _table(len(axes)))))
+    for name in _numbers(axes):
+        digest.update(np.asarray(file.attrs[name], "<i8" if name in _COUNTS else "<f8").tobytes())
+    return digest.hexdigest()
 
 
 def _require_kind(file: h5py.File, path: Path) -> None:
