@@ -162,7 +162,7 @@ def _table(n_dimensions: int) -> tuple[Variable, ...]:
 
 
 def _numbers(axes: Sequence[str]) -> tuple[str, ...]:
-    """Return the attributes that place the cells, and count what the map contains."""
+    """Return the names of the attributes with the place of the cells, and with counts."""
     return "cell_m", *(f"origin_{name}_m" for name in axes), *_COUNTS
 
 
