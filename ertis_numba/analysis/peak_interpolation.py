@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.frames import Energyscape
@@ -15,11 +16,6 @@ from ertis_numba.stages.plan_response import deviation_of
 __all__ = ["PeakInterpolator", "Tops", "listed"]
 
 _MAX_CORRECTIONS = 8  # Number of corrections of the parabola error; coarse grids need more than fine ones.
-_CONVERGED = 1e-5  # Change by a correction, in range bins, in unit vectors and in nepers.
-_MAX_DIFFERENCE = 1.0  # Deviation in nepers from the samples of a single reflector; beyond it, there are several.
-_MAX_SHIFT = 0.5  # Change by all corrections, in range bins and in nepers; beyond it, they have not converged.
-_ABSENT = math.log(np.finfo(np.float32).tiny)  # Logarithm of an amplitude of 0, as of a bin that cleaning removes.
-_DARK = 1e-6  # Amplitude below the side lobes of any array.
 _EDGE_OF_LOBE = 0.5  # Amplitude relative to the maximum, below which a sample is not part of the main lobe.
 _NOISE = 10 ** (0.5 / 20)  # Noise may raise a maximum above a main lobe through its strongest sample.
 _NARROWER = 3.0  # The main lobe of adaptive beamformers in decibels, relative to that of delay-and-sum, is at most so.
@@ -94,7 +90,9 @@ class PeakInterpolator:
         self._fits = QuadricFits.of(directions, neighbours, wanted)
         self._spread = PointSpread(settings)
         self._is_predicted = settings.processing.method == "fast"
-        self._deviation = deviation_of(settings, directions)
+        deviation = deviation_of(settings, directions)
+        self._pulse = self._spread.pulse if deviation is None else self._spread.tilted_pulse
+        self._beams = self._spread.beams(np.ascontiguousarray(directions), deviation)
 
     def __call__(self, image: Energyscape, directions: NDArray[np.int64], ranges: NDArray[np.int64]) -> Tops:
         """Return the interpolated maxima near given bins of an image.
@@ -108,9 +106,21 @@ class PeakInterpolator:
         step_m = float(image.range_m[1] - image.range_m[0]) if len(image.range_m) > 1 else 0.0
         rows, columns = _bins(directions, self._neighbours[directions], ranges, last=len(image.range_m) - 1)
         measured = np.log(np.maximum(image.amplitude[rows, columns].astype(np.float64), np.finfo(np.float32).tiny))
-        found = self._tops(directions, measured)
-        if self._is_predicted and not image.settings.processing.is_adaptive:
-            found = self._corrected(found, directions, measured, (rows, columns), step_m, image)
+        is_corrected = self._is_predicted and not image.settings.processing.is_adaptive
+        found = np.empty((len(measured), 5))
+        kernels.load_points().interpolate_tops(
+            self._pulse,
+            self._fits.quadrics,
+            self._beams,
+            rows,
+            self._row[directions],
+            measured,
+            step_m * (columns - columns[:, 1:2]).astype(np.float64),
+            step_m,
+            self._spread.scale(image.settings.air),
+            _MAX_CORRECTIONS if is_corrected else 0,
+            found,
+        )
         shift_m, offset = found[:, 0].clip(-0.5, 0.5) * step_m, found[:, 1:4]
         offset, width_rad = self._fits.within_cells(self._row[directions], offset)
         rises = _filled(measured)[:, 3:] - measured[:, 1:2]
@@ -137,76 +147,10 @@ class PeakInterpolator:
         lobe = loss**_NARROWER if image.settings.processing.is_adaptive else loss
         return np.asarray(np.exp(measured) * _NOISE / lobe)
 
-    def _corrected(
-        self,
-        found: NDArray[np.float64],
-        directions: NDArray[np.int64],
-        measured: NDArray[np.float64],
-        bins: tuple[NDArray[np.int64], NDArray[np.int64]],
-        step_m: float,
-        image: Energyscape,
-    ) -> NDArray[np.float64]:
-        """Return the result of `_tops`, corrected where the samples match a single reflector."""
-        rows, columns = bins
-        offsets = self._directions[rows] - self._directions[directions][:, None]
-        steps_m = step_m * (columns - columns[:, 1:2]).astype(np.float64)
-        first, found, active = found, found.copy(), np.arange(len(found))
-        last = np.full(len(found), np.inf)
-        for _ in range(_MAX_CORRECTIONS):
-            here = found[active]
-            predicted = self._predicted(here, rows[active], offsets[active], steps_m[active], step_m, image)
-            difference = measured[active] - predicted
-            is_alike = np.abs(difference - difference[:, 1:2]).max(axis=1) < _MAX_DIFFERENCE
-            correction = first[active] - self._tops(directions[active], predicted)
-            size = np.abs(correction).max(axis=1)
-            is_smaller = size < last[active]  # The corrections of noise need not converge.
-            corrected = np.where(is_smaller[:, None], here + correction, here)
-            found[active] = np.where(is_alike[:, None], corrected, first[active])
-            last[active] = size
-            active = active[is_alike & is_smaller & (size > _CONVERGED)]
-            if not len(active):
-                break
-        change = np.abs(found - first)
-        is_small = (change[:, 0] <= _MAX_SHIFT) & (change[:, 4] <= _MAX_SHIFT)
-        return np.where(is_small[:, None], found, first)
-
-    def _tops(self, directions: NDArray[np.int64], logs: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the maxima of parabolas: (place, 5) float64.
-
-        The columns are the shift along the range in bins, the three components of the direction offset, and the
-        logarithm of the amplitude. Bins without amplitude, such as those that cleaning removes, count as
-        half of the maximum. Results therefore change by about half a bin and 1 dB at most.
-        """
-        logs = _filled(logs)
-        before, level, after = logs[:, 0], logs[:, 1], logs[:, 2]
-        curvature = before - 2 * level + after
-        shift = np.divide(0.5 * (before - after), curvature, out=np.zeros_like(curvature), where=curvature < 0)
-        offset, rise = self._fits.tops(self._row[directions], logs[:, 3:] - level[:, None])
-        return np.column_stack([shift, offset, level + 0.25 * (after - before) * shift + rise])
-
-    def _predicted(
-        self,
-        found: NDArray[np.float64],
-        rows: NDArray[np.int64],
-        offsets: NDArray[np.float64],
-        steps_m: NDArray[np.float64],
-        step_m: float,
-        image: Energyscape,
-    ) -> NDArray[np.float64]:
-        """Return predicted log amplitudes of reflectors at the found positions: (place, sample) float64."""
-        middles = self._directions[rows[:, 0]]
-        tops = middles + found[:, 1:4]
-        tops = tops / np.linalg.norm(tops, axis=1)[:, None]
-        away = offsets + (middles - tops)[:, None]
-        away_m = steps_m - step_m * found[:, :1]
-        deviation = None if self._deviation is None else self._deviation.of(rows.ravel())
-        amplitude = self._spread(away.reshape(-1, 3), away_m.ravel(), image.settings.air, deviation=deviation)
-        return np.asarray(np.log(np.maximum(amplitude.reshape(away_m.shape), _DARK)) + found[:, 4:])
-
 
 def _filled(logs: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return logarithms of samples, (place, sample), with half of the maximum in bins without amplitude."""
-    return np.where(logs > _ABSENT, logs, logs[:, 1:2] - math.log(2))
+    return np.where(logs > kernels.ABSENT, logs, logs[:, 1:2] - math.log(2))
 
 
 def _bins(

@@ -6,6 +6,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import array_weights, microphones
 from ertis_numba.settings import Air, Settings
@@ -41,6 +42,8 @@ class PointSpread:
     reach_m : float
         Range offset in metres beyond which the image of the reflector ends. A side lobe is as long as the pulse. Its
         shift is half of the difference of two paths, which is at most the aperture's radius.
+    pulse : Pulse
+        Table of the kernels.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -60,11 +63,18 @@ class PointSpread:
         # Wave numbers are evenly spaced, so the sum is a Fourier transform, with a period of six times ``reach_m``.
         period_m = 2 * math.pi / float(wave_1_m[1] - wave_1_m[0]) if len(wave_1_m) > 1 else 8 * self.reach_m
         count = 2 ** math.ceil(math.log2(len(wave_1_m) * _STEPS_PER_WAVE))
-        self._path_m = np.arange(count) * (period_m / count)
+        path_m = np.arange(count) * (period_m / count)
         shares = power / power.sum()
-        self._turn = np.exp(1j * (wave_1_m[0] - self._carrier_1_m) * self._path_m)
-        self._shares, self._wave_1_m, self._count = shares, wave_1_m, count
-        self._pulse = np.fft.ifft(shares, count) * count * self._turn
+        self._turn = np.exp(1j * (wave_1_m[0] - self._carrier_1_m) * path_m)
+        self._shares, self._wave_1_m = shares, wave_1_m
+        self.pulse = kernels.Pulse(
+            self._table(shares),
+            np.empty(0, np.complex128),
+            float(path_m[1]),
+            self._carrier_1_m,
+            np.ascontiguousarray(self._positions_m),
+            np.array(self._weights, np.float64),
+        )
 
     @property
     def spectrum(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -72,12 +82,7 @@ class PointSpread:
         return self._wave_1_m * self._speed_m_s / (2 * math.pi), self._shares
 
     def __call__(
-        self,
-        direction_offset: NDArray[np.float64],
-        range_offset_m: NDArray[np.float64],
-        air: Air | None = None,
-        *,
-        deviation: Deviation | None = None,
+        self, direction_offset: NDArray[np.float64], range_offset_m: NDArray[np.float64], air: Air | None = None
     ) -> NDArray[np.float64]:
         """Return the amplitude, which is 1 at zero offset: (place,) float64.
 
@@ -89,30 +94,37 @@ class PointSpread:
             Difference of the ranges in metres.
         air : Air, optional
             Air of the image; by default, that of the settings.
-        deviation : Deviation, optional
-            Errors of the beam at each place.
         """
-        scale = 1.0 if air is None else self._speed_m_s / sound_speed_m_s(air)
-        path_m = scale * (2 * range_offset_m[:, None] - direction_offset @ self._positions_m.T)
-        pulse = self._at(path_m, self._pulse)
-        if deviation is not None:
-            carrier_hz = self._carrier_1_m * self._speed_m_s / (2 * math.pi)
-            pulse = pulse * (1 + deviation.mean + deviation.slope_s * (carrier_hz - deviation.centre_hz))
-            pulse += deviation.slope_s * self._at(path_m, self._tilted_hz)
-        return np.asarray(np.abs((pulse * np.exp(1j * self._carrier_1_m * path_m) * self._weights).mean(axis=1)))
+        found = np.empty(len(range_offset_m))
+        offsets = np.ascontiguousarray(direction_offset), np.ascontiguousarray(range_offset_m)
+        kernels.load_points().spread_amplitudes(self.pulse, *offsets, self.scale(air), found)
+        return found
+
+    def scale(self, air: Air | None) -> float:
+        """Return the sound speed of the settings relative to that in some air."""
+        return 1.0 if air is None else self._speed_m_s / sound_speed_m_s(air)
+
+    def beams(self, directions: NDArray[np.float64], deviation: Deviation | None) -> kernels.Beams:
+        """Return directions with the errors of their beams.
+
+        Parameters
+        ----------
+        directions : (direction, axis) float64
+        deviation : Deviation, optional
+        """
+        if deviation is None:
+            none = np.empty((0, len(self._weights)), np.complex64)
+            return kernels.Beams(directions, none, none)
+        centre_hz = self._carrier_1_m * self._speed_m_s / (2 * math.pi) - deviation.centre_hz
+        return kernels.Beams(directions, 1 + deviation.mean + deviation.slope_s * centre_hz, deviation.slope_s)
 
     @functools.cached_property
-    def _tilted_hz(self) -> NDArray[np.complex128]:
-        """Pulse with the spectrum weighted by the frequency relative to the carrier."""
+    def tilted_pulse(self) -> kernels.Pulse:
+        """Table that includes the pulse with the spectrum weighted by the frequency relative to the carrier."""
         offset_hz = (self._wave_1_m - self._carrier_1_m) * self._speed_m_s / (2 * math.pi)
-        return np.asarray(np.fft.ifft(self._shares * offset_hz, self._count) * self._count * self._turn)
+        return self.pulse._replace(tilted_hz=self._table(self._shares * offset_hz))
 
-    def _at(self, path_m: NDArray[np.float64], pulse: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return a pulse at given path differences; the pulse at negative ones is the complex conjugate."""
-        # Path differences of the table are evenly spaced; `numpy.interp` would search for the place of each.
-        place = np.minimum(np.abs(path_m) / self._path_m[1], self._count - 1.0)
-        before = np.minimum(place.astype(np.intp), self._count - 2)
-        found = pulse[before]
-        found += (place - before) * (pulse[before + 1] - found)
-        found.imag[path_m < 0] *= -1
-        return np.asarray(found)
+    def _table(self, spectrum: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the pulse of a spectrum, relative to its carrier: (path,) complex128."""
+        count = len(self._turn)
+        return np.asarray(np.fft.ifft(spectrum, count) * count * self._turn)

@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from ertis_numba import kernels
+
 __all__ = ["MAX_RISE_DB", "QuadricFits"]
 
 MAX_RISE_DB = 0.99
@@ -38,14 +40,7 @@ class QuadricFits:
 
     Attributes
     ----------
-    axes : (direction, 2, axis) float64
-        Axes of the plane; the first one is that of the line.
-    inverse : (direction, 5, neighbour) float64
-        Matrix from values to the coefficients of x, y, x², xy and y².
-    n_axes : (direction,) int64
-        Axes along which maxima are interpolated: 2, 1 or 0.
-    reach : (direction,) float64
-        Distance of the farthest neighbour; 0 without a fit.
+    quadrics : Quadrics
     width_rad : (direction,) float64
         Distance of the nearest other direction, which is the width of a cell; infinite if there is none.
     wanted : (direction,) int64
@@ -56,10 +51,7 @@ class QuadricFits:
         1 if all directions lie at one elevation, otherwise 2.
     """
 
-    axes: Floats
-    inverse: Floats
-    n_axes: NDArray[np.int64]
-    reach: Floats
+    quadrics: kernels.Quadrics
     width_rad: Floats
     wanted: NDArray[np.int64]
     grid: KDTree
@@ -81,7 +73,7 @@ class QuadricFits:
         """
         offsets = directions[neighbours[wanted]] - directions[wanted][:, None]
         _, sizes, axes = np.linalg.svd(np.pad(offsets, ((0, 0), (0, max(0, 3 - offsets.shape[1])), (0, 0))))
-        axes = axes[:, :2]
+        axes = np.ascontiguousarray(axes[:, :2])
         reach = np.linalg.norm(offsets, axis=2).max(axis=1, initial=0.0)
         x, y = np.moveaxis(offsets @ axes.transpose(0, 2, 1), 2, 0)
         is_plane = (sizes[:, 1] > _LINE * sizes[:, 0]) & (offsets.shape[1] > 5) & _are_around(x, y)
@@ -100,7 +92,9 @@ class QuadricFits:
         width_rad = np.where(distance > _SAME, distance, np.inf).min(axis=1, initial=np.inf)
         n_axes = np.where(reach > 0, n_axes, 0)
         n_axes_of_grid = 1 if np.ptp(directions[:, 2]) == 0 else 2
-        return cls(axes, inverse, n_axes, reach, width_rad, wanted, KDTree(directions), n_axes_of_grid)
+        return cls(
+            kernels.Quadrics(axes, inverse, n_axes, reach), width_rad, wanted, KDTree(directions), n_axes_of_grid
+        )
 
     def tops(self, directions: NDArray[np.int64], rises: Floats) -> tuple[Floats, Floats]:
         """Return offsets from directions to the maxima of their quadrics, (place, axis) float64, and the rise there.
@@ -114,16 +108,9 @@ class QuadricFits:
         rises : (place, neighbour) float64
             Values at the neighbours minus the value at the direction.
         """
-        slope_x, slope_y, xx, xy, yy = np.einsum("pcn,pn->cp", self.inverse[directions], rises)
-        xx, yy = 2 * xx, np.where(self.n_axes[directions] == 2, 2 * yy, -1.0)
-        determinant = xx * yy - xy * xy
-        is_top = (xx < 0) & (determinant > 0)
-        scale = np.divide(1.0, determinant, out=np.zeros_like(determinant), where=is_top)
-        x, y = (xy * slope_y - yy * slope_x) * scale, (xy * slope_x - xx * slope_y) * scale
-        is_near = np.hypot(x, y) <= self.reach[directions]
-        x, y = np.where(is_near, x, 0.0), np.where(is_near, y, 0.0)
-        offset = x[:, None] * self.axes[directions, 0] + y[:, None] * self.axes[directions, 1]
-        return offset, 0.5 * (slope_x * x + slope_y * y)
+        found = np.empty((len(rises), 4))
+        kernels.load_points().find_tops(self.quadrics, directions, np.ascontiguousarray(rises, np.float64), found)
+        return found[:, :3], found[:, 3]
 
     def within_cells(self, directions: NDArray[np.int64], offset: Floats) -> tuple[Floats, Floats]:
         """Return offsets that end within their cells, (place, axis) float64, and the width of cells: (place,) float64.
@@ -148,7 +135,7 @@ class QuadricFits:
             if not is_beyond.any():
                 break
             share[is_beyond] = half[is_beyond] / along[is_beyond]
-        is_between = offset.any(axis=1) & (share > _BESIDE) & (self.n_axes[directions] >= self.n_axes_of_grid)
+        is_between = offset.any(axis=1) & (share > _BESIDE) & (self.quadrics.n_axes[directions] >= self.n_axes_of_grid)
         cut_rad = (1 - share) * np.linalg.norm(offset, axis=1)  # The error is about as large: that of a wider cell.
         width_rad = self.width_rad[directions]
         return offset * share[:, None], np.where(is_between, np.minimum(math.sqrt(12) * cut_rad, width_rad), width_rad)
@@ -168,7 +155,7 @@ class QuadricFits:
             Values at the neighbours minus the value at the direction; if they are unknown, all edges are open.
         """
         is_open = np.zeros(len(directions), dtype=np.bool_)
-        for place in np.flatnonzero(self.n_axes[directions] < self.n_axes_of_grid):
+        for place in np.flatnonzero(self.quadrics.n_axes[directions] < self.n_axes_of_grid):
             row = directions[place]
             offsets = self.grid.data[neighbours[place]] - self.grid.data[self.wanted[row]]
             values = None if rises is None else rises[place]

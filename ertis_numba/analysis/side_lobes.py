@@ -226,10 +226,11 @@ class EdgeFloor:
         pulse = self._spread(np.zeros((near, 3)), offset_m[:near])
         width = int(np.argmax(pulse < _SKIRT)) or near
         envelope = np.maximum.accumulate(pulse[::-1])[::-1]
-        for place in range(near):
-            last = max(0, min(width, place - width))  # Between this bin and the edge, there is at most a skirt.
-            skirt = highest[: last + 1].max() / (_MARGIN * max(float(envelope[place - last]), _SKIRT))
-            floor[place] = np.inf if pulse[place] > _OPEN else max(float(floor[place]), float(skirt))
+        places = np.arange(near)
+        last = (places - width).clip(0, width)  # Between these bins and the edge, there is at most a skirt.
+        share = _MARGIN * np.maximum(envelope[places - last], _SKIRT)
+        skirt = np.maximum.accumulate(highest[:near])[last] / share.astype(np.float32)
+        floor[:near] = np.where(pulse > _OPEN, np.inf, np.maximum(floor[:near], skirt))
 
 
 def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) -> NDArray[np.float32]:

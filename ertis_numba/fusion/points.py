@@ -171,9 +171,7 @@ def joined(reflectors: Reflectors, image: Energyscape, grid: PolarGrid) -> Point
     amplitude = np.where(reflectors.confirmed, amplitude, np.minimum(amplitude, shown)).astype(np.float32)
     order = np.argsort(-amplitude, kind="stable")
     order = order[shown[order] > _FAINTEST * np.sqrt(reflectors.reflectivity[order])]
-    uncertainty_m = np.array(
-        [_along_and_across(*each) for each in zip(position_m, reflectors.covariance_m2, strict=True)]
-    ).reshape(-1, 2)
+    uncertainty_m = _along_and_across(position_m, reflectors.covariance_m2)
     return PointCloud(
         position_m[order].astype(np.float32),
         amplitude[order],
@@ -194,11 +192,11 @@ def _uncertainties(cloud: PointCloud) -> Floats:
     return np.asarray(np.where(np.isfinite(given_m), given_m, unknown_m))
 
 
-def _along_and_across(place_m: Floats, covariance: Floats) -> tuple[float, float]:
-    """Return standard deviations along the line from the platform, and across it in the horizontal plane."""
-    direction = place_m / max(_NEAREST_M, float(np.linalg.norm(place_m)))
-    across = tangents(direction)[0]
-    return math.sqrt(direction @ covariance @ direction), math.sqrt(across @ covariance @ across)
+def _along_and_across(position_m: Floats, covariance_m2: Floats) -> Floats:
+    """Return standard deviations along lines from the platform, and across in the horizontal plane: (reflector, 2)."""
+    along = position_m / np.maximum(np.linalg.norm(position_m, axis=1), _NEAREST_M)[:, None]
+    axes = np.stack([along, tangents(along)[0]], axis=1)
+    return np.asarray(np.sqrt(np.einsum("rai,rij,raj->ra", axes, covariance_m2, axes)))
 
 
 def _around(amplitude: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -7,24 +7,39 @@
 from ertis_numba.kernels._compile_notice import on_compiling
 from ertis_numba.kernels._contract.fusion import FusionKernels, HeardEchoes, PredictedPlaces
 from ertis_numba.kernels._contract.mapping import MappingKernels
+from ertis_numba.kernels._contract.points import ABSENT, Beams, PointKernels, Pulse, Quadrics
 from ertis_numba.kernels._contract.steering import SteeringKernels
 from ertis_numba.kernels._device_protocols import Lane, Memory
-from ertis_numba.kernels._dispatch import DEVICES, load, load_fusion, load_mapping, load_steering, usable
+from ertis_numba.kernels._dispatch import (
+    DEVICES,
+    load,
+    load_fusion,
+    load_mapping,
+    load_points,
+    load_steering,
+    usable,
+)
 from ertis_numba.kernels._kernel_set import KernelSet
 
 __all__ = [
+    "ABSENT",
     "DEVICES",
+    "Beams",
     "FusionKernels",
     "HeardEchoes",
     "KernelSet",
     "Lane",
     "MappingKernels",
     "Memory",
+    "PointKernels",
     "PredictedPlaces",
+    "Pulse",
+    "Quadrics",
     "SteeringKernels",
     "load",
     "load_fusion",
     "load_mapping",
+    "load_points",
     "load_steering",
     "on_compiling",
     "usable",

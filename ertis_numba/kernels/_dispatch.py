@@ -11,10 +11,11 @@ from ertis_numba.errors import DeviceError
 from ertis_numba.kernels import _numba_setup
 from ertis_numba.kernels._contract.fusion import FusionKernels
 from ertis_numba.kernels._contract.mapping import MappingKernels
+from ertis_numba.kernels._contract.points import PointKernels
 from ertis_numba.kernels._contract.steering import SteeringKernels
 from ertis_numba.kernels._kernel_set import KernelSet
 
-__all__ = ["DEVICES", "load", "load_fusion", "load_mapping", "load_steering", "usable"]
+__all__ = ["DEVICES", "load", "load_fusion", "load_mapping", "load_points", "load_steering", "usable"]
 
 _LOG = logging.getLogger("ertis_numba")
 
@@ -107,6 +108,24 @@ def load_mapping() -> MappingKernels:
     'find_walls'
     """
     kernels: MappingKernels = _compiled("mapping")
+    return kernels
+
+
+@functools.cache
+def load_points() -> PointKernels:
+    """Return the kernels of points: compiled ones, or those of NumPy if none can be compiled on this machine.
+
+    Returns
+    -------
+    PointKernels
+
+    Examples
+    --------
+    >>> from ertis_numba import kernels
+    >>> kernels.load_points().find_tops.__name__
+    'find_tops'
+    """
+    kernels: PointKernels = _compiled("points")
     return kernels
 
 

@@ -36,10 +36,6 @@ class Deviation(NamedTuple):
     mean: NDArray[np.complex64]
     slope_s: NDArray[np.complex64]
 
-    def of(self, directions: NDArray[np.int64]) -> "Deviation":
-        """Return the deviation of some directions' beams."""
-        return Deviation(self.centre_hz, self.mean[directions], self.slope_s[directions])
-
 
 def deviation_of(settings: Settings, directions: NDArray[np.float64]) -> Deviation | None:
     """Return the deviation of a complete plan of the fast method; None if the deviation is zero or unknown.
