@@ -18,6 +18,7 @@ N_PIXELS = N_DIRECTIONS * N_STEPS
 CELLS = 1, 20, 25
 N_CELLS = 500
 DOUBLE = "compare_echoes", "locate_reflector", "match_echoes"
+COUNTING = "find_arrivals", "match_echoes"  # Their first output holds indices.
 NAMES = [field.name for field in dataclasses.fields(FusionKernels)]
 
 
@@ -55,6 +56,23 @@ def matches(draws, n_places=6, n_echoes=40, n_sensors=3):
     variances = np.full((2, n_echoes), [[2e-5], [8e-6]])
     power = draws.choice([0.2, 1.0, 5.0], n_echoes)
     return places, kernels.HeardEchoes(receiver, direction, path_m, *variances, power), np.arange(3, n_echoes)
+
+
+def arrivals(draws, n_sources=15, n_echoes=60, n_sensors=3):
+    """Sources around sensors, and echoes of them with small errors: some are from behind, or of unknown paths."""
+    sensor_m, ahead = draws.normal(scale=0.1, size=(n_sensors, 3)), draws.normal(size=(n_sensors, 3))
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    origin_m, sent_m = draws.normal(size=(n_sources, n_sensors, 3)), draws.uniform(0.0, 2.0, (n_sources, n_sensors))
+    origin_m[3, 1] = np.nan
+    receiver, source = draws.integers(0, n_sensors, n_echoes), draws.integers(0, n_sources, n_echoes)
+    to_m = origin_m[source, :] - sensor_m[receiver, None]
+    path_m = np.linalg.norm(to_m, axis=2) + sent_m[source] + draws.normal(scale=0.01, size=(n_echoes, n_sensors))
+    direction = to_m[:, 0] / np.linalg.norm(to_m[:, 0], axis=1)[:, None]
+    depth = np.einsum("ei,ei->e", direction, ahead[receiver])
+    direction -= 2 * np.minimum(depth, 0.0)[:, None] * ahead[receiver]
+    direction += draws.normal(scale=0.03, size=direction.shape)
+    is_flat = np.array([True, False, True])
+    return origin_m, sent_m, sensor_m, ahead, is_flat, receiver, direction, path_m, 0.02, 0.1
 
 
 @functools.cache
@@ -119,6 +137,7 @@ def arguments(seed=3):
         "limit_cells": ((*seen, half), [(N_CELLS,)]),
         "confirm_cells": ((*seen, real(N_CELLS), half, 1), [(3, N_CELLS)]),
         "compare_echoes": ((*seen, real(N_CELLS), half, half), [(2,)]),
+        "find_arrivals": (arrivals(draws), [(3, 20)]),
         "match_echoes": ((*matches(draws), 16.0, 4.0), [(3, 60), (60,)]),
         "locate_reflector": ((*echoes(draws), 0.01, 0.05, 2.0, 8), [(3,), (3, 3)]),
     }
@@ -128,7 +147,7 @@ def outputs(kernel_set, name, change=lambda values: values, dtype=np.float32):
     """Results of a kernel, with changed arguments of type float32."""
     given, shapes = arguments()[name]
     found = [np.ones(shape, np.float64 if name in DOUBLE else dtype) for shape in shapes]
-    if name == "match_echoes":
+    if name in COUNTING:
         found[0] = found[0].astype(np.int64)
     getattr(kernel_set, name)(*map(change, given), *found)
     return found
@@ -160,6 +179,24 @@ def test_match_echoes_counts_matches_beyond_its_space(load):
     assert echo.min() >= 3
     assert np.isfinite(given[1].path_m[echo, emitter]).all()
     assert distance[:n_all].max() < 16.0
+
+
+@pytest.mark.parametrize("load", [kernels.load_fusion, lambda: _numpy_fusion.KERNELS], ids=["compiled", "numpy"])
+def test_find_arrivals_counts_matches_beyond_its_space(load):
+    given, _ = arguments()["find_arrivals"]
+    found, few = np.zeros((3, 500), np.int64), np.zeros((3, 5), np.int64)
+    n_all = load().find_arrivals(*given, found)
+    assert load().find_arrivals(*given, few) == n_all > 20
+    np.testing.assert_array_equal(few, found[:, :5])
+    source, emitter, echo = found[:, :n_all]
+    assert not ((source == 3) & (emitter == 1)).any()
+    origin_m, sent_m, sensor_m, ahead, is_flat, receiver, _, path_m, within_m, _ = given
+    to_m = origin_m[source, emitter] - sensor_m[receiver[echo]]
+    late_m = path_m[echo, emitter] - sent_m[source, emitter] - np.linalg.norm(to_m, axis=1)
+    assert np.abs(late_m).max() < within_m
+    is_behind = np.einsum("mi,mi->m", to_m, ahead[receiver[echo]]) < 0
+    assert is_flat[receiver[echo[is_behind]]].all()
+    assert is_behind.any()
 
 
 @pytest.mark.parametrize("name", ["share_echoes", "add_echoes"])

@@ -222,7 +222,6 @@ def _confirming(heard: EchoPaths, origin_m: Floats, sent_m: Floats, counts: Flag
     counts : (reflector, receiver, emitter) bool
     """
     found = np.zeros((len(origin_m), *heard.path_m.shape), np.bool_)
-    for receiver in heard.rows:
-        reflector, emitter, echo = heard.arriving(receiver, origin_m, sent_m, _PATH_M, _ANGLE_RAD)
-        found[reflector, echo, emitter] = counts[reflector, receiver, emitter]
+    reflector, emitter, echo = heard.arriving(origin_m, sent_m, _PATH_M, _ANGLE_RAD)
+    found[reflector, echo, emitter] = counts[reflector, heard.receiver[echo], emitter]
     return found

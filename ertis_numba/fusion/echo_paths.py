@@ -6,13 +6,15 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
+
 __all__ = ["NEAREST_M", "EchoPaths"]
 
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
-NEAREST_M: Final = 1e-9
-_LEAST_COSINE: Final = 0.25  # Directions are less certain beside a flat array, by up to this factor.
+NEAREST_M: Final = kernels.NEAREST_M
+_FEW: Final = 1024  # Matches that there is space for at first.
 
 
 class EchoPaths(NamedTuple):
@@ -40,14 +42,19 @@ class EchoPaths(NamedTuple):
     path_m: Floats
     power: Floats
 
-    def arriving(
-        self, receiver: int, origin_m: Floats, sent_m: Floats, within_m: float, within_rad: float
-    ) -> tuple[Numbers, Numbers, Numbers]:
-        """Return source, emitter and number of the echoes of a receiver that fit sound from predicted places.
+    @property
+    def receiver(self) -> Numbers:
+        """Receiver of each echo: (echo,) int64."""
+        found = np.zeros(len(self.path_m), np.int64)
+        for number, rows in self.rows.items():
+            found[rows] = number
+        return found
+
+    def arriving(self, origin_m: Floats, sent_m: Floats, within_m: float, within_rad: float) -> Numbers:
+        """Return source, emitter and number of the echoes that fit sound from predicted places: (3, match) int64.
 
         Parameters
         ----------
-        receiver : int
         origin_m : (source, emitter, axis) float64
             Place from which the call of each emitter arrives.
         sent_m : (source, emitter) float64
@@ -55,16 +62,12 @@ class EchoPaths(NamedTuple):
         within_m, within_rad : float
             Largest differences of paths, and of directions ahead of the receiver.
         """
-        rows = self.rows[receiver]
-        to_m = origin_m - self.sensor_m[receiver]
-        apart_m = np.maximum(np.linalg.norm(to_m, axis=2), NEAREST_M)
-        late_m = self.path_m[rows].T - (apart_m + sent_m)[..., None]
-        source, emitter, echo = np.nonzero(np.abs(late_m) < within_m)  # False for NaN.
-        toward = to_m[source, emitter] / apart_m[source, emitter, None]
-        depth = toward @ self.ahead[receiver]
-        seen = toward - 2 * np.minimum(depth, 0.0)[:, None] * self.ahead[receiver]  # See `SeenPlaces.seen`.
-        turn = np.linalg.norm(seen - self.direction[rows[echo]], axis=1)  # For small angles, the chord is the angle.
-        is_near = turn < within_rad / np.maximum(np.abs(depth), _LEAST_COSINE)
-        if receiver not in self.flat:
-            is_near &= depth > 0
-        return source[is_near], emitter[is_near], rows[echo[is_near]]
+        is_flat = np.isin(np.arange(len(self.sensor_m)), [*self.flat])
+        echoes = is_flat, self.receiver, self.direction, self.path_m
+        find_arrivals, count = kernels.load_fusion().find_arrivals, _FEW
+        while True:
+            found = np.empty((3, count), np.int64)
+            n_found = find_arrivals(origin_m, sent_m, self.sensor_m, self.ahead, *echoes, within_m, within_rad, found)
+            if n_found <= count:
+                return found[:, :n_found]
+            count = n_found

@@ -54,9 +54,8 @@ def over_hidden_walls(
             )
         )
         explained = np.zeros((len(origin_m), len(heard.path_m)), np.bool_)
-        for receiver in heard.rows:
-            source, _, row = heard.arriving(receiver, origin_m, sent_m, _PATH_M, _ANGLE_RAD)
-            explained[source, row] = True
+        source, _, row = heard.arriving(origin_m, sent_m, _PATH_M, _ANGLE_RAD)
+        explained[source, row] = True
         found[number] = explained[:, np.unique(echo)].all(axis=1).any()
     return found
 

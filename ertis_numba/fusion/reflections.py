@@ -71,9 +71,9 @@ class _Sources(NamedTuple):
     sent_m: Floats
     strength: Floats
 
-    def highest(self, source: Numbers, emitter: Numbers, sensor_m: Floats) -> Floats:
-        """Return the highest power of sound that a sensor hears from sources."""
-        apart_m = np.linalg.norm(self.origin_m[source, emitter] - sensor_m, axis=1)
+    def highest(self, source: Numbers, emitter: Numbers, receiver_m: Floats) -> Floats:
+        """Return the highest power of sound that receivers at (match, axis) hear from sources."""
+        apart_m = np.linalg.norm(self.origin_m[source, emitter] - receiver_m, axis=1)
         sent_m = self.sent_m[source, emitter]
         return np.asarray(self.strength[source] / (np.where(sent_m > 0, sent_m, 1.0) * apart_m) ** 2)
 
@@ -146,10 +146,7 @@ def _sources(heard: EchoPaths, place_m: Floats, walls: Walls, reflectivity: Floa
 
 def _explaining(heard: EchoPaths, sources: _Sources) -> tuple[Numbers, Numbers]:
     """Return the sources that may explain echoes, and these echoes."""
-    found = [(np.empty(0, np.int64), np.empty(0, np.int64))]
-    for receiver in heard.rows:
-        source, emitter, echo = heard.arriving(receiver, sources.origin_m, sources.sent_m, _PATH_M, _ANGLE_RAD)
-        is_weak = heard.power[echo] < _ALIKE * sources.highest(source, emitter, heard.sensor_m[receiver])
-        found.append((source[is_weak], echo[is_weak]))
-    source, echo = (np.concatenate(each) for each in zip(*found, strict=True))
-    return source, echo
+    source, emitter, echo = heard.arriving(sources.origin_m, sources.sent_m, _PATH_M, _ANGLE_RAD)
+    receiver_m = heard.sensor_m[heard.receiver[echo]]
+    is_weak = heard.power[echo] < _ALIKE * sources.highest(source, emitter, receiver_m)
+    return source[is_weak], echo[is_weak]

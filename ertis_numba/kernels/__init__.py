@@ -5,7 +5,7 @@
 """
 
 from ertis_numba.kernels._compile_notice import on_compiling
-from ertis_numba.kernels._contract.fusion import FusionKernels, HeardEchoes, PredictedPlaces
+from ertis_numba.kernels._contract.fusion import NEAREST_M, FusionKernels, HeardEchoes, PredictedPlaces
 from ertis_numba.kernels._contract.mapping import MappingKernels
 from ertis_numba.kernels._contract.points import ABSENT, Beams, PointKernels, Pulse, Quadrics
 from ertis_numba.kernels._contract.steering import SteeringKernels
@@ -24,6 +24,7 @@ from ertis_numba.kernels._kernel_set import KernelSet
 __all__ = [
     "ABSENT",
     "DEVICES",
+    "NEAREST_M",
     "Beams",
     "FusionKernels",
     "HeardEchoes",

@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.kernels._contract.arrays import Real, Turns
-from ertis_numba.kernels._contract.fusion import Doubles, FusionKernels, HeardEchoes, Places, PredictedPlaces, Truths
+from ertis_numba.kernels._contract.fusion import (
+    LEAST_COSINE,
+    NEAREST_M,
+    Doubles,
+    FusionKernels,
+    HeardEchoes,
+    Places,
+    PredictedPlaces,
+    Truths,
+)
 
 __all__ = ["KERNELS"]
 
@@ -217,6 +226,36 @@ def match_echoes(
     return len(entry)
 
 
+def find_arrivals(
+    origin_m: Doubles,
+    sent_m: Doubles,
+    sensor_m: Doubles,
+    ahead: Doubles,
+    is_flat: Truths,
+    receiver: Places,
+    direction: Doubles,
+    path_m: Doubles,
+    within_m: float,
+    within_rad: float,
+    found: Places,
+) -> int:
+    """Find the echoes that fit sound from given places, by path and direction."""
+    to_m = origin_m[:, :, None] - sensor_m
+    apart_m = np.maximum(np.linalg.norm(to_m, axis=3), NEAREST_M)
+    late_m = path_m.T - (apart_m[:, :, receiver] + sent_m[:, :, None])
+    source, emitter, echo = np.nonzero(np.abs(late_m) < within_m)  # False for NaN.
+    here = receiver[echo]
+    toward = to_m[source, emitter, here] / apart_m[source, emitter, here, None]
+    depth = np.einsum("mi,mi->m", toward, ahead[here])
+    seen = toward - 2 * np.minimum(depth, 0.0)[:, None] * ahead[here]
+    turn = np.linalg.norm(seen - direction[echo], axis=1)  # For small angles, the chord is the angle.
+    is_near = (turn < within_rad / np.maximum(np.abs(depth), LEAST_COSINE)) & (is_flat[here] | (depth > 0))
+    matches = np.stack([source, emitter, echo])[:, is_near]
+    n_kept = min(matches.shape[1], found.shape[1])
+    found[:, :n_kept] = matches[:, :n_kept]
+    return matches.shape[1]
+
+
 def _highest(values: NDArray[Any], near: Turns, out: NDArray[Any]) -> None:
     out[:] = values[near[:, 0]]
     for column in near.T[1:]:
@@ -241,4 +280,5 @@ KERNELS = FusionKernels(
     compare_echoes=compare_echoes,
     locate_reflector=locate_reflector,
     match_echoes=match_echoes,
+    find_arrivals=find_arrivals,
 )

@@ -6,14 +6,19 @@ twice. Other indices may repeat.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.kernels._contract.arrays import Real, Turns
 
-__all__ = ["FusionKernels", "HeardEchoes", "PredictedPlaces"]
+__all__ = ["LEAST_COSINE", "NEAREST_M", "FusionKernels", "HeardEchoes", "PredictedPlaces"]
+
+NEAREST_M: Final = 1e-9
+"""Least distance of a place from a sensor."""
+LEAST_COSINE: Final = 0.25
+"""Directions are less certain beside a flat array, by up to the reciprocal of this factor."""
 
 Truths = NDArray[np.bool_]
 Doubles = NDArray[np.float64]
@@ -415,6 +420,50 @@ class MatchEchoes(Protocol):
     ) -> int: ...
 
 
+class FindArrivals(Protocol):
+    """Find the echoes that fit sound from given places, by path and direction.
+
+    Parameters
+    ----------
+    origin_m : (source, emitter, axis) float64
+        Place from which the call of each emitter arrives; NaN for none.
+    sent_m : (source, emitter) float64
+        Path of the call to this place.
+    sensor_m, ahead : (sensor, axis) float64
+        Positions and axes of the sensors.
+    is_flat : (sensor,) bool
+        Receivers that hear echoes from behind.
+    receiver : (echo,) int64
+    direction : (echo, axis) float64
+    path_m : (echo, emitter) float64
+        Length of the path if the emitter's call caused the echo; NaN if it did not.
+    within_m, within_rad : float
+        Largest differences of paths, and of directions ahead of the receiver.
+    found : (3, count) int64
+        Output: source, emitter and echo of the first matches, in ascending order.
+
+    Returns
+    -------
+    int
+        Number of all matches, which may exceed the space for them.
+    """
+
+    def __call__(
+        self,
+        origin_m: Doubles,
+        sent_m: Doubles,
+        sensor_m: Doubles,
+        ahead: Doubles,
+        is_flat: Truths,
+        receiver: Places,
+        direction: Doubles,
+        path_m: Doubles,
+        within_m: float,
+        within_rad: float,
+        found: Places,
+    ) -> int: ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FusionKernels:
     """Kernels of fusion of one device, all for one thread."""
@@ -430,3 +479,4 @@ class FusionKernels:
     compare_echoes: CompareEchoes
     locate_reflector: LocateReflector
     match_echoes: MatchEchoes
+    find_arrivals: FindArrivals

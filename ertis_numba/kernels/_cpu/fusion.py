@@ -9,7 +9,7 @@ no code for negative ones.
 import numpy as np
 from numba import njit
 
-from ertis_numba.kernels._contract.fusion import FusionKernels
+from ertis_numba.kernels._contract.fusion import LEAST_COSINE, NEAREST_M, FusionKernels
 
 __all__ = ["KERNELS"]
 
@@ -263,6 +263,36 @@ def match_echoes(places, echoes, chosen, gate, alike, found, out):
     return count
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def find_arrivals(origin_m, sent_m, sensor_m, ahead, is_flat, receiver, direction, path_m, within_m, within_rad, found):
+    """Find the echoes that fit sound from given places, by path and direction."""
+    count, n_emitters = 0, path_m.shape[1]
+    to_m, seen = np.empty((len(sensor_m), 3)), np.empty(3)
+    apart_m = np.empty(len(sensor_m))
+    for source in range(len(origin_m)):
+        for emitter in range(n_emitters):
+            for here in range(len(sensor_m)):
+                for axis in range(3):
+                    to_m[here, axis] = origin_m[source, emitter, axis] - sensor_m[here, axis]
+                apart_m[here] = max(_length(to_m[here]), NEAREST_M)
+            for echo in range(len(path_m)):
+                here = receiver[echo]
+                depth = _product(to_m[here], ahead[here]) / apart_m[here]
+                is_audible = depth > 0.0 or is_flat[here]
+                late_m = path_m[echo, emitter] - (apart_m[here] + sent_m[source, emitter])
+                if not (is_audible and abs(late_m) < within_m):  # False for NaN.
+                    continue
+                for axis in range(3):
+                    seen[axis] = to_m[here, axis] / apart_m[here] - 2.0 * min(depth, 0.0) * ahead[here, axis]
+                    seen[axis] -= direction[echo, axis]
+                # For small angles, the chord is the angle.
+                if _length(seen) < within_rad / max(abs(depth), LEAST_COSINE):
+                    if count < found.shape[1]:
+                        found[0, count], found[1, count], found[2, count] = source, emitter, echo
+                    count += 1
+    return count
+
+
 KERNELS = FusionKernels(
     coarsen_image=coarsen_image,
     spread_cells=spread_cells,
@@ -275,4 +305,5 @@ KERNELS = FusionKernels(
     compare_echoes=compare_echoes,
     locate_reflector=locate_reflector,
     match_echoes=match_echoes,
+    find_arrivals=find_arrivals,
 )
