@@ -211,7 +211,7 @@ def angles_of(directions, *, shown):
     """Numbers of axes of the fits of directions, (azimuth, elevation) in degrees."""
     vectors = unit_vectors(*np.radians(directions).T)
     fits = QuadricFits.of(vectors, neighbours_of(vectors), np.arange(len(vectors)))
-    return fits.n_axes[shown].tolist()
+    return fits.quadrics.n_axes[shown].tolist()
 
 
 def test_fits_have_the_axes_that_neighbours_determine():

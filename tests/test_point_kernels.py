@@ -38,7 +38,7 @@ def grids(draws, beams_have_errors):
     quadrics = kernels.Quadrics(
         np.stack([axes, axes]), np.stack([inverse, inverse]), np.array([2, 1]), np.array([0.1, 0.05])
     )
-    return quadrics, kernels.Beams(directions, gain, slope_s)
+    return quadrics, kernels.BeamErrors(directions, gain, slope_s)
 
 
 def found_by(name, kernel, *given, shape):

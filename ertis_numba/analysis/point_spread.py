@@ -104,7 +104,7 @@ class PointSpread:
         """Return the sound speed of the settings relative to that in some air."""
         return 1.0 if air is None else self._speed_m_s / sound_speed_m_s(air)
 
-    def beams(self, directions: NDArray[np.float64], deviation: Deviation | None) -> kernels.Beams:
+    def beams(self, directions: NDArray[np.float64], deviation: Deviation | None) -> kernels.BeamErrors:
         """Return directions with the errors of their beams.
 
         Parameters
@@ -114,9 +114,9 @@ class PointSpread:
         """
         if deviation is None:
             none = np.empty((0, len(self._weights)), np.complex64)
-            return kernels.Beams(directions, none, none)
+            return kernels.BeamErrors(directions, none, none)
         centre_hz = self._carrier_1_m * self._speed_m_s / (2 * math.pi) - deviation.centre_hz
-        return kernels.Beams(directions, 1 + deviation.mean + deviation.slope_s * centre_hz, deviation.slope_s)
+        return kernels.BeamErrors(directions, 1 + deviation.mean + deviation.slope_s * centre_hz, deviation.slope_s)
 
     @functools.cached_property
     def tilted_pulse(self) -> kernels.Pulse:

@@ -7,7 +7,7 @@
 from ertis_numba.kernels._compile_notice import on_compiling
 from ertis_numba.kernels._contract.fusion import NEAREST_M, FusionKernels, HeardEchoes, PredictedPlaces
 from ertis_numba.kernels._contract.mapping import MappingKernels
-from ertis_numba.kernels._contract.points import ABSENT, Beams, PointKernels, Pulse, Quadrics
+from ertis_numba.kernels._contract.points import ABSENT, BeamErrors, PointKernels, Pulse, Quadrics
 from ertis_numba.kernels._contract.steering import SteeringKernels
 from ertis_numba.kernels._device_protocols import Lane, Memory
 from ertis_numba.kernels._dispatch import (
@@ -25,7 +25,7 @@ __all__ = [
     "ABSENT",
     "DEVICES",
     "NEAREST_M",
-    "Beams",
+    "BeamErrors",
     "FusionKernels",
     "HeardEchoes",
     "KernelSet",

@@ -250,10 +250,10 @@ def find_arrivals(
     seen = toward - 2 * np.minimum(depth, 0.0)[:, None] * ahead[here]
     turn = np.linalg.norm(seen - direction[echo], axis=1)  # For small angles, the chord is the angle.
     is_near = (turn < within_rad / np.maximum(np.abs(depth), LEAST_COSINE)) & (is_flat[here] | (depth > 0))
-    matches = np.stack([source, emitter, echo])[:, is_near]
-    n_kept = min(matches.shape[1], found.shape[1])
-    found[:, :n_kept] = matches[:, :n_kept]
-    return matches.shape[1]
+    matches = np.flatnonzero(is_near)
+    kept = matches[: found.shape[1]]
+    found[:, : len(kept)] = source[kept], emitter[kept], echo[kept]
+    return len(matches)
 
 
 def _highest(values: NDArray[Any], near: Turns, out: NDArray[Any]) -> None:

@@ -10,7 +10,7 @@ from ertis_numba.kernels._contract.points import (
     CONVERGED,
     DARK,
     MAX_SHIFT,
-    Beams,
+    BeamErrors,
     Complexes,
     Doubles,
     Places,
@@ -45,7 +45,7 @@ def find_tops(quadrics: Quadrics, fit: Places, rises: Doubles, out: Doubles) -> 
 def interpolate_tops(
     pulse: Pulse,
     quadrics: Quadrics,
-    beams: Beams,
+    beams: BeamErrors,
     row: Places,
     fit: Places,
     logs: Doubles,
@@ -86,7 +86,7 @@ def _interpolated(quadrics: Quadrics, fit: Places, logs: Doubles) -> Doubles:
     return np.column_stack([shift, found[:, :3], level + 0.25 * (after - before) * shift + found[:, 3]])
 
 
-def _predicted(pulse: Pulse, beams: Beams, row: Places, away_m: Doubles, scale: float, found: Doubles) -> Doubles:
+def _predicted(pulse: Pulse, beams: BeamErrors, row: Places, away_m: Doubles, scale: float, found: Doubles) -> Doubles:
     """Return predicted logarithms of the samples of reflectors: (place, sample) float64."""
     top = beams.directions[row[:, 0]] + found[:, 1:4]
     away = beams.directions[row] - (top / np.linalg.norm(top, axis=1)[:, None])[:, None]

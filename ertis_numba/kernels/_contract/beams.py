@@ -168,7 +168,7 @@ class DelayAndSumEnvelopeInt16(Protocol):
 class InterpolatedBeamsEnvelopeInt16(Protocol):
     """`InterpolatedBeamsEnvelope` on the tiles of `QuantiseTiles`, with integer sums.
 
-    Beams on the beam grid keep the upper 16 bits of their sums, rounded: ``(sum + 2¹⁵) >> 16``.
+    BeamErrors on the beam grid keep the upper 16 bits of their sums, rounded: ``(sum + 2¹⁵) >> 16``.
 
     Parameters
     ----------

@@ -13,7 +13,7 @@ __all__ = [
     "CONVERGED",
     "DARK",
     "MAX_SHIFT",
-    "Beams",
+    "BeamErrors",
     "Complexes",
     "Doubles",
     "Places",
@@ -87,7 +87,7 @@ class Quadrics(NamedTuple):
     reach: Doubles
 
 
-class Beams(NamedTuple):
+class BeamErrors(NamedTuple):
     """Directions of a grid, and the errors of their beams.
 
     Attributes
@@ -150,7 +150,7 @@ class InterpolateTops(Protocol):
     ----------
     pulse : Pulse
     quadrics : Quadrics
-    beams : Beams
+    beams : BeamErrors
     row : (place, sample) int64
         Directions of the samples: the first three are those of the maximum, at the range before, its own, and the
         range after; then its neighbours at its range.
@@ -174,7 +174,7 @@ class InterpolateTops(Protocol):
         self,
         pulse: Pulse,
         quadrics: Quadrics,
-        beams: Beams,
+        beams: BeamErrors,
         row: Places,
         fit: Places,
         logs: Doubles,

@@ -42,7 +42,7 @@ class Dot16:
     ----------
     builder : llvmlite.ir.IRBuilder
     n_beams : int
-        Beams that are summed at a time.
+        BeamErrors that are summed at a time.
     """
 
     def __init__(self, builder, n_beams=1):
