@@ -422,9 +422,8 @@ def test_fuser_follows_a_change_of_emitters():
 def test_emitters_of_one_platform_may_differ():
     """The front sensor does not hear the call of a piston that faces away, but that of an omnidirectional emitter."""
     emitters = Emitters(images()["front"].settings, [0.012, 0.012, 0.0, 0.012])
-    behind = np.full((1, 4), -1.0)
-    assert emitters.powers(behind)[0].round(3).tolist() == [0.001, 0.001, 1.0, 0.001]
-    assert [float(emitters.power(np.array(-1.0), number)) for number in range(4)] == emitters.powers(behind)[0].tolist()
+    power = [float(emitters.power(np.array(-1.0), number)) for number in range(4)]
+    assert np.round(power, 3).tolist() == [0.001, 0.001, 1.0, 0.001]
 
 
 def of_emitter(image, diameter_m):

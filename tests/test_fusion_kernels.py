@@ -17,7 +17,7 @@ N_DIRECTIONS, N_STEPS, N_RANGES, N_ENTRIES = 12, 31, 90, 200
 N_PIXELS = N_DIRECTIONS * N_STEPS
 CELLS = 1, 20, 25
 N_CELLS = 500
-DOUBLE = "compare_echoes", "locate_reflector", "match_echoes"
+DOUBLE = "compare_echoes", "locate_reflector", "match_echoes", "see_places"
 COUNTING = "find_arrivals", "match_echoes"  # Their first output holds indices.
 NAMES = [field.name for field in dataclasses.fields(FusionKernels)]
 
@@ -73,6 +73,17 @@ def arrivals(draws, n_sources=15, n_echoes=60, n_sensors=3):
     direction += draws.normal(scale=0.03, size=direction.shape)
     is_flat = np.array([True, False, True])
     return origin_m, sent_m, sensor_m, ahead, is_flat, receiver, direction, path_m, 0.02, 0.1
+
+
+def views(draws, n_places=9, n_sensors=3):
+    """Places around sensors, one of them at a sensor; sensors of two kinds of air, and one without an image."""
+    sensor_m, ahead = draws.normal(scale=0.1, size=(n_sensors, 3)), draws.normal(size=(n_sensors, 3))
+    place_m = np.concatenate([draws.normal(size=(n_places - 1, 3)), sensor_m[1:2]])
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    patterns = draws.uniform(0.0, 0.1, (2, n_sensors, 33)) * np.linspace(0.0, 1.0, 33)
+    lost = -np.linspace(0.0, 40.0, 129) * draws.uniform(0.5, 2.0, (2, 1))
+    is_flat, model = np.array([True, False, True]), np.array([1, -1, 0])
+    return place_m, kernels.ViewingSensors(sensor_m, ahead, is_flat, model, patterns, lost)
 
 
 @functools.cache
@@ -138,6 +149,7 @@ def arguments(seed=3):
         "confirm_cells": ((*seen, real(N_CELLS), half, 1), [(3, N_CELLS)]),
         "compare_echoes": ((*seen, real(N_CELLS), half, half), [(2,)]),
         "find_arrivals": (arrivals(draws), [(3, 20)]),
+        "see_places": (views(draws), [(9, 3), (9, 3, 3), (9, 3), (9, 3, 3), (9, 3), (9, 3, 3), (9, 3)]),
         "match_echoes": ((*matches(draws), 16.0, 4.0), [(3, 60), (60,)]),
         "locate_reflector": ((*echoes(draws), 0.01, 0.05, 2.0, 8), [(3,), (3, 3)]),
     }
@@ -149,7 +161,8 @@ def outputs(kernel_set, name, change=lambda values: values, dtype=np.float32):
     found = [np.ones(shape, np.float64 if name in DOUBLE else dtype) for shape in shapes]
     if name in COUNTING:
         found[0] = found[0].astype(np.int64)
-    getattr(kernel_set, name)(*map(change, given), *found)
+    out = found if name != "see_places" else [kernels.SeenPlaces(*found)]
+    getattr(kernel_set, name)(*map(change, given), *out)
     return found
 
 

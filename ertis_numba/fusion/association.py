@@ -14,7 +14,7 @@ from ertis_numba.fusion.overlaps import Overlap, PredictedEchoes, overlap
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
-from ertis_numba.fusion.sight import SeenPlaces, Viewers, mirrored
+from ertis_numba.fusion.sight import Viewers, mirrored
 
 __all__ = ["LocatedReflector", "Reflectors", "SensorEchoes", "tangents"]
 
@@ -260,7 +260,7 @@ class Reflectors:
         return np.where(cell >= 0, _EXCESS * self._bound[cell.clip(0)].astype(np.float64), 0.0)
 
     def _fits(
-        self, candidates: _Candidates, sight: SeenPlaces, extra_m: float
+        self, candidates: _Candidates, sight: kernels.SeenPlaces, extra_m: float
     ) -> tuple[Numbers, Numbers, Numbers, Floats]:
         """Return the free echoes that candidates predict: candidate, echo, emitter and squared distance."""
         across = candidates.across
@@ -330,7 +330,7 @@ class Reflectors:
         excess_db = 10 * np.log10(np.maximum(candidates.reflectivity / max(usual, _TINY), 1.0))
         return np.asarray(np.maximum(0.0, excess_db - _USUAL_DB) / _SURPRISE_DB)
 
-    def _accepted(self, here: _Candidates, sight: SeenPlaces) -> tuple[LocatedReflector | None, Numbers]:
+    def _accepted(self, here: _Candidates, sight: kernels.SeenPlaces) -> tuple[LocatedReflector | None, Numbers]:
         """Return the reflector at a candidate if enough echoes confirm it, and all echoes that it explains."""
         extra_m, covariance_m2, echo = 0.0, np.empty((3, 3)), np.empty(0, np.int64)
         for _ in range(2):
@@ -349,7 +349,7 @@ class Reflectors:
         reflectivity = self._reflectivity(sight, members, emitter)
         return LocatedReflector(place_m, covariance_m2, reflectivity, members, emitter), np.unique(echo)
 
-    def _reflectivity(self, sight: SeenPlaces, members: Numbers, emitter: Numbers) -> float:
+    def _reflectivity(self, sight: kernels.SeenPlaces, members: Numbers, emitter: Numbers) -> float:
         """Return the power at 1 m of a reflector that fits its echoes best, by least squares.
 
         Calls of emitters at about the same distance arrive together, with unknown phases.

@@ -6,11 +6,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
 
-__all__ = ["AUDIBLE", "Hypothesis", "Pair", "hypothesis", "pair_of"]
+__all__ = ["Hypothesis", "Pair", "hypothesis", "pair_of"]
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -24,8 +25,6 @@ _CONFIRM_DB: Final = -13.0
 _CONFIRM_COSINE: Final = math.cos(math.radians(80.0))
 _APART_STEPS: Final = 6.0  # Difference of paths that separates two echoes, and a margin for errors of directions.
 _NEAREST_M: Final = 0.05
-AUDIBLE: Final = 10 ** (-25.0 / 10)
-"""Radiated power that causes audible echoes."""
 
 
 class Pair(NamedTuple):
@@ -206,7 +205,7 @@ def hypothesis(
     from_m = np.linalg.norm(sent_m, axis=-1)
     radiated = emitters.power(sent_m[..., 0] / np.maximum(from_m, _NEAREST_M), emitter)
     cell = np.where((beyond > 0) & (to_m > _NEAREST_M), grid.cell_of(place_m), -1)
-    is_audible = (cell >= 0) & (radiated > AUDIBLE)
+    is_audible = (cell >= 0) & (radiated > kernels.AUDIBLE)
     gain = np.where(is_audible, radiated * emitters.spreading(from_m, to_m), 0.0).astype(np.float32)
     begin, end = is_audible.argmax(axis=1), gain.shape[1] - is_audible[:, ::-1].argmax(axis=1)
     count = np.where(is_audible.any(axis=1), end - begin, 0)

@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ertis_numba import kernels
 from ertis_numba.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones, mounting
@@ -25,10 +26,10 @@ Mountings = Mapping[str, tuple[Sequence[float], Sequence[float]]]
 USUAL_DIAMETER_M: Final = 0.012
 """Diameter of an emitter whose settings and layout state none."""
 _N_FREQUENCIES = 12  # of the band, over which the power of an emitter is averaged
-_NEAREST_M = 0.05  # Distance below which spreading does not increase.
+_NEAREST_M = kernels.SPREADING_M
 _STRAY_DB = -20.0  # Power that an emitter radiates at least to its front, which no piston model predicts.
 _BEHIND_DB = -30.0
-_PATHS_M = np.linspace(0.0, 256.0, 1025)  # of sound, for which the absorption is tabulated
+_PATHS_M = np.linspace(0.0, kernels.LAST_PATH_M, 1025)  # of sound, for which the absorption is tabulated
 
 
 class MountedSensor(NamedTuple):
@@ -105,13 +106,20 @@ class Emitters:
         Settings with the call and the air.
     diameters_m : sequence of float
         Diameter of each piston; 0 radiates equally in all directions.
+
+    Attributes
+    ----------
+    patterns : (emitter, cosine) float64
+        Power that each emitter radiates, relative to that ahead, for cosines from -1 to 1.
+    lost : (path,) float64
+        Logarithm of the power of echoes relative to a path of 2 m, without spreading, for paths from 0 to 256 m.
     """
 
     def __init__(self, settings: Settings, diameters_m: Sequence[float]) -> None:
         call = settings.call
         frequency_hz = _frequencies_of(call)
         self._loss_1_m = math.log(10) / 20 * absorption_db_m(settings.air, frequency_hz)
-        self._lost = self._echo(np.ones(_N_FREQUENCIES), _PATHS_M[:, None])
+        self.lost = self._echo(np.ones(_N_FREQUENCIES), _PATHS_M[:, None])
         # The pattern is tabulated over the cosine, because a Bessel function of each cell takes long.
         self._cosine = np.linspace(-1.0, 1.0, 2049)
         sine = np.sqrt(1 - self._cosine**2)
@@ -125,7 +133,7 @@ class Emitters:
             if diameter_m:
                 power = np.where(self._cosine > 0, np.maximum(power, 10 ** (_STRAY_DB / 10)), 10 ** (_BEHIND_DB / 10))
             patterns[diameter_m] = power
-        self._powers = [patterns[diameter_m] for diameter_m in diameters_m]
+        self.patterns = np.array([patterns[diameter_m] for diameter_m in diameters_m])
         self._diameters_m = tuple(diameters_m)
 
     def power(self, cosine: Floats, emitter: int) -> Floats:
@@ -138,23 +146,12 @@ class Emitters:
         emitter : int
             Index of the emitter.
         """
-        return np.asarray(np.interp(cosine, self._cosine, self._powers[emitter]))
-
-    def powers(self, cosine: Floats) -> Floats:
-        """Return the powers that all emitters radiate, relative to those ahead: (..., emitter) float64.
-
-        Parameters
-        ----------
-        cosine : (..., emitter) float64
-        """
-        if all(each is self._powers[0] for each in self._powers):
-            return self.power(cosine, 0)
-        return np.stack([self.power(cosine[..., number], number) for number in range(len(self._powers))], axis=-1)
+        return np.asarray(np.interp(cosine, self._cosine, self.patterns[emitter]))
 
     def spreading(self, to_point_m: Floats, from_point_m: Floats) -> Floats:
         """Return the power of an echo relative to that at 1 m: spherical spreading of both paths, and absorption."""
         there, back = np.maximum(to_point_m, _NEAREST_M), np.maximum(from_point_m, _NEAREST_M)
-        return np.asarray(np.exp(np.interp(there + back, _PATHS_M, self._lost)) / (there * back) ** 2)
+        return np.asarray(np.exp(np.interp(there + back, _PATHS_M, self.lost)) / (there * back) ** 2)
 
     def echo_powers(self, cosine: Floats, to_point_m: Floats, from_point_m: Floats) -> Floats:
         """Return the power of echoes in images, relative to that at 1 m ahead: (echo, emitter) float64.
@@ -173,7 +170,7 @@ class Emitters:
         place = np.rint((cosine + 1) / 2 * (len(self._cosine) - 1)).astype(np.int64)
         radiated = np.stack([self._radiated[each][at] for each, at in zip(self._diameters_m, place, strict=True)])
         exact = np.exp(self._echo(radiated, (there + back)[..., None]))
-        least = np.exp(np.interp(there + back, _PATHS_M, self._lost)) * 10 ** (_STRAY_DB / 10)
+        least = np.exp(np.interp(there + back, _PATHS_M, self.lost)) * 10 ** (_STRAY_DB / 10)
         behind = (cosine <= 0) & (np.array(self._diameters_m) > 0)
         found = np.where(behind, least * 10 ** ((_BEHIND_DB - _STRAY_DB) / 10), np.maximum(exact, least))
         return np.asarray(found / (there * back) ** 2)

@@ -5,7 +5,17 @@
 """
 
 from ertis_numba.kernels._compile_notice import on_compiling
-from ertis_numba.kernels._contract.fusion import NEAREST_M, FusionKernels, HeardEchoes, PredictedPlaces
+from ertis_numba.kernels._contract.fusion import (
+    AUDIBLE,
+    LAST_PATH_M,
+    NEAREST_M,
+    SPREADING_M,
+    FusionKernels,
+    HeardEchoes,
+    PredictedPlaces,
+    SeenPlaces,
+    ViewingSensors,
+)
 from ertis_numba.kernels._contract.mapping import MappingKernels
 from ertis_numba.kernels._contract.points import ABSENT, BeamErrors, PointKernels, Pulse, Quadrics
 from ertis_numba.kernels._contract.steering import SteeringKernels
@@ -23,8 +33,11 @@ from ertis_numba.kernels._kernel_set import KernelSet
 
 __all__ = [
     "ABSENT",
+    "AUDIBLE",
     "DEVICES",
+    "LAST_PATH_M",
     "NEAREST_M",
+    "SPREADING_M",
     "BeamErrors",
     "FusionKernels",
     "HeardEchoes",
@@ -36,7 +49,9 @@ __all__ = [
     "PredictedPlaces",
     "Pulse",
     "Quadrics",
+    "SeenPlaces",
     "SteeringKernels",
+    "ViewingSensors",
     "load",
     "load_fusion",
     "load_mapping",

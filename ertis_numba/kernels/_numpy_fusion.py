@@ -10,14 +10,21 @@ from numpy.typing import NDArray
 
 from ertis_numba.kernels._contract.arrays import Real, Turns
 from ertis_numba.kernels._contract.fusion import (
+    AUDIBLE,
+    BESIDE_DB,
+    BESIDE_M,
+    LAST_PATH_M,
     LEAST_COSINE,
     NEAREST_M,
+    SPREADING_M,
     Doubles,
     FusionKernels,
     HeardEchoes,
     Places,
     PredictedPlaces,
+    SeenPlaces,
     Truths,
+    ViewingSensors,
 )
 
 __all__ = ["KERNELS"]
@@ -256,6 +263,31 @@ def find_arrivals(
     return len(matches)
 
 
+def see_places(place_m: Doubles, sensors: ViewingSensors, out: SeenPlaces) -> None:
+    """Compute how the sensors of a platform see places."""
+    away_m = place_m[:, None] - sensors.sensor_m
+    apart_m = np.maximum(np.linalg.norm(away_m, axis=2), SPREADING_M)
+    toward = away_m / apart_m[..., None]
+    depth = np.einsum("psi,si->ps", toward, sensors.ahead)
+    out.apart_m[:], out.toward[:], out.depth[:] = apart_m, toward, depth
+    out.seen[:] = toward - 2 * np.where(sensors.is_flat, np.minimum(depth, 0.0), 0.0)[..., None] * sensors.ahead
+    cosine = np.linspace(-1.0, 1.0, sensors.patterns.shape[2])
+    path_m = np.linspace(0.0, LAST_PATH_M, sensors.lost.shape[1])
+    powers = [
+        np.stack([np.interp(each, cosine, pattern) for each, pattern in zip(depth.T, several, strict=True)], axis=1)
+        for several in sensors.patterns
+    ]
+    out.gain[:] = 0.0
+    for receiver, model in enumerate(sensors.model):
+        if model >= 0:
+            back_m = apart_m[:, receiver, None]
+            spread = np.exp(np.interp(apart_m + back_m, path_m, sensors.lost[model])) / (apart_m * back_m) ** 2
+            out.gain[:, receiver] = np.where(powers[model] > AUDIBLE, powers[model], 0.0) * spread
+    out.radiated[:] = powers[0]
+    power_db = 10 * np.log10(np.maximum(powers[0], _TINY))
+    out.beside_m[:] = BESIDE_M * np.clip((power_db - BESIDE_DB[0]) / (BESIDE_DB[1] - BESIDE_DB[0]), 0.0, 1.0)
+
+
 def _highest(values: NDArray[Any], near: Turns, out: NDArray[Any]) -> None:
     out[:] = values[near[:, 0]]
     for column in near.T[1:]:
@@ -281,4 +313,5 @@ KERNELS = FusionKernels(
     locate_reflector=locate_reflector,
     match_echoes=match_echoes,
     find_arrivals=find_arrivals,
+    see_places=see_places,
 )

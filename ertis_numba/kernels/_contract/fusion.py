@@ -13,8 +13,31 @@ from numpy.typing import NDArray
 
 from ertis_numba.kernels._contract.arrays import Real, Turns
 
-__all__ = ["LEAST_COSINE", "NEAREST_M", "FusionKernels", "HeardEchoes", "PredictedPlaces"]
+__all__ = [
+    "AUDIBLE",
+    "BESIDE_DB",
+    "BESIDE_M",
+    "LAST_PATH_M",
+    "LEAST_COSINE",
+    "NEAREST_M",
+    "SPREADING_M",
+    "FusionKernels",
+    "HeardEchoes",
+    "PredictedPlaces",
+    "SeenPlaces",
+    "ViewingSensors",
+]
 
+AUDIBLE: Final = 10 ** (-25.0 / 10)
+"""Power that an emitter radiates in a direction, relative to ahead, above which its echoes are audible."""
+BESIDE_DB: Final = (-13.0, -16.0)
+"""Power of a call to the side from which its path is uncertain, and most uncertain."""
+BESIDE_M: Final = 6e-3
+"""Largest error of such a path."""
+LAST_PATH_M: Final = 256.0
+"""Last path of sound whose absorption is tabulated."""
+SPREADING_M: Final = 0.05
+"""Distance below which spreading does not increase."""
 NEAREST_M: Final = 1e-9
 """Least distance of a place from a sensor."""
 LEAST_COSINE: Final = 0.25
@@ -420,6 +443,79 @@ class MatchEchoes(Protocol):
     ) -> int: ...
 
 
+class ViewingSensors(NamedTuple):
+    """Sensors of a platform, and the sound that their emitters radiate.
+
+    Attributes
+    ----------
+    sensor_m, ahead : (sensor, axis) float64
+        Positions and axes.
+    is_flat : (sensor,) bool
+        Receivers that hear echoes from behind.
+    model : (receiver,) int64
+        Model of the emitters in the air of each receiver; -1 for receivers without an image.
+    patterns : (model, emitter, cosine) float64
+        Power that each emitter radiates, relative to that ahead, for evenly spaced cosines from -1 to 1.
+    lost : (model, path) float64
+        Logarithm of the power after evenly spaced paths from 0 to `LAST_PATH_M`, without spreading.
+    """
+
+    sensor_m: Doubles
+    ahead: Doubles
+    is_flat: Truths
+    model: Places
+    patterns: Doubles
+    lost: Doubles
+
+
+class SeenPlaces(NamedTuple):
+    """Places seen from all sensors.
+
+    Attributes
+    ----------
+    apart_m : (place, sensor) float64
+        Distances.
+    toward : (place, sensor, axis) float64
+        Unit vectors to the places.
+    depth : (place, sensor) float64
+        Cosines of the angles to the axes of the sensors.
+    seen : (place, sensor, axis) float64
+        Directions in which the echoes appear: a flat array shows those from behind in front.
+    radiated : (place, emitter) float64
+        Power of each call towards the places, relative to ahead.
+    gain : (place, receiver, emitter) float64
+        Power of echoes relative to 1 m ahead, 0 where they are inaudible.
+    beside_m : (place, emitter) float64
+        Errors of paths from emitters beside their beams. There, what a piston radiates depends on the frequency, and
+        echoes come early or late.
+    """
+
+    apart_m: Doubles
+    toward: Doubles
+    depth: Doubles
+    seen: Doubles
+    radiated: Doubles
+    gain: Doubles
+    beside_m: Doubles
+
+    def only(self, number: int) -> "SeenPlaces":
+        """Return one of the places."""
+        return SeenPlaces._make(each[number : number + 1] for each in self)
+
+
+class SeePlaces(Protocol):
+    """Compute how the sensors of a platform see places.
+
+    Parameters
+    ----------
+    place_m : (place, axis) float64
+    sensors : ViewingSensors
+    out : SeenPlaces
+    """
+
+    def __call__(self, place_m: Doubles, sensors: ViewingSensors, out: SeenPlaces) -> None: ...
+
+
 class FindArrivals(Protocol):
     """Find the echoes that fit sound from given places, by path and direction.
 
@@ -480,3 +576,4 @@ class FusionKernels:
     locate_reflector: LocateReflector
     match_echoes: MatchEchoes
     find_arrivals: FindArrivals
+    see_places: SeePlaces

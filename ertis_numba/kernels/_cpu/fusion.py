@@ -9,7 +9,16 @@ no code for negative ones.
 import numpy as np
 from numba import njit
 
-from ertis_numba.kernels._contract.fusion import LEAST_COSINE, NEAREST_M, FusionKernels
+from ertis_numba.kernels._contract.fusion import (
+    AUDIBLE,
+    BESIDE_DB,
+    BESIDE_M,
+    LAST_PATH_M,
+    LEAST_COSINE,
+    NEAREST_M,
+    SPREADING_M,
+    FusionKernels,
+)
 
 __all__ = ["KERNELS"]
 
@@ -293,6 +302,56 @@ def find_arrivals(origin_m, sent_m, sensor_m, ahead, is_flat, receiver, directio
     return count
 
 
+@njit(nogil=True, cache=True, error_model="numpy")
+def see_places(place_m, sensors, out):
+    """Compute how the sensors of a platform see places."""
+    cosine_step = 2.0 / (sensors.patterns.shape[2] - 1)
+    for place in range(len(place_m)):
+        for sensor in range(len(sensors.sensor_m)):
+            toward, ahead = out.toward[place, sensor], sensors.ahead[sensor]
+            for axis in range(3):
+                toward[axis] = place_m[place, axis] - sensors.sensor_m[sensor, axis]
+            apart_m = max(_length(toward), SPREADING_M)
+            for axis in range(3):
+                toward[axis] /= apart_m
+            cosine = _product(toward, ahead)
+            twice = 2.0 * min(cosine, 0.0) if sensors.is_flat[sensor] else 0.0
+            for axis in range(3):
+                out.seen[place, sensor, axis] = toward[axis] - twice * ahead[axis]
+            power = _at(sensors.patterns[0, sensor], cosine, -1.0, cosine_step)
+            fallen = (10.0 * np.log10(max(power, 1e-30)) - BESIDE_DB[0]) / (BESIDE_DB[1] - BESIDE_DB[0])
+            out.apart_m[place, sensor], out.depth[place, sensor] = apart_m, cosine
+            out.radiated[place, sensor], out.beside_m[place, sensor] = power, BESIDE_M * min(max(fallen, 0.0), 1.0)
+        _see_echoes(out.apart_m[place], out.depth[place], sensors, out.gain[place])
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _see_echoes(apart_m, depth, sensors, out):
+    """Compute the power of the echoes of one place for all pairs of receiver and emitter."""
+    cosine_step, path_step_m = 2.0 / (sensors.patterns.shape[2] - 1), LAST_PATH_M / (sensors.lost.shape[1] - 1)
+    for receiver in range(len(out)):
+        model = sensors.model[receiver]
+        for emitter in range(len(out)):
+            out[receiver, emitter] = 0.0
+            power = _at(sensors.patterns[max(model, 0), emitter], depth[emitter], -1.0, cosine_step)
+            if model >= 0 and power > AUDIBLE:
+                there_m, back_m = apart_m[emitter], apart_m[receiver]
+                spread = np.exp(_at(sensors.lost[model], there_m + back_m, 0.0, path_step_m)) / (there_m * back_m) ** 2
+                out[receiver, emitter] = power * spread
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _at(table, place, first, step):
+    """Interpolate in a table of evenly spaced places, and keep its values beyond its ends."""
+    between = (place - first) / step
+    if not between > 0.0:
+        return table[0]
+    before = int(min(between, len(table) - 1.0))
+    if before == len(table) - 1:
+        return table[before]
+    return (table[before + 1] - table[before]) / step * (place - (first + before * step)) + table[before]
+
+
 KERNELS = FusionKernels(
     coarsen_image=coarsen_image,
     spread_cells=spread_cells,
@@ -306,4 +365,5 @@ KERNELS = FusionKernels(
     locate_reflector=locate_reflector,
     match_echoes=match_echoes,
     find_arrivals=find_arrivals,
+    see_places=see_places,
 )
