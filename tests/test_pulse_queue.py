@@ -21,7 +21,7 @@ def test_ended_queue_returns_the_pulses_that_wait():
     assert (queue.take(), queue.take()) == (1, None)
 
 
-def test_pulses_are_kept_within_the_limit_and_as_long_again(monkeypatch):
+def test_pulses_are_kept_within_the_limits_of_size_and_time(monkeypatch):
     now_s = 100.0
     monkeypatch.setattr(pulse_queue.time, "monotonic", lambda: now_s)
     queue = PulseQueue()
@@ -30,13 +30,24 @@ def test_pulses_are_kept_within_the_limit_and_as_long_again(monkeypatch):
             queue.put(number, MAX_KEPT_BYTES // 6)
         now_s += 2.0
     assert queue.n_skipped == 3
-    now_s += 1.9
+    now_s += 7.9
     assert queue.take() == 3
     queue.put(9, 1)
     assert queue.n_skipped == 3
     now_s += 0.2
     queue.put(10, 1)
     assert [queue.take(), queue.take(), queue.take(0.0), queue.n_skipped] == [9, 10, None, 8]
+
+
+def test_application_that_has_caught_up_gets_the_latest_pulses():
+    queue = PulseQueue()
+    with queue.keeping():
+        for number in range(4):
+            queue.put(number, 1)
+    assert [queue.take() for _ in range(4)] == [0, 1, 2, 3]
+    for number in range(4, 8):
+        queue.put(number, 1)
+    assert [queue.take(), queue.take(), queue.n_skipped] == [6, 7, 2]
 
 
 def test_failure_and_end_wake_the_application():

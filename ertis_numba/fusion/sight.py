@@ -37,7 +37,7 @@ class Viewers:
         self.sensor_m = np.array([each.translation_m for each in sensors])
         self.ahead = np.array([each.rotation[:, 0] for each in sensors])
         self.is_flat = np.isin(np.arange(len(sensors)), [*flat])
-        self._models = [*{id(each): each for each in emitters.values()}.values()]
+        self._models: list[Emitters] = [*{id(each): each for each in emitters.values()}.values()]
         places = {id(each): place for place, each in enumerate(self._models)}
         self._sensors = kernels.ViewingSensors(
             self.sensor_m,
@@ -59,7 +59,7 @@ class Viewers:
 
     def echo_powers(self, sight: kernels.SeenPlaces, receiver: NDArray[np.int64]) -> Floats:
         """Return the power of echoes of one place after the matched filter: (echo, emitter), by receiver (echo,)."""
-        model = self._models[self._sensors.model[receiver[0]]]
+        model = self._models[int(self._sensors.model[receiver[0]])]
         return model.echo_powers(sight.depth[0], sight.apart_m[0], sight.apart_m[0, receiver])
 
 

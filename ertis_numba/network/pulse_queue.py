@@ -14,6 +14,7 @@ MAX_WAITING: Final = 2
 """Limit on waiting pulses; a slow application gets the latest ones."""
 MAX_KEPT_BYTES: Final = 64_000_000
 """Limit on the images that wait while pulses are kept."""
+_CATCHING_UP: Final = 4.0  # Longest time until all that waited is used, relative to the time in which it arrived.
 
 Pulse = TypeVar("Pulse")
 
@@ -56,7 +57,12 @@ class PulseQueue(Generic[Pulse]):
             self._changed.wait_for(lambda: self._waiting or self._failure or self._closed or self._ended, timeout_s)
             if self._failure is not None:
                 raise self._failure
-            return self._waiting.popleft()[0] if self._waiting and not self._closed else None
+            if self._closed or not self._waiting:
+                return None
+            pulse, _ = self._waiting.popleft()
+            if not self._waiting:
+                self._kept_until_s = -math.inf
+            return pulse
 
     def fail(self, failure: Exception) -> None:
         """Raise an exception in calls of `take`."""
@@ -78,9 +84,9 @@ class PulseQueue(Generic[Pulse]):
 
     @contextmanager
     def keeping(self) -> Iterator[None]:
-        """Keep all pulses that arrive until the block ends, and for as long again, in which the application catches up.
+        """Keep all pulses that arrive until the block ends, and until the application has caught up.
 
-        The images that wait take at most 64 MB.
+        It must do so within four times the duration of the block. The images that wait take at most 64 MB.
         """
         begun_s = time.monotonic()
         self._kept_until_s = math.inf
@@ -88,7 +94,7 @@ class PulseQueue(Generic[Pulse]):
             yield
         finally:
             end_s = time.monotonic()
-            self._kept_until_s = end_s + (end_s - begun_s)
+            self._kept_until_s = end_s + _CATCHING_UP * (end_s - begun_s)
 
     def _are_kept(self) -> bool:
         return time.monotonic() < self._kept_until_s and sum(size for _, size in self._waiting) <= MAX_KEPT_BYTES
