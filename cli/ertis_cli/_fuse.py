@@ -57,6 +57,7 @@ def write_fused(
     """
     from ertis_numba.fusion import PLATFORM, Fuser
     from ertis_numba.storage import EnergyscapeWriter, check_target
+    from ertis_numba.storage.placed_truth import PlacedTruth
 
     check_target(target, overwrite=force, sources=paths)
     with ExitStack() as stack:
@@ -71,6 +72,7 @@ def write_fused(
         clocks = _clock_check(mountings, groups, by_name)
         for text in clocks.warnings():
             options.warn(text)
+        truth = PlacedTruth(readers, mountings)
         incomplete = empty = 0
         unheard, unshown = Counter[str](), Counter[str]()
         writer = stack.enter_context(
@@ -78,7 +80,9 @@ def write_fused(
         )
         with options.progress(groups, length=len(groups), label="fusing", quiet=quiet) as shown:
             for number, group in enumerate(shown):
-                fused = fuser(pipelines.image(by_name[name][place.index]) for name, place in group.items())
+                images = {name: pipelines.image(by_name[name][place.index]) for name, place in group.items()}
+                fused = fuser(images.values())
+                truth.add(images, {name: place.index for name, place in group.items()})
                 missing = [name for name in fused.missing if name in by_name]
                 incomplete += bool(missing)
                 if missing:
@@ -87,6 +91,9 @@ def write_fused(
                 unheard.update(fused.unheard)
                 unshown.update(fused.without_own_echo)
                 writer.write(_numbered(fused, number))
+        _pulses.note_truth(truth, quiet=quiet)
+        if (placed := truth.truth()) is not None:
+            writer.note_truth(PLATFORM, placed)
     _pulses.note_empty(empty, len(groups), quiet=quiet)
     contradiction = fuser.emitter_warning()  # With wrong emitters, echoes seem to be missing.
     every = [_unheard(name, count, len(groups)) for name, count in unheard.items()]
@@ -108,6 +115,7 @@ def write_fused(
             "left_out": active.n_passive,
             "unheard": dict(unheard),
             "without_own_echo": dict(unshown),
+            "simulated": placed is not None,
         }
         warnings = [*clocks.warnings(), *pipelines.warnings, *warnings]
         options.print_json(report | {"direct_sound": _direct_sound(clocks), "warnings": warnings})

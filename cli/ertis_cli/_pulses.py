@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
     from ertis_numba.storage import RecordingReader
+    from ertis_numba.storage.placed_truth import PlacedTruth
 
 __all__ = [
     "PipelinesBySensor",
@@ -27,6 +28,7 @@ __all__ = [
     "mountings_of",
     "note_empty",
     "note_missing",
+    "note_truth",
     "open_sensors",
     "platform_mountings",
     "processing",
@@ -125,6 +127,14 @@ def platform_mountings(
             quiet=quiet,
         )
     return found | others
+
+
+def note_truth(truth: "PlacedTruth", *, quiet: bool) -> None:
+    """Print why recordings yield no ground truth although some are simulated, and that poses differ from the scene."""
+    if truth.missing and truth.is_partial:
+        options.note(f"no ground truth is stored, because {truth.missing}", quiet=quiet)
+    elif (differs := truth.note()) is not None:
+        options.note(differs, quiet=quiet)
 
 
 def note_missing(groups: "Sequence[Mapping[str, StampedIndex]]", sensors: "Sequence[str]", *, quiet: bool) -> None:

@@ -102,6 +102,7 @@ def mapping(
     from ertis_numba.interop import map_files, write_map
     from ertis_numba.mapping import Mapper
     from ertis_numba.storage import check_target
+    from ertis_numba.storage.placed_truth import PlacedTruth
 
     target = target or paths[0].with_suffix(".map.h5")
     for each in map_files(target, n_dimensions=dimensions, probabilities=probabilities):
@@ -112,8 +113,10 @@ def mapping(
         trajectory = _trajectory(poses_file, paths, quiet=quiet, **reading)
         changed = _pulses.image_settings(settings_file, preset)
         pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, device=device, threads=threads, plan=plan)
+        mountings = _pulses.platform_mountings(readers, mounting, quiet=quiet)
+        truth = PlacedTruth(readers, mountings, trajectory)
         mapper = Mapper(
-            _pulses.platform_mountings(readers, mounting, quiet=quiet),
+            mountings,
             dimensions=dimensions,
             cell_m=cell_m,
             half_life_s=half_life_s,
@@ -131,7 +134,9 @@ def mapping(
             warnings.catch_warnings(category=PoseWarning, action="ignore"),  # A note says the same.
         ):
             for group in shown:
-                mapper.add([pipelines.image(by_name[name][place.index]) for name, place in group.items()], trajectory)
+                images = {name: pipelines.image(by_name[name][place.index]) for name, place in group.items()}
+                mapper.add(images.values(), trajectory)
+                truth.add(images, {name: place.index for name, place in group.items()})
     occupancy = mapper.map
     if contradiction := mapper.emitter_warning():
         options.warn(contradiction)
@@ -140,7 +145,9 @@ def mapping(
         _pulses.note_without_own_echo(mapper.without_own_echo, len(located), quiet=quiet)
     if height_m is not None and not mapper.n_points and mapper.n_empty < len(located):
         _report_heights(occupancy, height_m, quiet=quiet)
-    written = write_map(target, occupancy, overwrite=force, probabilities=probabilities)
+    _pulses.note_truth(truth, quiet=quiet)
+    placed = truth.truth(height_m)
+    written = write_map(target, occupancy, overwrite=force, probabilities=probabilities, truth=placed)
     if len(located) < len(groups):
         left_out = options.counted(len(groups) - len(located), "pulse")
         options.note(f"{left_out} of {len(groups)} outside of the time of the poses left out", quiet=quiet)
@@ -148,6 +155,7 @@ def mapping(
         "left_out": active.n_passive + len(groups) - len(located),
         "empty": mapper.n_empty,
         "without_own_echo": mapper.without_own_echo,
+        "simulated": placed is not None and target.suffix.lower() == ".h5",
         "notes": list(trajectory.notes),
         "warnings": [] if contradiction is None else [contradiction],
     }

@@ -354,16 +354,21 @@ def comparisons(
     """Yield the index of each measurement, or of one, and the comparison of its energyscape with the ground truth."""
     from ertis_numba.analysis.compare import compare
     from ertis_numba.errors import DataError
+    from ertis_numba.file_kinds import quoted
     from ertis_numba.fusion import PLATFORM
     from ertis_numba.storage import open_energyscapes
 
     with open_energyscapes(path, sensor=sensor) as images:
+        if sensor == PLATFORM:
+            raise DataError(
+                f"{path} has fused images, which have points instead of peaks; use 'ertis compare {quoted(path)}', or "
+                "images of single sensors"
+            )
         if images.truth is None:
             images.settings.processing.require_sensor_frame("the ground truth is in the frame of the sensor")
-            remedy = "simulate a scene and process that recording"
-            if sensor == PLATFORM:
-                remedy = "that of fused images is not stored; compare the images of single sensors"
-            raise DataError(f"{path}: sensor {sensor} holds no ground truth; {remedy}")
+            raise DataError(
+                f"{path}: sensor {sensor} holds no ground truth; simulate a scene and process that recording"
+            )
         for index in places(measurement, len(images)):
             yield index, compare(images[index], images.truth.reflectors[index], min_level_db=min_level_db)
 

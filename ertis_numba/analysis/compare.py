@@ -1,5 +1,6 @@
 """Comparison of the peaks of an image with the scene's ground truth."""
 
+import functools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from ertis_numba.geometry import array_weights, microphones, unit_vectors
 from ertis_numba.settings import Settings
 from ertis_numba.waveform import matched_filter_spectrum
 
-__all__ = ["Comparison", "Errors", "Match", "compare", "errors_of"]
+__all__ = ["Comparison", "Errors", "Match", "compare", "errors_of", "visible"]
 
 _GATE_M = 0.1  # Maximum range difference between a reflector and its peak.
 _GATE_HALF_LOBES = 3.0  # Maximum angle between them: one and a half main lobes.
@@ -145,7 +146,7 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     lobe = _Lobe(image.settings)
     in_view = _in_view(image, reflectors, lobe)
     in_range = _in_range(image, reflectors)
-    is_shown = in_view & in_range & np.array([not reflector.emitter for reflector in reflectors], dtype=np.bool_)
+    is_shown = in_view & in_range & _is_own(reflectors)
     levels_db = np.array([reflector.level_db for reflector in reflectors])
     strongest_db = float(np.max(levels_db, where=is_shown, initial=_MIN_DB))
     counts = is_shown & (levels_db >= strongest_db + min_level_db)
@@ -169,6 +170,15 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
         spurious=tuple(peak for peak, due in zip(left, is_due, strict=True) if not due),
         explained=tuple(peak for peak, due in zip(left, is_due, strict=True) if due),
     )
+
+
+def visible(image: Energyscape, reflectors: Sequence[Reflector]) -> NDArray[np.bool_]:
+    """Return True for each reflector that an image can show, whatever its level: (reflector,) bool.
+
+    It returns the sensor's own call, its range lies on the range axis, and its direction within half a main lobe of the
+    nearest direction of the image.
+    """
+    return _in_range(image, reflectors) & _is_own(reflectors) & _in_view(image, reflectors, _lobe_of(image.settings))
 
 
 def errors_of(comparisons: Iterable[Comparison]) -> Errors:
@@ -236,11 +246,21 @@ class _Lobe:
         return np.asarray(np.linalg.norm(direction_offset @ self._reach.T, axis=-1))
 
 
+@functools.lru_cache(maxsize=64)
+def _lobe_of(settings: Settings) -> _Lobe:
+    return _Lobe(settings)
+
+
 def _in_view(image: Energyscape, reflectors: Sequence[Reflector], lobe: _Lobe) -> NDArray[np.bool_]:
     """Return True for each reflector within the solid angle of an image: (reflector,) bool."""
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
     chords = np.array([np.min(np.linalg.norm(directions - unit, axis=1)) for unit in _units(reflectors)])
     return np.asarray(_degrees_between(chords) <= lobe.half_deg)
+
+
+def _is_own(reflectors: Sequence[Reflector]) -> NDArray[np.bool_]:
+    """Return True for each reflector that returns the sensor's own call: (reflector,) bool."""
+    return np.array([not reflector.emitter for reflector in reflectors], dtype=np.bool_)
 
 
 def _in_range(image: Energyscape, reflectors: Sequence[Reflector]) -> NDArray[np.bool_]:

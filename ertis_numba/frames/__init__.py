@@ -12,6 +12,7 @@ from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._reflectors import Peak, Reflector
 from ertis_numba.frames._sound_event import SoundEvent
 from ertis_numba.frames._stamp import BEHAVIOURS, Behaviour, Stamp, is_passive
+from ertis_numba.frames._surfaces import Surfaces
 from ertis_numba.frames._trajectory import PoseAxes, Trajectory
 from ertis_numba.frames._true_source import TrueSource
 
@@ -39,6 +40,7 @@ __all__ = [
     "SoundDirection",
     "SoundEvent",
     "Stamp",
+    "Surfaces",
     "Trajectory",
     "TrueSource",
     "is_passive",

@@ -16,7 +16,7 @@ from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import FREE_BELOW, OCCUPIED_ABOVE, OccupancyMap
 from ertis_numba.interop._mcap import map_mcap, require_mcap
 from ertis_numba.interop.ros_messages import occupancy_values
-from ertis_numba.storage import write_map_file
+from ertis_numba.storage import GroundTruth, write_map_file
 
 __all__ = ["MAP_SUFFIXES", "map_files", "write_map"]
 
@@ -57,7 +57,12 @@ def map_files(path: str | Path, *, n_dimensions: int = 2, probabilities: bool = 
 
 
 def write_map(
-    path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = False, probabilities: bool = False
+    path: str | Path,
+    occupancy: OccupancyMap,
+    *,
+    overwrite: bool = False,
+    probabilities: bool = False,
+    truth: GroundTruth | None = None,
 ) -> tuple[Path, ...]:
     """Write an occupancy map; the suffix of the path chooses the format.
 
@@ -76,6 +81,8 @@ def write_map(
     probabilities : bool
         Write the probability of each known cell in percent to ``.mcap``, and to ``.pgm`` in the mode ``raw``. With its
         default parameters, Nav2 takes all of these cells for free space.
+    truth : GroundTruth, optional
+        Ground truth of each pulse in the frame of the map, which only ``.h5`` stores.
 
     Returns
     -------
@@ -103,7 +110,7 @@ def write_map(
     for each in paths:
         check_target(each, overwrite=overwrite)
     if paths[0].suffix.lower() == ".h5":
-        write_map_file(paths[0], occupancy, overwrite=overwrite)
+        write_map_file(paths[0], occupancy, truth=truth, overwrite=overwrite)
         return paths
     try:
         contents = _contents(paths[0], occupancy, probabilities=probabilities)

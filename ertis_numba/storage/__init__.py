@@ -14,7 +14,7 @@ from ertis_numba.storage.energyscape import (
     open_energyscapes,
     write_energyscapes,
 )
-from ertis_numba.storage.maps import is_map, read_map, write_map_file
+from ertis_numba.storage.maps import is_map, read_map, read_map_truth, write_map_file
 from ertis_numba.storage.poses import add_poses, platform_trajectory, recorded_trajectory, require_fitting_poses
 from ertis_numba.storage.recording import (
     RecordingReader,
@@ -43,6 +43,7 @@ __all__ = [
     "open_recording",
     "platform_trajectory",
     "read_map",
+    "read_map_truth",
     "recorded_trajectory",
     "require_fitting_poses",
     "sensor_names",

@@ -63,7 +63,7 @@ class FileWriter(ABC, Generic[Item]):
         self.path = Path(path)
         self._overwrite = overwrite
         self._attributes = dict(attributes)
-        self._truth = truth or {}
+        self._truth = dict(truth or {})
         self._part: Path
         self._format_version = VERSION_WITHOUT_POSES
         self._file: h5py.File | None = None

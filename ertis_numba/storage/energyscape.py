@@ -145,6 +145,10 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         if wavefront_error_db is not None:
             self._state(sensor, wavefront_error_db=wavefront_error_db)
 
+    def note_truth(self, sensor: str, truth: GroundTruth) -> None:
+        """Set the ground truth of a sensor's images, at any time before the file is complete."""
+        self._truth[sensor] = truth
+
     def _state(self, sensor: str, **attributes: float | str) -> None:
         self._stated.setdefault(sensor, {}).update(attributes)
 
@@ -190,6 +194,7 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
             truth,
             reflectors=tuple(truth.reflectors[row] for row in rows),
             sources=tuple(truth.sources[row] for row in rows if truth.sources),
+            frames=tuple(truth.frames[row] for row in rows if truth.frames),
         )
 
 

@@ -28,8 +28,9 @@ from ertis_numba.storage.schema import (
     to_python,
 )
 from ertis_numba.storage.structure import require_attributes, require_variables
+from ertis_numba.storage.truth import GroundTruth, read_truth, write_truth
 
-__all__ = ["is_map", "read_map", "write_map_file"]
+__all__ = ["is_map", "read_map", "read_map_truth", "write_map_file"]
 
 _KIND: Final = "occupancy_map"
 _NAME: Final = "an occupancy map"
@@ -37,13 +38,17 @@ _AXES: Final = ("x", "y", "z")
 _COUNTS: Final = ("n_groups", "time_ns")
 
 
-def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool = False) -> Path:
+def write_map_file(
+    path: str | Path, occupancy: OccupancyMap, *, truth: GroundTruth | None = None, overwrite: bool = False
+) -> Path:
     """Write an occupancy map as HDF5.
 
     Parameters
     ----------
     path : str or Path
     occupancy : OccupancyMap
+    truth : GroundTruth, optional
+        Ground truth of each pulse in the frame of the map, from `PlacedTruth`.
     overwrite : bool
         Replace an existing file.
 
@@ -71,6 +76,8 @@ def write_map_file(path: str | Path, occupancy: OccupancyMap, *, overwrite: bool
             for name, edge_m in zip(axes, occupancy.origin_m, strict=True):
                 file[name][:] = edge_m + (np.arange(sizes[name]) + 0.5) * occupancy.cell_m
             file["log_odds"][:] = occupancy.log_odds
+            if truth is not None:
+                write_truth(file, truth, len(truth.reflectors))
             numbers = (occupancy.cell_m, *occupancy.origin_m, occupancy.n_groups, occupancy.time_ns)
             set_attributes(file, dict(zip(_numbers(axes), numbers, strict=True)))
             content = _content(file, axes)
@@ -155,6 +162,23 @@ def read_map(path: str | Path) -> OccupancyMap:
                     f"{path}: cell_m or origin_{name}_m contradicts the positions of the cells in {name}; copy it again"
                 )
         return found
+
+
+def read_map_truth(path: str | Path) -> GroundTruth | None:
+    """Read the ground truth of an occupancy map, one row per pulse; None if its recordings were not simulated.
+
+    Parameters
+    ----------
+    path : str or Path
+        File of a map that `read_map` accepts.
+
+    Returns
+    -------
+    GroundTruth or None
+    """
+    path = Path(path)
+    with open_file(path, _NAME) as file, reading(file, path):
+        return read_truth(file)
 
 
 def _table(n_dimensions: int) -> tuple[Variable, ...]:

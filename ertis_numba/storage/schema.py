@@ -241,6 +241,21 @@ TRUTH: Final = (
         "sensor whose call the reflector returns, if not its own",
         optional=True,
     ),
+    Variable(
+        "frame_position",
+        ("measurement", "axis"),
+        "<f8",
+        "x, y, z of the frame of the reflectors in the scene",
+        "m",
+        optional=True,
+    ),
+    Variable(
+        "frame_rotation",
+        ("measurement", "quaternion"),
+        "<f8",
+        "unit quaternion x, y, z, w that rotates the frame of the reflectors into the scene",
+        optional=True,
+    ),
     Variable("source_name", ("source",), "str", "names of the sources of sound in the scene", optional=True),
     Variable("source_kind", ("source",), "str", "tone, noise or sonar", optional=True),
     Variable(

@@ -1,5 +1,6 @@
 """Ground truth of simulated sensors."""
 
+import math
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -17,7 +18,7 @@ from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector, TrueSource
 from ertis_numba.storage.schema import TRUTH, create_variables, set_attributes, text_type, to_python
 
-__all__ = ["GroundTruth", "GroundTruthLog", "read_truth", "write_truth"]
+__all__ = ["Frame", "GroundTruth", "GroundTruthLog", "read_truth", "write_truth"]
 
 _FIELDS = {
     "azimuth": "azimuth_deg",
@@ -28,6 +29,7 @@ _FIELDS = {
 }
 _TEXTS = ("name", "emitter")
 _ANGLES = ("azimuth", "elevation")  # The file stores radians, as for its other angles.
+_MAX_LENGTH_ERROR = 1e-3  # Of a unit quaternion.
 _MAX_SEED = 2**63 - 1  # Limit of an attribute.
 _BLOCK_ROWS = 512  # Limit on the measurements whose reflectors are in memory.
 _RECORD = np.dtype(
@@ -39,6 +41,10 @@ _SOURCE_TEXTS = ("name", "kind")
 _SOURCE_RECORD = np.dtype([(name, "<f8", 3 if name == "position" else ()) for name in _PLACES])
 _OF_SOURCES = "source_"  # First part of the names of variables.
 _SOURCE_VARIABLES = {f"{_OF_SOURCES}{name}" for name in (*_SOURCE_TEXTS, "band", *_PLACES)}
+_FRAME_VARIABLES = ("frame_position", "frame_rotation")
+
+Frame = tuple[tuple[float, ...], tuple[float, ...]]
+"""Position x, y, z in metres, and unit quaternion x, y, z, w."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,6 +63,9 @@ class GroundTruth:
         Effects that were not simulated although they change the image slightly; none by default.
     sources : tuple of tuple of TrueSource
         Sources of sound during each measurement, in the order of the scene; empty, the default, if there are none.
+    frames : tuple of (position_m, rotation_xyzw)
+        Pose in the scene of the frame of the reflectors of each measurement, for fused images and maps. Empty, the
+        default, if it is the frame of the sensor.
     """
 
     scene: str
@@ -64,6 +73,7 @@ class GroundTruth:
     reflectors: tuple[tuple[Reflector, ...], ...]
     left_out: tuple[str, ...] = ()
     sources: tuple[tuple[TrueSource, ...], ...] = ()
+    frames: tuple[Frame, ...] = ()
 
     def __post_init__(self) -> None:
         checks.integer("seed", self.seed, 0, _MAX_SEED)
@@ -74,6 +84,14 @@ class GroundTruth:
                 f"the truth has sources of {len(self.sources)} measurements, but reflectors of "
                 f"{len(self.reflectors)}; give both of each"
             )
+        if self.frames and len(self.frames) != len(self.reflectors):
+            raise ArgumentError(
+                f"the truth has frames of {len(self.frames)} measurements, but reflectors of {len(self.reflectors)}; "
+                "pass both of each"
+            )
+        for number, (_, rotation_xyzw) in enumerate(self.frames):
+            if abs(math.hypot(*rotation_xyzw) - 1.0) > _MAX_LENGTH_ERROR:
+                raise ArgumentError(f"the rotation of frame {number} is {rotation_xyzw}; pass a unit quaternion")
 
 
 class GroundTruthLog:
@@ -225,6 +243,7 @@ def write_truth(group: h5py.Group, truth: GroundTruth | GroundTruthLog, n_measur
             for row, reflectors in enumerate(truth.reflectors):
                 log.append(reflectors, truth.sources[row] if truth.sources else ())
             write_truth(group, log, n_measurements)
+        _write_frames(group["truth"], truth.frames)
         return
     if len(truth) != n_measurements:
         raise ArgumentError(
@@ -256,6 +275,22 @@ def write_truth(group: h5py.Group, truth: GroundTruth | GroundTruthLog, n_measur
             whole = np.full((rows.stop - rows.start, *dataset.shape[1:]), missing, dtype=dataset.dtype)
             whole[place] = columns[name][records[name]] if name in columns else records[name]
             dataset[rows] = whole
+
+
+def _write_frames(group: h5py.Group, frames: Sequence[Frame]) -> None:
+    """Write the pose of the frame of each measurement."""
+    table = [variable for variable in TRUTH if variable.name in _FRAME_VARIABLES and frames]
+    create_variables(group, table, sizes={"measurement": len(frames), "axis": 3, "quaternion": 4})
+    for variable, values in zip(table, zip(*frames, strict=True), strict=True):
+        group[variable.name][:] = values
+
+
+def _read_frames(group: h5py.Group) -> tuple[Frame, ...]:
+    """Return the pose of the frame of each measurement, if they are stored."""
+    if not all(name in group for name in _FRAME_VARIABLES):
+        return ()
+    columns = ([tuple(row) for row in group[name][:].tolist()] for name in _FRAME_VARIABLES)
+    return tuple(zip(*columns, strict=True))
 
 
 def _source_kinds(sources: Sequence[TrueSource]) -> dict[str, Any]:
@@ -306,6 +341,7 @@ def read_truth(group: h5py.Group) -> GroundTruth | None:
         reflectors=tuple(rows),
         left_out=tuple(left_out.split()),
         sources=_read_sources(group) if f"{_OF_SOURCES}name" in group else (),
+        frames=_read_frames(group),
     )
 
 
