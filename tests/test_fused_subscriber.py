@@ -45,7 +45,7 @@ def test_each_pulse_is_fused_once():
         FusedSubscriber(publisher.address, mountings=MOUNTINGS) as subscriber,
     ):
         arrivals = [subscriber.receive(PATIENCE_S) for _ in range(2)]
-    counts = [arrival.fused.image.stamp.sync_count for arrival in arrivals]
+    counts = [arrival.fused.stamp.sync_count for arrival in arrivals]
     assert counts == sorted(set(counts))
     last = arrivals[-1].fused
     assert (last.sensors, last.missing) == (("front", "back"), ())
@@ -60,7 +60,7 @@ def test_pulses_that_arrive_while_tables_are_computed_are_fused_later(monkeypatc
         """Fuse, and the first time return only once all further pulses have arrived."""
         begun.set()
         fused = fuse(fuser, images)
-        if fused.image.stamp.sync_count == 0:
+        if fused.stamp.sync_count == 0:
             waiting = subscriber._receiver.queue._waiting  # noqa: SLF001
             assert until(lambda: len(waiting) == 7, timeout_s=PATIENCE_S)
             assert subscriber.counts.received == 16
@@ -79,7 +79,7 @@ def test_pulses_that_arrive_while_tables_are_computed_are_fused_later(monkeypatc
         publisher.playing(first_one_and_then_others()),
     ):
         monkeypatch.setattr(Fuser, "__call__", slowly)
-        counts = [subscriber.receive(PATIENCE_S).fused.image.stamp.sync_count for _ in range(8)]
+        counts = [subscriber.receive(PATIENCE_S).fused.stamp.sync_count for _ in range(8)]
         assert (counts, subscriber.n_skipped) == ([*range(8)], 0)
 
 
@@ -105,7 +105,7 @@ def test_pulse_without_all_images_is_fused_by_the_next_one():
         found = {}
         while 3 not in found:
             fused = subscriber.receive(PATIENCE_S).fused
-            found[fused.image.stamp.sync_count] = fused.sensors, fused.missing
+            found[fused.stamp.sync_count] = fused.sensors, fused.missing
     assert found.get(2, (("front",), ("back",))) == (("front",), ("back",))
     assert found[3] == (("front", "back"), ())
 
@@ -145,7 +145,7 @@ def test_sensor_that_cannot_be_fused_is_left_out_with_one_note(mountings, peak, 
             found = {}
             while 3 not in found:
                 fused = subscriber.receive(PATIENCE_S).fused
-                found[fused.image.stamp.sync_count] = fused.sensors
+                found[fused.stamp.sync_count] = fused.sensors
     assert set(found.values()) == {("front",)}
     assert [reason in note for note in notes if note.startswith("sensor back is left out")] == [True]
 
@@ -179,7 +179,7 @@ def test_pulse_that_cannot_be_fused_is_left_out_and_noted(monkeypatch):
         FusedSubscriber(publisher.address, mountings=MOUNTINGS, on_note=note) as subscriber,
     ):
         while 2 not in counts:
-            counts.append(subscriber.receive(PATIENCE_S).fused.image.stamp.sync_count)
+            counts.append(subscriber.receive(PATIENCE_S).fused.stamp.sync_count)
             used.release()
     assert (counts, notes) == ([0, 2], ["SYNC pulse 1 is left out: it is refused"])
 

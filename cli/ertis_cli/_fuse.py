@@ -164,5 +164,5 @@ def _require_several(readers: "Sequence[RecordingReader]") -> None:
 
 def _numbered(fused: "Fused", number: int) -> "Energyscape":
     """Return the image and its points with the number of the pulse; sensors may have begun at different numbers."""
-    stamp = replace(fused.image.stamp, sequence=number, session_id=0)
+    stamp = replace(fused.stamp, sequence=number, session_id=0)
     return fused.image.replace(stamp=stamp, points=fused.points.replace(stamp=stamp))

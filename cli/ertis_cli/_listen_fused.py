@@ -57,15 +57,15 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
     range_m = np.linalg.norm(fused.points.position_m, axis=1)
     nearest = int(np.argmin(range_m)) if len(range_m) else None
     age_ms = None if arrival.age_s is None else round(1e3 * arrival.age_s, 3)
-    is_checked = fused.image.stamp.sync_count % _CHECKED_EVERY == 0
+    is_checked = fused.stamp.sync_count % _CHECKED_EVERY == 0
     without_own = list(fused.without_own_echo) if is_checked else None
     if as_json:
         position_m = None if nearest is None else [round(each, 4) for each in fused.points.position_m[nearest].tolist()]
         options.print_json(
             {
                 "event": "fused",
-                "sync_count": fused.image.stamp.sync_count,
-                "timestamp_ns": fused.image.stamp.timestamp_ns,
+                "sync_count": fused.stamp.sync_count,
+                "timestamp_ns": fused.stamp.timestamp_ns,
                 "age_ms": age_ms,
                 "n_points": len(range_m),
                 "nearest_m": position_m,
@@ -86,7 +86,5 @@ def _show(arrival: "FusedArrival", *, as_json: bool) -> None:
     unproven = [name for name in without_own or () if name not in fused.unheard]
     absent += f", emission of {' '.join(unproven)} not proven" if unproven and not fused.is_empty else ""
     age = "-" if age_ms is None else f"{age_ms:.1f} ms"
-    row = (
-        f"{fused.image.stamp.sync_count:8d}  {age:>8}  {len(range_m):6d}  {place:24}  {' '.join(fused.sensors)}{absent}"
-    )
+    row = f"{fused.stamp.sync_count:8d}  {age:>8}  {len(range_m):6d}  {place:24}  {' '.join(fused.sensors)}{absent}"
     click.echo(row)

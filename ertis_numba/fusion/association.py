@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.fusion.confirmation import confirmation
 from ertis_numba.fusion.echo_paths import EchoPaths
+from ertis_numba.fusion.known_echoes import KnownEchoes
 from ertis_numba.fusion.overlaps import Overlap, PredictedEchoes, overlap
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
@@ -448,6 +449,33 @@ class Reflectors:
     def predicted(self) -> PredictedEchoes:
         """Return the echoes that the reflectors should cause if all sensors emit."""
         return self._predicted(self.located)
+
+    def known_echoes(self, receiver: int) -> KnownEchoes:
+        """Return the echoes of the reflectors in the image of a receiver: those that locate them, and predicted ones.
+
+        Parameters
+        ----------
+        receiver : int
+        """
+        sight = self._viewers.sight(self.position_m)
+        is_heard = np.isfinite(self._path_m[self._rows[receiver]]).any(axis=0)
+        power = sight.gain[:, receiver] * self.reflectivity[:, None] * is_heard
+        path_m = sight.apart_m[:, receiver, None] + sight.apart_m
+        direction = np.repeat(sight.seen[:, receiver, None], power.shape[1], axis=1)
+        for number, each in enumerate(self.located):
+            here = self._receiver[each.echo] == receiver
+            echo, emitter = each.echo[here], each.emitter[here]
+            path_m[number, emitter], direction[number, emitter] = self._path_m[echo, emitter], self._direction[echo]
+            power[number, emitter] = self._power[echo]
+        reflector, emitter = np.nonzero(power > 0)
+        return KnownEchoes(
+            reflector,
+            emitter,
+            path_m[reflector, emitter],
+            direction[reflector, emitter],
+            power[reflector, emitter],
+            sight.depth[reflector, receiver] > 0,
+        )
 
     def _predicted(self, found: Sequence[LocatedReflector]) -> PredictedEchoes:
         """Return the echoes that reflectors cause."""

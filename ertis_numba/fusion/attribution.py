@@ -49,12 +49,15 @@ class Attributed(NamedTuple):
         Emitters whose calls no other sensor seems to hear, although it should. Ghosts may pretend this.
     bound : (cell,) float32
         Highest reflectivity that all pairs allow; infinite where none can see the cell.
+    unheard : frozenset of int
+        Emitters of which no echoes were expected at other sensors.
     """
 
     reflectivity: Singles
     shares: Shares
     suspects: frozenset[int]
     bound: Singles
+    unheard: frozenset[int] = frozenset()
 
 
 class _Evidence(NamedTuple):
@@ -163,7 +166,21 @@ class Attribution:
             if suppression < _SUPPRESSION[-1]:
                 reflectivity = self._mean(own, images, shares)
         _limit_sums(shares)
-        return Attributed(np.minimum(self._mean(evidence, images, shares), bound), shares, suspects, bound)
+        reflectivity = np.minimum(self._mean(evidence, images, shares), bound)
+        return Attributed(reflectivity, shares, suspects, bound, self._unheard)
+
+    def informed(self, images: Mapping[int, CoarseImage], found: Attributed, shares: Shares) -> Singles:
+        """Return the reflectivity of each cell by other shares of the pixels than those found: (cell,) float32.
+
+        Parameters
+        ----------
+        images : mapping of int to CoarseImage
+        found : Attributed
+            Result of the attribution.
+        shares : Shares
+        """
+        evidence = [self._evidence(pair, images[pair.receiver]) for pair in self._pairs]
+        return np.asarray(np.minimum(self._mean(evidence, images, shares), found.bound))
 
     def single(self, images: Mapping[int, CoarseImage]) -> Singles:
         """Return the mean reflectivity if each sensor takes all echoes for its own: (cell,) float32.

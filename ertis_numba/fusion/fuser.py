@@ -10,7 +10,7 @@ import numpy as np
 
 from ertis_numba import checks
 from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.fusion.emissions import is_much_better
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.pulses import is_same_pulse
@@ -32,12 +32,15 @@ class Fused:
 
     Attributes
     ----------
+    stamp : Stamp
+        That of the earliest image, with the sensor ``base_link``.
     image : Energyscape
-        Image around the platform. Amplitudes are those of echoes at 1 m from reflectors of the same strength. The stamp
-        is that of the earliest image, with the sensor ``base_link``.
+        Image around the platform, computed at the first access, together with the points. Amplitudes are those of
+        echoes at 1 m from reflectors of the same strength. Echoes of confirmed points appear at the points only, with
+        their amplitude.
     points : PointCloud
-        Reflectors in the frame of the platform, with uncertainties. They are computed at the first access, which takes
-        about as long as the image. Echoes that do not exceed the noise of their image yield none.
+        Reflectors in the frame of the platform, with uncertainties, computed at the first access. Echoes that do not
+        exceed the noise of their image yield none.
     sensors : tuple of str
         Sensors whose images were fused.
     missing : tuple of str
@@ -73,13 +76,19 @@ class Fused:
     (('sensor',), ('left',))
     """
 
-    image: Energyscape
+    stamp: Stamp
     sensors: tuple[str, ...]
     missing: tuple[str, ...]
     _solve: Callable[[], PulseReflectors] = field(repr=False)
-    _locate: Callable[[PulseReflectors, Energyscape], PointCloud] = field(repr=False)
+    _render: Callable[[PulseReflectors], Energyscape] = field(repr=False)
+    _locate: Callable[[PulseReflectors], PointCloud] = field(repr=False)
     _evidence: Callable[[], dict[int, float]] = field(repr=False)
     _names: tuple[str, ...] = field(repr=False)
+
+    @functools.cached_property
+    def image(self) -> Energyscape:
+        """Image around the platform."""
+        return self._render(self._solve())
 
     @functools.cached_property
     def points(self) -> PointCloud:
@@ -88,7 +97,7 @@ class Fused:
         Amplitudes are those that a single sensor would measure if the reflector were at 1 m on the axis of its emitter.
         Where the calls of two sensors arrive together, with unknown phases, they may be off by 3 dB.
         """
-        return self._locate(self._solve(), self.image)
+        return self._locate(self._solve())
 
     @property
     def unheard(self) -> tuple[str, ...]:
@@ -232,13 +241,13 @@ class Fuser:
         recent = self._evidence = [*self._evidence, evidence][-_N_SHOWN:]
         if len(self._first) < _N_COMPARED:
             self._first.append((tuple(group.values()), solve))
-        image = tables.image((solve().attributed if unheard or found.suspects else found).reflectivity, group)
         return Fused(
-            image=image,
+            stamp=tables.stamp(group),
             sensors=tuple(self._mountings[number].name for number in group),
             missing=tuple(sensor.name for number, sensor in enumerate(self._mountings) if number not in group),
             _solve=solve,
-            _locate=tables.points,
+            _render=lambda reflectors: tables.image(reflectors, group, coarse),
+            _locate=lambda reflectors: tables.points(reflectors, group),
             _evidence=functools.cache(lambda: _best(recent)),
             _names=self.sensors,
         )

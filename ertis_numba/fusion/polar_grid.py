@@ -106,11 +106,16 @@ class PolarGrid:
     def positions_m(self) -> Floats:
         """Centres of the cells on the platform: (cell, axis) float64, directions first."""
         points_m = self.directions[:, None] * self.range_m[:, None]
-        return np.asarray(points_m.reshape(-1, 3) + self._centre_m)
+        return np.asarray(points_m.reshape(-1, 3) + self.centre_m)
+
+    @property
+    def centre_m(self) -> Floats:
+        """Centre of the grid on the platform: (axis,) float64."""
+        return np.array([0.0, 0.0, self.height_m])
 
     def cell_of(self, position_m: Floats) -> Places:
         """Return the index of the cell at each position, or -1 outside of the grid: (point,) int64."""
-        offset_m = position_m - self._centre_m
+        offset_m = position_m - self.centre_m
         level_m = np.hypot(offset_m[..., 0], offset_m[..., 1])
         distance_m = level_m if self.is_planar else np.hypot(level_m, offset_m[..., 2])
         turn = np.arctan2(offset_m[..., 1], offset_m[..., 0]) / (2 * math.pi) + 0.5
@@ -120,10 +125,6 @@ class PolarGrid:
             direction += self.n_azimuths * row.astype(np.int64).clip(0, len(self.elevation_rad) - 1)
         step = (distance_m / self.step_m).astype(np.int64)
         return np.where(step < self.n_ranges, direction * self.n_ranges + step, _NONE)
-
-    @property
-    def _centre_m(self) -> Floats:
-        return np.array([0.0, 0.0, self.height_m])
 
     @property
     def _azimuths_rad(self) -> Floats:

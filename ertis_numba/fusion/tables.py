@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.noise import EchoFloor
-from ertis_numba.frames import Energyscape, PointCloud
+from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.fusion.association import Reflectors, SensorEchoes
 from ertis_numba.fusion.attribution import Attributed, Attribution, Rivalries
 from ertis_numba.fusion.emissions import (
@@ -24,6 +24,7 @@ from ertis_numba.fusion.emissions import (
     silent_one,
     suspect,
 )
+from ertis_numba.fusion.known_echoes import explained_shares, levelled
 from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
 from ertis_numba.fusion.points import PointFuser, joined
 from ertis_numba.fusion.polar_grid import PolarGrid
@@ -172,9 +173,13 @@ class FusionTables:
             self._known[key] = Attribution(self.grid, pairs, hypotheses, self._receivers, rivalries=self._rivalries)
         return self._known[key]
 
-    def image(self, reflectivity: NDArray[np.float32], group: Mapping[int, Energyscape]) -> Energyscape:
-        """Return the fused image."""
-        first = min(group.values(), key=lambda image: image.stamp.timestamp_ns)
+    @staticmethod
+    def stamp(group: Mapping[int, Energyscape]) -> Stamp:
+        """Return the stamp of the fused image of a group."""
+        return replace(_first(group).stamp, sensor=PLATFORM)
+
+    def _image(self, reflectivity: NDArray[np.float32], group: Mapping[int, Energyscape]) -> Energyscape:
+        first = _first(group)
         known = self._converted.get(first.stamp.sensor)
         if known is None or known[0] != first.settings:
             known = self._converted[first.stamp.sensor] = first.settings, self._fused_settings(first.settings)
@@ -184,7 +189,7 @@ class FusionTables:
             elevation_rad=self.grid.elevations_rad,
             range_m=self.grid.range_m,
             settings=known[1],
-            stamp=replace(first.stamp, sensor=PLATFORM),
+            stamp=self.stamp(group),
         )
 
     def pulse_reflectors(
@@ -295,9 +300,33 @@ class FusionTables:
         coarse = {number: self.coarse(number, each) for number, each in group.items()}
         return self.attribution(group).without(unheard)(coarse)
 
-    def points(self, found: PulseReflectors, image: Energyscape) -> PointCloud:
-        """Return the points of a group, given its fused image."""
-        return joined(found.reflectors, image, self.grid)
+    def points(self, found: PulseReflectors, group: Mapping[int, Energyscape]) -> PointCloud:
+        """Return the points of a group."""
+        return joined(found.reflectors, self._image(found.attributed.reflectivity, group), self.grid)
+
+    def image(
+        self, found: PulseReflectors, group: Mapping[int, Energyscape], coarse: Mapping[int, CoarseImage]
+    ) -> Energyscape:
+        """Return the fused image of a group, in which no echoes of confirmed reflectors are ghosts.
+
+        Parameters
+        ----------
+        found : PulseReflectors
+        group : mapping of int to Energyscape
+        coarse : mapping of int to CoarseImage
+            Powers of the images.
+        """
+        reflectors, shares = found.reflectors, found.attributed.shares
+        informed: dict[tuple[int, int], NDArray[np.float32]] = {}
+        for number, each in coarse.items():
+            echoes = reflectors.known_echoes(number)
+            factors = echoes.amplitudes(self._receivers[number], self._late_m[number])
+            informed |= explained_shares(shares, number, each, echoes, factors, reflectors.confirmed)
+        attribution = self.attribution(group).without(found.attributed.unheard)
+        reflectivity = attribution.informed(coarse, found.attributed, informed)
+        sure = reflectors.confirmed
+        reflectivity = levelled(reflectivity, self.grid, reflectors.position_m[sure], reflectors.reflectivity[sure])
+        return self._image(reflectivity, group)
 
     def _explained(
         self,
@@ -412,6 +441,10 @@ class FusionTables:
         kind = "2d" if self.grid.is_planar else "3d"
         directions = f"{kind}:{self.grid.n_directions}"
         return settings.replace(processing=settings.processing.replace(directions=directions, **limits))
+
+
+def _first(group: Mapping[int, Energyscape]) -> Energyscape:
+    return min(group.values(), key=lambda image: image.stamp.timestamp_ns)
 
 
 def _key(group: Mapping[int, Energyscape]) -> tuple[tuple[int, ...], frozenset[int]]:

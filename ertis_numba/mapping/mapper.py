@@ -177,7 +177,7 @@ class Mapper:
                 "with directions such as 3d:1000, or give dimensions 2"
             )
         fused = self._fuser(group) if fused is None else fused
-        time_ns = fused.image.stamp.timestamp_ns
+        time_ns = fused.stamp.timestamp_ns
         translation_m, rotation, covariance = _pose(pose, time_ns)
         self._attitude(pose, translation_m, rotation)
         view = self._view(translation_m, rotation, covariance)

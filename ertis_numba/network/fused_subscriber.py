@@ -43,7 +43,7 @@ class FusedArrival:
     @property
     def age_s(self) -> float | None:
         """Time in s from the emission to the end of the fusion, if the clocks of both machines agree."""
-        stamp = self.fused.image.stamp
+        stamp = self.fused.stamp
         return (self.ready_utc_ns - stamp.timestamp_ns) / 1e9 if stamp.is_timed else None
 
 
@@ -131,4 +131,5 @@ class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
         images = received.images.values()
         with nullcontext() if self._fuser.has_tables(images) else self._receiver.queue.keeping():
             fused = self._fuser(images)
+            assert fused.image.amplitude.size  # noqa: S101  The time of the arrival includes the image.
         return FusedArrival(fused, received.images, received.first_ns, time.monotonic_ns(), time.time_ns())

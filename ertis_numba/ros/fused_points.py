@@ -89,13 +89,13 @@ class FusedImages:
         fused = self._fuser[1](image for image in images if image.is_planar == images[0].is_planar)
         self._note_empty(fused)
         self._note_emitters(fused)
-        stamp = replace(fused.image.stamp, sensor=LOCAL_FRAME if any(origin_m) else PLATFORM_FRAME)
+        stamp = replace(fused.stamp, sensor=LOCAL_FRAME if any(origin_m) else PLATFORM_FRAME)
         points = fused.points.replace(stamp=stamp, translation_m=origin_m)
         return fused.image.replace(stamp=stamp, points=points)
 
     def _note_empty(self, fused: Fused) -> None:
         """State when pulses begin to carry nothing but noise, and when they end."""
-        count = fused.image.stamp.sync_count
+        count = fused.stamp.sync_count
         if not fused.is_empty:
             if self._n_empty:
                 self._note(f"SYNC pulse {count} has echoes again, after {self._n_empty} without any above the noise")
@@ -110,7 +110,7 @@ class FusedImages:
         self._n_fused += 1
         if fused.is_empty or self._n_fused % _CHECKED_EVERY != _N_EVIDENCE:
             return
-        unshown, count = frozenset(fused.without_own_echo), fused.image.stamp.sync_count
+        unshown, count = frozenset(fused.without_own_echo), fused.stamp.sync_count
         if unshown - self._unshown:
             self._note(
                 f"SYNC pulse {count}: no echo proves that these sensors emit: {', '.join(sorted(unshown))}; if an "

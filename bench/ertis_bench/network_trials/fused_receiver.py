@@ -87,7 +87,7 @@ def main(job: FusedReceiverJob) -> None:
             _emit(event="subscribed")
         for arrival in subscriber:
             n_points = len(arrival.fused.points)
-            count = arrival.fused.image.stamp.sync_count
+            count = arrival.fused.stamp.sync_count
             line = FusedPulse(count, len(arrival.images), arrival.first_ns, arrival.ready_ns, time.monotonic_ns())
             os.write(diary, f"{json.dumps(line)}\n".encode())
             if n_points:

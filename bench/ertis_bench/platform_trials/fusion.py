@@ -87,16 +87,17 @@ def run(*, count: int, rooms: int, seed: int, say: Callable[[str], None], only: 
         return report
     rows, times = [], []
     for diameter_m in EMITTERS_M:
-        ghosts, positions, lost = [], [], 0
+        ghosts, positions, levels, lost = [], [], [], 0
         for number in range(seed, seed + count):
             shot = _shot(platform_scene(number, random_reflectors(number), diameter_m), diameter_m)
             ghosts.append(_ghosts(shot))
             errors, n_lost = _position_errors_m(shot)
             positions += errors
             lost += n_lost
+            levels += _levels_db(shot)
             times.append(shot.took_s)
             say(f"scene {number}, emitters of {1000 * diameter_m:g} mm: ghosts {_decibels(*ghosts[-1].sum(0)):.1f} dB")
-        rows.append(_row(diameter_m, ghosts, np.array(positions), lost, count))
+        rows.append(_row(diameter_m, ghosts, np.array(positions), lost, count) | _level_row(np.array(levels)))
     walls = [_wall_errors_m(number, say) for number in range(seed, seed + rooms)]
     is_wall = np.concatenate([error < _WALL_M for error in walls]) if walls else np.zeros(0, bool)
     near = np.concatenate([error[error < _WALL_M] for error in walls]) if walls else np.zeros(0)
@@ -124,6 +125,7 @@ def form(report: dict[str, Any]) -> str:
         "strongest ghost, fused (single)",
         "position RMS, fused (better sensor)",
         "reflectors lost",
+        "level of confirmed ones within 1 dB (5–95 %)",
     ]
     rows = [
         [
@@ -133,6 +135,7 @@ def form(report: dict[str, Any]) -> str:
             f"{row['strongest_db']:.1f} dB ({row['strongest_single_db']:.1f} dB)",
             f"{1000 * row['rms_m']:.1f} mm ({1000 * row['single_rms_m']:.1f} mm), {row['n_positions']} reflectors",
             f"{row['lost']} of {N_REFLECTORS * report['count']}",
+            f"{row['n_right']} of {row['n_confirmed']} ({row['low_db']:+.1f} to {row['high_db']:+.1f} dB)",
         ]
         for row in report["rows"]
     ]
@@ -147,7 +150,8 @@ def form(report: dict[str, Any]) -> str:
         f"{table(head, rows)}\n\n{report['count']} scenes of {N_REFLECTORS} reflectors from seed {report['seed']}, "
         f"four sensors. Ghosts are foreign echoes far from all reflectors, above {_LOUD_DB:g} dB; levels are relative "
         f"to the strongest reflector. Positions are those of reflectors that two sensors locate; "
-        f"the better sensor faces it more directly.{walls} "
+        f"the better sensor faces it more directly. Levels are those of the fused image at reflectors "
+        f"that a confirmed point locates, relative to the strength of the reflector and to the median.{walls} "
         f"A fusion takes {1000 * report['median_s']:.0f} ms (median). {sentence(report['machine'])}"
     )
 
@@ -167,6 +171,7 @@ def _shot(scene: Scene, diameter_m: float, **processing: Any) -> _Shot:
     fuser(images.values())
     begin_s = time.perf_counter()
     fused = fuser(images.values())
+    assert fused.image.amplitude.size  # noqa: S101  computed when it is used
     return _Shot(scene, images, fused, time.perf_counter() - begin_s)
 
 
@@ -218,6 +223,27 @@ def _position_errors_m(shot: _Shot) -> tuple[list[tuple[float, float]], int]:
         if len(located) > 1 and here < _FOUND_M:
             errors.append((here, located[0]))
     return errors, lost
+
+
+def _levels_db(shot: _Shot) -> list[float]:
+    """Return the level in the fused image relative to the strength, for reflectors that a confirmed point locates."""
+    points = shot.fused.points
+    assert points.confirmed is not None  # noqa: S101  by Fuser
+    cloud_m = points.position_m[points.confirmed].astype(np.float64)
+    return [
+        _decibels(_highest(shot.fused.image, complex(*(point.position_m or ())[:2])) ** 2, 1.0) - point.strength_db
+        for point in shot.scene.points
+        if _nearest_m(cloud_m, np.array(point.position_m)) < _FOUND_M
+    ]
+
+
+def _level_row(levels_db: Floats) -> dict[str, Any]:
+    if not len(levels_db):
+        return {"n_confirmed": 0, "n_right": 0, "low_db": math.nan, "high_db": math.nan}
+    error_db = levels_db - np.median(levels_db)
+    low_db, high_db = np.percentile(error_db, (5, 95))
+    n_right = int(np.sum(np.abs(error_db) <= 1))
+    return {"n_confirmed": len(error_db), "n_right": n_right, "low_db": float(low_db), "high_db": float(high_db)}
 
 
 def _cosine(sensor: Sensor, place_m: Floats) -> float:

@@ -297,7 +297,7 @@ def _mapped(
         fused = fuser(images)
         _ = fused.points
         after_s = time.process_time()
-        mapper.add(images, _around(motion, fused.image.stamp.timestamp_ns), fused=fused)
+        mapper.add(images, _around(motion, fused.stamp.timestamp_ns), fused=fused)
         end_s = time.process_time()
         taken_s.append(end_s - after_s)
         fused_s.append(end_s - begin_s)
