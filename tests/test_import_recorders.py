@@ -131,14 +131,14 @@ def test_join_command_combines_files(tmp_path):
 
 def test_commands_of_the_page_run(tmp_path):
     """Runs all commands of recordings.md."""
-    for folder, names in (("card", ("20240518_042537", "20240518_042637")), ("microphones", ("mic1", "mic2"))):
+    for folder, names in (("CARD", ("20240518_042537", "20240518_042637")), ("MICROPHONES", ("mic1", "mic2"))):
         (tmp_path / folder).mkdir()
         for name in names:
             write(tmp_path / folder / f"{name}.wav", noise()[:, 0])
     (tmp_path / "one.csv").write_text("0, 0\n")
-    (tmp_path / "pair.csv").write_text("y_mm, z_mm\n0, 0\n10, 0\n")
-    write(tmp_path / "loopback.wav", record([1.37e-3], 0.02).astype("f4"))
-    ring_file(tmp_path).rename(tmp_path / "call.toml")
+    (tmp_path / "PAIR.csv").write_text("y_mm, z_mm\n0, 0\n10, 0\n")
+    write(tmp_path / "LOOPBACK.wav", record([1.37e-3], 0.02).astype("f4"))
+    ring_file(tmp_path).rename(tmp_path / "CALL.toml")
     for each in commands_in(page("recordings")):
         run_here(tmp_path, each)
     with ertis.open_recording(tmp_path / "joined.h5") as recording:

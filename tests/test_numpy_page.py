@@ -10,7 +10,7 @@ import pytest
 
 from ertis_numba.analysis.compare import compare
 from ertis_numba.storage import open_recording
-from tests.pages import ROOT, page, python_in, run_code_here
+from tests.pages import ROOT, commands_in, page, python_in, run_code_here
 
 PAGE = page("numpy")
 EXAMPLES = python_in(PAGE)
@@ -24,6 +24,7 @@ def place(tmp_path):
 
 
 def test_page_has_short_examples():
+    assert commands_in(PAGE) == ["example reflectors"]  # writes the recording of the other tests
     assert len(EXAMPLES) == 6
     assert max(len(example.splitlines()) for example in EXAMPLES) <= 12
     assert max(map(len, "".join(EXAMPLES).splitlines())) <= 120

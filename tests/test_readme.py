@@ -1,7 +1,6 @@
 """Commands and code in the README and in the pages on simulation and sensors run."""
 
 import contextlib
-import importlib.metadata
 import re
 import shlex
 import shutil
@@ -11,9 +10,8 @@ from pathlib import Path
 import pytest
 from ertis_cli.main import COMMANDS
 
-from ertis_numba.storage import open_recording, write_recording
+from ertis_numba.storage import open_recording
 from tests.emulated import PATIENT, patient
-from tests.files import SMALL, noise
 from tests.pages import command_program, commands_in, forking, in_background, page, run_code_here, run_here
 
 ROOT = Path(__file__).parents[1]
@@ -29,6 +27,7 @@ ELSEWHERE = {
         "configure",
         "demo",
         "doctor",
+        "import",
         "import-poses",
         "keys",
         "layouts",
@@ -57,21 +56,14 @@ pytestmark = PATIENT
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
-    """Folder with the files named in the README's commands."""
+    """Empty folder, with a folder of its own for links to emulated sensors."""
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
-    (tmp_path / "data").symlink_to(ROOT / "data")
-    real = importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin")
-    shutil.copy(str(real), tmp_path / "RAW.bin")
-    shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", tmp_path / "reflectors.h5")
-    (tmp_path / "RUNS").mkdir()
-    write_recording(tmp_path / "RUNS" / "first.h5", noise(SMALL, 1))
-    for name in ("SCENE.toml", "reflectors.toml"):
-        shutil.copy(ROOT / "data" / "synthetic" / "reflectors.toml", tmp_path / name)
     return tmp_path
 
 
 def test_readme_code_runs(place):
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    run_here(place, "example reflectors")
     run_code_here(place, code)
     assert (place / "image.png").stat().st_size > 10_000
 
@@ -87,17 +79,17 @@ def test_readme_describes_every_folder():
 def test_readme_commands_run(place, tmp_path_factory):
     """Each command imports its own modules at its first occurrence.
 
-    The first emulator replays a recording of its scene, which starts sooner.
+    The emulator replays a recording of its scene, which starts sooner.
     """
     started = set()
     with contextlib.ExitStack() as stack:
         run_forked = stack.enter_context(forking(place, tmp_path_factory.mktemp("output")))
-        for command in commands_in(README.replace(NETWORK, "").replace("emulate SCENE.toml", "emulate reflectors.h5")):
+        for command in commands_in(
+            README.replace(NETWORK, "").replace("emulate reflectors.toml", "emulate reflectors.h5")
+        ):
             name, *arguments = shlex.split(command)
             if name in ELSEWHERE:
                 continue
-            if (place / "REC.h5").exists() and "REC.h5" in arguments and name in {"import", "simulate"}:
-                (place / "REC.h5").unlink()  # The README shows two ways to make a recording.
             if arguments[-1:] == ["&"]:
                 stack.enter_context(in_background(place, command))
             elif name in started:
@@ -107,7 +99,7 @@ def test_readme_commands_run(place, tmp_path_factory):
                 assert done.code == 0, (command, done)
             started.add(name)
     assert started == {*COMMANDS} - ELSEWHERE - {"bench"}
-    assert (place / "IMAGES" / "first.energy.h5").exists()
+    assert (place / "images" / "captured.energy.h5").exists()
     assert (place / "picture.png").stat().st_size > 10_000
     assert (place / "shelf.png").stat().st_size > 10_000
 
@@ -116,7 +108,7 @@ def test_readme_commands_run(place, tmp_path_factory):
 def test_commands_of_the_devices_page_run(place):
     """The first emulator replays a recording of its scene, which starts sooner."""
     with contextlib.ExitStack() as background:
-        for command in commands_in(DEVICES.replace("emulate SCENE.toml", "emulate reflectors.h5")):
+        for command in commands_in(DEVICES.replace("emulate reflectors.toml", "emulate reflectors.h5")):
             if command.endswith("&"):
                 background.enter_context(in_background(place, command))
             else:
@@ -128,20 +120,21 @@ def test_commands_of_the_devices_page_run(place):
 def test_readme_example_runs(place, monkeypatch):
     """The example prints the nearest strong reflector of the emulated recording."""
     example = ROOT / "examples" / "1_nearest_reflector.py"
+    shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", place)
     monkeypatch.setattr(sys, "argv", [str(example), "sensor"])
-    with in_background(place, "emulate data/synthetic/reflectors.h5 &"):
+    with in_background(place, "emulate reflectors.h5 &"):
         reported = run_code_here(place, example.read_text("utf-8"), str(example))
     assert reported.splitlines() == [f"#{number}: 1.15 m at -38°" for number in range(5)]
 
 
 def test_commands_of_the_simulation_page_run(place):
+    for command in commands_in(SIMULATION):
+        reported = run_here(place, command)
+    assert "points[0]" in reported
     (code,) = re.findall(r"```python\n(.*?)```", SIMULATION, re.DOTALL)
     reported = run_code_here(place, code)
     assert "absorption True" in reported
     assert reported.endswith("() ()\n")  # No missed reflector and no ghost.
-    for command in commands_in(SIMULATION):
-        reported = run_here(place, command)
-    assert "points[0]" in reported
 
 
 def test_gallery_starts_like_the_readme():

@@ -224,7 +224,10 @@ def test_code_of_the_page_on_sensors_runs(pipeline, tmp_path, monkeypatch):
     (code,) = python_in(page.read_text("utf-8"))
     words = words_of(13)
     with ertis.Emulator([words], name="front") as device:
-        names = {"ertis": ertis, "port": device.port, "settings": SETTINGS}
+        for shown, here in (('"sensor"', "PORT"), ('ertis.Settings.from_preset("default_25_50")', "SETTINGS")):
+            assert shown in code
+            code = code.replace(shown, here)
+        names = {"PORT": device.port, "SETTINGS": SETTINGS}
         exec(compile(code, str(page), "exec"), names)
     np.testing.assert_array_equal(names["block"].data, words)
     np.testing.assert_array_equal(names["image"].amplitude, image_of(pipeline, words))
