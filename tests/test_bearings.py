@@ -13,10 +13,10 @@ from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.passive import AcousticCamera, BearingFinder, find_bearings
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.detection_law import LAGS, exceedance, independent_samples
+from ertis_numba.passive.direction_errors import _inverse
 from ertis_numba.passive.likelihood import BandLikelihood, moved
 from ertis_numba.passive.noise_model import NoiseModel
 from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
-from ertis_numba.passive.source_search import _inverse
 from tests.test_acoustic_camera import settings_of, sound
 
 pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")  # Small grids save time.

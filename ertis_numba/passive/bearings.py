@@ -117,8 +117,7 @@ class BearingFinder:
         spectrum = self._camera.cross_spectrum()
         out = []
         for bins, search, band_hz in zip(self._bins, self._searches, self._camera.band_hz, strict=True):
-            matrix = spectrum.matrix[bins].astype(np.complex128)
-            sources = search(matrix, spectrum.n_blocks, false_alarm=self._false_alarm, top=self._top, least=self._least)
+            sources = search(spectrum.of_bins(bins), false_alarm=self._false_alarm, top=self._top, least=self._least)
             sources.sort(key=lambda source: -source.power)
             out += [_bearing(source, band_hz, self._camera.settings) for source in sources]
         return out

@@ -1,6 +1,7 @@
 """Spectra of blocks of a measurement: demodulation, window, and Fourier transform."""
 
 import math
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
@@ -14,7 +15,29 @@ from ertis_numba.passive.block_lengths import BINS_OF_A_BAND, block_length, spac
 from ertis_numba.passive.heard_signals import HeardSignals, heard_bands
 from ertis_numba.settings import Settings
 
-__all__ = ["BlockSpectra"]
+__all__ = ["BlockSpectra", "Products"]
+
+_CHANNELS: Final = 16  # Largest number of channels whose frequencies are measured.
+
+
+class Products(NamedTuple):
+    """Sums over the blocks of a measurement.
+
+    Attributes
+    ----------
+    matrix : (bin, mic, mic) complex64
+        Products of the spectra.
+    slopes : (bin, n, n) complex64
+        Products of the spectra under the slope of the window with those under the window, of some channels.
+    squares : (bin,) float64
+        Mean power of these channels under the slope of the window.
+    n_blocks : int
+    """
+
+    matrix: NDArray[np.complex64]
+    slopes: NDArray[np.complex64]
+    squares: NDArray[np.float64]
+    n_blocks: int
 
 
 class BlockSpectra:
@@ -36,6 +59,8 @@ class BlockSpectra:
         Their numbers; bin 1 has the frequency ``spacing_hz``.
     spacing_hz : float
         Spacing of the bins in hertz.
+    channels : (n,) intp
+        Microphones whose frequencies within bins are measured.
 
     Raises
     ------
@@ -60,13 +85,16 @@ class BlockSpectra:
         self._lane = self._memory.lane()
         self._heard = np.zeros((n_mics, n_samples), np.float32)
         self._window = scipy.signal.get_window("hann", self._n_block).astype(np.float32)
+        turns = np.arange(self._n_block) / self._n_block
+        self._slope = (np.sin(2 * np.pi * turns) / 2 * self.spacing_hz).astype(np.float32)
+        self.channels = np.unique(np.linspace(0, n_mics - 1, min(_CHANNELS, n_mics)).astype(int))
         self._scale = np.float32(2 / (self._n_block * float((self._window.astype(np.float64) ** 2).sum())))
         self.masked_s = self._read.n_masked / rate_hz
         self._transforms: dict[int, tuple[NDArray[np.float32], fft.Transforms]] = {}
         self._sums = self._memory.zeros((len(self.bins), n_mics, n_mics), np.complex64)
 
-    def products(self, measurement: Measurement, *, masked: bool) -> tuple[NDArray[np.complex64], int]:
-        """Return the sum of the products over the blocks of a measurement, (bin, mic, mic), and their number.
+    def products(self, measurement: Measurement, *, masked: bool) -> Products:
+        """Return the sums of the products over the blocks of a measurement.
 
         Parameters
         ----------
@@ -100,7 +128,24 @@ class BlockSpectra:
             self._lane.fetch(self._sums, out)
             self._lane.wait()
         out *= self._scale
-        return out, n_blocks
+        return Products(out, *self._slopes(pieces[self.channels, : n_blocks * hop : hop]), n_blocks)
+
+    def _slopes(self, pieces: NDArray[np.float32]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
+        """Return the products of blocks, (channel, block, sample), under the slope of the window, and their powers.
+
+        With the window w, a tone has the spectrum X in a bin, and X′ with the slope of the window: -Im X′ / X is its
+        frequency relative to the centre of the bin.
+        """
+        first, stop = int(self.bins[0]), int(self.bins[-1]) + 1
+        own, slope = (
+            np.ascontiguousarray(
+                scipy.fft.rfft(pieces * window, axis=2, workers=self._threads)[..., first:stop].transpose(2, 0, 1)
+            )
+            for window in (self._window, self._slope)
+        )
+        squares = (slope.real**2 + slope.imag**2).mean(axis=1).sum(axis=1, dtype=np.float64)
+        products: NDArray[np.complex64] = slope @ own.conj().transpose(0, 2, 1)
+        return self._scale * products, self._scale * squares
 
     def _planned(self, n_blocks: int) -> tuple[NDArray[np.float32], fft.Transforms]:
         """Return an array of the host for blocks, and the transforms of its copy on the device."""

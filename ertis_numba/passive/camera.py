@@ -4,7 +4,7 @@ import functools
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.block_spectra import BlockSpectra
 from ertis_numba.passive.components import gathered
-from ertis_numba.passive.cross_spectrum import CrossSpectrum
+from ertis_numba.passive.cross_spectrum import CrossSpectrum, FrequencyMoments
 from ertis_numba.passive.edge_tones import EdgeTones
 from ertis_numba.passive.methods import METHODS
 from ertis_numba.passive.outside_bands import OutsideBands
@@ -27,6 +27,8 @@ from ertis_numba.settings import HIGHEST_SHARE, Settings
 from ertis_numba.stages.interpolation_fit import one_thread
 
 __all__ = ["AcousticCamera"]
+
+_TINY: Final = 1e-30
 
 
 class AcousticCamera:
@@ -158,10 +160,12 @@ class AcousticCamera:
         """
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         masked = measurement.stamp.behaviour == "active"
-        products, n_blocks = self._blocks.products(measurement, masked=masked)
+        products = self._blocks.products(measurement, masked=masked)
         self._outside.add(measurement)
-        self._sums += products
-        self._n_blocks += n_blocks
+        self._sums += products.matrix
+        self._slopes += products.slopes
+        self._squares += products.squares
+        self._n_blocks += products.n_blocks
         self._masked_s = max(self._masked_s, self._blocks.masked_s if masked else 0.0)
         self._stamp = measurement.stamp
         self.n_measurements += 1
@@ -181,7 +185,13 @@ class AcousticCamera:
         if not self.n_measurements:
             raise DataError("the acoustic camera has no measurement; call add first")
         matrix = (self._sums / self._n_blocks).astype(np.complex64)
-        return CrossSpectrum(matrix, self.frequency_hz, self._n_blocks)
+        channels = self._blocks.channels
+        first = np.asarray(self._slopes / self._n_blocks, np.complex128)
+        power = np.maximum(np.einsum("bmm->b", matrix[:, channels[:, None], channels].real) / len(channels), _TINY)
+        mean_hz = np.einsum("bmm->b", first.imag) / len(channels) / power
+        width_hz = np.sqrt(np.maximum(self._squares / self._n_blocks / power - mean_hz**2, 0))
+        moments = FrequencyMoments(channels, first, width_hz)
+        return CrossSpectrum(matrix, self.frequency_hz, self._n_blocks, moments)
 
     def powers(self) -> NDArray[np.float32]:
         """Return the power from each direction in each bin: (bin, direction) float32.
@@ -232,6 +242,9 @@ class AcousticCamera:
     def reset(self) -> None:
         """Discard all measurements."""
         self._sums: NDArray[Any] = np.zeros(self._shape, np.complex128)
+        n_channels = len(self._blocks.channels)
+        self._slopes: NDArray[Any] = np.zeros((len(self.frequency_hz), n_channels, n_channels), np.complex128)
+        self._squares = np.zeros(len(self.frequency_hz))
         self._n_blocks = self.n_measurements = 0
         self._masked_s = 0.0
         self._stamp = Stamp()

@@ -14,10 +14,12 @@ Delays = Callable[[Floats], Floats]
 
 _NONE: Final = np.zeros((0, 3))
 _LEAST: Final = 1e-30
+_ROUNDING: Final = 1e-6  # of powers in single precision, which have a mean of 1
 _SINGULAR: Final = 1e-12  # Keeps the inverse of equal waves finite.
 _STEP_RAD: Final = 1e-4  # of numerical derivatives
-_MAX_STEPS: Final = 12
-_LAST_STEP_RAD: Final = 1e-5  # Newton's method converges quadratically: the error after such a step is below 1e-8.
+_MAX_STEPS: Final = 20
+_MAX_HALVINGS: Final = 6
+_LAST_STEP_RAD: Final = 1e-7
 _FLATTEST: Final = 1e-3  # Least curvature relative to the largest, so that steps along blind directions stay short.
 
 
@@ -73,6 +75,8 @@ class BandLikelihood:
         Returns the delays of the sound from unit vectors, (direction, mic).
     others : (source, axis) float64
         Directions of the other sources; none by default.
+    others_omega : (bin, source) float64, optional
+        Their angular frequencies; ``omega`` by default.
 
     Attributes
     ----------
@@ -81,6 +85,8 @@ class BandLikelihood:
     dimensions : int
         Number of dimensions outside of the other sources.
     is_whitened : bool
+    omega : (bin,) float64
+        Angular frequencies.
     """
 
     def __init__(
@@ -91,15 +97,16 @@ class BandLikelihood:
         weights: Floats,
         delays: Delays,
         others: Floats = _NONE,
+        others_omega: Floats | None = None,
     ) -> None:
-        self._whitening, self._omega, self._delays = whitening, omega, delays
+        self._whitening, self.omega, self._delays = whitening, omega, delays
         self.is_whitened = whitening is not None
         self.weights = weights
         self._matrix, self.dimensions = matrix, matrix.shape[1] - len(others)
         power = np.trace(matrix, axis1=1, axis2=2).real
         self._basis = None
         if len(others):
-            self._basis, _ = np.linalg.qr(self.waves(others))
+            self._basis, _ = np.linalg.qr(self.waves(others, others_omega))
             power = power - (self._basis.conj() * (matrix @ self._basis)).sum(axis=(1, 2)).real
         self.power = np.maximum(power, _LEAST)
 
@@ -122,9 +129,13 @@ class BandLikelihood:
             return waves
         return np.asarray(waves - self._basis @ (self._basis.conj().transpose(0, 2, 1) @ waves))
 
-    def beside(self, others: Floats) -> Self:
-        """Return the likelihood given other sources in some directions, (source, axis)."""
-        return type(self)(self._matrix, self._whitening, self._omega, self.weights, self._delays, others)
+    def beside(self, others: Floats, others_omega: Floats | None = None, omega: Floats | None = None) -> Self:
+        """Return the likelihood given other sources in some directions, (source, axis).
+
+        Frequencies of the other sources, (bin, source), and those of the likelihood, (bin,), are its own by default.
+        """
+        omega = self.omega if omega is None else omega
+        return type(self)(self._matrix, self._whitening, omega, self.weights, self._delays, others, others_omega)
 
     def unwhitened(self, matrices: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the matrices whose powers for a wave are those of given matrices for the whitened wave."""
@@ -132,12 +143,18 @@ class BandLikelihood:
             return matrices
         return np.asarray(self._whitening.transpose(0, 2, 1) @ matrices @ self._whitening)
 
-    def waves(self, directions: Floats) -> NDArray[np.complex128]:
-        """Return the whitened waves from directions: (bin, mode, direction) complex128."""
-        lags = -self._omega[:, None, None] * np.ascontiguousarray(self._delays(directions).T)
+    def waves(self, directions: Floats, omega: Floats | None = None, *, order: int = 0) -> NDArray[np.complex128]:
+        """Return the whitened waves from directions, or a derivative by angular frequency: (bin, mode, direction).
+
+        Angular frequencies, (bin, direction), are those of the likelihood by default.
+        """
+        delay_s = np.ascontiguousarray(self._delays(directions).T)
+        lags = -(self.omega[:, None] if omega is None else omega)[:, None] * delay_s
         waves = np.empty(lags.shape, np.complex128)
         np.cos(lags, out=waves.real)  # Sine and cosine together take half as long as a complex exponential.
         np.sin(lags, out=waves.imag)
+        if order:
+            waves *= (-1j * delay_s) ** order
         if self._whitening is None:
             return waves
         return (self._whitening @ waves.view(np.float64)).view(np.complex128)  # Weights are real.
@@ -148,7 +165,7 @@ class BandLikelihood:
         size = np.maximum((waves.real**2 + waves.imag**2).sum(axis=1), _LEAST)
         return (waves.conj() * (self._matrix @ waves)).sum(axis=1).real / size, size
 
-    def separated(self, directions: Floats) -> tuple[Floats, Floats]:
+    def separated(self, directions: Floats, omega: Floats | None = None) -> tuple[Floats, Floats]:
         """Return the powers of sources without noise, each outside of the others, and the noise in each dimension.
 
         Each row of the pseudoinverse of the waves is orthogonal to the waves of the other sources.
@@ -157,13 +174,15 @@ class BandLikelihood:
         ----------
         directions : (source, axis) float64
             All sources, one or more. This likelihood must have no other sources.
+        omega : (bin, source) float64, optional
+            Their angular frequencies; those of the likelihood by default.
 
         Returns
         -------
         powers : (bin, source) float64
         noise : (bin,) float64
         """
-        waves = self.waves(directions)
+        waves = self.waves(directions, omega)
         products = waves.conj().transpose(0, 2, 1) @ waves
         inverse = np.linalg.inv(products + _SINGULAR * waves.shape[1] * np.eye(len(directions)))
         beams = waves @ inverse
@@ -181,11 +200,32 @@ class BandLikelihood:
     def __call__(self, directions: Floats) -> Floats:
         """Return the logarithm of the likelihood of directions, per sample: (direction,) float64."""
         powers, _ = self.beams(directions)
-        left = np.maximum(self.power[:, None] - powers, 1e-12 * self.power[:, None])
+        left = np.maximum(self.power[:, None] - powers, 0) + _ROUNDING
         return np.asarray(-self.weights @ np.log(left))
 
+    def slopes(self, direction: Floats) -> tuple[NDArray[np.complex128], NDArray[np.complex128], Floats]:
+        """Return the wave of a direction outside of other sources, its changes outside of itself, and its size.
+
+        Returns
+        -------
+        wave : (bin, mode, 1) complex128
+        changes : (bin, mode, 2) complex128
+            Per radian sideways and upwards.
+        size : (bin,) float64
+        """
+        offsets = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)]) * _STEP_RAD
+        waves = self.outside(self.waves(moved(direction, offsets, level=False)))
+        wave, changes = waves[..., :1], (waves[..., 1:3] - waves[..., 3:]) / (2 * _STEP_RAD)
+        size = np.maximum((wave.real**2 + wave.imag**2).sum(axis=(1, 2)), _LEAST)
+        along = (wave.conj() * changes).sum(axis=1, keepdims=True) / size[:, None, None]
+        return wave, changes - wave * along, size
+
+    def powers_of(self, vectors: NDArray[np.complex128], others: NDArray[np.complex128]) -> Floats:
+        """Return the real parts of ``x^H C y`` for vectors x and y: (bin, x, y) float64."""
+        return np.asarray((vectors.conj().transpose(0, 2, 1) @ (self._matrix @ others)).real)
+
     def maximum(self, start: Floats, *, reach_rad: float, level: bool) -> Floats:
-        """Return the direction of the maximum next to a direction, by Newton's method with numerical derivatives.
+        """Return the direction of the maximum next to a direction, by a Gauss-Newton method.
 
         Parameters
         ----------
@@ -200,59 +240,41 @@ class BandLikelihood:
         -------
         (axis,) float64
         """
-        longest_rad = reach_rad / 2
-        here, (value, step) = start, self._newton_step(start, longest_rad=longest_rad, level=level)
+        here, value = start, float(self(start[None])[0])
         for _ in range(_MAX_STEPS):
-            if np.linalg.norm(step) < _LAST_STEP_RAD:
-                return np.asarray(moved(here, step[None], level=level)[0])
-            for _ in range(4):
+            step = self._step(here, longest_rad=reach_rad / 2, level=level)
+            for _ in range(_MAX_HALVINGS):
                 there = moved(here, step[None], level=level)[0]
-                new, next_step = self._newton_step(there, longest_rad=longest_rad, level=level)
+                new = float(self(there[None])[0])
                 if new >= value and np.linalg.norm(there - start) <= reach_rad:
                     break
                 step = step / 2
             else:
                 break
-            here, value, step = there, new, next_step
+            here, value = there, new
+            if np.linalg.norm(step) < _LAST_STEP_RAD:
+                break
         return here
 
-    def _newton_step(self, here: Floats, *, longest_rad: float, level: bool) -> tuple[float, Floats]:
-        """Return the value, and the step to the maximum of a parabola: (2,) float64, sideways and upwards."""
-        grid = _STEP_RAD * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)], np.float64)
-        f = self(moved(here, grid, level=level)).reshape(3, 3)
-        gradient = np.array([f[2, 1] - f[0, 1], f[1, 2] - f[1, 0]]) / (2 * _STEP_RAD)
-        mixed = (f[2, 2] - f[2, 0] - f[0, 2] + f[0, 0]) / 4
-        along, across = f[2, 1] - 2 * f[1, 1] + f[0, 1], f[1, 2] - 2 * f[1, 1] + f[1, 0]
-        values, vectors = np.linalg.eigh(-np.array([[along, mixed], [mixed, across]]) / _STEP_RAD**2)
+    def _step(self, here: Floats, *, longest_rad: float, level: bool) -> Floats:
+        """Return a step towards the maximum: (2,) float64, sideways and upwards.
+
+        For the power r of the rest, the gradient of ``-log r`` is ``2 Re(u^H C d) / N r`` with the wave u, its size N,
+        and its changes d. The curvature of r is that of the wave's power, without changes of the changes.
+        """
+        wave, changes, size = self.slopes(here)
+        powers = self.powers_of(wave, np.concatenate([wave, changes], axis=2))[:, 0]
+        power = powers[:, 0] / size
+        rest = np.maximum(self.power - power, 0) + _ROUNDING
+        scale = 2 * self.weights / (size * rest)
+        gradient = scale @ powers[:, 1:]
+        metric = (changes.conj().transpose(0, 2, 1) @ changes).real
+        curvature = np.tensordot(scale, power[:, None, None] * metric - self.powers_of(changes, changes), 1)
+        if level:
+            gradient, curvature = gradient * [1, 0], curvature * [[1, 0], [0, 0]]
+        values, vectors = np.linalg.eigh(curvature)
         values = np.maximum(np.abs(values), _FLATTEST * np.abs(values).max())
         if not values.all():
-            return float(f[1, 1]), np.zeros(2)
+            return np.zeros(2)
         step = vectors @ ((vectors.T @ gradient) / values)
-        return float(f[1, 1]), np.asarray(step * min(1.0, longest_rad / max(float(np.linalg.norm(step)), 1e-30)))
-
-    def information(self, direction: Floats, others: Floats, ratio: float, *, level: bool) -> Floats:
-        """Return the Fisher information of a direction per sample in 1/rad²: (2, 2) float64.
-
-        With the power ρ of a source relative to the noise, its whitened wave u, its size ``N = u^H u`` outside of other
-        sources, and the projection P outside of all sources, the information is ``2 ρ² N / (1 + ρ N) · Re(∂u^H P ∂u)``
-        (P. Stoica and A. Nehorai, Performance study of conditional and unconditional direction-of-arrival estimation,
-        1990).
-
-        Parameters
-        ----------
-        direction : (axis,) float64
-        others : (source, axis) float64
-            All other sources.
-        ratio : float
-            Power ρ of the source relative to the noise of a microphone.
-        level : bool
-            The elevation is given.
-        """
-        _, size = self.beside(others).beams(direction[None])
-        gain = float(self.weights @ size[:, 0])
-        every = self.beside(np.concatenate([direction[None], others]))
-        places = _STEP_RAD * np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)])
-        waves = every.outside(every.waves(moved(direction, places, level=level)))
-        slopes = (waves[..., ::2] - waves[..., 1::2]) / (2 * _STEP_RAD)
-        metric = np.einsum("k,kmi,kmj->ij", self.weights, slopes.conj(), slopes).real
-        return np.asarray(2 * ratio**2 * gain / (1 + ratio * gain) * metric)
+        return np.asarray(step * min(1.0, longest_rad / max(float(np.linalg.norm(step)), 1e-30)))

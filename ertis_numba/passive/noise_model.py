@@ -49,22 +49,35 @@ class NoiseModel:
         values, self._modes = np.linalg.eigh(coherence)
         self._values = np.maximum(values, 0.0)
 
-    def diffuse_share(self, matrix: NDArray[np.complex128], weights: NDArray[np.float64]) -> float:
+    def diffuse_share(
+        self,
+        matrix: NDArray[np.complex128],
+        weights: NDArray[np.float64],
+        sources: NDArray[np.complex128] | None = None,
+    ) -> float:
         """Return the most likely share of the diffuse field, 0 to 1.
 
         Parameters
         ----------
         matrix : (bin, mic, mic) complex128
-            Cross-spectral matrix of the noise.
+            Cross-spectral matrix.
         weights : (bin,) float64
             Number of samples of each bin.
+        sources : (bin, mic, n) complex128, optional
+            Waves of sources, outside of which there is noise alone.
         """
-        modes = self._modes
-        powers = np.maximum(np.einsum("kim,kij,kjm->km", modes, matrix.real, modes, optimize=True), _TINY)
+        modes: NDArray[np.complex128] = self._modes.astype(np.complex128)
+        if sources is not None and sources.shape[2]:
+            basis = np.linalg.qr(sources)[0]
+            modes = modes - basis @ (basis.conj().transpose(0, 2, 1) @ modes)
+        powers = np.maximum((modes.conj() * (matrix @ modes)).sum(axis=1).real, _TINY)
+        products = self._modes.transpose(0, 2, 1) @ modes
+        of_white = np.maximum(np.einsum("kmm->km", products).real, _TINY)
+        of_diffuse = ((products.real**2 + products.imag**2) @ self._values[:, :, None])[:, :, 0]
         n_mics = powers.shape[1]
 
         def misfit(share: float) -> float:
-            values = 1 - share + share * self._values
+            values = (1 - share) * of_white + share * of_diffuse
             terms = np.log(values).sum(axis=1) + n_mics * np.log((powers / values).sum(axis=1))
             return float(weights @ terms)
 

@@ -1,6 +1,5 @@
 """Search for the sources of one band of a cross-spectral matrix."""
 
-import functools
 import math
 from collections.abc import Callable
 from typing import Final, NamedTuple
@@ -8,7 +7,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.detection_law import LAGS, exceedance, independent_samples
+from ertis_numba.passive.direction_errors import covariance_of, powers_in_noise
+from ertis_numba.passive.heard_band import HeardBand
 from ertis_numba.passive.likelihood import BandLikelihood, Delays
 from ertis_numba.passive.noise_model import NoiseModel
 from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
@@ -18,10 +20,11 @@ __all__ = ["BandSearch", "FoundSource", "Scan"]
 Floats = NDArray[np.float64]
 Matrices = NDArray[np.complex128]
 
+_NONE: Final = np.zeros((0, 3))
 _BLIND: Final = 0.3  # Size of a wave outside of other sources, relative to its whole, below which it is theirs.
-_FLAT: Final = 1e-9  # Information relative to the largest, below which a direction is not resolved.
 _SHARE_STEPS: Final = 10  # Per decade of white noise. Between steps, extents change by a few hundredths.
 _SWEEPS: Final = 2  # Corrections of all sources after each new one.
+_OWN: Final = 0.75  # Largest distance of sound from the centre of its bin, in spacings of bins.
 _MAX_EXCESS: Final = 10**0.1  # Power of all sources relative to that of the band: 1 dB for errors of estimates.
 
 
@@ -94,19 +97,16 @@ class BandSearch:
         self._scan, self._noise, self._delays, self._steer = scan, noise, delays, steer
         self._shares, self._weights = shares, shares / shares.sum()
         self._omega = 2 * np.pi * frequency_hz
+        self._spacing_hz = float(frequency_hz[1] - frequency_hz[0]) if len(frequency_hz) > 1 else 0.0
         self._laws: dict[int, tuple[ScanExtent, NDArray[np.float64]]] = {}
 
-    def __call__(
-        self, matrix: Matrices, n_blocks: int, *, false_alarm: float, top: int, least: float
-    ) -> list[FoundSource]:
+    def __call__(self, heard: CrossSpectrum, *, false_alarm: float, top: int, least: float) -> list[FoundSource]:
         """Return the sources of a matrix that noise does not explain.
 
         Parameters
         ----------
-        matrix : (bin, mic, mic) complex128
-            Cross-spectral matrix.
-        n_blocks : int
-            Number of blocks of which it is the mean.
+        heard : CrossSpectrum
+            Spectrum in the bins of the band.
         false_alarm : float
             Probability that noise alone yields a source.
         top : int
@@ -114,58 +114,76 @@ class BandSearch:
         least : float
             Least power relative to the strongest source.
         """
-        level = np.trace(matrix, axis1=1, axis2=2).real / matrix.shape[1]
-        if not level.all():
-            return []
-        scaled = matrix / level[:, None, None]
-        n_samples = independent_samples(self._shares, n_blocks)
-        places = np.zeros((0, 3))
-        likelihood, share = self._likelihood(scaled, places)
-        while len(places) < min(top, matrix.shape[1] - 1):
-            extent, similarity = self._of_noise(share)
-            n_beam_samples = independent_samples(self._shares, n_blocks, similarity)
-            law = functools.partial(exceedance, n_samples=n_beam_samples, extent=extent)
-            place = self._next(likelihood, places, law, false_alarm=false_alarm, least=least)
-            if place is None:
+        places, n_mics = np.zeros((0, 3)), heard.matrix.shape[1]
+        band = HeardBand.of(heard, places, self._shares, self._delays) if _has_power(heard) else None
+        while band is not None and len(places) < min(top, n_mics - 1):
+            likelihood, share = self._likelihood(band, places)
+            rest = likelihood.beside(places, band.omegas)
+            place = self._place(rest, likelihood)
+            if not self._is_found(place, rest, likelihood, band, share, places, false_alarm=false_alarm, least=least):
                 break
             more = np.concatenate([places, place[None]])
-            next_likelihood, next_share = self._likelihood(scaled, more)
-            more = self._corrected(next_likelihood, more)
-            if not self._is_possible(next_likelihood, more, level, least=least):
+            next_band = HeardBand.of(heard, more, band.shares, self._delays)
+            if next_band is None or next_band.is_beyond:
                 break
-            places, likelihood, share = more, next_likelihood, next_share
-        sources = [self._source(likelihood, places, k, level, n_samples) for k in range(len(places))]
+            likelihood, share = self._likelihood(next_band, more)
+            rest = next_band.beside(likelihood, more, len(places))
+            if (next_band.shares < band.shares).any() and not self._is_found(
+                place, rest, likelihood, next_band, share, places, false_alarm=false_alarm, least=least
+            ):  # It is sound beyond the band, which the window spreads.
+                band = HeardBand.of(heard, places, next_band.shares, self._delays)
+                continue
+            more = self._corrected(likelihood, more, next_band)
+            if not self._is_possible(likelihood, more, next_band, least=least):
+                break
+            places, band = more, next_band
+        if band is None or not len(places):
+            return []
+        likelihood, _ = self._likelihood(band, places)
+        sources = [self._source(likelihood, places, k, band) for k in range(len(places))]
         strongest = max((source.power for source in sources), default=0.0)
         return [source for source in sources if source.power >= least * strongest]
 
-    def _is_possible(self, likelihood: BandLikelihood, places: Floats, level: Floats, *, least: float) -> bool:
+    def _is_possible(self, likelihood: BandLikelihood, places: Floats, band: HeardBand, *, least: float) -> bool:
         """Return False if corrected sources lie too close together to be separated, or exceed the sound of the band.
 
         The last of them, which is new, must also have its least power.
         """
-        whole = likelihood.beams(places)[1]
         for k, place in enumerate(places):
-            size = likelihood.beside(np.delete(places, k, axis=0)).beams(place[None])[1][:, 0]
-            if self._weights @ size < _BLIND * (self._weights @ whole[:, k]):
+            beside = band.beside(likelihood, places, k)
+            size, whole = (band.weights @ each.beams(place[None])[1] for each in (beside, beside.beside(_NONE)))
+            if size < _BLIND * whole:
                 return False
-        powers = np.maximum(self._shares @ (likelihood.separated(places)[0] * level[:, None]), 0)
+        powers = np.maximum(band.shares @ (likelihood.separated(places, band.omegas)[0] * band.level[:, None]), 0)
         is_heard = powers[-1] > 0 and powers[-1] >= least * powers.max()
-        return bool(is_heard and powers.sum() <= _MAX_EXCESS * (self._shares @ level))
+        return bool(is_heard and powers.sum() <= _MAX_EXCESS * (band.shares @ band.level))
 
-    def _next(
-        self, likelihood: BandLikelihood, places: Floats, law: Callable[..., float], *, false_alarm: float, least: float
-    ) -> Floats | None:
-        """Return the direction of a further source; None if noise or errors of the known sources may cause it."""
-        rest = likelihood.beside(places)
-        place = rest.maximum(self._loudest(rest, likelihood), reach_rad=self._scan.reach_rad, level=self._scan.level)
+    def _place(self, rest: BandLikelihood, whole: BandLikelihood) -> Floats:
+        """Return the most likely direction of a further source."""
+        return rest.maximum(self._loudest(rest, whole), reach_rad=self._scan.reach_rad, level=self._scan.level)
+
+    def _is_found(
+        self,
+        place: Floats,
+        rest: BandLikelihood,
+        whole: BandLikelihood,
+        band: HeardBand,
+        diffuse: float,
+        places: Floats,
+        *,
+        false_alarm: float,
+        least: float,
+    ) -> bool:
+        """Return False if noise or errors of the known sources may cause a further source."""
+        extent, similarity = self._of_noise(diffuse)
+        n_samples = independent_samples(band.shares, band.n_blocks, similarity)
         share = float(rest.relative_power(place[None])[0]) / rest.dimensions
-        chance = law(share, n_dimensions=rest.dimensions)
-        known = self._weights @ likelihood.separated(places)[0] if len(places) else np.zeros(0)
+        chance = exceedance(share, n_samples=n_samples, n_dimensions=rest.dimensions, extent=extent)
+        known = band.weights @ whole.separated(places, band.omegas[:, : len(places)])[0] if len(places) else np.zeros(0)
         strongest = max(0.0, known.max(initial=0.0))
-        power = float(self._weights @ _powers(rest, place)[0])
-        size, whole = (float(self._weights @ each.beams(place[None])[1][:, 0]) for each in (rest, likelihood))
-        is_source = chance <= false_alarm and power >= least * strongest and size >= _BLIND * whole
-        return place if is_source else None
+        power = float(band.weights @ powers_in_noise(rest, place)[0])
+        size, whole_size = (float(band.weights @ each.beams(place[None])[1][:, 0]) for each in (rest, whole))
+        return chance <= false_alarm and power >= least * strongest and size >= _BLIND * whole_size
 
     def _of_noise(self, share: float) -> tuple[ScanExtent, Floats]:
         """Return the extent of the scan, and the similarity of the beams of neighbouring bins.
@@ -181,25 +199,23 @@ class BandSearch:
             self._laws[step] = mesh.extent(omega, whitening), mesh.similarity(omega, spacing, LAGS + 1, whitening)
         return self._laws[step]
 
-    def _likelihood(self, matrix: Matrices, places: Floats) -> tuple[BandLikelihood, float]:
+    def _likelihood(self, band: HeardBand, places: Floats) -> tuple[BandLikelihood, float]:
         """Return the likelihood of sources in noise, and the diffuse share of the noise."""
-        plain, rest = BandLikelihood(matrix, None, self._omega, self._weights, self._delays), matrix
-        if len(places):
-            waves, powers = plain.waves(places), np.maximum(plain.separated(places)[0], 0)
-            rest = matrix - (waves * powers[:, None]) @ waves.conj().transpose(0, 2, 1)
-        share = self._noise.diffuse_share(rest, self._weights)
+        matrix = band.matrix
+        plain = BandLikelihood(matrix, None, band.omega, band.weights, self._delays)
+        share = self._noise.diffuse_share(matrix, band.weights, _of_sources(plain, places, band.omegas))
         if not share:
             return plain, share
         whitening = self._noise.whitening(share)
         white = whitening @ matrix @ whitening.transpose(0, 2, 1)
-        return BandLikelihood(white, whitening, self._omega, self._weights, self._delays), share
+        return BandLikelihood(white, whitening, band.omega, band.weights, self._delays), share
 
-    def _corrected(self, likelihood: BandLikelihood, places: Floats) -> Floats:
+    def _corrected(self, likelihood: BandLikelihood, places: Floats, band: HeardBand) -> Floats:
         """Return the directions of sources that are most likely together."""
         places = places.copy()
         for _ in range(_SWEEPS if len(places) > 1 else 1):
             for k, place in enumerate(places):
-                beside = likelihood.beside(np.delete(places, k, axis=0))
+                beside = band.beside(likelihood, places, k)
                 places[k] = beside.maximum(place, reach_rad=self._scan.reach_rad, level=self._scan.level)
         return places
 
@@ -211,39 +227,29 @@ class BandSearch:
         sizes = every if rest.dimensions == whole.dimensions else self._powers_of(whole, rest.projection)
         powers = self._powers_of(whole, rest.rest)
         ratio = np.where(sizes >= _BLIND * every, powers / np.maximum(sizes, _BLIND * every), 0)
-        return np.asarray(self._scan.directions[int(((rest.weights / rest.power) @ ratio).argmax())])
+        # Beams of bins with the sound of other bins point elsewhere.
+        is_own = np.abs(rest.omega - self._omega) <= _OWN * 2 * np.pi * self._spacing_hz
+        weights = np.where(is_own, rest.weights, 0) if (is_own & (rest.weights > 0)).any() else rest.weights
+        return np.asarray(self._scan.directions[int(((weights / rest.power) @ ratio).argmax())])
 
     def _powers_of(self, whole: BandLikelihood, matrices: Matrices) -> NDArray[np.float32]:
         """Return the powers of matrices for the whitened wave from each direction: (bin, direction)."""
         return self._steer(whole.unwhitened(matrices).astype(np.complex64))
 
-    def _source(
-        self, likelihood: BandLikelihood, places: Floats, k: int, level: Floats, n_samples: float
-    ) -> FoundSource:
+    def _source(self, likelihood: BandLikelihood, places: Floats, k: int, band: HeardBand) -> FoundSource:
         """Return one of the sources with its power and uncertainty."""
-        place, others = places[k], np.delete(places, k, axis=0)
-        powers, noise = _powers(likelihood.beside(others), place)
-        ratio = max(0.0, float(self._weights @ (powers / noise)))
-        information = n_samples * likelihood.information(place, others, ratio, level=self._scan.level)
-        covariance = _inverse(information[:1, :1] if self._scan.level else information)
-        return FoundSource(place, max(0.0, float(self._shares @ (powers * level))), ratio, covariance)
+        powers, noise = powers_in_noise(band.beside(likelihood, places, k), places[k], band.width)
+        ratio, power = float(band.weights @ (powers / noise)), float(band.shares @ (powers * band.level))
+        covariance = covariance_of(likelihood, places, k, band, level=self._scan.level)
+        return FoundSource(places[k], max(0.0, power), max(0.0, ratio), covariance)
 
 
-def _powers(beside: BandLikelihood, place: Floats) -> tuple[Floats, Floats]:
-    """Return the power of a source without noise, and that of the noise in each dimension, both (bin,)."""
-    powers, size = beside.beams(place[None])
-    noise = (beside.power - powers[:, 0]) / max(beside.dimensions - 1, 1)
-    return (powers[:, 0] - noise) / size[:, 0], noise
+def _has_power(heard: CrossSpectrum) -> bool:
+    return bool(np.trace(heard.matrix, axis1=1, axis2=2).real.all())
 
 
-def _inverse(information: Floats) -> Floats:
-    """Return the covariance (2, 2), infinite along directions without information; one row has a given elevation."""
-    out = np.diag([math.inf, math.inf])
-    n = len(information)
-    values, vectors = np.linalg.eigh(information)
-    if values[0] > _FLAT * values[-1]:
-        out[:n, :n] = (vectors / values) @ vectors.T
-    elif values[-1] > 0:
-        seen = np.flatnonzero(np.abs(vectors[:, 0]) <= math.sqrt(_FLAT))
-        out[seen, seen] = 1 / values[-1]
-    return out
+def _of_sources(plain: BandLikelihood, places: Floats, omegas: Floats) -> Matrices:
+    """Return the waves of sources with their changes by frequency, if enough dimensions are left: (bin, mic, n)."""
+    n_left = plain.dimensions // 2
+    orders = [order for order in range(3) if (order + 1) * len(places) <= n_left] or [0]
+    return np.concatenate([plain.waves(places, omegas, order=order) for order in orders], axis=2)

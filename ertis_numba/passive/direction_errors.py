@@ -1,0 +1,122 @@
+"""Powers of sources in noise, and the errors of their directions."""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.passive.detection_law import independent_samples
+from ertis_numba.passive.heard_band import HeardBand
+from ertis_numba.passive.likelihood import BandLikelihood
+
+__all__ = ["covariance_of", "powers_in_noise"]
+
+Floats = NDArray[np.float64]
+
+_LEAST: Final = 1e-30
+_FLAT: Final = 1e-9  # Information relative to the largest, below which a direction is not resolved.
+_ROUNDING: Final = 3e-7  # of powers in single precision
+_SIGNIFICANT: Final = 3.0  # Power beyond noise relative to its standard deviation that shows several sources.
+_OF_WIDTH: Final = 0.3  # Uncertain share of the power that the width of a bin causes.
+
+
+def powers_in_noise(beside: BandLikelihood, place: Floats, width: Floats | None = None) -> tuple[Floats, Floats]:
+    """Return the power of a source without noise, and that of the noise in each dimension, both (bin,).
+
+    Blocks of distant microphones hear slightly different sound, which changes the wave like a change of its frequency.
+    This is no noise of the microphones, if the width of the frequencies in a bin is given.
+
+    Parameters
+    ----------
+    beside : BandLikelihood
+        Given all other sources.
+    place : (axis,) float64
+        Unit vector.
+    width : (bin,) float64, optional
+        Standard deviation of the angular frequency in each bin.
+    """
+    powers, size = beside.beams(place[None])
+    rest, n = beside.power - powers[:, 0], beside.dimensions - 1
+    if width is not None and n > 1:
+        wave, _, _ = beside.slopes(place)
+        changes = beside.outside(beside.waves(place[None], order=1))
+        changes = changes - wave * (wave.conj() * changes).sum(axis=1, keepdims=True) / size[:, None]
+        sizes = np.maximum((changes.real**2 + changes.imag**2).sum(axis=(1, 2)), _LEAST)
+        rest, n = rest - beside.powers_of(changes, changes)[:, 0, 0] / sizes, n - 1
+    noise = np.maximum(rest / max(n, 1), _ROUNDING)
+    return (powers[:, 0] - noise) / size[:, 0], noise
+
+
+def covariance_of(likelihood: BandLikelihood, places: Floats, k: int, band: HeardBand, *, level: bool) -> Floats:
+    """Return the covariance of a direction's errors, sideways and upwards, infinite if not resolved: (2, 2) rad².
+
+    The gradient of the likelihood has the variance of products of the beam with the noise outside of it. Sources that
+    are not separated leave more power in the changes of the wave than this noise, which shows how far they are apart.
+
+    Parameters
+    ----------
+    likelihood : BandLikelihood
+        Without other sources.
+    places : (source, axis) float64
+        Directions of all sources.
+    k : int
+        Number of the source.
+    band : HeardBand
+    level : bool
+        The elevation is given.
+    """
+    place, beside = places[k], band.beside(likelihood, places, k)
+    powers, noise = powers_in_noise(beside, place, band.width)
+    powers, (_, changes, size) = np.maximum(powers, 0), beside.slopes(place)
+    gains = band.weights * powers / noise
+    if not gains.any():
+        return np.diag([math.inf, math.inf])
+    metrics = (changes.conj().transpose(0, 2, 1) @ changes).real
+    metric = np.tensordot(gains / gains.sum(), metrics, 1)
+    parts = band.weights * np.sqrt((size * powers / noise + 1) / size)
+    samples = independent_samples(parts, band.n_blocks)
+    scale = 2 * samples * (gains.sum() / parts.sum()) ** 2
+    every = np.maximum(likelihood.separated(places, band.omegas)[0], 0)
+    of_blocks = beside.waves(places, band.omegas, order=1) * (band.width[:, None] * np.sqrt(every))[:, None]
+    across = changes.conj().transpose(0, 2, 1) @ beside.outside(of_blocks)
+    of_width, of_others = (
+        np.tensordot(band.weights, (each @ each.conj().transpose(0, 2, 1)).real, 1)
+        for each in (across, np.delete(across, k, axis=2))
+    )
+    of_noise = np.tensordot(band.weights * noise, metrics, 1)
+    excess = np.tensordot(band.weights, beside.powers_of(changes, changes), 1) - of_noise - of_width
+    limit = _SIGNIFICANT / math.sqrt(samples) * of_noise + _OF_WIDTH * of_width
+    n = 1 if level else 2
+    out = _inverse(scale * metric[:n, :n])
+    out[:n, :n] += _of_excess(excess, limit, metric, float(band.weights @ powers))[:n, :n]
+    # Blocks of distant microphones hear different sound of other sources, which looks like noise.
+    out[:n, :n] += _of_excess(of_others, 0 * limit, metric, scale * float(band.weights @ noise))[:n, :n]
+    return out
+
+
+def _of_excess(excess: Floats, limit: Floats, metric: Floats, power: float) -> Floats:
+    """Return the covariance of directions for which changes of a wave have an excess of power; 0 below a limit."""
+    values, vectors = np.linalg.eigh(metric)
+    if values[-1] <= 0:
+        return np.zeros((2, 2))
+    seen = values > _FLAT * values[-1]
+    whitening = vectors[:, seen] / np.sqrt(values[seen])
+    powers, axes = np.linalg.eigh(whitening.T @ excess @ whitening)
+    limits = np.einsum("ij,ik,kj->j", axes, whitening.T @ limit @ whitening, axes)
+    kept = np.where(powers > limits, powers, 0.0)
+    turned = whitening @ axes
+    return np.asarray((turned * kept) @ turned.T / max(power, _LEAST))
+
+
+def _inverse(information: Floats) -> Floats:
+    """Return the covariance (2, 2), infinite along directions without information; one row has a given elevation."""
+    out = np.diag([math.inf, math.inf])
+    n = len(information)
+    values, vectors = np.linalg.eigh(information)
+    if values[0] > _FLAT * values[-1]:
+        out[:n, :n] = (vectors / values) @ vectors.T
+    elif values[-1] > 0:
+        seen = np.flatnonzero(np.abs(vectors[:, 0]) <= math.sqrt(_FLAT))
+        out[seen, seen] = 1 / values[-1]
+    return out
