@@ -1,5 +1,6 @@
 """Table of the devices and their kernels, read once when a pipeline is created."""
 
+import dataclasses
 import functools
 import importlib
 import importlib.util
@@ -161,7 +162,10 @@ def _compiled(name: str) -> Any:
     except DeviceError as error:
         _LOG.info("%s uses NumPy: %s", name, error)
         return _in_numpy(name)
-    return importlib.import_module(f"ertis_numba.kernels._cpu.{name}").KERNELS
+    kernels = importlib.import_module(f"ertis_numba.kernels._cpu.{name}").KERNELS
+    loading = importlib.import_module("ertis_numba.kernels._cpu.loading")
+    loading.load_without_compiler(getattr(kernels, field.name) for field in dataclasses.fields(kernels))
+    return kernels
 
 
 def _in_numpy(name: str) -> Any:
