@@ -73,20 +73,20 @@ class EchoFloor(NamedTuple):
             follow noise that swells and fades, but also dense echoes. They exclude the slopes of the bin's own echo.
         """
         last, n_around = amplitude.shape[1] - 1, self.n_around
-        ratio = self.ratio * (math.log(2) / -math.log1p(-quantile)) ** (self.exponent / 2)
-        thresholds = [self.by_direction[direction], self.by_range[place]]
-        for first in (1 - n_around, -n_around // 2, 0):  # A click may begin or end at the bin.
-            columns = np.abs(place[:, None] + first + np.arange(n_around))
-            columns = (last - np.abs(last - columns)).clip(0)  # The image is mirrored at its ends.
-            around = amplitude[direction[:, None], columns]
-            n_own = np.zeros(len(around), np.int64)
-            if quantile > 0.5:
-                is_own = _slopes(around, min(-first, n_around - 1))
-                around, n_own = np.where(is_own, -np.inf, around), is_own.sum(axis=1)
+        first = np.array([1 - n_around, -n_around // 2, 0])  # A click may begin or end at the bin.
+        columns = np.abs(place[:, None] + first[:, None, None] + np.arange(n_around))
+        columns = (last - np.abs(last - columns)).clip(0)  # The image is mirrored at its ends.
+        around = amplitude[direction[:, None], columns]
+        rank = np.full(around.shape[:2], int(quantile * (n_around - 1)))
+        if quantile > 0.5:
+            is_own = np.stack([_slopes(*each) for each in zip(around, np.minimum(-first, n_around - 1), strict=True)])
+            n_own = is_own.sum(axis=2)
+            around = np.where(is_own, -np.inf, around)
             rank = np.minimum(n_own + (quantile * (n_around - n_own - 1)).astype(np.int64), n_around - 1)
-            found = np.take_along_axis(np.sort(around, axis=1), rank[:, None], axis=1)[:, 0]
-            thresholds.append(np.maximum(found, 0) * np.float32(ratio))
-        return np.asarray(np.max(thresholds, axis=0))
+        found = np.take_along_axis(np.sort(around, axis=2), rank[..., None], axis=2)[..., 0]
+        ratio = self.ratio * (math.log(2) / -math.log1p(-quantile)) ** (self.exponent / 2)
+        clicks = np.maximum(found, 0).max(axis=0) * np.float32(ratio)
+        return np.asarray(np.maximum(np.maximum(self.by_direction[direction], self.by_range[place]), clicks))
 
 
 def _slopes(around: NDArray[np.float32], middle: int) -> NDArray[np.bool_]:

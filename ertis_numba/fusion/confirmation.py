@@ -162,8 +162,7 @@ def _behind(heard: EchoPaths, away_m: Floats) -> Flags:
     range_m = np.linalg.norm(away_m, axis=2)
     toward = away_m / np.maximum(range_m, NEAREST_M)[..., None]
     depth = np.einsum("psi,si->ps", toward, heard.ahead)
-    flat = np.isin(np.arange(len(heard.sensor_m)), [*heard.flat])
-    toward = toward - 2 * np.where(flat, np.minimum(depth, 0.0), 0.0)[..., None] * heard.ahead
+    toward = toward - 2 * np.where(heard.is_flat, np.minimum(depth, 0.0), 0.0)[..., None] * heard.ahead
     cosine = np.einsum("psi,qsi->pqs", toward, toward)
     is_nearer = range_m + _MIN_APART_M < range_m[:, None]
     return np.asarray((is_nearer & (cosine > math.cos(_SAME_RAD))).any(axis=1))

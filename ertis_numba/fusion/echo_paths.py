@@ -43,6 +43,11 @@ class EchoPaths(NamedTuple):
     power: Floats
 
     @property
+    def is_flat(self) -> NDArray[np.bool_]:
+        """True for receivers that do not distinguish front and back: (sensor,) bool."""
+        return np.array([number in self.flat for number in range(len(self.sensor_m))], np.bool_)
+
+    @property
     def receiver(self) -> Numbers:
         """Receiver of each echo: (echo,) int64."""
         found = np.zeros(len(self.path_m), np.int64)
@@ -62,8 +67,7 @@ class EchoPaths(NamedTuple):
         within_m, within_rad : float
             Largest differences of paths, and of directions ahead of the receiver.
         """
-        is_flat = np.isin(np.arange(len(self.sensor_m)), [*self.flat])
-        echoes = is_flat, self.receiver, self.direction, self.path_m
+        echoes = self.is_flat, self.receiver, self.direction, self.path_m
         find_arrivals, count = kernels.load_fusion().find_arrivals, _FEW
         while True:
             found = np.empty((3, count), np.int64)

@@ -248,7 +248,7 @@ def _disturbance(
     """Return the power of other echoes at expected ones of a receiver, relative to these: (reflector, emitter)."""
     emitters, delay_m = [*late_m], np.array([*late_m.values()])
     path_m, power = predicted.path_m[:, number, emitters], predicted.power[:, number, emitters]
-    heard = np.where(np.isin(emitters, [*silent]), 0.0, power)
+    heard = np.where([each in silent for each in emitters], 0.0, power)
     here = PredictedEchoes(path_m[:, None], heard[:, None], predicted.direction[:, [number]])
     of, emitter = (each.ravel() for each in np.indices(path_m.shape))
     is_other = np.ones((len(of), *path_m.shape), np.bool_)
