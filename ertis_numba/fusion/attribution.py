@@ -247,7 +247,7 @@ class Attribution:
         return bound
 
     def _confirmed(self, evidence: Sequence[_Evidence], alone: Singles) -> dict[int, Singles]:
-        """Return the reflectivity that all pairs but a sensor's own confirm, by sensor: (cell,) float32.
+        """Return the power of own echoes that all pairs but a sensor's own confirm, by sensor: (pixel,) float32.
 
         It is 0 where no other pair can see the cell.
         """
@@ -262,7 +262,7 @@ class Attribution:
                 pair.cell, pair.confirms, pair.gain, each.values, alone, np.float32(_VISIBLE), own, least
             )
         least[~np.isfinite(least)] = 0
-        return dict(zip(numbers, least, strict=True))
+        return {number: row[cell] * gain for row, (number, (cell, gain)) in zip(least, self._own.items(), strict=True)}
 
     def _around(self, reflectivity: Singles) -> Singles:
         """Return the highest reflectivity of each cell and its neighbours: (cell,) float32."""
@@ -301,10 +301,7 @@ class Attribution:
                 if (each.emitter, number) not in found:
                     found[each.emitter, number] = np.zeros_like(power)
                 continue
-            expected = _NONE
-            if each.emitter == number and confirmed is not None:
-                cell, gain = self._own[number]
-                expected = confirmed[cell] * gain
+            expected = confirmed if each.emitter == number and confirmed is not None else _NONE
             share = found[each.emitter, number] = np.empty_like(power)
             self._kernels.share_echoes(
                 predicted,

@@ -276,30 +276,35 @@ def match_echoes(places, echoes, chosen, gate, alike, found, out):
 def find_arrivals(origin_m, sent_m, sensor_m, ahead, is_flat, receiver, direction, path_m, within_m, within_rad, found):
     """Find the echoes that fit sound from given places, by path and direction."""
     count, n_emitters = 0, path_m.shape[1]
-    to_m, seen = np.empty((len(sensor_m), 3)), np.empty(3)
-    apart_m = np.empty(len(sensor_m))
+    to_m, whole_m = np.empty((len(sensor_m), 3)), np.empty(len(sensor_m))
     for source in range(len(origin_m)):
         for emitter in range(n_emitters):
             for here in range(len(sensor_m)):
                 for axis in range(3):
                     to_m[here, axis] = origin_m[source, emitter, axis] - sensor_m[here, axis]
-                apart_m[here] = max(_length(to_m[here]), NEAREST_M)
+                whole_m[here] = max(_length(to_m[here]), NEAREST_M) + sent_m[source, emitter]
             for echo in range(len(path_m)):
                 here = receiver[echo]
-                depth = _product(to_m[here], ahead[here]) / apart_m[here]
-                is_audible = depth > 0.0 or is_flat[here]
-                late_m = path_m[echo, emitter] - (apart_m[here] + sent_m[source, emitter])
-                if not (is_audible and abs(late_m) < within_m):  # False for NaN.
-                    continue
-                for axis in range(3):
-                    seen[axis] = to_m[here, axis] / apart_m[here] - 2.0 * min(depth, 0.0) * ahead[here, axis]
-                    seen[axis] -= direction[echo, axis]
-                # For small angles, the chord is the angle.
-                if _length(seen) < within_rad / max(abs(depth), LEAST_COSINE):
+                if abs(path_m[echo, emitter] - whole_m[here]) < within_m and _arrives(  # False for NaN.
+                    to_m[here], ahead[here], is_flat[here], direction[echo], within_rad
+                ):
                     if count < found.shape[1]:
                         found[0, count], found[1, count], found[2, count] = source, emitter, echo
                     count += 1
     return count
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _arrives(to_m, ahead, is_flat, direction, within_rad):
+    """Return True if sound from a place appears in a direction."""
+    apart_m = max(_length(to_m), NEAREST_M)
+    depth = _product(to_m, ahead) / apart_m
+    turned = 0.0
+    for axis in range(3):
+        seen = to_m[axis] / apart_m - 2.0 * min(depth, 0.0) * ahead[axis]
+        turned += (seen - direction[axis]) ** 2
+    is_near = np.sqrt(turned) < within_rad / max(abs(depth), LEAST_COSINE)  # For small angles, the chord is the angle.
+    return is_near and (is_flat or depth > 0.0)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
