@@ -30,7 +30,7 @@ def test_pulses_are_kept_within_the_limits_of_size_and_time(monkeypatch):
             queue.put(number, MAX_KEPT_BYTES // 6)
         now_s += 2.0
     assert queue.n_skipped == 3
-    now_s += 7.9
+    now_s += 3.9
     assert queue.take() == 3
     queue.put(9, 1)
     assert queue.n_skipped == 3

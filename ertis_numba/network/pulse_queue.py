@@ -14,7 +14,7 @@ MAX_WAITING: Final = 2
 """Limit on waiting pulses; a slow application gets the latest ones."""
 MAX_KEPT_BYTES: Final = 64_000_000
 """Limit on the images that wait while pulses are kept."""
-_CATCHING_UP: Final = 4.0  # Longest time until all that waited is used, relative to the time in which it arrived.
+_CATCHING_UP: Final = 2.0  # Longest time until all that waited is used, relative to the time in which it arrived.
 
 Pulse = TypeVar("Pulse")
 
@@ -86,7 +86,7 @@ class PulseQueue(Generic[Pulse]):
     def keeping(self) -> Iterator[None]:
         """Keep all pulses that arrive until the block ends, and until the application has caught up.
 
-        It must do so within four times the duration of the block. The images that wait take at most 64 MB.
+        It must do so within twice the duration of the block. The images that wait take at most 64 MB.
         """
         begun_s = time.monotonic()
         self._kept_until_s = math.inf
