@@ -453,6 +453,12 @@ class Reflectors:
         """Return the echoes that the reflectors should cause if all sensors emit."""
         return self._predicted(self.located)
 
+    @property
+    def is_sure(self) -> NDArray[np.bool_]:
+        """True for confirmed reflectors, and for those that several echoes locate: (reflector,) bool."""
+        several = [len(each.echo) >= _N_CONFIRMING for each in self.located]
+        return np.asarray(self.confirmed | np.array(several, np.bool_))
+
     def known_echoes(self, receiver: int) -> KnownEchoes:
         """Return the echoes of the reflectors in the image of a receiver: those that locate them, and predicted ones.
 

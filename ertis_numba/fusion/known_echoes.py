@@ -18,7 +18,7 @@ Singles = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
-_MARGIN: Final = np.float32(4.0)  # Power up to which confirmed reflectors explain a pixel, relative to their echoes.
+_MARGIN: Final = np.float32(4.0)  # Power up to which sure reflectors explain a pixel, relative to their echoes.
 _LOBE: Final = -1.0  # Logarithm of the amplitude at the width of the main lobe: the beamformer falls off faster.
 _PULSE: Final = -0.875  # Compressed pulses are 26 dB down at six widths, and 40 dB at fourteen.
 _TINY: Final = np.float32(1e-30)
@@ -74,11 +74,11 @@ def explained_shares(
     image: CoarseImage,
     echoes: KnownEchoes,
     factors: tuple[Singles, Singles],
-    confirmed: Flags,
+    is_sure: Flags,
 ) -> Shares:
     """Return the shares of a receiver's pixels, which belong to located reflectors where these explain them.
 
-    Confirmed reflectors explain a pixel if the sum of their echoes in phase may have its power. Their phases are
+    Sure reflectors explain a pixel if the sum of their echoes in phase may have its power. Their phases are
     unknown. All located reflectors share such a pixel by the powers of their echoes there. Echoes that arrive from
     behind, and reflectors of other calls, are thus no ghosts in front. Other pixels keep the shares of the attribution.
 
@@ -92,10 +92,11 @@ def explained_shares(
     echoes : KnownEchoes
     factors : tuple of (echo, direction) and (echo, step) float32
         Amplitudes of the echoes, `KnownEchoes.amplitudes`.
-    confirmed : (reflector,) bool
+    is_sure : (reflector,) bool
+        Reflectors that explain pixels.
     """
     lobe, pulse = factors
-    sure = confirmed[echoes.reflector]
+    sure = is_sure[echoes.reflector]
     explained = _MARGIN * (lobe[sure].T @ pulse[sure]) ** 2 / (image.power + _TINY)
     np.minimum(explained, 1, out=explained)
     lobe, pulse = lobe**2, pulse**2

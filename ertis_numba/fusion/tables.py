@@ -321,7 +321,7 @@ class FusionTables:
         for number, each in coarse.items():
             echoes = reflectors.known_echoes(number)
             factors = echoes.amplitudes(self._receivers[number], self._late_m[number])
-            informed |= explained_shares(shares, number, each, echoes, factors, reflectors.confirmed)
+            informed |= explained_shares(shares, number, each, echoes, factors, reflectors.is_sure)
         attribution = self.attribution(group).without(found.attributed.unheard)
         reflectivity = attribution.informed(coarse, found.attributed, informed)
         sure = reflectors.confirmed
