@@ -9,6 +9,7 @@ from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.geometry import microphones
 from ertis_numba.passive import BeamSound, HeardSignals, heterodyned, listen_to, time_expanded
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.wav import read_wav
@@ -37,6 +38,8 @@ def test_sound_equals_the_mean_of_signals_delayed_in_float64():
         row @ np.sinc(samples + delay * found.rate_hz - samples[:, None])
         for row, delay in zip(rows, delay_s, strict=True)
     )
+    spectrum, frequency_hz = np.fft.rfft(expected), np.fft.rfftfreq(len(expected), 1 / found.rate_hz)
+    expected = np.fft.irfft(np.where(frequency_hz > signals.band_hz[1], 0, spectrum), len(expected))
     inner = slice(50, 250)  # ends depend on what the interpolation assumes beyond them
     assert np.abs(found.samples - expected / 6)[inner].max() < 0.02 * np.abs(expected / 6).max()
 
@@ -166,3 +169,28 @@ def test_command_names_its_option_for_a_shift_above_the_sound(recording, tmp_pat
     assert done.exit_code == 2
     assert "--heterodyne is 4e+09; give a number from 0 to 56250" in done.stderr
     assert not (tmp_path / "x.wav").exists()
+
+
+@pytest.mark.parametrize("rate_hz", [16e3, 44.1e3, 48e3])
+@pytest.mark.parametrize("away", [1.05, 1.2, 1.5, 1.9])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_tones_beyond_half_of_the_rate_leave_no_aliases(rate_hz, away, side):
+    n, source_rate_hz, shift_hz = 45_000, 225e3, 50e3
+    time_s = np.arange(n) / source_rate_hz
+    swell = np.hanning(n)  # no clicks at its ends
+    tone = swell * np.sin(2 * np.pi * (shift_hz + side * away * rate_hz / 2) * time_s)
+    found = heterodyned(BeamSound(tone.astype(np.float32), source_rate_hz), shift_hz, rate_hz)
+    assert np.sqrt(np.mean(found.samples**2)) < 1e-3 * np.sqrt(np.mean(tone**2))
+
+
+@pytest.mark.parametrize("frequency_hz", [41e3, 60e3, 100e3])
+def test_sound_above_the_highest_frequency_leaves_no_aliases(frequency_hz):
+    settings = settings_of(passive__bands_hz=[[20e3, 30e3]])
+    recording = settings.recording
+    time_s = np.arange(recording.n_samples) / recording.sample_rate_hz
+    tone = np.hanning(len(time_s)) * np.sin(2 * np.pi * frequency_hz * time_s)
+    n_mics = len(microphones(settings.array).enabled_positions_m)
+    data = np.repeat(tone[:, None], n_mics, axis=1).astype(np.float32)
+    found = listen_to(ertis.Measurement(data, settings), 0.0)
+    assert found.rate_hz < recording.sample_rate_hz
+    assert np.sqrt(np.mean(found.samples**2)) < 1e-3 * np.sqrt(np.mean(tone**2))

@@ -19,6 +19,8 @@ from ertis_numba.passive.wave_delays import WaveDelays
 __all__ = ["BeamSound", "heterodyned", "listen_to", "time_expanded"]
 
 _MAX_EXPANSION: Final = 1000.0
+_PASSED: Final = 0.9  # Highest frequency that keeps its level, relative to half of the sample rate.
+_SILENCE: Final = 64  # Samples after a sound, which keep its end apart from its start.
 _FINEST_RATIO: Final = 100_000  # Largest denominator of the ratio of two sample rates.
 
 
@@ -70,7 +72,8 @@ def listen_to(
     """Return the sound of a measurement from one direction, by delay-and-sum.
 
     The signals of the microphones are delayed by exact fractions of a sample, as phase shifts of their spectra, and
-    averaged. Sound from the direction keeps its level, and noise of 32 microphones loses 15 dB.
+    averaged. Sound from the direction keeps its level, and noise of 32 microphones loses 15 dB. If the signals have a
+    lower rate than the record, sound above the highest frequency of the bands is left out.
 
     Parameters
     ----------
@@ -113,9 +116,12 @@ def listen_to(
     n_samples = heard.shape[1]
     n_fft = scipy.fft.next_fast_len(n_samples + 2 * math.ceil(float(np.abs(delay_s).max()) * rate_hz) + 64, real=True)
     frequency_hz = np.fft.rfftfreq(n_fft, 1 / rate_hz)
+    is_decimated = rate_hz < signals.settings.recording.sample_rate_hz
     spectrum = np.zeros(len(frequency_hz), np.complex128)
     for row, delay in zip(heard, delay_s, strict=True):
         spectrum += scipy.fft.rfft(row, n_fft) * np.exp(2j * np.pi * frequency_hz * delay)
+    if is_decimated:  # Above, the filter lets aliases pass.
+        spectrum[frequency_hz > signals.band_hz[1]] = 0
     samples = scipy.fft.irfft(spectrum / len(heard), n_fft)[:n_samples]
     return BeamSound(samples.astype(np.float32), rate_hz)
 
@@ -124,7 +130,8 @@ def heterodyned(sound: BeamSound, shift_hz: float, rate_hz: float = 48e3) -> Bea
     """Return a sound whose frequencies are lower by a shift, at another sample rate.
 
     A tone at ``shift_hz + f`` becomes one of f. Tones below the shift become audible too, with ``−f``, as with a bat
-    detector. Frequencies farther from the shift than half of the sample rate are removed.
+    detector. Frequencies farther from the shift than half of the sample rate are removed, and those from 0.9 of this
+    distance on are attenuated.
 
     Parameters
     ----------
@@ -157,12 +164,19 @@ def heterodyned(sound: BeamSound, shift_hz: float, rate_hz: float = 48e3) -> Bea
     checks.between("rate_hz", rate_hz, 1e3, sound.rate_hz)
     if not len(sound.samples):
         return BeamSound(sound.samples, rate_hz)
-    time_s = np.arange(len(sound.samples)) / sound.rate_hz
-    lowered = (scipy.signal.hilbert(sound.samples.astype(np.float64)) * np.exp(-2j * np.pi * shift_hz * time_s)).real
     ratio = Fraction(rate_hz / sound.rate_hz).limit_denominator(_FINEST_RATIO)
     if not ratio:
         raise ArgumentError(f"rate_hz is {rate_hz:g}, too low for a sound of {sound.rate_hz:g} Hz; give a higher rate")
-    samples = scipy.signal.resample_poly(lowered, ratio.numerator, ratio.denominator)
+    n_samples = math.ceil(len(sound.samples) * ratio)
+    size = ratio.denominator * math.ceil((len(sound.samples) + _SILENCE) / ratio.denominator)
+    time_s = np.arange(size) / sound.rate_hz
+    padded = np.pad(sound.samples.astype(np.float64), (0, size - len(sound.samples)))
+    spectrum = scipy.fft.fft(scipy.signal.hilbert(padded) * np.exp(-2j * np.pi * shift_hz * time_s))
+    n_kept = size * ratio.numerator // ratio.denominator
+    number = np.rint(np.fft.fftfreq(n_kept, 1 / n_kept)).astype(np.intp)
+    away = np.abs(number) / (n_kept / 2)
+    passed = np.cos(np.pi / 2 * np.clip((away - _PASSED) / (1 - _PASSED), 0, 1)) ** 2
+    samples = (scipy.fft.ifft(spectrum[number] * passed).real * float(ratio))[:n_samples]
     return BeamSound(samples.astype(np.float32), rate_hz)
 
 
