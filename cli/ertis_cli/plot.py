@@ -69,10 +69,8 @@ _ONLY = {
 @click.option(
     "--dynamic-range",
     type=click.FloatRange(max=1000.0),
-    default=40.0,
-    show_default=True,
     metavar="DB",
-    help="Range of the colours.",
+    help="Range of the colours; 40 by default, and 20 for acoustic maps.",
 )
 @click.option(
     "--theme",
@@ -126,7 +124,7 @@ def plot(
     target: Path | None,
     sensor: str | None,
     measurement: int | None,
-    dynamic_range: float,
+    dynamic_range: float | None,
     theme: Literal["dark", "light", "paper"],
     columns: Literal[1, 2] | None,
     font: Literal["sans", "serif"],
@@ -165,9 +163,8 @@ def plot(
         "band": band_hz,
         "photo": photo,
         "photo-fov": photo_fov_deg,
+        "dynamic-range": dynamic_range,
     }
-    source = click.get_current_context().get_parameter_source("dynamic_range")
-    given["dynamic-range"] = dynamic_range if source is click.core.ParameterSource.COMMANDLINE else None
     if not typed("kind"):
         kind = _default_kind(path, sensor, measurement or 0, kind)
     _require_supported(kind, path, given)
@@ -179,7 +176,7 @@ def plot(
     checks.file_ending("picture", target, _FORMATS)
     check_target(target, overwrite=force)
     look: dict[str, Any] = {
-        "dynamic_range_db": dynamic_range,
+        **({} if dynamic_range is None else {"dynamic_range_db": dynamic_range}),
         "theme": theme,
         "columns": columns,
         "font": font,
@@ -200,7 +197,6 @@ def plot(
         figure = figures.calibration(made, settings, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, **look)
         reported = f"calibration with {path}"
     elif kind == "map":
-        del look["dynamic_range_db"]
         figure, reported = figures.occupancy(read_map(path), **look), f"map of {path}"
     else:
         row, index = _acoustic_plots.row_name(path), measurement or 0

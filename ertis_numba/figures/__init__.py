@@ -273,7 +273,7 @@ def acoustic_map(
     band_hz: tuple[float, float] | None = None,
     photo: str | Path | None = None,
     photo_fov_deg: tuple[float, float] | None = None,
-    dynamic_range_db: float = 40.0,
+    dynamic_range_db: float = 20.0,
     **look: Unpack[StyleOptions],
 ) -> Figure:
     """Draw an acoustic map over azimuth and elevation, or as a line over azimuth if it has one elevation.
@@ -290,7 +290,9 @@ def acoustic_map(
         Picture over which the map is drawn, half-transparent. The camera is at the sensor and looks along x.
     photo_fov_deg : (azimuth, elevation), optional
         Horizontal and vertical field of view of the picture in degrees, 1 to 170; needed with ``photo``.
-    dynamic_range_db, **look
+    dynamic_range_db : float, default 20
+        Range of the colours in decibels.
+    **look
         As for `plot`.
 
     Raises
