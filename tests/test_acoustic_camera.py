@@ -439,3 +439,14 @@ def test_too_few_blocks_are_refused():
     settings = settings_of(passive__resolution_hz=28.0)
     with AcousticCamera(settings, "cpu") as camera, pytest.raises(DataError, match="no block of"):
         camera.process(ertis.Measurement(sound(settings, []).data, settings, ertis.Stamp(behaviour="active")))
+
+
+@pytest.mark.parametrize("scale", [2e13, 1e18, 1e38])
+def test_sound_whose_powers_exceed_single_precision_is_refused(scale):
+    measurement = sound(settings_of(), [(20, 0.1)], noise=0.01)
+    data = (scale * measurement.data.astype(float) / np.abs(measurement.data).max()).astype(np.float32)
+    with AcousticCamera(measurement.settings, "cpu") as camera, pytest.raises(DataError, match="divide the samples"):
+        camera.process(ertis.Measurement(data, measurement.settings))
+    data = (0.9e12 * measurement.data.astype(float) / np.abs(measurement.data).max()).astype(np.float32)
+    with AcousticCamera(measurement.settings, "cpu") as camera:
+        assert np.isfinite(camera.process(ertis.Measurement(data, measurement.settings)).power).all()

@@ -197,3 +197,15 @@ def test_arguments_outside_their_limits_are_refused():
             time_differences(*arguments, **options)
     with HeardSignals(settings_of()) as signals:
         assert signals.band_hz == (20e3, 40e3)
+
+
+@pytest.mark.parametrize("scale", [1e-35, 1e-18, 1e15, 1e19, 1e37])
+@pytest.mark.parametrize("weighting", ["phat", "none"])
+def test_loudness_does_not_change_time_differences(scale, weighting):
+    rows = delayed_noise((0.0, 7.7e-6), noise=0.1)
+    (expected,), (found,) = (
+        time_differences((each * rows.astype(float)).astype(np.float32), rate_hz=RATE_HZ, weighting=weighting)
+        for each in (1.0, scale)
+    )
+    assert found.delay_s == pytest.approx(expected.delay_s, abs=1e-9)
+    assert found.uncertainty_s == pytest.approx(expected.uncertainty_s, rel=0.01)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks, kernels
 from ertis_numba.accepted_words import AcceptedWords
+from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.passive.bands import band_edges
@@ -20,6 +21,7 @@ __all__ = ["HeardSignals", "heard_bands"]
 
 _RINGING_S: Final = 1e-3  # Time after the call in which the transducer and the filters ring.
 
+_LARGEST: Final = 1e12  # relative to full scale
 _RATE: Final = 2.5  # Least signal rate relative to the highest frequency.
 _MAX_FACTOR: Final = 40  # Largest decimation; 16 bits cannot hold the filters of larger ones.
 
@@ -112,7 +114,7 @@ class HeardSignals:
         Raises
         ------
         DataError
-            Its array, call, record or air are not those of the settings.
+            Its array, call, record or air are not those of the settings, or samples exceed 1e12 times full scale.
         """
         checks.instance("measurement", measurement, Measurement, "a recording holds")
         words, exponent = self._words.read(measurement)
@@ -121,7 +123,14 @@ class HeardSignals:
             self._demodulate(self._lane.send(words), self._room, self._signals)
             self._lane.fetch(self._signals, out)
             self._lane.wait()
-        out *= np.float32(2.0**exponent) / self._gain
+        with np.errstate(over="ignore", invalid="ignore"):
+            out *= np.float32(2.0**exponent) / self._gain
+        largest = float(max(out.max(initial=0.0), -out.min(initial=0.0)))
+        if not largest <= _LARGEST:
+            raise DataError(
+                f"a measurement has samples above {_LARGEST:g} times full scale, whose powers exceed single precision; "
+                "divide the samples by their largest value"
+            )
         return out
 
     def close(self) -> None:

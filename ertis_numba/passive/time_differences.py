@@ -199,6 +199,8 @@ class _Correlator:
                 "Hz apart; give a wider band, or a smaller resolution_hz"
             )
         self._omega = 2 * np.pi * np.asarray(frequency_hz, np.float64)
+        largest = np.abs(signals.rows).max()  # Powers of very large or small sound exceed single precision.
+        signals = signals._replace(rows=signals.rows / (largest if largest > 0 else np.float32(1)))
         self._signals, self._n_block, self._weighting = signals, n_block, weighting
         self._spectra = [self._spectra_of(row) for row in signals.rows]
 
