@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from ertis_bench.passive import separation
-from ertis_bench.sound_signals import NoiseSource, listening, noise
+from ertis_bench.passive.sound_signals import NoiseSource, listening, noise
 
 from ertis_numba.passive import AcousticCamera
 from ertis_numba.passive.high_resolution import HighResolutionClean

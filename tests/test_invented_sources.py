@@ -8,7 +8,7 @@ import os
 
 import numpy as np
 import pytest
-from ertis_bench.sound_signals import NoiseSource, listening, noise
+from ertis_bench.passive.sound_signals import NoiseSource, listening, noise
 from scipy.spatial import KDTree
 
 import ertis_numba as ertis

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from ertis_bench.sound_signals import NoiseSource, listening, noise
+from ertis_bench.passive.sound_signals import NoiseSource, listening, noise
 from matplotlib.text import Text
 
 import ertis_numba as ertis

@@ -7,11 +7,10 @@ from ertis_bench import timing
 from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import or_dash, table
-from ertis_bench.network.latency import latency
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RESTRICTED
 from ertis_numba.verification import PEAKS
 
-__all__ = ["FORMS", "accuracy", "accuracy_front", "latency", "paper"]
+__all__ = ["FORMS", "accuracy", "accuracy_front", "paper"]
 
 _MEANING = {
     "scipy": "`scipy`: the paper's algorithm, NumPy and SciPy",
@@ -152,7 +151,6 @@ def _accuracy_conditions(report: dict[str, Any]) -> str:
 
 FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
     "paper": {"paper": paper},
-    "latency": {"latency": latency},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
 }
 """Forms of the table of each command in the wheel, by the name in its markers. A file's markers select the form."""

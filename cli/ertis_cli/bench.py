@@ -63,7 +63,7 @@ _update = click.option(
 def bench() -> None:
     """Run benchmarks of speed and accuracy.
 
-    The wheel contains paper, accuracy and latency. The others exist only in the source folder.
+    The wheel contains paper and accuracy. The others exist only in the source folder.
     """
 
 
@@ -550,9 +550,7 @@ def latency(**given: Any) -> None:
 
     Also measures the processor time of each process.
     """
-    from ertis_bench.network import latency as benchmark
-
-    _run("latency", benchmark, **given)
+    _run("latency", _in_source_folder("latency", "network.latency"), **given)
 
 
 @bench.command()

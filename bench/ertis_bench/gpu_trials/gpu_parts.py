@@ -22,8 +22,8 @@ from ertis_bench.gpu_trials import rivals
 from ertis_bench.gpu_trials.gpu import REFUSED
 from ertis_bench.gpu_trials.gpu_stages import stages
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RANGE_M
+from ertis_bench.passive.sound_signals import OWN_RMS, SOURCES, listening, noise
 from ertis_bench.plans import in_words
-from ertis_bench.sound_signals import OWN_RMS, SOURCES, listening, noise
 from ertis_numba import kernels, verification
 from ertis_numba.errors import DataError, DeviceError
 from ertis_numba.frames import Measurement

@@ -8,15 +8,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_bench import machine, serial_stream
+from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_bench.network import imaging
+from ertis_bench.network import imaging, serial_stream
 from ertis_bench.network.sent import read_diaries
 from ertis_bench.network.serving import percentile
 from ertis_numba.network.trace import VARIABLE
 
-__all__ = ["STAGES", "latency", "run"]
+__all__ = ["FORMS", "STAGES", "latency", "run"]
 
 STAGES: Final = {
     "kept": ("sensor node", "CRC-32 and spool"),
@@ -152,3 +152,7 @@ def latency(report: dict[str, Any]) -> str:
     return "\n\n".join(
         [*parts, table(columns, rows, numbers=False), line, f"Measured on {sentence(report['machine'])}", conditions]
     )
+
+
+FORMS = {"latency": latency}
+"""Table of the command, by the name in its markers."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_bench.passive._acoular import AcousticMapper
-from ertis_bench.sound_signals import N_BLOCK, OWN_RMS, SOURCES, listening, noise
+from ertis_bench.passive.sound_signals import N_BLOCK, OWN_RMS, SOURCES, listening, noise
 from ertis_numba.errors import DataError
 from ertis_numba.passive import AcousticCamera
 

@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_bench.sound_signals import NoiseSource, listening, noise
+from ertis_bench.passive.sound_signals import NoiseSource, listening, noise
 from ertis_numba.passive import AcousticCamera
 
 __all__ = ["AVERAGES", "BAND_HZ", "PAIRS", "SNR_DB", "SourcePair", "are_separated", "measure"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ertis_bench.passive._acoular import AcousticMapper
 from ertis_bench.passive.agreement import CASES, Case, bins_of
-from ertis_bench.sound_signals import N_BLOCK, OWN_RMS, SOURCES, listening, noise
+from ertis_bench.passive.sound_signals import N_BLOCK, OWN_RMS, SOURCES, listening, noise
 from ertis_numba.frames import Measurement
 from ertis_numba.passive import AcousticCamera
 

@@ -1,4 +1,4 @@
-"""Time from the last byte of a block to its image, with and without a stream: ``python -m ertis_bench.serial_stream``.
+"""Time from the last byte of a block to its image, with and without a stream: `ertis bench latency`.
 
 The sender runs in a process of its own, so that it shares no interpreter lock with the receiver.
 """
@@ -55,7 +55,7 @@ def measure(*, duration_s: float, seed: int, rate_hz: float = 10.0, directions: 
         measurements = [Measurement(words, settings) for words in np.load(path)]
         expected = [pipeline.process(each).amplitude for each in measurements]
         job = _SenderJob(str(path), count, rate_hz)
-        command = [sys.executable, "-m", "ertis_bench.serial_stream", json.dumps(asdict(job))]
+        command = [sys.executable, "-m", "ertis_bench.network.serial_stream", json.dumps(asdict(job))]
         with JsonLinesProcess(command, stated=Path(place) / "sender.txt") as sender:
             port = sender.wait_for("ready")["port"]
             ready_ns = _received(pipeline, settings, port, expected, count, begin=lambda: sender.signal(_BEGIN))
