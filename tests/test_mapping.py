@@ -363,7 +363,8 @@ def test_doubtful_echoes_must_repeat_until_a_cell_is_occupied(n_dimensions, stre
     coverage = coverage._replace(weight=weight * coverage.weight)
     echoes = echoes_of(np.array([[2.0, 0.0, 0.0]]), np.zeros((1, 2)), np.full(1, strength), n_dimensions)
     found = []
-    for _ in range(n_pulses):
+    for number in range(n_pulses):
+        grid.view_from(np.array([0.1 * number, 0.0, 0.0]), np.eye(3), 0.0)
         window = grid.window(np.zeros(3), 3.0)
         add_evidence(window, ORIGIN, echoes, coverage, near_m=0.0)
         found.append(ertis.OccupancyMap(window.log_odds, (0.0, 0.0, 0.0), 0.05).is_occupied.any())
@@ -379,6 +380,7 @@ def test_cells_lose_evidence_in_pulses_without_their_echo(n_dimensions):
     is_near = np.hypot(y_m, z_m) < 0.2
     for place_m, log_odds in ((far_m, 1.0), (far_m + 0.1, 4.0), (hidden_m, 1.0)):
         window.log_odds[is_near & (np.abs(x_m - place_m) < 0.05)] = log_odds
+    window.before[:] = window.log_odds
 
     def after(n_pulses, view):
         for _ in range(n_pulses):
@@ -389,6 +391,65 @@ def test_cells_lose_evidence_in_pulses_without_their_echo(n_dimensions):
     assert after(1, ORIGIN._replace(covariance=covariance_of(100.0, 0.0))) == pytest.approx([1.0, 1.0], abs=1e-6)
     assert after(2, ORIGIN) == pytest.approx([1.0 - 2 * lost, 1.0], abs=1e-6)
     assert after(math.ceil(1.0 / lost), ORIGIN) == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("n_dimensions", [2, 3])
+@pytest.mark.parametrize(("moved_m", "turned_deg"), [(0.0, 0.0), (0.009, 1.0), (0.0, 360.0)])
+def test_echoes_from_one_viewpoint_are_one_observation(n_dimensions, moved_m, turned_deg):
+    """A ghost repeats at the same place while the platform stands still, or moves by less than 10 cm in all."""
+    echoes = echoes_of(np.array([[2.0, 0.0, 0.0]]), np.zeros((1, 2)), np.full(1, 0.85), n_dimensions)
+    grid, highest = CellGrid(0.05, n_dimensions), []
+    for number in range(9):
+        turn = Rotation.from_euler("z", number * turned_deg, degrees=True).as_matrix()
+        grid.view_from(np.array([moved_m * number, 0.0, 0.0]), turn, 0.2)
+        window = grid.window(np.zeros(3), 3.0)
+        add_evidence(window, ORIGIN, echoes, everywhere(n_dimensions), near_m=0.0)
+        highest.append(float(window.log_odds.max()))
+    most = highest[0] * sensor_model.TRUST[n_dimensions].repeats
+    assert highest[1:] == pytest.approx([most] * 8)
+    assert highest[0] > 0
+
+
+@pytest.mark.parametrize(("moved_m", "turned_deg"), [(0.1, 0.0), (0.0, 60.0), (0.05, 30.0)])
+def test_echoes_from_several_viewpoints_add_up(moved_m, turned_deg):
+    echoes = echoes_of(np.array([[2.0, 0.0, 0.0]]), np.zeros((1, 2)), np.full(1, 0.85))
+    grid, highest = CellGrid(0.05), []
+    for number in range(3):
+        turn = Rotation.from_euler("z", number * turned_deg, degrees=True).as_matrix()
+        grid.view_from(np.array([moved_m * number, 0.0, 0.0]), turn, 0.2)
+        window = grid.window(np.zeros(3), 3.0)
+        add_evidence(window, ORIGIN, echoes, everywhere(), near_m=0.0)
+        highest.append(float(window.log_odds.max()))
+    assert highest == pytest.approx([highest[0], 2 * highest[0], 3 * highest[0]])
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_objects_that_arrive_occupy_free_cells(moves):
+    """Also in front of a platform at rest, which has seen these cells free."""
+    wall, post = (echoes_of(np.array([[away_m, 0.0, 0.0]]), np.zeros((1, 2)), np.ones(1)) for away_m in (2.5, 1.5))
+    grid = CellGrid(0.05)
+    for number, echoes in enumerate([wall] * 9 + [post] * 6):
+        grid.view_from(np.array([0.2 * number * moves, 0.0, 0.0]), np.eye(3), 0.2)
+        window = grid.window(np.zeros(3), 3.0)
+        add_evidence(window, ORIGIN, echoes, everywhere(), near_m=0.0)
+        if number == 8:
+            assert window.log_odds[0, 60, 90] < -2.0
+    assert window.log_odds[0, 59:61, 89:91].max() > 1.0
+
+
+@pytest.mark.parametrize("n_dimensions", [2, 3])
+def test_unconfirmed_points_occupy_no_cell_alone(n_dimensions):
+    """From several viewpoints, they do."""
+    place_m = np.array([[2.0, 0.0, 0.0]])
+    echoes = echoes_of(place_m, np.zeros((1, 2)), np.ones(1), n_dimensions, np.zeros(1, np.bool_))
+    grid, found = CellGrid(0.05, n_dimensions), []
+    for number in range(4):
+        grid.view_from(np.array([0.1 * number, 0.0, 0.0]), np.eye(3), 0.2)
+        window = grid.window(np.zeros(3), 3.0)
+        add_evidence(window, ORIGIN, echoes, everywhere(n_dimensions), near_m=0.0)
+        found.append(bool(ertis.OccupancyMap(window.log_odds, (0.0, 0.0, 0.0), 0.05).is_occupied.any()))
+    assert not found[0]
+    assert found[-1]
 
 
 def share_behind(monkeypatch, obstacle_m, known, n_dimensions=2, **trust):
@@ -402,6 +463,7 @@ def share_behind(monkeypatch, obstacle_m, known, n_dimensions=2, **trust):
         x_m, y_m, z_m = axes_m(window)
         window.log_odds[:] = known(x_m, y_m + 0 * z_m) if len(places_m) == 2 else 0.0
         before = window.log_odds.copy()
+        window.before[:] = before
         offset_m = np.column_stack([places_m, np.zeros(len(places_m))])
         echoes = echoes_of(offset_m, np.full((len(places_m), 2), 0.01), np.ones(len(places_m)))
         add_evidence(window, ORIGIN, echoes, everywhere(n_dimensions), near_m=0.0)
@@ -640,11 +702,11 @@ def test_unknown_format_of_a_map_is_refused(tmp_path):
 
 def test_map_of_a_furnished_room_shows_its_walls():
     """`ertis bench map` measures maps of many rooms, with more poses."""
-    report = mapping.run(count=1, poses=6, length_m=0.0, rate_hz=2.5, seed=1, say=lambda _: None)
+    report = mapping.run(count=1, poses=12, length_m=0.0, rate_hz=2.5, seed=1, say=lambda _: None)
     (row,) = report["rows"]
     assert row["found"] > 0.5
     assert row["false"] < 0.06
-    assert "| room 1 | 6 |" in mapping.form(report)
+    assert "| room 1 | 12 |" in mapping.form(report)
 
 
 def test_distances_in_a_place_are_those_to_walls_posts_and_boxes():

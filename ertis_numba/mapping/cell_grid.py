@@ -1,5 +1,6 @@
 """Grid of cells that grows with the explored space."""
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ Singles = NDArray[np.float32]
 
 _BLOCK: Final = np.array([64, 64, 16])  # The grid grows by whole blocks of cells, so that it is copied rarely.
 
+_MOVED_M: Final = 0.1  # Motion of a sensor after which it sees from a new viewpoint.
+
 
 class Window(NamedTuple):
     """Part of a grid as a view.
@@ -30,12 +33,18 @@ class Window(NamedTuple):
         Side of the cells.
     is_planar : bool
         True for a plane, which has one layer. All places are in its middle.
+    before : (layer, row, column) float32
+        View of the log-odds before the pulses from the present viewpoint.
+    shown : (layer, row, column) float32
+        View of the largest evidence of one of these pulses for an occupied cell.
     """
 
     log_odds: Singles
     first: Counts
     cell_m: float
     is_planar: bool
+    before: Singles
+    shown: Singles
 
     def cells_of(self, place_m: Floats) -> Floats:
         """Return places in cells from the centre of the first cell: (..., axis) float64."""
@@ -61,7 +70,39 @@ class CellGrid:
     def __init__(self, cell_m: float, n_dimensions: int = 2, height_m: tuple[float, float] = (-np.inf, np.inf)) -> None:
         self._cell_m, self._n_dimensions, self._height_m = cell_m, n_dimensions, height_m
         self._first = np.zeros(3, np.int64)  # Column, row and layer of the first cell, from the world's origin.
-        self.log_odds: Singles = np.zeros((0, 0, 0), np.float32)
+        # Log-odds, those before the present viewpoint, and the largest evidence of a pulse from it.
+        self._cells: Singles = np.zeros((3, 0, 0, 0), np.float32)
+        self._viewpoint: tuple[Floats, Floats] | None = None
+
+    @property
+    def log_odds(self) -> Singles:
+        """Log-odds of all cells: (layer, row, column) float32."""
+        return np.asarray(self._cells[0])
+
+    def decay(self, factor: float) -> None:
+        """Multiply all evidence by a factor."""
+        self._cells *= np.float32(factor)
+
+    def view_from(self, place_m: Floats, rotation: Floats, radius_m: float) -> None:
+        """Begin a new viewpoint if sensors have moved away from the present one.
+
+        Ghosts repeat at the same places until the sensors move, so pulses from one viewpoint are one observation.
+
+        Parameters
+        ----------
+        place_m : (3,) float64
+            Position of the platform.
+        rotation : (3, 3) float64
+            Rotation from its frame to the world.
+        radius_m : float
+            Largest distance of a sensor from this position.
+        """
+        if self._viewpoint is not None:
+            turned = math.sqrt(max(0.0, 3.0 - float(np.sum(rotation * self._viewpoint[1]))))  # Chord of the turn.
+            if float(np.linalg.norm(place_m - self._viewpoint[0])) + radius_m * turned < _MOVED_M:
+                return
+        self._viewpoint = place_m.copy(), rotation.copy()
+        self._cells[1], self._cells[2] = self._cells[0], 0.0
 
     def window(self, centre_m: Floats, radius_m: float) -> Window:
         """Return the square or cube around a place, for which the grid grows if necessary.
@@ -86,7 +127,8 @@ class CellGrid:
         layers, rows, columns = (
             slice(a, b) for a, b in zip((low - self._first)[::-1], (high - self._first)[::-1], strict=True)
         )
-        return Window(self.log_odds[layers, rows, columns], low, self._cell_m, self._n_dimensions == 2)
+        log_odds, before, shown = self._cells[:, layers, rows, columns]
+        return Window(log_odds, low, self._cell_m, self._n_dimensions == 2, before, shown)
 
     def _grow(self, low: Counts, high: Counts) -> None:
         size = np.array(self.log_odds.shape[::-1])
@@ -104,10 +146,10 @@ class CellGrid:
                 f"the map would have {n_cells} cells ({sides} m), but the limit is {MAX_CELLS}; give larger cells "
                 "(cell_m), or poses closer together"
             )
-        grown = np.zeros(sizes[::-1], np.float32)
+        grown = np.zeros((3, *sizes[::-1]), np.float32)
         column, row, layer = (self._first - first).tolist()
-        grown[layer : layer + size[2], row : row + size[1], column : column + size[0]] = self.log_odds
-        self._first, self.log_odds = first, grown
+        grown[:, layer : layer + size[2], row : row + size[1], column : column + size[0]] = self._cells
+        self._first, self._cells = first, grown
 
     def used(self) -> tuple[Singles, tuple[float, ...]]:
         """Return a copy of the smallest part with all known cells, and its outer corner.

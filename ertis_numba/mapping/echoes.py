@@ -10,6 +10,7 @@ __all__ = ["CLEAR", "LocatedEchoes", "UsualAmplitude", "View", "displaced_covari
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
+Flags = NDArray[np.bool_]
 
 _USUAL: Final = 50.0  # Percentile of the amplitudes of a pulse that defines the usual one.
 # Amplitude at which half of the points are ghosts, relative to the usual amplitude. It comes from a logistic regression
@@ -91,11 +92,14 @@ class LocatedEchoes(NamedTuple):
         Standard deviations along and across the direction, without those of the pose.
     strength : (point,) float64
         Weight, at most 1: probability that the point is a reflector.
+    is_confirmed : (point,) bool
+        False for points that too few pairs of emitter and receiver confirm.
     """
 
     offset_m: Floats
     sd_m: Floats
     strength: Floats
+    is_confirmed: Flags
 
     @property
     def range_m(self) -> Floats:
@@ -134,7 +138,13 @@ class UsualAmplitude:
         return np.asarray(power / (power + _GHOST**2))
 
 
-def echoes_of(offset_m: Floats, uncertainty_m: Floats, strength: Floats, n_dimensions: int = 2) -> LocatedEchoes:
+def echoes_of(
+    offset_m: Floats,
+    uncertainty_m: Floats,
+    strength: Floats,
+    n_dimensions: int = 2,
+    is_confirmed: Flags | None = None,
+) -> LocatedEchoes:
     """Return points as echoes, whose uncertainties include errors that noise does not explain.
 
     Parameters
@@ -146,8 +156,11 @@ def echoes_of(offset_m: Floats, uncertainty_m: Floats, strength: Floats, n_dimen
     strength : (point,) float64
     n_dimensions : int
         Number of dimensions of the map.
+    is_confirmed : (point,) bool, optional
+        True for points that the fusion confirms; all by default.
     """
     range_m = np.linalg.norm(offset_m, axis=1)
     added_m = np.stack([np.full(len(range_m), _RANGE_SD_M), _ANGLE_SD_RAD[n_dimensions] * range_m], axis=1)
     sd_m = np.hypot(uncertainty_m, added_m)
-    return LocatedEchoes(offset_m, sd_m, strength)
+    confirmed = np.ones(len(range_m), np.bool_) if is_confirmed is None else is_confirmed
+    return LocatedEchoes(offset_m, sd_m, strength, confirmed)

@@ -40,13 +40,14 @@ class Mapper:
     """Occupancy map that grows with the images of a platform at known poses.
 
     Echoes are fused (`Fuser`) and located. Each point adds evidence to the cells of its uncertainty ellipse, or in a
-    map of three dimensions, of its ellipsoid. Occupied cells lose evidence in pulses that do not return their echo.
-    Cells in front of the first clear echo of a direction become free, but less so at larger distances. A smooth wall
-    that the sound meets obliquely returns no echo, so silence alone shows free space near the platform only, and only
-    as far as a clear echo would exceed the noise. Noise is no echo: without any echo so far, only the place of the
-    platform is free. If no echo proves that a sensor emits (`Fused.without_own_echo`), its silence shows no free space
-    either, because its emitter may be broken; sensors in `Fused.undecided` count as working. Uncertain poses spread the
-    evidence of echoes, and shorten free space.
+    map of three dimensions, of its ellipsoid. Pulses from one viewpoint count as one observation, and points that the
+    fusion does not confirm need two, because ghosts repeat while the platform stands still. Occupied cells lose
+    evidence in pulses that do not return their echo. Cells in front of the first clear echo of a direction become free,
+    but less so at larger distances. A smooth wall that the sound meets obliquely returns no echo, so silence alone
+    shows free space near the platform only, and only as far as a clear echo would exceed the noise. Noise is no echo:
+    without any echo so far, only the place of the platform is free. If no echo proves that a sensor emits
+    (`Fused.without_own_echo`), its silence shows no free space either, because its emitter may be broken; sensors in
+    `Fused.undecided` count as working. Uncertain poses spread the evidence of echoes, and shorten free space.
 
     Parameters
     ----------
@@ -184,8 +185,9 @@ class Mapper:
         points = _at_rest(fused.points, pose, rotation) if isinstance(pose, Trajectory) else fused.points
         echoes = self._echoes(points, translation_m, rotation, view)
         coverage = self._coverage(group, fused)
-        window = self._grid.window(view.place_m, coverage.reach_m)
         self._decay(time_ns)
+        self._grid.view_from(view.place_m, view.rotation, self._near_m)
+        window = self._grid.window(view.place_m, coverage.reach_m)
         add_evidence(window, view, echoes, coverage, near_m=self._near_m)
         self._n_groups += 1
         self._n_empty += fused.is_empty
@@ -218,7 +220,7 @@ class Mapper:
                 f"the images are from {-after_s:.3g} s before those added last; add groups in the order of their "
                 "times, or leave out half_life_s"
             )
-        self._grid.log_odds *= np.float32(0.5 ** (after_s / self._half_life_s))
+        self._grid.decay(0.5 ** (after_s / self._half_life_s))
 
     def _coverage(self, group: Sequence[Energyscape], fused: Fused) -> Coverage:
         """Return the coverage of the sensors of a group that emitted."""
@@ -264,7 +266,9 @@ class Mapper:
         uncertainty_m = np.zeros((len(points), 2)) if points.uncertainty_m is None else points.uncertainty_m
         strength = self._usual.strength(points.amplitude[kept])
         self._heard.strength(points.amplitude)
-        return echoes_of(offset_m, np.asarray(uncertainty_m, np.float64)[kept], strength, self._dimensions)
+        uncertainty_m = np.asarray(uncertainty_m, np.float64)[kept]
+        confirmed = None if points.confirmed is None else points.confirmed[kept]
+        return echoes_of(offset_m, uncertainty_m, strength, self._dimensions, confirmed)
 
 
 def _at_rest(points: PointCloud, trajectory: Trajectory, rotation: Floats) -> PointCloud:

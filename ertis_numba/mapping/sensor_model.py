@@ -20,6 +20,7 @@ __all__ = ["MAX_LOG_ODDS", "TRUST", "Trust", "add_evidence"]
 Floats = NDArray[np.float64]
 Places = NDArray[np.int64]
 Singles = NDArray[np.float32]
+Flags = NDArray[np.bool_]
 
 MAX_LOG_ODDS: Final = 4.0
 """Limit of log-odds, which keeps the map able to change (K. M. Wurm et al., OctoMap, 2010)."""
@@ -59,6 +60,10 @@ class Trust(NamedTuple):
         Log-odds of a cell relative to those of the echo in it. Reflectors often repeat, and ghosts seldom do.
     total : float
         Log-odds of a certain echo, shared among the cells that may contain it.
+    unconfirmed : float
+        Reduction of the log-odds of points that the fusion does not confirm.
+    repeats : float
+        Evidence of all pulses from one viewpoint, relative to that of one.
     missed : float
         Log-odds that an occupied cell ahead of a sensor loses in a pulse without an echo there.
     """
@@ -69,23 +74,38 @@ class Trust(NamedTuple):
     beside: float
     cell: float
     total: float
+    unconfirmed: float
+    repeats: float
     missed: float
 
     @property
     def most(self) -> float:
         """Largest log-odds that one echo adds to a cell."""
-        return self.cell * float(self.log_odds(*np.ones((3, 1)))[0])
+        return self.cell * float(self.log_odds(np.ones(1), np.ones(1), np.ones(1), np.ones(1, np.bool_))[0])
 
-    def log_odds(self, strength: Floats, visible: Floats, coverage: Floats) -> Floats:
+    def log_odds(self, strength: Floats, visible: Floats, coverage: Floats, is_confirmed: Flags) -> Floats:
         """Return the log-odds of echoes, negative infinity for those that no sensor can hear: (point,) float64."""
         found = self.clear + self.strength * logit(np.clip(strength, 1 - _CERTAIN, _CERTAIN))
         found -= self.hidden * (1 - visible) + self.beside * np.maximum(_AHEAD - coverage, 0.0)
+        found -= np.where(is_confirmed, 0.0, self.unconfirmed)
         return np.asarray(np.where((coverage > 0) & (visible > 0), found, -np.inf))
 
 
 TRUST: Final = {
-    2: Trust(clear=0.0, strength=1.0, hidden=3.7, beside=0.0, cell=0.18, total=10.0, missed=0.14),
-    3: Trust(clear=1.5, strength=0.0, hidden=1.6, beside=5.6, cell=0.6, total=15.0, missed=0.03),
+    2: Trust(
+        clear=0.0,
+        strength=1.0,
+        hidden=3.7,
+        beside=0.0,
+        cell=0.18,
+        total=10.0,
+        unconfirmed=2.6,
+        repeats=1.0,
+        missed=0.14,
+    ),
+    3: Trust(
+        clear=1.5, strength=0.0, hidden=1.6, beside=5.6, cell=0.6, total=15.0, unconfirmed=1.0, repeats=2.0, missed=0.03
+    ),
 }
 """Trust in echoes by number of dimensions. Echoes in space overlap more often, so their amplitude does not count."""
 _AHEAD: Final = 0.4  # Coverage above which echoes are equally reliable.
@@ -115,7 +135,7 @@ def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Co
     hiding_m = np.minimum(np.where(is_open, np.inf, first_m), wall_m)
     visible = _visible(echoes, cosine, np.cos(grid.elevations_rad), hiding_m, wall_m)
     trust = TRUST[2 if window.is_planar else 3]
-    log_odds = trust.log_odds(echoes.strength, visible, coverage.at(echoes.offset_m))
+    log_odds = trust.log_odds(echoes.strength, visible, coverage.at(echoes.offset_m), echoes.is_confirmed)
     position_sd_m, rotation_sd_rad = view.sd
     end_m = np.minimum(_end_m(echoes, cosine, first_m, position_sd_m, rotation_sd_rad), wall_m)
     is_free = grid.range_m < end_m[:, None]
@@ -123,8 +143,10 @@ def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Co
     # If the pose is uncertain, the echo of a cell may appear in another cell.
     missed = trust.missed / (1 + (position_sd_m**2 + (rotation_sd_rad * grid.range_m) ** 2) / window.cell_m**2)
     free = (coverage.silence * np.where(is_free, _FREE, np.where(is_ahead, -missed, 0.0))).astype(np.float32)
+    occupied = _occupied(window, view, echoes, log_odds, trust)
+    np.maximum(window.shown, occupied, out=window.shown)
     kernel.add_evidence(
-        _occupied(window, view, echoes, log_odds, trust),
+        occupied,
         np.float32(_TOUCHED),
         np.float32(trust.most),
         free.reshape(-1, grid.n_azimuths, grid.n_ranges),
@@ -136,6 +158,9 @@ def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Co
         np.float32(MAX_LOG_ODDS),
         window.log_odds,
     )
+    # Pulses from one viewpoint are one observation. They may occupy a cell that was free, as objects that arrive do.
+    most = np.maximum(window.before, 0.0) + np.float32(trust.repeats) * window.shown
+    np.minimum(window.log_odds, most, out=window.log_odds)
 
 
 def _direction(coverage: Coverage, echoes: LocatedEchoes) -> Places:
