@@ -17,6 +17,7 @@ _LEAST: Final = 1e-30
 _SINGULAR: Final = 1e-9  # Keeps the inverse of equal waves finite.
 _ROUNDING: Final = 3e-7  # of powers in single precision
 _SWEEPS: Final = 2  # Waves depend on the frequencies.
+_OWN: Final = 0.75  # Largest distance of sound from the centre of its bin, in spacings of bins.
 _CERTAIN: Final = 2.0  # Power of a source relative to its deviation in noise that shows frequencies.
 
 
@@ -78,7 +79,10 @@ class HeardBand(NamedTuple):
         if not shares.any():
             return None
         turn = 2 * np.pi
-        weights = shares / shares.sum()
+        # Bins with sound of other bins only are no further samples of it.
+        is_own = np.abs(last_hz - heard_hz) <= _OWN * 2 * reach_hz / len(heard_hz)
+        weights = np.where(is_own, shares, 0.0) if (is_own & (shares > 0)).any() else shares
+        weights = weights / weights.sum()
         return cls(
             matrix,
             level,

@@ -176,7 +176,7 @@ class BandSearch:
     ) -> bool:
         """Return False if noise or errors of the known sources may cause a further source."""
         extent, similarity = self._of_noise(diffuse)
-        n_samples = independent_samples(band.shares, band.n_blocks, similarity)
+        n_samples = independent_samples(band.weights, band.n_blocks, similarity)
         share = float(rest.relative_power(place[None])[0]) / rest.dimensions
         chance = exceedance(share, n_samples=n_samples, n_dimensions=rest.dimensions, extent=extent)
         known = band.weights @ whole.separated(places, band.omegas[:, : len(places)])[0] if len(places) else np.zeros(0)
