@@ -181,6 +181,26 @@ def test_unwritable_cache_folder_of_the_user_is_named(monkeypatch, caplog, tmp_p
     )
 
 
+def test_kernels_cached_with_types_that_no_longer_exist_are_compiled_again(monkeypatch, tmp_path):
+    """A later version of a module has renamed a type; Numba's index of the first version names it."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    program = (
+        "import grown\n"
+        "from ertis_numba.kernels._cpu.loading import load_without_compiler\n"
+        "load_without_compiler([grown.first])\n"
+        "print(grown.first(grown.{0}(1)))\n"
+    )
+    for name in ("Old", "New", "New"):
+        (tmp_path / "grown.py").write_text(
+            "from typing import NamedTuple\nfrom numba import njit\n"
+            f"class {name}(NamedTuple):\n    x: int\n"
+            "@njit(cache=True)\ndef first(p):\n    return p[0] + 1\n"
+        )
+        done = subprocess.run([sys.executable, "-c", program.format(name)], capture_output=True, text=True, check=True)
+        assert done.stdout == "2\n"
+
+
 def test_kernels_run_without_space_for_their_cache(monkeypatch, caplog):
     def save(*_):
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -51,7 +51,18 @@ def _warn_of_compilations(folder: str, reason: str) -> None:
 
 
 def _load(cache: Any, signature: Any, context: Any) -> Any:
-    """Return the compiled code for a signature, or None if there is none, like `FunctionCache.load_overload`."""
+    """Return the compiled code for a signature, or None if there is none, like `FunctionCache.load_overload`.
+
+    Numba reads the types of all signatures before it compares the age of the source, so that a type which another
+    version of this package has renamed is an error of any kind. Such a cache is emptied.
+    """
     rtsys.initialize(context)  # registers the functions that compiled code calls
-    with cache._guard_against_spurious_io_errors():  # noqa: SLF001 - Numba has no public function for this
-        return cache._load_overload(signature, context)  # noqa: SLF001
+    try:
+        with cache._guard_against_spurious_io_errors():  # noqa: SLF001 - Numba has no public function for this
+            return cache._load_overload(signature, context)  # noqa: SLF001
+    except OSError:
+        raise
+    except Exception as error:  # noqa: BLE001
+        _LOG.info("compiled kernels in %s are of another version and are replaced (%s)", cache.cache_path, error)
+        cache.flush()
+        return None
