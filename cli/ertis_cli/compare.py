@@ -28,7 +28,7 @@ _NUMBERS = (
 @click.command()
 @options.input_file("IMG.h5|MAP.h5")
 @options.sensor("Compare this sensor only; all sensors by default.")
-@options.min_level("Ignore reflectors and peaks below this level, relative to the strongest.")
+@options.min_level("Ignore reflectors, and peaks of images, below this level, relative to the strongest.")
 @options.as_json
 def compare(*, path: Path, sensor: str | None, min_level: float, as_json: bool) -> None:
     """Compare an energyscape file or a map with the scene's ground truth.
