@@ -571,7 +571,7 @@ def test_amplitudes_of_points_are_those_of_echoes_at_1_m():
 def test_comparison_of_fused_images_names_the_remedy(fused_file):
     code, output = run("compare", fused_file)
     assert code == 1
-    assert "sensor base_link holds no ground truth; that of fused images is not stored; compare the images of" in output
+    assert "contains no ground truth; fuse simulated recordings of one scene with 'ertis process --fuse'" in output
 
 
 def test_peaks_plots_and_exports_of_fused_files_show_the_points_of_the_fusion(fused_file, tmp_path):

@@ -6,7 +6,6 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -384,13 +383,3 @@ def test_map_beside_its_recording_is_no_recording(tmp_path):
     shutil.copy(Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5", tmp_path / "rec.h5")
     ertis.write_map(tmp_path / "rec.map.h5", ertis.OccupancyMap(np.array([[0.0, 2.0]]), (0.0, 0.0), 0.1))
     assert [each.path.name for each in find_recordings([tmp_path])] == ["rec.h5"]
-
-
-@pytest.mark.parametrize(("name", "value"), [("cell_m", 0.1), ("origin_x_m", 1.0)])
-def test_map_whose_scale_contradicts_its_cells_is_refused(tmp_path, name, value):
-    path = tmp_path / "m.h5"
-    ertis.write_map(path, ertis.OccupancyMap(np.ones((20, 30)), (0.0, 0.0), 0.05))
-    with h5py.File(path, "r+") as file:
-        file.attrs[name] = value
-    with pytest.raises(ertis.ErtisError, match="cell_m or origin_x_m contradicts the positions of the cells"):
-        ertis.read_map(path)

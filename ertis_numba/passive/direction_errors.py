@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 _LEAST: Final = 1e-30
 _FLAT: Final = 1e-9  # Information relative to the largest, below which a direction is not resolved.
 _ROUNDING: Final = 3e-7  # of powers in single precision
-_SIGNIFICANT: Final = 3.0  # Power beyond noise relative to its standard deviation that shows several sources.
+_SIGNIFICANT: Final = 5.0  # Power beyond noise relative to its standard deviation that shows several sources.
 _OF_WIDTH: Final = 0.3  # Uncertain share of the power that the width of a bin causes.
 
 
