@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
+from ertis_numba import kernels
 from ertis_numba.frames import AcousticMap, Energyscape
 from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
 from ertis_numba.network.keys import ClientKeys
@@ -86,6 +87,7 @@ class Live:
                 device=device,
             )
         else:
+            kernels.load_points()  # Importing Numba takes a second, in which the central node would drop images.
             # The status lists the sensors. If all are subscribed, it would only take the bandwidth of images.
             products: tuple[Product, ...] = ("energyscape", "status") if sensors else ("energyscape",)
             self._subscriber = Subscriber(
