@@ -1,11 +1,13 @@
 """`ertis map`: maps of a simulated platform, poses from a file or a recording, and input that is refused."""
 
+import hashlib
 import json
 import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -383,3 +385,21 @@ def test_map_beside_its_recording_is_no_recording(tmp_path):
     shutil.copy(Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5", tmp_path / "rec.h5")
     ertis.write_map(tmp_path / "rec.map.h5", ertis.OccupancyMap(np.array([[0.0, 2.0]]), (0.0, 0.0), 0.1))
     assert [each.path.name for each in find_recordings([tmp_path])] == ["rec.h5"]
+
+
+@pytest.mark.parametrize(("name", "value"), [("cell_m", 0.1), ("origin_x_m", 1.0)])
+def test_map_whose_scale_contradicts_its_cells_is_refused(tmp_path, name, value):
+    """Another program may state a right SHA-256 of contradictory numbers; its rule is that of formats.md."""
+    path = tmp_path / "m.h5"
+    ertis.write_map(path, ertis.OccupancyMap(np.ones((20, 30)), (0.0, 0.0), 0.05))
+    with h5py.File(path, "r+") as file:
+        file.attrs.modify(name, value)
+        variables = hashlib.sha256()
+        for each in ("log_odds", "x", "y"):
+            variables.update(each.encode() + file[each][:].tobytes())
+        numbers = [file.attrs[each] for each in ("cell_m", "origin_x_m", "origin_y_m")]
+        counts = [file.attrs[each] for each in ("n_groups", "time_ns")]
+        packed = np.array(numbers, "<f8").tobytes() + np.array(counts, "<i8").tobytes()
+        file.attrs["content_sha256"] = hashlib.sha256(variables.digest() + packed).hexdigest()
+    with pytest.raises(ertis.ErtisError, match="cell_m or origin_x_m contradicts the positions of the cells"):
+        ertis.read_map(path)

@@ -439,7 +439,7 @@ def test_objects_that_arrive_occupy_free_cells(moves):
 
 @pytest.mark.parametrize("n_dimensions", [2, 3])
 def test_unconfirmed_points_occupy_no_cell_alone(n_dimensions):
-    """From several viewpoints, they do."""
+    """Points that appear again from other viewpoints occupy cells."""
     place_m = np.array([[2.0, 0.0, 0.0]])
     echoes = echoes_of(place_m, np.zeros((1, 2)), np.ones(1), n_dimensions, np.zeros(1, np.bool_))
     grid, found = CellGrid(0.05, n_dimensions), []

@@ -146,7 +146,7 @@ def read_map(path: str | Path) -> OccupancyMap:
         if _content(file, axes) != to_python(file.attrs["content_sha256"]):
             raise DamagedError(f"{path}: the SHA-256 of the content differs from the stated one; copy it again")
         try:
-            return OccupancyMap(
+            found = OccupancyMap(
                 np.asarray(file["log_odds"][:]),
                 tuple(float(file.attrs[f"origin_{name}_m"]) for name in axes),
                 float(file.attrs["cell_m"]),
@@ -155,6 +155,13 @@ def read_map(path: str | Path) -> OccupancyMap:
             )
         except ArgumentError as error:
             raise DamagedError(f"{path}: {error}") from error
+        for name, edge_m, n_cells in zip(axes, found.origin_m, found.log_odds.shape[::-1], strict=True):
+            stated_m = edge_m + (np.arange(n_cells) + 0.5) * found.cell_m
+            if not np.allclose(stated_m, file[name][:], rtol=0, atol=1e-3 * found.cell_m):
+                raise DamagedError(
+                    f"{path}: cell_m or origin_{name}_m contradicts the positions of the cells in {name}; copy it again"
+                )
+        return found
 
 
 def read_map_truth(path: str | Path) -> GroundTruth | None:
