@@ -147,13 +147,19 @@ def test_compare_of_maps_from_other_poses_moves_the_truth(folder, tmp_path):
     assert (found["matched"], found["missed"], found["spurious"]) == (2, 0, 0)
 
 
+def write_mountings(path, *, x_m, left_m):
+    """Write the mountings of the scene, whose sensors are 0.15 m to the left and to the right."""
+    path.write_text(
+        "".join(
+            f'[[sensors]]\nname = "{name}"\nposition_m = [{x_m}, {y_m}, 0.4]\nyaw_deg = {yaw_deg}\n'
+            for name, y_m, yaw_deg in (("left", left_m, 20.0), ("right", -0.15, -20.0))
+        )
+    )
+
+
 def test_fusion_with_another_mounting_file_moves_the_truth(folder, tmp_path):
     """The platform's origin lies half a metre behind, so that all places move by the same amount."""
-    text = "".join(
-        f'[[sensors]]\nname = "{name}"\nposition_m = [0.65, {y}, 0.4]\nyaw_deg = {yaw}\n'
-        for name, y, yaw in (("left", 0.15, 20.0), ("right", -0.15, -20.0))
-    )
-    (tmp_path / "other.toml").write_text(text)
+    write_mountings(tmp_path / "other.toml", x_m=0.65, left_m=0.15)
     done = run(f"process {folder}/scene.h5 --fuse --mounting {tmp_path}/other.toml -o {tmp_path}/other.h5")
     assert "mountings are not those" not in done.stderr
     found = report(f"compare {tmp_path}/other.h5")
@@ -161,11 +167,7 @@ def test_fusion_with_another_mounting_file_moves_the_truth(folder, tmp_path):
 
 
 def test_map_with_wrong_mountings_has_a_note(folder, tmp_path):
-    text = "".join(
-        f'[[sensors]]\nname = "{name}"\nposition_m = [0.15, {y}, 0.4]\nyaw_deg = {yaw}\n'
-        for name, y, yaw in (("left", 0.25, 20.0), ("right", -0.15, -20.0))
-    )
-    (tmp_path / "wrong.toml").write_text(text)
+    write_mountings(tmp_path / "wrong.toml", x_m=0.15, left_m=0.25)
     done = run(f"map {folder}/scene.h5 --mounting {tmp_path}/wrong.toml -o {tmp_path}/wrong.h5")
     assert "poses are not those of the simulated scene. The ground truth is moved to fit them" in done.stderr
 
