@@ -31,7 +31,7 @@ _NUMBERS = (
 @options.min_level("Ignore reflectors, and peaks of images, below this level, relative to the strongest.")
 @options.as_json
 def compare(*, path: Path, sensor: str | None, min_level: float, as_json: bool) -> None:
-    """Compare an energyscape file or a map with the scene's ground truth.
+    """Compare an energyscape file or a map with the ground truth.
 
     The file must come from a simulated recording, which contains the ground truth. Only reflectors that the image can
     show count: on its range axis, and within half of the array's main lobe from its directions. A reflector is matched

@@ -23,7 +23,7 @@ COMMANDS = {
     "capture": ("ertis_cli.capture:capture", "Record measurements, or send them to a central node."),
     "check": ("ertis_cli.check:check", "Check whether sensors are fit for use."),
     "command": ("ertis_cli.command:command", "Send commands to a sensor and print its answers."),
-    "compare": ("ertis_cli.compare:compare", "Compare an energyscape file or a map with the scene's ground truth."),
+    "compare": ("ertis_cli.compare:compare", "Compare an energyscape file or a map with the ground truth."),
     "completion": ("ertis_cli.completion:completion", "Print a script that completes commands and options in a shell."),
     "configure": ("ertis_cli.configure:configure", "Change the settings of a sensor that sends to a central node."),
     "demo": ("ertis_cli.demo:demo", "Run four emulated sensors, a central node and an application."),
