@@ -155,8 +155,13 @@ def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any],
         for key in table:
             if key not in options:
                 raise click.ClickException(f"{where}{name} has no option {key!r}; {instead(key, options)}")
-        found[name] = {str(options[key].name): _value(value) for key, value in table.items()}
+        found[name] = {str(options[key].name): _values(options[key], value) for key, value in table.items()}
     return found
+
+
+def _values(option: click.Option, value: Any) -> Any:
+    """Return the value of an option, in a list if the option may be repeated."""
+    return _value([value] if option.multiple and not isinstance(value, list) else value)
 
 
 def _value(value: Any) -> Any:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ertis_cli._mountings import Mounting
     from ertis_numba.frames import Energyscape
     from ertis_numba.fusion import DirectSoundCheck, Fused
-    from ertis_numba.settings import Settings
+    from ertis_numba.settings import ExcludedChannels, Settings
     from ertis_numba.storage import RecordingReader
 
 __all__ = ["write_fused"]
@@ -29,6 +29,7 @@ def write_fused(
     target: Path,
     changed: "Callable[[Settings], Settings]",
     *,
+    without: "ExcludedChannels",
     mounting: "Path | None",
     emitter_diameter_m: float | None,
     force: bool,
@@ -46,6 +47,8 @@ def write_fused(
         Energyscape file to write.
     changed : callable
         Function that returns the settings to use from those of the recording.
+    without : ExcludedChannels
+        Channels to exclude.
     mounting : Path or None
         File with the mountings of all sensors, instead of those of the recordings.
     emitter_diameter_m : float or None
@@ -65,7 +68,8 @@ def write_fused(
         _require_several(readers)
         mountings = _pulses.platform_mountings(readers, mounting, quiet=quiet)
         fuser = Fuser(mountings, emitter_diameter_m=emitter_diameter_m)
-        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, **device)
+        without.require_known([reader.sensor for reader in readers])
+        pipelines = _pulses.PipelinesBySensor(changed, stack, quiet=quiet, without=without, **device)
         active = _pulses.active_groups(readers, changed, quiet=quiet)
         groups = active.groups
         by_name = {reader.sensor: reader for reader in readers}

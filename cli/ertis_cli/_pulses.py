@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ertis_cli._mountings import Mounting
     from ertis_numba.frames import Energyscape, Measurement, Stamp
     from ertis_numba.pipeline import Pipeline
-    from ertis_numba.settings import Settings
+    from ertis_numba.settings import ExcludedChannels, Settings
     from ertis_numba.storage import RecordingReader
     from ertis_numba.storage.placed_truth import PlacedTruth
 
@@ -280,9 +280,16 @@ class PipelinesBySensor:
     """
 
     def __init__(
-        self, changed: "Callable[[Settings], Settings]", stack: ExitStack, *, quiet: bool, **device: Any
+        self,
+        changed: "Callable[[Settings], Settings]",
+        stack: ExitStack,
+        *,
+        quiet: bool,
+        without: "ExcludedChannels | None" = None,
+        **device: Any,
     ) -> None:
         self._changed, self._stack, self._quiet, self._device = changed, stack, quiet, device
+        self._without = without
         self._made: dict[str, tuple[Settings, Pipeline]] = {}
         self._checked: set[str] = set()
         self.warnings: list[str] = []
@@ -324,7 +331,10 @@ class PipelinesBySensor:
             return measurement
         sensor, settings = measurement.stamp.sensor, measurement.settings
         if sensor not in self._made or self._made[sensor][0] != settings:
-            pipeline = options.pipeline(self._changed(settings), quiet=self._quiet, **self._device)
+            used = self._changed(settings)
+            if self._without is not None:
+                used = self._without.applied(used, sensor)
+            pipeline = options.pipeline(used, quiet=self._quiet, **self._device)
             self._made[sensor] = settings, self._stack.enter_context(pipeline)
         pipeline = self._made[sensor][1]
         return pipeline.process(replace(measurement, settings=pipeline.settings))

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from ertis_numba.frames import Beams, Energyscape, MicrophoneSignals
-    from ertis_numba.settings import Settings
+    from ertis_numba.settings import ExcludedChannels, Settings
     from ertis_numba.storage import RecordingReader
 
 __all__ = ["is_results_file", "require_image", "write_results"]
@@ -42,6 +42,7 @@ def write_results(
     target: Path,
     changed: "Callable[[Settings], Settings]",
     *,
+    without: "ExcludedChannels",
     sensor: str | None,
     force: bool,
     quiet: bool,
@@ -56,6 +57,8 @@ def write_results(
         Recording, and the file to write.
     changed : callable
         Function that returns the settings to use from those of the recording.
+    without : ExcludedChannels
+        Channels to exclude.
     sensor : str or None
         Name of the sensor; None if there is only one.
     force, quiet, as_json : bool
@@ -75,6 +78,7 @@ def write_results(
             f"{path} has sensors {', '.join(names)}, but an NPZ file holds one; choose one with --sensor",
             click.get_current_context(),
         )
+    without.require_known(options.sensors_of(path, None))
     check_target(target, overwrite=force, sources=[path])
     with open_recording(path, sensor=names[0]) as recording:
         stage = changed(recording.settings).processing.last_stage
@@ -83,7 +87,7 @@ def write_results(
                 f"-o {target} is for signals and beams; give --last-stage, or export images with 'ertis export'",
                 click.get_current_context(),
             )
-        results = _Results(recording, changed, device, quiet=quiet)
+        results = _Results(recording, lambda each: without.applied(changed(each), names[0]), device, quiet=quiet)
         export(target, results, file_format="npz", overwrite=force)
         count = len(recording)
     options.say(f"{target}: {stage} of {options.counted(count, 'measurement')} of {names[0]}", quiet=quiet)

@@ -11,6 +11,7 @@ from ertis_cli import _tables, options
 
 if TYPE_CHECKING:
     from ertis_numba.sensor_check import RecordingCheck, SensorCheck
+    from ertis_numba.settings import ExcludedChannels
 
 __all__ = ["check"]
 
@@ -27,9 +28,7 @@ _UNFIT = 1
     metavar="FILE",
     help="Settings to check against, such as another layout or call; keys in FILE replace those in the recording.",
 )
-@click.option(
-    "--without", type=options.CHANNELS, help="Channels to exclude from the check, such as those with known faults."
-)
+@options.without("Channels to exclude from the check, such as those with known faults")
 @click.option(
     "--rate",
     "nominal_rate_hz",
@@ -47,7 +46,7 @@ def check(
     *,
     paths: tuple[Path, ...],
     settings_file: Path | None,
-    without: tuple[int, ...] | None,
+    without: "ExcludedChannels",
     nominal_rate_hz: float | None,
     page: Path | None,
     force: bool,
@@ -75,13 +74,13 @@ def check(
         check_target(page, overwrite=force, sources=paths)
         page.unlink(missing_ok=True)  # If this command fails, the verdict of an earlier one must not remain.
     used = None
-    if settings_file is not None or without is not None:
-        used = functools.partial(options.settings_with, settings_file=settings_file, without=without)
+    if settings_file is not None:
+        used = functools.partial(options.settings_with, settings_file=settings_file)
     found: list[RecordingCheck] = []
     for path in paths:
         try:
             with options.note_when_slow(f"checking {path} ...", quiet=quiet):
-                found.append(check_recording(path, settings=used, nominal_rate_hz=nominal_rate_hz))
+                found.append(check_recording(path, settings=used, without=without, nominal_rate_hz=nominal_rate_hz))
         except (ErtisError, OSError) as error:
             found.append(uncheckable_recording(path, error))
             click.echo(f"ertis: error: {error}", err=True)

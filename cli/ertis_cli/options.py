@@ -21,12 +21,11 @@ if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
     from ertis_numba.angles import DegreesFromRadians
     from ertis_numba.pipeline import Pipeline
-    from ertis_numba.settings import Array, Settings
+    from ertis_numba.settings import Array, ExcludedChannels, Settings
     from ertis_numba.stages.costs import PlanCosts
     from ertis_numba.storage import EnergyscapeReader, RecordingReader
 
 __all__ = [
-    "CHANNELS",
     "COMPILING",
     "DIRECTION",
     "ELEVATION",
@@ -76,6 +75,7 @@ __all__ = [
     "warn",
     "warn_of",
     "warn_of_spacing",
+    "without",
 ]
 
 _MAX_DEG = 90.0  # limit of azimuth and elevation in front of an array
@@ -104,15 +104,33 @@ class _Elevation(_Interval):
 
 
 class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
-    name = "N,..."
+    """Channels of a sensor, or of all sensors if there is no name."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
-        with suppress(ValueError):
-            channels = tuple(int(channel) for channel in str(value).split(","))
+    name = "[NAME:]N,..."
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, tuple[int, ...]]:
+        from ertis_numba.checks import sensor_name
+
+        name, _, numbers = str(value).rpartition(":")
+        with suppress(ValueError):  # also of names that no sensor can have
+            channels = tuple(int(channel) for channel in numbers.split(","))
             if all(0 <= channel < MAX_MICROPHONES for channel in channels):
-                return channels
-        wanted = f"integers from 0 to {MAX_MICROPHONES - 1}, as in 5,12"
+                return (sensor_name(name) if ":" in str(value) else ""), channels
+        wanted = f"integers from 0 to {MAX_MICROPHONES - 1}, as in 5,12, or those of one sensor, as in left:5,12"
         return self.fail(f"{value!r} is not a list of channels; give {wanted}", param, ctx)
+
+
+def _excluded_channels(
+    _ctx: click.Context, _param: click.Parameter, values: tuple[tuple[str, tuple[int, ...]], ...]
+) -> "ExcludedChannels":
+    from ertis_numba.settings import ExcludedChannels
+
+    channels: dict[str, tuple[int, ...]] = {}
+    for name, each in values:
+        channels[name] = (*channels.get(name, ()), *each)
+    return ExcludedChannels(channels.pop("", ()), channels)
 
 
 class _Names(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -169,7 +187,6 @@ class _Folder(_File):
     noun = "folder"
 
 
-CHANNELS = _Channels()
 DIRECTION = _Direction()
 ELEVATION = _Elevation()
 ERROR_BUDGET = _ErrorBudget()
@@ -285,6 +302,17 @@ def cleaning(default: str) -> Decorator:
     return lambda command: within(above_mean(command))
 
 
+def without(text: str) -> Decorator:
+    """Return the option that excludes channels; ``text`` is the beginning of its help."""
+    return click.option(
+        "--without",
+        type=_Channels(),
+        multiple=True,
+        callback=_excluded_channels,
+        help=f"{text}, counted from 0, as in 5,12; or of one sensor, as in left:5,12. Repeat the option for others.",
+    )
+
+
 def emitter_diameter(text: str) -> Decorator:
     """Return the option for the diameter of emitters; ``text`` is the beginning of its help."""
     return click.option(
@@ -391,15 +419,14 @@ def settings_with(
     settings_file: Path | None = None,
     preset: str | None = None,
     max_error_db: float | None = None,
-    without: tuple[int, ...] | None = None,
     elevation: tuple[float, float] | float | None = None,
     **options: Any,
 ) -> "Settings":
     """Return the settings of a recording, updated from a settings file, a processing preset and then from options.
 
-    A settings file changes the keys that it contains; a layout or positions replace the whole array. ``without``
-    disables further channels. ``elevation`` is that of a grid of one elevation, or limits. Other options are named like
-    the fields of `Processing`; None changes nothing.
+    A settings file changes the keys that it contains; a layout or positions replace the whole array. ``elevation`` is
+    that of a grid of one elevation, or limits. Other options are named like the fields of `Processing`; None changes
+    nothing.
     """
     from ertis_numba.settings import preset_tables
 
@@ -408,9 +435,6 @@ def settings_with(
     if preset is not None:
         keys = preset_tables(preset, "processing")["processing"]
         settings = settings.replace(processing=settings.processing.replace(**keys))
-    if without is not None:
-        disabled = tuple(sorted({*(settings.array.disabled or ()), *without}))
-        settings = settings.replace(array=settings.array.replace(disabled=disabled))
     given = {name: value for name, value in options.items() if value is not None}
     if elevation is not None:
         given["elevation_deg" if isinstance(elevation, float) else "elevation_limits_deg"] = elevation

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from ertis_numba.campaign import CampaignOptions
     from ertis_numba.pipeline import Pipeline
-    from ertis_numba.settings import Settings
+    from ertis_numba.settings import ExcludedChannels, Settings
 
 __all__ = ["process"]
 
@@ -34,11 +34,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     "for several recordings; FILE.npz for signals or beams.",
 )
 @options.sensor("Process this sensor only; all sensors by default.")
-@click.option(
-    "--without",
-    type=options.CHANNELS,
-    help="Channels to exclude, such as those of faulty microphones, counted from 0, as in 5,12.",
-)
+@options.without("Channels to exclude, such as those of faulty microphones")
 @_presets.processing_preset
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N, 3d:N, or a CSV of azimuth, elevation in °.")
 @click.option("--azimuth", type=options.INTERVAL, help="Azimuth limits of 2d:N and 3d:N in °.")
@@ -131,7 +127,7 @@ def process(
     paths: tuple[str, ...],
     target: str | None,
     sensor: str | None,
-    without: tuple[int, ...] | None,
+    without: "ExcludedChannels",
     preset: str | None,
     directions: str | None,
     azimuth: tuple[float, float] | None,
@@ -190,7 +186,6 @@ def process(
             recorded,
             settings_file=settings_file,
             preset=preset,
-            without=without,
             directions=directions,
             azimuth_limits_deg=azimuth,
             elevation=elevation,
@@ -217,6 +212,7 @@ def process(
             [Path(each) for each in paths],
             Path(target) if target else Path(paths[0]).with_suffix(".fused.h5"),
             changed,
+            without=without,
             mounting=mounting,
             emitter_diameter_m=emitter_diameter_m,
             force=force,
@@ -231,6 +227,7 @@ def process(
 
     wanted = CampaignOptions(
         settings=changed,
+        without=without,
         sensor=sensor,
         dtype=dtype,
         device=device,
@@ -258,6 +255,7 @@ def process(
             path,
             Path(target),
             changed,
+            without=without,
             sensor=sensor,
             force=force,
             quiet=quiet,

@@ -1,12 +1,17 @@
 """``ertis serve``: run a central node that computes and publishes images."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
 from ertis_cli import _central_watch, _network, _presets, _supervisor, options
 from ertis_cli._saving import withdrawn
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    from ertis_numba.settings import ExcludedChannels
 
 __all__ = ["serve"]
 
@@ -23,6 +28,7 @@ __all__ = ["serve"]
     "--workers", type=click.IntRange(1, 256), metavar="N", help="Number of worker processes; one per core by default."
 )
 @options.threads
+@options.without("Channels to exclude, such as those of faulty microphones")
 @_presets.processing_preset
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own grid by default.")
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
@@ -78,6 +84,7 @@ def serve(
     max_bytes: int,
     workers: int | None,
     threads: int | None,
+    without: "ExcludedChannels",
     preset: str | None,
     directions: str | None,
     range_m: tuple[float, float] | None,
@@ -134,6 +141,7 @@ def serve(
                 keys=keys,
                 processing=chosen | {option: value for option, value in changes.items() if value is not None},
                 max_error_db=max_error_db,
+                without=without,
                 plan=plan,
                 device=device,
                 workers=workers,
@@ -165,6 +173,17 @@ def serve(
         )
         _central_watch.run(node, watch, made=made, metrics=served, duration_s=life.remaining_s(duration))
     _central_watch.report(node.latest, watch, event="served")
+    _warn_of_unknown(without, node.latest.sensors)
+
+
+def _warn_of_unknown(without: "ExcludedChannels", sensors: "Collection[str]") -> None:
+    """Warn of channels that were excluded of a sensor which never connected: its name may be wrong."""
+    from ertis_numba.errors import ArgumentError
+
+    try:
+        without.require_known(sensors)
+    except ArgumentError as error:
+        options.warn(f"--without: {error}")
 
 
 def _make(folder: Path) -> None:

@@ -13,7 +13,7 @@ from ertis_numba.campaign.events import Event, Outcome, RecordingEnded, Recordin
 from ertis_numba.campaign.existing_output import difference
 from ertis_numba.campaign.folder import clear_parts, exclusive_folder
 from ertis_numba.campaign.plans import Plans
-from ertis_numba.campaign.recordings import RecordingFile, ResultKind, map_path, output_paths
+from ertis_numba.campaign.recordings import RecordingFile, ResultKind, known_sensors, map_path, output_paths
 from ertis_numba.campaign.tasks import (
     MAX_WAITING_BYTES,
     TASK_OPTIONS,
@@ -81,8 +81,8 @@ class Campaign:
     Raises
     ------
     ArgumentError
-        Two recordings have the same output file, the folder cannot be created, or both ``workers`` and ``scheduler``
-        are given.
+        Two recordings have the same output file, the folder cannot be created, both ``workers`` and ``scheduler`` are
+        given, or channels are excluded of a sensor that is in no recording.
     """
 
     def __init__(
@@ -110,6 +110,8 @@ class Campaign:
             _RecordingState(found, {"energyscape": target, "acoustic_map": map_path(target)}, expected)
             for found, target in zip(recordings, targets, strict=True)
         )
+        if self._options.without.of_sensor:
+            self._options.without.require_known(known_sensors(recordings))
         self._workers, self._scheduler = workers, scheduler
         self._plans = Plans()
         self._unplanned: deque[_RecordingState] = deque()
@@ -279,9 +281,10 @@ class Campaign:
         """Set the kind of result, the settings of each sensor that has results, and the number of measurements."""
         path, behaviours = case.found.path, reported["behaviours"]
         wanted = {
-            name: self_contained(_absolute(self._options.settings(Settings.from_toml(text, f"{path}: settings"))))
+            name: self._options.settings_of(name, Settings.from_toml(text, f"{path}: settings"))
             for name, text in reported["sensors"].items()
         }
+        wanted = {name: self_contained(_absolute(settings)) for name, settings in wanted.items()}
         n_images = {name: count_images(settings, behaviours[name]) for name, settings in wanted.items()}
         case.measurements = sum(n_images.values())
         if not case.measurements:

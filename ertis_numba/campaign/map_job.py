@@ -20,7 +20,7 @@ from ertis_numba.passive import AcousticCamera, find_sound_sources
 from ertis_numba.passive.bands import shaped_noise_warning
 from ertis_numba.passive.components import gathered
 from ertis_numba.settings import Settings
-from ertis_numba.storage import AcousticMapWriter, RecordingReader, open_recording
+from ertis_numba.storage import AcousticMapWriter, RecordingReader, open_recording, sensor_names
 
 __all__ = ["MapJob", "check_maps", "prepare_maps"]
 
@@ -176,13 +176,17 @@ def prepare_maps(
         The recording, its settings or the target is invalid.
     """
     with ExitStack() as stack:
+        if settings is None:
+            options.without.require_known(sensor_names(path))
         recordings = [stack.enter_context(open_recording(path, sensor=name)) for name in sensors]
         mounting = {name: place for name, place in (options.mounting or {}).items() if name in sensors}
         writer = AcousticMapWriter(target, recording=recordings, mounting=mounting, overwrite=options.overwrite)
         cameras = [
             stack.enter_context(
                 AcousticCamera(
-                    options.settings(recording.settings) if settings is None else settings[recording.sensor],
+                    options.settings_of(recording.sensor, recording.settings)
+                    if settings is None
+                    else settings[recording.sensor],
                     options.device,
                     options.threads,
                     check=False,
@@ -191,7 +195,7 @@ def prepare_maps(
             for recording in recordings
         ]
         for recording, camera in zip(recordings, cameras, strict=True):
-            _check_sensor(recording, camera.settings, options, warn)
+            _check_sensor(recording, camera.settings, options, warn, several=len(recordings) > 1)
             if noisy := shaped_noise_warning(camera.settings, camera.band_hz):
                 warn(f"{path}: {noisy}")
             if camera.warning:
@@ -221,15 +225,18 @@ def check_maps(
     """
     for name, each in settings.items():
         with open_recording(path, sensor=name) as recording:
-            _check_sensor(recording, each, options, warn)
+            _check_sensor(recording, each, options, warn, several=len(settings) > 1)
 
 
-def _check_sensor(recording: RecordingReader, settings: Settings, options: CampaignOptions, warn: _Warn) -> None:
+def _check_sensor(
+    recording: RecordingReader, settings: Settings, options: CampaignOptions, warn: _Warn, *, several: bool
+) -> None:
     """Report faulty microphones, or refuse them."""
     name = f"{recording.path}: sensor {recording.sensor}"
     report = health(replace(recording[0], settings=settings))
     layout = LayoutMatch.of(report.findings).warning
-    for text in filter(None, (describe_faults(name, report), layout and f"{name}: {layout}")):
+    faults = describe_faults(name, report, recording.sensor if several else "")
+    for text in filter(None, (faults, layout and f"{name}: {layout}")):
         if options.strict:
             raise DataError(text)
         warn(text)

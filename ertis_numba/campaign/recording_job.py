@@ -28,7 +28,7 @@ from ertis_numba.prediction import planner_of, predict
 from ertis_numba.settings import Settings
 from ertis_numba.stages.planner import Planner
 from ertis_numba.stages.wavefronts import plane_wave_error_db
-from ertis_numba.storage import EnergyscapeWriter, open_recording
+from ertis_numba.storage import EnergyscapeWriter, open_recording, sensor_names
 
 __all__ = ["Pipelines", "RecordingJob", "check_recording", "prepare_recording"]
 
@@ -123,9 +123,11 @@ def prepare_recording(
         The recording, its settings or the target is invalid.
     """
     with ExitStack() as stack:
+        if settings is None:
+            options.without.require_known(sensor_names(path))
         readers = [stack.enter_context(open_recording(path, sensor=name)) for name in sensors]
         every = {
-            name: options.settings(reader.settings) if settings is None else settings[name]
+            name: options.settings_of(name, reader.settings) if settings is None else settings[name]
             for name, reader in zip(sensors, readers, strict=True)
         }
         recordings, chosen = _with_echoes(
@@ -237,14 +239,16 @@ def _begin_checks(
     """Start the checks of all sensors' signals in a thread, in parallel with planning and loading of pipelines."""
     thread = ThreadPoolExecutor(1, thread_name_prefix="ertis-checks")
     stack.callback(thread.shutdown, cancel_futures=True)  # Ctrl-C does not wait for the other sensors.
-    return [thread.submit(_check, *each) for each in zip(recordings, settings, strict=True)]
+    several = len(recordings) > 1
+    return [thread.submit(_check, *each, several=several) for each in zip(recordings, settings, strict=True)]
 
 
-def _check(recording: EchoMeasurements, settings: Settings) -> _Checks:
+def _check(recording: EchoMeasurements, settings: Settings, *, several: bool) -> _Checks:
     """Return the faults of a sensor's microphones, the shift of its records, and the match of its call and layout."""
     first = recording[0]
     report = health(replace(first, settings=settings))
-    faults = describe_faults(f"{recording.path}: sensor {recording.sensor}", report)
+    sensor = recording.sensor if several else ""
+    faults = describe_faults(f"{recording.path}: sensor {recording.sensor}", report, sensor)
 
     def heard() -> Iterator[Measurement]:
         others = (recording[index] for index in range(1, len(recording)))

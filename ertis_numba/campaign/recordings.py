@@ -3,14 +3,15 @@
 import glob
 import os
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.storage import is_map
+from ertis_numba.errors import ArgumentError, DataError, ErtisError
+from ertis_numba.storage import is_map, sensor_names
 
-__all__ = ["RecordingFile", "ResultKind", "find_recordings", "map_path", "output_paths"]
+__all__ = ["RecordingFile", "ResultKind", "find_recordings", "known_sensors", "map_path", "output_paths"]
 
 ResultKind = Literal["energyscape", "acoustic_map"]
 
@@ -81,6 +82,15 @@ def _expand(text: str) -> Sequence[RecordingFile]:
 def _is_candidate(path: Path) -> bool:
     """Return True for a file, or a broken link to one. Maps are left out: `ertis map` writes them beside recordings."""
     return (path.is_file() and not is_map(path)) or not path.exists()
+
+
+def known_sensors(recordings: Iterable[RecordingFile]) -> set[str]:
+    """Return the names of the sensors in all recordings that can be read; processing reports the others."""
+    names: set[str] = set()
+    for found in recordings:
+        with suppress(ErtisError, OSError):
+            names.update(sensor_names(found.path))
+    return names
 
 
 def output_paths(recordings: Sequence[RecordingFile], folder: Path) -> list[Path]:

@@ -24,8 +24,10 @@ if TYPE_CHECKING:
 __all__ = ["SensorProcessing", "describe_faults", "require_same_air"]
 
 
-def describe_faults(name: str, report: Health) -> str:
+def describe_faults(name: str, report: Health, sensor: str = "") -> str:
     """Return the faults of the microphones with the remedy, in one line; empty if there are none.
+
+    ``sensor`` is the name for the remedy if the recording has several sensors.
 
     `describe_shift` describes a shift of the record from several measurements, and `LayoutMatch` a wrong layout.
     """
@@ -42,7 +44,7 @@ def describe_faults(name: str, report: Health) -> str:
     remedy = "check its cable and supply" if every else next(iter(remedies))
     if remedy == DISABLE:
         channels = sorted({channel.channel for channel in report.channels if channel.faults})
-        remedy = f"exclude them with --without {','.join(map(str, channels))}"
+        remedy = f"exclude them with --without {sensor and f'{sensor}:'}{','.join(map(str, channels))}"
     return f"{name} has faulty microphones ({report.verdict()}); {remedy}, or see 'ertis info --health'"
 
 

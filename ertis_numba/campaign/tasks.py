@@ -1,7 +1,7 @@
 """Options of a campaign, and tasks to workers, which JSON can represent."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol, TypeAlias
 
@@ -9,7 +9,7 @@ import msgspec
 
 from ertis_numba import checks
 from ertis_numba.errors import DataError
-from ertis_numba.settings import Settings
+from ertis_numba.settings import ExcludedChannels, Settings
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.storage.recording import Mounting
 
@@ -39,6 +39,8 @@ class CampaignOptions:
     ----------
     settings : callable
         Function that returns the settings for processing, given the recorded settings. By default, they are the same.
+    without : ExcludedChannels
+        Channels to exclude from processing, of all sensors or of some; none by default.
     sensor : str, optional
         Name of the only sensor to process; all sensors by default.
     dtype : {"float32", "float16"}
@@ -69,6 +71,7 @@ class CampaignOptions:
     """
 
     settings: Callable[[Settings], Settings] = lambda recorded: recorded
+    without: ExcludedChannels = field(default_factory=ExcludedChannels)
     sensor: str | None = None
     dtype: Literal["float32", "float16"] = "float32"
     device: str = "auto"
@@ -87,6 +90,10 @@ class CampaignOptions:
         checks.choice("plan", self.plan, PLAN_COSTS)
         checks.choice("device", self.device, ("auto", "cpu", "cuda", "numpy"))
         checks.integer("batch", self.batch, 1)
+
+    def settings_of(self, sensor: str, recorded: Settings) -> Settings:
+        """Return the settings for processing a sensor, given the recorded ones, without its excluded channels."""
+        return self.without.applied(self.settings(recorded), sensor)
 
     def require_maps(self, path: Path) -> None:
         """Refuse options that need images, for a recording that becomes acoustic maps.

@@ -24,7 +24,7 @@ from ertis_numba.sensor_check.clock import check_clock
 from ertis_numba.sensor_check.lost_words import find_lost_words
 from ertis_numba.sensor_check.residuals import CalibrationResiduals, calibration_residuals
 from ertis_numba.sensor_check.result import CheckFault, CheckItem, RecordingCheck, SensorCheck
-from ertis_numba.settings import Settings
+from ertis_numba.settings import ExcludedChannels, Settings
 from ertis_numba.storage import file_kind, open_recording, sensor_names
 from ertis_numba.storage.verify import SensorReport, verify
 
@@ -40,6 +40,7 @@ def check_recording(
     path: str | Path,
     *,
     settings: Callable[[Settings], Settings] | None = None,
+    without: ExcludedChannels | None = None,
     nominal_rate_hz: float | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> RecordingCheck:
@@ -57,6 +58,8 @@ def check_recording(
     settings : callable, optional
         Function that takes the settings of a sensor and returns those in use, such as with another layout; by default
         the settings in the recording.
+    without : ExcludedChannels, optional
+        Channels to exclude from the check, of all sensors or of some.
     nominal_rate_hz : float, optional
         Nominal rate of pulses or measurements, in hertz; the drift of the clock is not known without it.
     on_progress : callable, optional
@@ -71,7 +74,7 @@ def check_recording(
     DataError
         The file cannot be read at all, or is not a recording.
     ArgumentError
-        The rate is invalid.
+        The rate is invalid, or channels are excluded of a sensor that the recording does not contain.
     SettingsError
         ``settings`` refuses the settings of a sensor.
 
@@ -92,6 +95,8 @@ def check_recording(
         name = "an energyscape file" if kind == "energyscape" else "a file of acoustic maps"
         raise DataError(f"{path} is {name}, wanted a recording; use the recording from which it was made")
     names = sensor_names(path)
+    without = without or ExcludedChannels()
+    without.require_known(names)
     try:
         stored = {report.sensor: report for report in verify(path)}
     except DataError as error:  # No sensor can be read.
@@ -101,7 +106,7 @@ def check_recording(
         if stored[name].fault:
             unreadable.append(_unreadable(path, stored[name].fault))
         else:
-            sensors.append(_check_sensor(path, stored[name], settings, nominal_rate_hz))
+            sensors.append(_check_sensor(path, stored[name], settings, without, nominal_rate_hz))
         if on_progress is not None:
             on_progress(number + 1)
     return RecordingCheck(path=path, sensors=tuple(sensors), unreadable=tuple(unreadable))
@@ -153,10 +158,12 @@ def _check_sensor(
     path: Path,
     stored: SensorReport,
     settings: Callable[[Settings], Settings] | None,
+    without: ExcludedChannels,
     nominal_rate_hz: float | None,
 ) -> SensorCheck:
     with open_recording(path, sensor=stored.sensor) as recording:
         used = recording.settings if settings is None else settings(recording.settings)
+        used = without.applied(used, stored.sensor)
         damaged = {item.index for item in stored.damaged}
         intact = [index for index in range(len(recording)) if index not in damaged]
         stamps = recording.stamps()

@@ -130,7 +130,7 @@ class RecordingCheck:
                 CheckFault(
                     check=fault.check,
                     text=f"sensor {each.sensor}: {fault.text}" if several else fault.text,
-                    remedy=fault.remedy,
+                    remedy=fault.remedy.replace("--without ", f"--without {each.sensor}:") if several else fault.remedy,
                 )
                 for each in self.sensors
                 for fault in each.faults

@@ -17,6 +17,7 @@ from ertis_numba.settings.array import (
 )
 from ertis_numba.settings.array_windows import ArrayWindow, parse_window
 from ertis_numba.settings.call import MAX_CALL_SAMPLES, Call
+from ertis_numba.settings.excluded_channels import ExcludedChannels
 from ertis_numba.settings.passive import HIGHEST_SHARE, MAP_METHODS, MAX_BANDS, MapMethod, Passive
 from ertis_numba.settings.presets import PRESETS, PresetKind, preset_tables, preset_text, presets
 from ertis_numba.settings.processing import STAGES, Processing
@@ -47,6 +48,7 @@ __all__ = [
     "Array",
     "ArrayWindow",
     "Call",
+    "ExcludedChannels",
     "MapMethod",
     "Passive",
     "PresetKind",

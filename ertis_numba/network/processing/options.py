@@ -9,7 +9,7 @@ from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import direction_grid
 from ertis_numba.network.addresses import DEFAULT_PUBLISH
 from ertis_numba.network.keys import ServerKeys
-from ertis_numba.settings import Settings
+from ertis_numba.settings import ExcludedChannels, Settings
 from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 
 __all__ = ["ProcessingOptions"]
@@ -29,6 +29,8 @@ class ProcessingOptions:
         Fields of `ertis_numba.settings.Processing` that override a sensor's own.
     max_error_db : float, optional
         Error budget of images; the sensor's own by default.
+    without : ExcludedChannels
+        Channels to exclude, of all sensors or of some; none by default.
     device : {"auto", "cpu", "cuda", "numpy"}
     plan : {"nominal", "measured"}
         Costs by which plans are chosen, as for `ertis_numba.Pipeline`.
@@ -59,6 +61,7 @@ class ProcessingOptions:
     keys: ServerKeys | None = None
     processing: dict[str, Any] = field(default_factory=dict)
     max_error_db: float | None = None
+    without: ExcludedChannels = field(default_factory=ExcludedChannels)
     device: str = "auto"
     plan: PlanCosts = "nominal"
     workers: int | None = None
@@ -85,7 +88,7 @@ class ProcessingOptions:
         if "directions" in self.processing:
             direction_grid(applied.processing)
 
-    def applied(self, settings: Settings) -> Settings:
+    def applied(self, settings: Settings, sensor: str = "") -> Settings:
         """Return a sensor's settings with these options applied.
 
         Raises
@@ -93,6 +96,7 @@ class ProcessingOptions:
         ArgumentError
             The result cannot be used.
         """
+        settings = self.without.applied(settings, sensor)
         if self.processing:
             settings = settings.replace(processing=settings.processing.replace(**self.processing))
         if self.max_error_db is not None:

@@ -180,7 +180,7 @@ class Sensors:
 
     def _applied(self, sensor: str, settings: Settings) -> Settings | None:
         try:
-            return self._options.applied(settings)
+            return self._options.applied(settings, sensor)
         except ArgumentError as error:
             self._log.warning("unusable", sensor=sensor, text=str(error))
             return None
