@@ -11,7 +11,7 @@ KERNELS := $(patsubst %,tests/test_%.py,kernels passive_kernels fusion_kernels i
 COMPILED := $(KERNELS) tests/test_streams.py tests/test_steering_kernels.py
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
 
-.PHONY: demo test test-kernels test-host test-simulator test-ptx test-arm check docs data pictures bench peers soak gpu clean
+.PHONY: demo test test-kernels test-host test-simulator test-ptx test-arm check docs reference data pictures bench peers soak gpu clean
 
 $(VENV)/ready: setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -55,6 +55,9 @@ check: $(VENV)/ready-to-test
 
 docs: $(VENV)/ready-to-test  ## build the documentation; open site/index.html
 	$(BIN)/python -m sphinx -q -W --keep-going docs site
+
+reference: $(VENV)/ready  ## rewrite the generated parts of the reference pages
+	$(BIN)/python docs/reference/build.py
 
 data: $(VENV)/ready  ## rebuild data/synthetic from its scenes, and the gallery
 	$(BIN)/python data/build.py
