@@ -1,5 +1,6 @@
 """Predicted error of the images of a sensor, and the warning if it may exceed the budget."""
 
+import math
 from dataclasses import dataclass
 from typing import Final, TypedDict
 
@@ -27,7 +28,7 @@ __all__ = [
 ]
 
 UNCERTAINTY_DB: Final = 1.0
-"""Largest amount by which a prediction may be too low: see tests/test_accuracy.py."""
+"""Largest amount by which the prediction for a large image may be too low: see tests/test_accuracy.py."""
 ADAPTIVE_UNCERTAINTY_DB: Final = 2.0
 """The same for adaptive beamformers, whose error is measured in a sample of the directions.
 
@@ -38,6 +39,7 @@ MAX_MEMORY_BYTES: Final = 2**28
 """Limit on the memory for a prediction of real-time images."""
 
 _MAX_DIRECTIONS: Final = 64
+_SPREAD_DB: Final = 0.25  # Smaller effects of the number of image points are within the uncertainty.
 _FAINTER_RATIO: Final = 0.1
 _ROWS: Final = 16
 
@@ -143,11 +145,16 @@ def predict(planner: Planner) -> Prediction:
     """Return a planner's prediction for its complete plan, with the budget."""
     settings = planner.settings
     processing = settings.processing
+    uncertainty_db = ADAPTIVE_UNCERTAINTY_DB
+    if not processing.is_adaptive:
+        # The mean power of few independent errors differs from its expectation, by up to three standard deviations.
+        spread_db = 10 * math.log10(1 + 3 / math.sqrt(planner.n_independent))
+        uncertainty_db = UNCERTAINTY_DB + (round(spread_db, 1) if spread_db > _SPREAD_DB else 0.0)
     weighted = "" if processing.weighting == "none" else f" with {processing.weighting}"
     return Prediction(
         predicted_error_db=round(planner.error_db(settings.accuracy), 2),
         max_error_db=settings.accuracy.max_error_db,
-        uncertainty_db=ADAPTIVE_UNCERTAINTY_DB if processing.is_adaptive else UNCERTAINTY_DB,
+        uncertainty_db=uncertainty_db,
         budget_applies_to=planner.budget_scope(settings.accuracy),
         beamformer=f"{processing.beamformer}{weighted}",
     )

@@ -81,7 +81,7 @@ def test_error_model_names_each_part_of_a_plan(real):
     for name, parts in wanted.items():
         chosen = real.predicted(PLANS[name])
         assert set(chosen.parts) == set(PARTS)
-        assert {part for part, power in chosen.parts.items() if power > 0} == parts | {"filter", "arithmetic"}
+        assert {part for part, power in chosen.parts.items() if power > 0} == parts | {"filter", "window", "arithmetic"}
         assert chosen.error_db == pytest.approx(decibels(sum(chosen.parts.values())))
 
 

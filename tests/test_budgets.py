@@ -6,13 +6,15 @@ import subprocess
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_bench.error_trials import budgets
+from ertis_bench.error_trials import budgets, reference_image
+from ertis_bench.error_trials.random_settings import random_measurement
 from ertis_cli.main import cli
 
 from ertis_numba import kernels, verification
 from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.errors import ErrorBudgetWarning
 from ertis_numba.frames import Measurement
+from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.prediction import planner_of, predict
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
@@ -53,6 +55,41 @@ def test_sound_outside_the_window_does_not_wrap_into_pcm_images(sound, budget_db
     assert true_db <= budget_db or predicted.warning
     if budget_db == -35.0:
         assert true_db <= budget_db
+
+
+@pytest.mark.parametrize("hum_hz", [50.0, 1203.0, 4711.0])
+def test_hum_below_the_band_causes_no_needless_warning(hum_hz):
+    """A transform rounds the hum 100 dB below; the images keep -35 dB, 70 dB below the hum."""
+    settings = PCM.replace(accuracy=Accuracy(max_error_db=-35.0))
+    time_s = np.arange(settings.recording.n_samples) / settings.recording.sample_rate_hz
+    hum = 0.8 * np.sin(2 * np.pi * hum_hz * time_s)
+    signals = pcm(settings, echo=3e-4).data + hum[:, None].astype(np.float32)
+    signals += 1e-5 * np.random.default_rng(3).standard_normal(signals.shape).astype(np.float32)
+    true_db, predicted = errors(Measurement(signals, settings))
+    assert true_db <= -35.0
+    assert not predicted.warning
+    assert true_db < predicted.predicted_error_db + predicted.uncertainty_db
+
+
+# Decimated by 1 to 22; calls of 0.06 to 0.6 ms, whose matched filters ring beyond the window.
+@pytest.mark.parametrize("seed", [15, 58, 62, 68, 81, 139, 155, 158, 181, 184, 190])
+@pytest.mark.parametrize("budget_db", [-60.0, -90.0])
+def test_errors_of_exact_plans_for_short_calls_are_predicted(seed, budget_db):
+    drawn = random_measurement(seed)
+    settings = drawn.settings.replace(
+        accuracy=Accuracy(max_error_db=budget_db, delay_taps=0),
+        processing=drawn.settings.processing.replace(wavefront="plane"),
+    )
+    measurement = Measurement(drawn.data, settings)
+    with Pipeline(settings, "cpu", 1, predict=False) as made:
+        image = made.process(measurement)
+    grid = direction_grid(settings.processing)
+    directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+    exact = reference_image.exact(drawn.data, settings, directions, image.range_m)
+    true_db = verification.error_db(image.amplitude, exact)
+    predicted = predict(planner_of(image, measurement, CPU, threads=1))
+    assert true_db < predicted.predicted_error_db + predicted.uncertainty_db
+    assert true_db > predicted.predicted_error_db - 12
 
 
 @pytest.mark.parametrize("beamformer", ["delay_and_sum", "dmas"])

@@ -225,12 +225,12 @@ def differences_db(measurement, settings):
 
 
 def assert_predicted(pairs):
-    """Predictions agree within 2 dB; where rounding is all that is left, they may be more pessimistic."""
+    """Predictions agree within 2 dB, below -100 dB within 3 dB if pessimistic; more where only rounding is left."""
     predicted_db, true_db = pairs.T
     assert (predicted_db > true_db - 2).all(), pairs
     audible = true_db > -118
     assert audible.any()
-    assert (predicted_db < true_db + 2)[audible].all(), pairs
+    assert (predicted_db < true_db + np.where(true_db > -100, 2, 3))[audible].all(), pairs
 
 
 @pytest.mark.parametrize(

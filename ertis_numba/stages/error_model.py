@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.geometry import array_weights, effective_count
@@ -28,7 +29,7 @@ from ertis_numba.settings import Settings
 from ertis_numba.stages.beam_grid import Aperture, BeamGrid
 from ertis_numba.stages.focal_zones import NEAREST_M
 from ertis_numba.stages.interpolation_fit import WAVES, DelayFit
-from ertis_numba.waveform import matched_band_hz, matched_noise_spectrum
+from ertis_numba.waveform import matched_band_hz, matched_filter_spectrum, matched_noise_spectrum
 
 __all__ = ["PARTS", "ErrorModel", "SignalModel", "decibels"]
 
@@ -38,16 +39,17 @@ PARTS: Final = {
     "zones": "one set of delays for each focal zone",
     "samples": "16-bit samples and weights",
     "filter": "noise aliased by the decimation",
+    "window": "ringing of the matched filter cut off at the time window",
     "arithmetic": "single precision",
 }
 """Name and cause of the error of each step."""
 
 _ARITHMETIC = 10 ** (-114 / 10)  # Single precision through two transforms and a sum, of any sound.
-_ROUNDING = 10 ** (-114 / 10)  # Single precision, relative to all transformed samples: -115 to -140 dB were measured.
-# Single precision by cause, fitted to phase shifts of PDM: real and synthetic measurements, noise, and random scenes.
+# Single precision by cause, fitted to phase shifts: real and synthetic measurements, noise, hum, and random scenes.
 _OF_IMAGE = 10 ** (-137 / 10)  # Sums and output, relative to the image.
 _OF_BAND = 10 ** (-136 / 10)  # Inverse transforms, which spread errors over all ranges, relative to the whole record.
 _OF_SIGNALS = 10 ** (-146 / 10)  # Forward transforms, relative to the signals at all frequencies.
+_OF_BAND_PCM, _OF_SIGNALS_PCM = 10 ** (-130 / 10), 10 ** (-139 / 10)  # PCM may be equal in all microphones.
 _PHASE_STEP = 2 * math.pi / 2**32  # Resolution of phases in radians.
 _SAFE_GAIN = 0.5  # Most of the sound comes from outside the directions of the image.
 _SAFE_COLOUR = 2.0  # Echoes are strongest at the edges of the band.
@@ -57,6 +59,7 @@ _SAFE_LEVEL = 10 ** (-24 / 10)  # Level in a quiet room that eRTIS was tested in
 _UNLIKE = 1.3  # Margin for differences between images: 1 dB, from the scenes of tests/test_accuracy.py.
 _NOISE_CORNER_HZ = 500e3  # Corner of the shaped noise of eRTIS at 4.5 MHz.
 _NOISE_RATE_HZ = 4.5e6
+_GUARDS = 8  # Ringing is computed over so many times the time by which a window extends beyond the image.
 
 
 def decibels(power: float) -> float:
@@ -290,18 +293,61 @@ class ErrorModel:
         The integer taps of the filter are used, so the stopband includes the effect of rounding. Noise covers the whole
         image. At image points darker than the noise, all of its power changes magnitudes.
         """
-        settings, noise = self._settings, self.signal_model.noise
+        settings = self._settings
         low_hz, high_hz = matched_band_hz(settings)
-        n_fft = 2 * (len(noise) - 1)
-        n_fft *= max(1, -(-8 * len(taps) // n_fft))  # The bins resolve the side lobes of the filter.
-        gain_2 = np.abs(np.fft.rfft(taps / taps.sum(dtype=np.int64), n_fft)) ** 2
-        frequency_hz = np.arange(len(gain_2)) * settings.recording.sample_rate_hz / n_fft
-        folded = gain_2 * np.interp(frequency_hz, np.linspace(0, frequency_hz[-1], len(noise)), noise)
+        frequency_hz, folded = self._filtered_noise(taps)
         rate_hz = settings.signal_rate_hz
         distance_hz = np.abs(frequency_hz - rate_hz * np.rint(frequency_hz / rate_hz))
         outside = (frequency_hz > rate_hz / 2) & (distance_hz > low_hz) & (distance_hz < high_hz)
         passed = float(folded[outside].sum()) * (frequency_hz[1] - frequency_hz[0]) / (high_hz - low_hz)
-        power = _UNLIKE * passed / self.signal_model.level / self.signal_model.gain
+        return self._everywhere(_UNLIKE * passed / self.signal_model.level)
+
+    def window(self, taps: NDArray[np.int16] | NDArray[np.int32], *, guard_s: float, imaged_s: float) -> float:
+        """Return the error power of ringing beyond a time window: it is cut off at each end, and as much wraps around.
+
+        The matched filter h rings before and after the call. At the first and the last range, the window lacks the
+        samples that h beyond the guard weights. Further inside it lacks less: the power of the cut, which extends
+        beyond the band and lets noise through, falls with the sixth power of the time.
+
+        Parameters
+        ----------
+        taps : (tap,) int16 or int32
+            Decimation filter.
+        guard_s : float
+            Time by which the window extends beyond the image and the call, at each end.
+        imaged_s : float
+            Duration of the image.
+        """
+        settings, model = self._settings, self.signal_model
+        rate_hz, call_s = settings.signal_rate_hz, settings.call.end_s
+        n_fft = scipy.fft.next_fast_len(math.ceil((2 * call_s + _GUARDS * guard_s) * rate_hz))
+        matched = matched_filter_spectrum(settings, n_fft=n_fft)
+        spectrum = np.zeros(n_fft, dtype=np.complex128)
+        spectrum[matched.first_bin : matched.first_bin + len(matched.values)] = matched.values
+        response = scipy.fft.ifft(spectrum)
+        time_s = scipy.fft.fftfreq(n_fft, 1 / n_fft) / rate_hz
+        response[(time_s <= guard_s) & (time_s >= -call_s - guard_s)] = 0
+        noise_hz, noise = self._filtered_noise(taps)
+        heard = np.interp(np.abs(scipy.fft.fftfreq(n_fft, 1 / rate_hz)), noise_hz, noise)
+        missed = float(np.abs(scipy.fft.fft(response)) ** 2 @ heard) / float(np.sum(np.abs(matched.values) ** 2))
+        inside = imaged_s / guard_s
+        mean = (1 - (1 + inside) ** -5) / (5 * inside) if inside else 1.0
+        return self._everywhere(2 * mean * missed / model.level)
+
+    def _filtered_noise(
+        self, taps: NDArray[np.int16] | NDArray[np.int32]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the power density of the noise after the decimation filter, relative to white bits, by frequency."""
+        noise = self.signal_model.noise
+        n_fft = 2 * (len(noise) - 1)
+        n_fft *= max(1, -(-8 * len(taps) // n_fft))  # The bins resolve the side lobes of the filter.
+        gain_2 = np.abs(np.fft.rfft(taps / taps.sum(dtype=np.int64), n_fft)) ** 2
+        frequency_hz = np.arange(len(gain_2)) * self._settings.recording.sample_rate_hz / n_fft
+        return frequency_hz, gain_2 * np.interp(frequency_hz, np.linspace(0, frequency_hz[-1], len(noise)), noise)
+
+    def _everywhere(self, power: float) -> float:
+        """Return the error power of independent noise in the whole image, from its power relative to the signals."""
+        power /= self.signal_model.gain
         # The exponential approximates the mean of a Rice distribution.
         dark = np.exp(-4 * np.sqrt(self.signal_model.places / max(power, 1e-30)))
         return float(power * (0.5 + 0.5 * np.mean(dark)))
@@ -309,13 +355,14 @@ class ErrorModel:
     def arithmetic(self) -> float:
         """Return the error power of single precision.
 
-        PCM microphones may receive the same loud sound outside the band or the window. They then round it alike, and
-        their errors add up in a beam. The noise of PDM bits differs between microphones, so that it prevents this.
+        PCM microphones may receive the same loud sound outside the window. They then round it alike, and their errors
+        add up in a beam. The noise of PDM bits differs between microphones, so that it prevents this.
         """
         model = self.signal_model
         if not self._settings.recording.is_pdm:
             alike = effective_count(self._weights)
-            return (_ARITHMETIC + alike * _ROUNDING * model.loudness) / model.gain
+            of_signals = _ARITHMETIC + _OF_SIGNALS_PCM * model.loudness
+            return of_signals / model.gain + alike * _OF_BAND_PCM * model.record_level
         if not model.record_level:  # not measured
             return _ARITHMETIC / model.gain
         return (_OF_IMAGE + _OF_SIGNALS * model.loudness) / model.gain + _OF_BAND * model.record_level

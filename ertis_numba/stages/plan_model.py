@@ -34,7 +34,7 @@ from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.stream_plan import StreamPlanner
 from ertis_numba.stages.stream_recipe import recipe_of, uses_streams
 from ertis_numba.stages.time_window import TimeWindow, time_window
-from ertis_numba.waveform import matched_band_hz
+from ertis_numba.waveform import matched_band_hz, matched_guard_s
 
 __all__ = ["MIN_STOPBAND_ATTENUATION_DB", "TABLE_BYTES", "Delays", "ImagePlan", "Nodes", "PlanModel", "plan_of"]
 
@@ -165,11 +165,7 @@ class PlanModel:
         """
         if self.uses_streams(plan):
             return self._stream_parts(plan, noise_only=noise_only)
-        _, filter_error = self.filter(plan.stopband_attenuation_db)
-        parts = dict.fromkeys(PARTS, 0.0)
-        parts["filter"], parts["arithmetic"] = filter_error, self.errors.arithmetic()
-        if self.settings.processing.wavefront == "spherical":
-            parts["zones"] = self.zone_error(plan.focal_zones)
+        parts = self._common_parts(plan)
         if not plan.delay_taps:
             parts["arithmetic"] += self.errors.phases(self._n_bins(self._windows(plan.stopband_attenuation_db)))
             return parts
@@ -183,6 +179,23 @@ class PlanModel:
             parts["samples"] = self._spread * self._whole_numbers(delays, None if nodes is None else nodes.squares)
         return parts
 
+    def _common_parts(self, plan: ImagePlan) -> dict[str, float]:
+        """Return the error power of the steps that every plan has."""
+        parts = dict.fromkeys(PARTS, 0.0)
+        parts["filter"], parts["window"] = self._band_errors(plan.stopband_attenuation_db)
+        parts["arithmetic"] = self.errors.arithmetic()
+        if self.settings.processing.wavefront == "spherical":
+            parts["zones"] = self.zone_error(plan.focal_zones)
+        return parts
+
+    @cached_in_instance
+    def _band_errors(self, stopband_attenuation_db: float) -> tuple[float, float]:
+        """Return the error powers of the decimation filter and of the ringing that its plan's window cuts off."""
+        taps, filter_error = self.filter(stopband_attenuation_db)
+        guard_s = matched_guard_s(self.settings, down_db=self._ringing_db(stopband_attenuation_db))
+        imaged_s = len(self.window.range_m) / self.settings.output_rate_hz
+        return filter_error, self.errors.window(taps, guard_s=guard_s, imaged_s=imaged_s)
+
     def uses_streams(self, plan: ImagePlan) -> bool:
         """Return True if a plan computes an adaptive beamformer from streams."""
         accuracy = Accuracy(precision=plan.precision, delay_taps=plan.delay_taps, beam_taps=plan.beam_taps)  # type: ignore[arg-type]
@@ -192,11 +205,7 @@ class PlanModel:
         assert self._stream_planner is not None  # noqa: S101
         planned, kind = self.streams(plan), "noise" if noise_only else "echoes"
         linear = Sensitivity.of(self.settings.processing, self.n_mics).linear
-        _, filter_error = self.filter(plan.stopband_attenuation_db)
-        parts = dict.fromkeys(PARTS, 0.0)
-        parts["filter"], parts["arithmetic"] = filter_error, self.errors.arithmetic()
-        if self.settings.processing.wavefront == "spherical":
-            parts["zones"] = self.zone_error(plan.focal_zones)
+        parts = self._common_parts(plan)
         amplified = 1.0
         for each in planned.streams:
             squares = None
@@ -390,9 +399,12 @@ class PlanModel:
     @cached_in_instance
     def _windows(self, stopband_attenuation_db: float) -> TimeWindow:
         """Return the window of a plan, whose ringing depends on its stopband attenuation."""
-        accuracy = self.settings.accuracy.replace(stopband_attenuation_db=stopband_attenuation_db)
-        ringing = ringing_db(self.settings.replace(accuracy=accuracy))
+        ringing = self._ringing_db(stopband_attenuation_db)
         return time_window(self.settings, largest_delay_s=self._reach_s(), n_taps=1, ringing_db=ringing)
+
+    def _ringing_db(self, stopband_attenuation_db: float) -> float:
+        accuracy = self.settings.accuracy.replace(stopband_attenuation_db=stopband_attenuation_db)
+        return ringing_db(self.settings.replace(accuracy=accuracy))
 
     def _reach_s(self) -> float:
         positions_m = self.aperture.square_m2

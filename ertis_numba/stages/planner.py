@@ -19,6 +19,7 @@ from ertis_numba.stages.plan_model import ImagePlan, PlanModel, plan_of
 from ertis_numba.stages.plan_search import open_plans
 from ertis_numba.stages.sensitivity import Sensitivity
 from ertis_numba.stages.wavefronts import with_wavefront
+from ertis_numba.waveform import matched_band_hz
 
 __all__ = ["BudgetScope", "Chosen", "Planner", "complete"]
 
@@ -142,6 +143,13 @@ class Planner:
     def model(self) -> ErrorModel:
         """Error model of the signal chain."""
         return self._plans.errors
+
+    @property
+    def n_independent(self) -> float:
+        """Number of independent points of an image: those of the band, in as many directions as microphones resolve."""
+        low_hz, high_hz = matched_band_hz(self.settings)
+        imaged_s = len(self._plans.window.range_m) / self.settings.output_rate_hz
+        return max(2.0, imaged_s * (high_hz - low_hz) * min(self._plans.n_directions, self._plans.n_mics))
 
     def _rated(
         self, plans: Sequence[ImagePlan], sizes: Sequence[int], smallest: int, largest: int
