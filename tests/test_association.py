@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.fusion.association import Reflectors, SensorEchoes
+from ertis_numba.fusion.association import Reflectors
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.rig import Emitters, mounted_sensors
+from ertis_numba.fusion.sensor_echoes import SensorEchoes
 
 N_SENSORS = 4
 PATH_SD_M, ANGLE_SD_RAD = 2e-3, math.radians(0.25)

@@ -95,7 +95,8 @@ class Fused:
         """Reflectors in the frame of the platform.
 
         Amplitudes are those that a single sensor would measure if the reflector were at 1 m on the axis of its emitter.
-        Where the calls of two sensors arrive together, with unknown phases, they may be off by 3 dB.
+        Where the calls of two sensors arrive together, with unknown phases, they may be 3 dB too high, or up to 13 dB
+        too low where the calls cancel each other.
         """
         return self._locate(self._solve())
 

@@ -5,7 +5,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Overlap", "PredictedEchoes", "overlap"]
+__all__ = ["Overlap", "PredictedEchoes", "overlap", "summed_m2"]
 
 Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -14,6 +14,8 @@ _FAINT: Final = 1e-4  # Power relative to that of an echo, below which another o
 _GRAZING: Final = 0.1  # Least cosine of the angle to the axis of the array.
 _SHIFT: Final = 0.28  # Error of a path or a direction relative to the distance of an equally strong echo.
 _DECAY: Final = -1.75  # Compressed pulses are 26 dB down at six widths, and 40 dB at fourteen.
+_SUMMED: Final = 0.5  # Largest error of the path of a sum of two equal pulses of any phases, in widths of the pulse, …
+_SEPARATE: Final = 2.0  # … and difference of their paths, in such widths, from which their maxima are separate.
 
 
 class PredictedEchoes(NamedTuple):
@@ -101,3 +103,22 @@ def overlap(
     total = ratio.sum(axis=2)
     facing_to = np.maximum(np.einsum("ei,ei->e", direction, facing), _GRAZING)
     return Overlap(total, path_m2, total * (_SHIFT * np.minimum(across, width) / facing_to[:, None]) ** 2)
+
+
+def summed_m2(late_m: Floats, ratio: Floats, width_m: Floats) -> Floats:
+    """Return the variances of the paths of echoes that are sums of the calls of several emitters: (echo,) float64.
+
+    Their maxima are not between those of the calls if these cancel each other, so that errors reach half of the width.
+
+    Parameters
+    ----------
+    late_m : (echo, emitter) float64
+        Differences of the paths from that of the call to which the echo is attributed.
+    ratio : (echo, emitter) float64
+        Power of each call relative to the echo.
+    width_m : (echo, 1) float64
+        Width of the compressed pulse.
+    """
+    here = np.minimum(ratio * np.exp(-2 * (late_m / (_SEPARATE * width_m)) ** 4), 1.0)
+    here[here < _FAINT] = 0.0
+    return np.asarray(np.sum(here * np.minimum(late_m, _SUMMED * width_m) ** 2, axis=1))

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.noise import EchoFloor, echo_floor
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import Energyscape, PointCloud
-from ertis_numba.fusion.association import Reflectors, SensorEchoes, tangents
+from ertis_numba.fusion.association import Reflectors
 from ertis_numba.fusion.attribution import Shares
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import MountedSensor
+from ertis_numba.fusion.sensor_echoes import SensorEchoes
+from ertis_numba.fusion.sight import tangents
 from ertis_numba.geometry import Grid
 
 __all__ = ["PointFuser", "joined"]

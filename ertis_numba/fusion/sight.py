@@ -1,6 +1,7 @@
 """Places as the sensors of a platform see them: distances, directions, and power of their echoes."""
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,9 +9,11 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.fusion.rig import Emitters, MountedSensor
 
-__all__ = ["Viewers", "mirrored"]
+__all__ = ["Viewers", "mirrored", "tangents"]
 
 Floats = NDArray[np.float64]
+
+_VERTICAL: Final = 1e-6
 
 
 class Viewers:
@@ -66,3 +69,15 @@ class Viewers:
 def mirrored(direction: Floats, ahead: Floats) -> Floats:
     """Return directions mirrored at the planes of flat arrays: (..., axis) float64."""
     return np.asarray(direction - 2 * np.einsum("...i,...i->...", direction, ahead)[..., None] * ahead)
+
+
+def tangents(direction: Floats) -> tuple[Floats, Floats]:
+    """Return unit vectors to the left and upwards, across directions: two of (..., axis) float64."""
+    x, y, z = np.moveaxis(direction, -1, 0)
+    level = np.hypot(x, y)
+    # Straight up, any horizontal direction will do.
+    is_level = level > _VERTICAL
+    safe = np.where(is_level, level, 1.0)
+    left_x, left_y = np.where(is_level, -y / safe, 0.0), np.where(is_level, x / safe, 1.0)
+    left = np.stack([left_x, left_y, np.zeros_like(x)], axis=-1)
+    return left, np.stack([-z * left_y, z * left_x, x * left_y - y * left_x], axis=-1)
