@@ -269,14 +269,6 @@ def test_generated_readme_has_all_tables(name):
     assert "| ---: |" in table
 
 
-def test_interpolation_benchmark_gives_the_documented_errors():
-    done = CliRunner().invoke(cli, ["bench", "interpolation", "--quiet", "--json"])
-    assert done.exit_code == 0, (done.output, done.exception)
-    found = {row["oversampling"]: row["error_db"] for row in json.loads(done.stdout)["rows"]}
-    assert found[2]["fitted, 2 taps"] == pytest.approx(-44, abs=0.5)
-    assert found[2]["linear between rotated carriers"] == pytest.approx(-33, abs=0.5)
-
-
 @pytest.mark.usefixtures("hardly_warm")
 def test_beamformers_benchmark_rates_every_combination(tmp_path):
     target = tmp_path / "page.md"

@@ -446,42 +446,6 @@ def many(**given: Any) -> None:
     _run("many", _in_source_folder("many", "cpu_times.campaign_scaling"), **given)
 
 
-@bench.command()
-@_update
-@options.quiet
-@options.as_json
-def factorisation(**given: Any) -> None:
-    """Count multiplications with and without sub-arrays.
-
-    Nothing is timed.
-    """
-    _run("factorisation", _in_source_folder("factorisation", "rejected_plans.factorisation"), **given)
-
-
-@bench.command()
-@_update
-@options.quiet
-@options.as_json
-def interpolation(**given: Any) -> None:
-    """Compare fitted and textbook weights for delays.
-
-    Nothing is timed.
-    """
-    _run("interpolation", _in_source_folder("interpolation", "rejected_plans.delay_interpolation"), **given)
-
-
-@bench.command()
-@_update
-@options.quiet
-@options.as_json
-def ptx(**given: Any) -> None:
-    """Estimate the time of GPU kernels without a GPU.
-
-    Compiles them for an H200; nothing is timed.
-    """
-    _run("ptx", _in_source_folder("ptx"), **given)
-
-
 @bench.command("health")
 @click.option(
     "--long", is_flag=True, help="Use 1,000 healthy arrays and 30 trials per fault instead of 40 arrays and 1 trial."
