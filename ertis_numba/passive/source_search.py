@@ -12,7 +12,7 @@ from ertis_numba.passive.detection_law import LAGS, exceedance, independent_samp
 from ertis_numba.passive.direction_errors import covariance_of, powers_in_noise
 from ertis_numba.passive.heard_band import HeardBand
 from ertis_numba.passive.likelihood import BandLikelihood, Delays
-from ertis_numba.passive.noise_model import NoiseModel
+from ertis_numba.passive.noise_model import NoiseFluctuations, NoiseModel
 from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
 
 __all__ = ["BandSearch", "FoundSource", "Scan"]
@@ -175,15 +175,33 @@ class BandSearch:
         least: float,
     ) -> bool:
         """Return False if noise or errors of the known sources may cause a further source."""
-        extent, similarity = self._of_noise(diffuse)
-        n_samples = independent_samples(band.weights, band.n_blocks, similarity)
         share = float(rest.relative_power(place[None])[0]) / rest.dimensions
-        chance = exceedance(share, n_samples=n_samples, n_dimensions=rest.dimensions, extent=extent)
+        chance = self._chance(share, place, rest, whole, band, diffuse, places)
         known = band.weights @ whole.separated(places, band.omegas[:, : len(places)])[0] if len(places) else np.zeros(0)
         strongest = max(0.0, known.max(initial=0.0))
         power = float(band.weights @ powers_in_noise(rest, place)[0])
         size, whole_size = (float(band.weights @ each.beams(place[None])[1][:, 0]) for each in (rest, whole))
         return chance <= false_alarm and power >= least * strongest and size >= _BLIND * whole_size
+
+    def _chance(
+        self,
+        share: float,
+        place: Floats,
+        rest: BandLikelihood,
+        whole: BandLikelihood,
+        band: HeardBand,
+        diffuse: float,
+        places: Floats,
+    ) -> float:
+        """Return the probability that noise as it is heard outside of a direction and of known sources has a share."""
+        extent, similarity = self._of_noise(diffuse)
+        of_white = independent_samples(band.weights, band.n_blocks, similarity)
+        omegas = np.append(band.omegas[:, : len(places)], rest.omega[:, None], axis=1)
+        outside = whole.beside(np.concatenate([places, place[None]]), omegas).projection
+        wave = rest.unwhitened_waves(place[None])
+        noise = NoiseFluctuations.of(whole.matrix, outside, wave, band.weights, of_white)
+        n_samples = noise.samples_at(share, rest.dimensions)
+        return exceedance(share, n_samples=n_samples, n_dimensions=rest.dimensions, extent=extent)
 
     def _of_noise(self, share: float) -> tuple[ScanExtent, Floats]:
         """Return the extent of the scan, and the similarity of the beams of neighbouring bins.
