@@ -401,7 +401,7 @@ def test_command_never_overwrites_its_input(tmp_path, command):
     before = path.read_bytes()
     arguments = [command, path, "-o", path, "--force", *(LAYOUT if command == "import" else [])]
     done = run(*arguments, code=1)
-    assert "is the input itself; give another name" in done.stderr
+    assert "is the input itself; choose another name" in done.stderr
     assert path.read_bytes() == before
 
 

@@ -45,7 +45,7 @@ def test_point_of_a_moving_sensor_returns_to_its_place(velocity_m_s, yaw_rate_de
 @pytest.mark.parametrize(
     ("velocity_m_s", "yaw_rate_rad_s", "message"),
     [
-        ((1.0, 0.0), 0.0, r"velocity_m_s has shape \(2,\); give x, y, z"),
+        ((1.0, 0.0), 0.0, r"velocity_m_s has shape \(2,\); use x, y, z"),
         ((math.nan, 0.0, 0.0), 0.0, "velocity_m_s is nan"),
         ((0.0, 0.0, 0.0), 1e3, "yaw_rate_rad_s is 1000"),
     ],

@@ -99,7 +99,7 @@ def test_plot_accepts_the_name_of_a_layout(tmp_path):
         ("plot rec.h5 --kind signals --peaks 3", 2, "--peaks is for --kind image, polar, projection, slices"),
         ("plot rec.h5 --kind array -m 1", 2, "--measurement is for --kind image, polar, projection, slices, signals"),
         ("plot img.h5 --frequency 4e4", 2, "--frequency is for --kind array; remove it with image"),
-        ("plot img.h5 --columns 1", 1, "--columns is 1, which theme 'dark' has none of; give theme 'paper'"),
+        ("plot img.h5 --columns 1", 1, "--columns is 1, which theme 'dark' does not have; use theme 'paper'"),
         ("plot img.h5 --kind signals", 1, "img.h5 is an energyscape file, wanted a recording"),
         ("plot settings.toml --kind array --sensor x", 2, "--sensor is for files with several sensors"),
         (
@@ -107,8 +107,8 @@ def test_plot_accepts_the_name_of_a_layout(tmp_path):
             1,
             "layout 'eRTIS_v3D2' is unknown (did you mean 'eRTIS_v3D1'?); known are eR",
         ),
-        ("plot eRTIS_v3D1", 2, "eRTIS_v3D1 contains no measurement; give --kind array, or a recording, an energy"),
-        ("plot settings.toml --kind signals", 2, "settings.toml contains no measurement; give --kind array, or a"),
+        ("plot eRTIS_v3D1", 2, "eRTIS_v3D1 contains no measurement; use --kind array, or a recording, an energyscape"),
+        ("plot settings.toml --kind signals", 2, "settings.toml contains no measurement; use --kind array, or a"),
         (
             "plot none.h5 --kind array",
             1,

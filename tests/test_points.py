@@ -163,7 +163,7 @@ def test_platform_frame_rotates_then_translates():
 
 @pytest.mark.parametrize(
     ("arguments", "match"),
-    [({"top": 0}, "top is 0; give a whole number of at least 1"), ({"min_level_db": 3.0}, "min_level_db is 3")],
+    [({"top": 0}, "top is 0; use a whole number of at least 1"), ({"min_level_db": 3.0}, "min_level_db is 3")],
 )
 def test_point_extractor_refuses_invalid_arguments(arguments, match):
     with pytest.raises(ArgumentError, match=match):

@@ -63,7 +63,9 @@ def require_fitting(name: str, paths: "Sequence[Path]") -> None:
         if typed(option):
             raise click.UsageError(f"--{spelling} is for format batslam, not for {name}; leave it out", context)
     if len(paths) > 1:
-        raise click.UsageError(f"format {name} exports one recording, but {len(paths)} are given; give one", context)
+        raise click.UsageError(
+            f"format {name} exports one recording, but {len(paths)} are given; choose one of them", context
+        )
 
 
 def open_ears(
@@ -127,7 +129,7 @@ def drive_of(
     true = ears.trajectory if poses is None else _poses.trajectory_of(poses, quiet=quiet)
     if true is None:
         raise ArgumentError(
-            f"{ears.path} has no poses; give true ones with --poses TRAJ, or without ground truth the output of "
+            f"{ears.path} has no poses; add the true poses with --poses TRAJ, or without ground truth the output of "
             "'ertis odometry'"
         )
     simulated = None if scene is None else load_scene(scene)
@@ -177,5 +179,5 @@ def _measured(
 
 
 def _as_recorded(settings: "Settings") -> "Settings":
-    _results.require_image(settings, "odometry needs images; give --odometry TRAJ")
+    _results.require_image(settings, "odometry needs images; add its result with --odometry TRAJ")
     return settings

@@ -102,9 +102,11 @@ def require_possible(sound: SoundOptions) -> None:
         if typed(parameter):
             raise click.UsageError(f"{option} is not for sound; remove it", context)
     if sound.direction is None:
-        raise click.UsageError("a .wav file has the sound of one direction; give it with --listen AZ,EL", context)
+        raise click.UsageError(
+            "a .wav file contains the sound of one direction; choose it with --listen AZ,EL", context
+        )
     if sound.heterodyne_hz is not None and sound.expansion is not None:
-        raise click.UsageError("--heterodyne and --expand both lower the sound; give one of them", context)
+        raise click.UsageError("--heterodyne and --expand both lower the sound; choose one of them", context)
 
 
 def export_sound(

@@ -159,7 +159,7 @@ def costs(*, count: int, targets: tuple[Path, ...], units: tuple[str, ...], quie
             markdown.around(target, benchmark.MARKER)
         elif target.name != "nominal_costs.py":
             raise click.BadParameter(
-                f"{target} is not nominal_costs.py; give that of ertis_numba/stages, or a Markdown file",
+                f"{target} is not nominal_costs.py; choose ertis_numba/stages/nominal_costs.py, or a Markdown file",
                 param_hint="--update",
             )
     report = benchmark.run(count=count, say=lambda text: options.say(text, quiet=quiet), units=units or benchmark.UNITS)

@@ -122,7 +122,7 @@ def _recordings(path: Path) -> list[Path]:
         return [path]
     recordings = [each.path for each in find_recordings([path]) if file_kind(each.path) == "recording"]
     if not recordings:
-        raise DataError(f"folder {path} contains energyscape files only; give a folder with recordings")
+        raise DataError(f"folder {path} contains energyscape files only; choose a folder with recordings")
     return recordings
 
 

@@ -124,7 +124,7 @@ def peaks(
 
     if truth and top is not None:
         raise click.UsageError(
-            "--top would omit reflectors that --truth compares; give one of them", click.get_current_context()
+            "--top would omit reflectors that --truth compares; choose one of them", click.get_current_context()
         )
     if detector == "cfar" and truth:
         raise click.UsageError(
@@ -309,7 +309,7 @@ def _note_left_out(sensor: str, count: int) -> None:
 def _note_unconfirmed(sensor: str, count: int) -> None:
     """Print a note on points of a fusion that are not listed."""
     if count:
-        points = "1 point" if count == 1 else f"{count} points"
+        points = options.counted(count, "point")
         options.note(
             f"sensor {sensor}: {points} left out because too few pairs of emitter and receiver confirm them: they may "
             "be ghosts, or reflectors that few sensors hear; the file contains them with point_confirmed = 0"

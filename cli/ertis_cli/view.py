@@ -248,7 +248,7 @@ def _is_address(location: str) -> bool:
     host_port = None if live or Path(location).exists() else _HOST_PORT.fullmatch(location)
     if host_port:
         raise click.UsageError(
-            f"{location!r} is not a file; for the address of a central node, give tcp://{host_port[2]}"
+            f"{location!r} is not a file; for the address of a central node, use tcp://{host_port[2]}"
         )
     return live
 

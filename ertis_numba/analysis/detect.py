@@ -123,7 +123,7 @@ def peaks_of_grid(
         where = np.asarray(where)
         checks.shape("where", where.shape, image.amplitude.shape)
         if where.dtype != np.bool_:
-            raise ArgumentError(f"where has dtype {where.dtype}; give bool, such as image.amplitude > 0.01")
+            raise ArgumentError(f"where has dtype {where.dtype}; use bool, such as image.amplitude > 0.01")
     edges = EdgeFloor(directions, PointSpread(image.settings))(image)
     places = _local_maxima(image.amplitude, neighbours, np.maximum(floor, edges), where)
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)

@@ -72,7 +72,7 @@ class PointExtractor:
     def __init__(
         self, settings: Settings, grid: Grid | None = None, *, top: int = TOP, min_level_db: float = MIN_LEVEL_DB
     ) -> None:
-        checks.instance("settings", settings, Settings, "an image or a recording holds")
+        checks.instance("settings", settings, Settings, "an image or a recording contains")
         self._has_directions = any(observable_angles(settings.array)[:2])
         self._top = checks.integer("top", top, 1)
         self._smallest = 10 ** (checks.between("min_level_db", min_level_db, -1000.0, 0.0) / 20)

@@ -98,7 +98,7 @@ class Trials:
         found_m = float(np.linalg.norm(point))
         across_m = range_m * float(point / found_m @ self._min_resolved(azimuth_rad, elevation_rad))
         if cloud.uncertainty_m is None:
-            raise DataError("points have no uncertainty; give settings with a complete plan")
+            raise DataError("points have no uncertainty; use settings with a complete plan")
         return np.asarray(np.array([found_m - range_m, across_m]) / cloud.uncertainty_m[0].astype(np.float64))
 
     def _min_resolved(
