@@ -69,8 +69,8 @@ class _PathMarks:
         length_m = 0.06 * (limits[0][1] - limits[0][0])
         tip_m = self._path_m[-1] + length_m * self._ahead
         arrow = {"arrowstyle": "-|>", "color": _POSE, "linewidth": 1.2 * line_pt, "mutation_scale": em_pt}
-        ends = [(float(each[0]), float(each[up])) for each in (tip_m, self._path_m[-1])]
-        axes.annotate("", *ends, arrowprops=arrow)
+        tip, end = ((float(each[0]), float(each[up])) for each in (tip_m, self._path_m[-1]))
+        axes.annotate("", tip, end, arrowprops=arrow)
         axes.plot(self._sensors_m[:, 0], self._sensors_m[:, up], "o", markersize=0.3 * em_pt, color=_POSE)
         axes.set_xlim(limits[0])
         axes.set_ylim(limits[1])
