@@ -156,7 +156,10 @@ class BandLikelihood:
 
     def beams(self, directions: Floats) -> tuple[Floats, Floats]:
         """Return the power b^H C b, and the size of the wave outside of other sources, both (bin, direction)."""
-        waves = self.outside(self.waves(directions))
+        return self._powers(self.waves(directions))
+
+    def _powers(self, waves: NDArray[np.complex128]) -> tuple[Floats, Floats]:
+        waves = self.outside(waves)
         size = np.maximum((waves.real**2 + waves.imag**2).sum(axis=1), _LEAST)
         return (waves.conj() * (self.matrix @ waves)).sum(axis=1).real / size, size
 
@@ -207,7 +210,16 @@ class BandLikelihood:
 
     def __call__(self, directions: Floats) -> Floats:
         """Return the logarithm of the likelihood of directions, per sample: (direction,) float64."""
-        powers, _ = self.beams(directions)
+        return self._of_powers(self.beams(directions)[0])
+
+    def of_equal_channels(self) -> float:
+        """Return the logarithm of the likelihood of a signal that is equal at all microphones, per sample."""
+        waves = np.ones((*self.matrix.shape[:2], 1), np.complex128)
+        if self._whitening is not None:
+            waves = self._whitening @ waves
+        return float(self._of_powers(self._powers(waves)[0])[0])
+
+    def _of_powers(self, powers: Floats) -> Floats:
         left = np.maximum(self.power[:, None] - powers, 0) + _ROUNDING
         return np.asarray(-self.weights @ np.log(left))
 
