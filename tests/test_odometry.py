@@ -173,7 +173,7 @@ def test_odometry_command_takes_mountings_from_a_file(folder, tmp_path):
         (["both.h5", "--mounting", "front.h5"], 1, "front.h5 does not contain sensor 'back'; add its mounting, or"),
         (["single.h5"], 1, "single.h5 contains one pulse; at least two"),
         (["front.h5", "both.h5"], 2, "contain the same sensor 'front'"),
-        (["timeless.h5"], 1, "timeless.h5 has different pulses at the same time"),
+        (["timeless.h5"], 1, "timeless.h5 contains several pulses with the same timestamp"),
         (["front.h5", "late.h5"], 1, "no pulse has measurements of two sensors: front has pulses 0 to 2 from 0.000 s"),
         (
             ["front.h5", "other_chain.h5"],

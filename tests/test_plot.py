@@ -101,7 +101,7 @@ def test_plot_accepts_the_name_of_a_layout(tmp_path):
         ("plot img.h5 --frequency 4e4", 2, "--frequency is for --kind array; remove it with image"),
         ("plot img.h5 --columns 1", 1, "--columns is 1, which theme 'dark' does not have; use theme 'paper'"),
         ("plot img.h5 --kind signals", 1, "img.h5 is an energyscape file, wanted a recording"),
-        ("plot settings.toml --kind array --sensor x", 2, "--sensor is for files with several sensors"),
+        ("plot settings.toml --kind array --sensor x", 2, "--sensor chooses a sensor in a file"),
         (
             "plot eRTIS_v3D2 --kind array",
             1,

@@ -34,7 +34,8 @@ def drive_options(command: Any) -> Any:
             default=30.0,
             show_default=True,
             metavar="DEG",
-            help="Azimuth of the virtual ears for BatSLAM in °, each to its own side; 0 is the front.",
+            help="Azimuth of the two virtual ears for BatSLAM in °: the left ear to the left, the right ear to the "
+            "right; 0 is ahead.",
         ),
         click.option("--scene", type=options.FILE, metavar="SCENE.toml", help="Scene with the reflectors for BatSLAM."),
         click.option(
@@ -47,7 +48,8 @@ def drive_options(command: Any) -> Any:
             "--poses",
             type=options.FILE,
             metavar="TRAJ",
-            help="True poses of the platform for BatSLAM, such as a TUM file; those of the recording by default.",
+            help="File with the true poses of the platform for BatSLAM, such as a TUM file; by default, the poses "
+            "in the recording.",
         ),
     ):
         command = option(command)

@@ -56,7 +56,8 @@ def sound_options(command: Any) -> Any:
             "--silence",
             "with_silence",
             is_flag=True,
-            help="Keep the time between measurements as silence; by default, they follow each other.",
+            help="Fill the time between two measurements with silence; by default, measurements follow each other "
+            "without a gap.",
         ),
         click.option(
             "--expand",
@@ -70,7 +71,7 @@ def sound_options(command: Any) -> Any:
             "heterodyne_hz",
             type=click.FloatRange(min=0),
             metavar="HZ",
-            help="Shift the sound down by this frequency, to 48 kHz of samples.",
+            help="Shift the sound down by this frequency, and write it with a sample rate of 48 kHz.",
         ),
         click.option(
             "--listen",

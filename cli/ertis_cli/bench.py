@@ -433,7 +433,7 @@ def simulation(*, verdicts: int | None, **given: Any) -> None:
     default=5,
     show_default=True,
     metavar="N",
-    help="Rounds over all cases, in turn.",
+    help="Number of times to measure each case; all cases take turns.",
 )
 @_update
 @options.quiet

@@ -55,7 +55,7 @@ _PLACE = _Place()
     "--layout",
     metavar="NAME|FILE",
     shell_complete=options.complete_layouts,
-    help="Layout in use; that of the first recording by default.",
+    help="Layout to calibrate, by name or file; by default, the layout in the first recording.",
 )
 @options.sensor("Sensor to calibrate; required if a recording contains several.")
 @click.option(
@@ -105,7 +105,7 @@ _PLACE = _Place()
 @click.option(
     "--sensors",
     type=options.NAMES,
-    help="Sensors for --poses in the order of the SYNC chain, as in front,left; all sensors by default.",
+    help="With --poses: names of the sensors in the order of the SYNC chain, as in front,left; all sensors by default.",
 )
 @options.force
 @options.quiet

@@ -101,7 +101,7 @@ __all__ = ["capture"]
     "emission_period_s",
     type=float,
     metavar="S",
-    help="Interval between the emissions of a measurement in seconds; without a pause by default.",
+    help="Time between two emissions of a measurement, in s; no pause by default.",
 )
 @recording_settings
 @click.option("--name", "names", multiple=True, metavar="NAME", help="Name of a sensor; repeat in the order of --port.")

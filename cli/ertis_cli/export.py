@@ -69,7 +69,7 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
     "topics",
     type=click.Choice(TOPICS),
     multiple=True,
-    help="Topic to write to MCAP; repeatable; all by default.",
+    help="Topic to write to an MCAP file; repeat for several; all topics by default.",
 )
 @click.option("--top", type=int, metavar="N", help="Largest number of points per image; 256 by default.")
 @click.option(

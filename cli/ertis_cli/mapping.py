@@ -52,7 +52,7 @@ __all__ = ["mapping"]
     "half_life_s",
     type=click.FloatRange(0.0, min_open=True),
     metavar="S",
-    help="Time in which evidence decays to one half, for places where things move; none by default.",
+    help="Time in s after which old echoes count half, for places where things move; by default, they count for ever.",
 )
 @click.option(
     "--height",

@@ -167,7 +167,8 @@ def _require_times(readers: "Sequence[RecordingReader]", groups: "Sequence[Mappi
     times_ns = [next(iter(group.values())).stamp.timestamp_ns for group in groups]
     if any(later <= earlier for earlier, later in pairwise(times_ns)):
         raise DataError(
-            f"{readers[0].path} has different pulses at the same time; use recordings whose timestamps increase"
+            f"{readers[0].path} contains several pulses with the same timestamp; use recordings whose timestamps "
+            "increase"
         )
     if len(readers) > 1 and all(len(group) == 1 for group in groups):
         spans = ", ".join(_span(reader) for reader in readers)

@@ -50,7 +50,8 @@ _SD = {"angle_sd_deg": ".2g", "range_sd_m": ".2g", "level_sd_db": ".2g"}
     "--top",
     type=int,
     metavar="N",
-    help=f"Largest number per measurement, or per band of a map; {_TOP} by default, all with --truth.",
+    help=f"Largest number of rows per measurement, or per band of an acoustic map; {_TOP} by default, all with "
+    f"--truth.",
 )
 @click.option(
     "--min-level",

@@ -72,7 +72,7 @@ _ONLY = {
     "--dynamic-range",
     type=click.FloatRange(max=1000.0),
     metavar="DB",
-    help="Range of the colours; 40 by default, and 20 for acoustic maps.",
+    help="Dynamic range of the colour scale, in dB below the maximum; 40 by default, and 20 for acoustic maps.",
 )
 @click.option(
     "--theme",
@@ -341,7 +341,7 @@ def _settings(path: Path, sensor: str | None) -> "Settings":
     is_layout = is_name or (suffix in LAYOUT_SUFFIXES and (suffix != ".toml" or _is_layout(path)))
     if sensor is not None and (is_layout or suffix == ".toml"):
         raise click.UsageError(
-            "--sensor is for files with several sensors; remove it with settings or a layout",
+            "--sensor chooses a sensor in a file; remove it, because settings and layouts have no sensors",
             click.get_current_context(),
         )
     if is_layout:

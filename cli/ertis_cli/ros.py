@@ -110,14 +110,19 @@ class _MaxRate(click.ParamType[Any]):
     metavar="DBFS",
     help="Lowest absolute level of echoes in scans; without it, noise counts as an echo in images without echoes.",
 )
-@click.option("--use-sim-time", "sim_time", is_flag=True, help="Keep the times of a file, and publish them on /clock.")
+@click.option(
+    "--use-sim-time",
+    "sim_time",
+    is_flag=True,
+    help="Use the recorded timestamps instead of the current time, and publish them on /clock.",
+)
 @click.option(
     "--rate",
     type=click.FloatRange(0.01, 100),
     default=1.0,
     show_default=True,
     metavar="X",
-    help="Speed of a file relative to the recording.",
+    help="Speed of playback relative to real time; 1 by default.",
 )
 @click.option(
     "--control",

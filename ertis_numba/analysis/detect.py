@@ -199,7 +199,7 @@ def left_out_at_edges(
     peaks : sequence of Peak
         Reflectors of the image, from `find_peaks` with the same arguments.
     min_level_db, false_alarm
-        As for `find_peaks`.
+        Lowest level relative to the strongest in dB, and the probability of a false alarm, as for `find_peaks`.
     """
     if image.points is not None:
         return 0

@@ -17,7 +17,7 @@ class PointFinder:
     Parameters
     ----------
     top, min_level_db : optional
-        As for `ertis_numba.analysis.points.PointExtractor`.
+        Largest number of points, and their lowest level relative to the strongest in dB.
     """
 
     def __init__(self, *, top: int | None = None, min_level_db: float | None = None) -> None:

@@ -223,7 +223,7 @@ def check_maps(
     settings : mapping of str to Settings
         Settings with which its maps were made, by sensor.
     warn : callable
-        As for `prepare_maps`.
+        Receiver of warnings, as for `prepare_maps`.
 
     Raises
     ------

@@ -184,7 +184,7 @@ def check_recording(
     settings : mapping of str to Settings
         Settings with which its energyscapes were made, by sensor.
     pipelines, warn : callable
-        As for `prepare_recording`.
+        Source of pipelines, and receiver of warnings, as for `prepare_recording`.
 
     Raises
     ------

@@ -209,7 +209,7 @@ def slices(
     left_m : float, optional
         Position y of the vertical section in metres; 0 by default.
     dynamic_range_db, peaks, **look
-        As for `plot`.
+        Range of the colours in dB, marked reflectors and the style, as for `plot`.
 
     Raises
     ------
@@ -241,7 +241,7 @@ def signals(
     microphone : int, optional
         Channel of the only microphone to draw; all by default.
     dynamic_range_db, **look
-        As for `plot`.
+        Range of the colours in dB and the style, as for `plot`.
 
     Raises
     ------
@@ -293,7 +293,7 @@ def acoustic_map(
     dynamic_range_db : float, default 20
         Range of the colours in decibels.
     **look
-        As for `plot`.
+        Style of the figure, as for `plot`.
 
     Raises
     ------
@@ -345,7 +345,7 @@ def spectrum(
     direction_deg : (azimuth, elevation), optional
         Direction in degrees. By default the loudest direction of a map, or the mean of the microphones.
     dynamic_range_db, **look
-        As for `plot`.
+        Range of the colours in dB and the style, as for `plot`.
 
     Raises
     ------
@@ -376,7 +376,7 @@ def spectrogram(
     direction_deg : (azimuth, elevation), optional
         Direction of the beam in degrees.
     dynamic_range_db, **look
-        As for `plot`.
+        Range of the colours in dB and the style, as for `plot`.
 
     Raises
     ------
@@ -407,7 +407,7 @@ def array(
     azimuth_deg, elevation_deg : float
         Steering direction in degrees, -90 to 90.
     dynamic_range_db, **look
-        As for `plot`.
+        Range of the colours in dB and the style, as for `plot`.
 
     Raises
     ------
@@ -448,7 +448,7 @@ def calibration(
     azimuth_deg, elevation_deg : float
         Steering direction in degrees, -90 to 90.
     dynamic_range_db, **look
-        As for `plot`.
+        Range of the colours in dB and the style, as for `plot`.
 
     Raises
     ------
@@ -476,7 +476,7 @@ def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack
     title, note : str
         Heading, and the line below it.
     **look
-        As for `plot`.
+        Style of the figure, as for `plot`.
 
     Returns
     -------
@@ -510,7 +510,7 @@ def occupancy(
     mountings : mapping of str to (translation_m, rotation_xyzw), optional
         Sensors on the platform, drawn as dots at the last pose.
     **look
-        As for `plot`.
+        Style of the figure, as for `plot`.
 
     Returns
     -------

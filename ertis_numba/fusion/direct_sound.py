@@ -85,7 +85,7 @@ class DirectSoundCheck:
     Parameters
     ----------
     mountings : mapping of str to (translation_m, rotation_xyzw)
-        As for `Fuser`.
+        Position and orientation of each sensor on the platform, by name.
 
     Raises
     ------

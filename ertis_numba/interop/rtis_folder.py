@@ -154,7 +154,8 @@ def _settings_in(folder: Path) -> dict[str, Any]:
             name = _KEYS_OF_DICT.get(key, key)
             if name in reported and reported[name] != content[key]:
                 raise DataError(
-                    f"{path}: {key} is {content[key]!r}, but {reported[name]!r} in {sources[name].name}; keep one"
+                    f"{path}: {key} is {content[key]!r}, but {reported[name]!r} in {sources[name].name}; keep one of "
+                    "them"
                 )
             reported[name], sources[name] = content[key], path
     return reported

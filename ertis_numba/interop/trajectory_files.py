@@ -209,7 +209,7 @@ def check_tum_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = (
     Raises
     ------
     ArgumentError
-        As for `write_tum`.
+        The file exists and ``overwrite`` is false, or its name has another ending.
     """
     suffix = path.suffix.lower()
     if suffix in _OTHER_SUFFIXES:

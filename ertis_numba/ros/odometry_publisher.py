@@ -29,7 +29,7 @@ class OdometryPublisher:
     is_paused : callable
         Returns True while nothing is to be published; the pose is still computed.
     alone : bool, optional
-        As for `Odometry`.
+        True if no other sensor emits than those given, as for `Odometry`; False by default.
     """
 
     def __init__(
