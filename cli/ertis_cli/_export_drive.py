@@ -107,7 +107,7 @@ def drive_of(
     readers : sequence of RecordingReader
         Recordings of all sensors of the platform.
     ears : RecordingReader
-        Recording of the sensor with ears.
+        Recording of the sensor whose microphones act as ears.
     chosen : sequence of int
         Indices of its measurements with a call.
     known : mapping of str to Mounting

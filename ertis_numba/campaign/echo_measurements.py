@@ -21,7 +21,7 @@ class EchoMeasurements(Sequence[Measurement]):
     ----------
     recording : RecordingReader
     settings : Settings
-        Their ``processing.mode`` decides, as for `is_passive`.
+        Settings whose ``processing.mode`` decides if a measurement is passive.
 
     Attributes
     ----------

@@ -78,7 +78,7 @@ def listen_to(
     Parameters
     ----------
     measurement : Measurement
-        Its settings give the air, and ``passive`` the distance of the sound's source and the highest frequency.
+        Measurement whose settings state the air, the distance of the source and the highest frequency (``passive``).
     azimuth_deg, elevation_deg : float
         Direction in the sensor frame in degrees; the elevation is 0 by default.
     signals : HeardSignals, optional

@@ -76,7 +76,7 @@ class BandLikelihood:
     others : (source, axis) float64
         Directions of the other sources; none by default.
     others_omega : (bin, source) float64, optional
-        Their angular frequencies; ``omega`` by default.
+        Angular frequencies of the other sources; ``omega`` by default.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ class BandLikelihood:
         directions : (source, axis) float64
             All sources, one or more. This likelihood must have no other sources.
         omega : (bin, source) float64, optional
-            Their angular frequencies; those of the likelihood by default.
+            Angular frequencies of the sources; by default, those of the likelihood.
 
         Returns
         -------

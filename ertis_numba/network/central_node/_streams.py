@@ -224,7 +224,7 @@ class PeerConnection:
     waiting_bytes : int
         Bytes from it that wait for the disk.
     key : str
-        Its key; empty without keys.
+        Key of the sensor node; empty without keys.
     """
 
     streams: dict[SensorSession, Stream] = field(default_factory=dict)
