@@ -114,7 +114,7 @@ def mode_of(path: Path) -> int:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Run the block while no other process is in such a block; a process that ends leaves it."""
+    """Hold a lock of a file during a block, so that only one process at a time is in such a block."""
     try:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o600)
     except OSError as error:
