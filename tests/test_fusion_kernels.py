@@ -145,6 +145,10 @@ def arguments(seed=3):
             (cell, *pixels, real(N_ENTRIES), real(N_ENTRIES), real(N_PIXELS), real(N_PIXELS), True),
             [(2, N_CELLS)],
         ),
+        "add_lobes": (
+            (real(5, N_DIRECTIONS) * np.float32([[1], [1], [1e-21], [1], [1e-30]]), real(5, N_STEPS)),
+            [image],
+        ),
         "limit_cells": ((*seen, half), [(N_CELLS,)]),
         "confirm_cells": ((*seen, real(N_CELLS), half, 1), [(3, N_CELLS)]),
         "compare_echoes": ((*seen, real(N_CELLS), half, half), [(2,)]),

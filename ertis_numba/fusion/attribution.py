@@ -51,13 +51,15 @@ class Attributed(NamedTuple):
         Highest reflectivity that all pairs allow; infinite where none can see the cell.
     unheard : frozenset of int
         Emitters of which no echoes were expected at other sensors.
+    evidence : sequence of _Evidence
     """
 
     reflectivity: Singles
     shares: Shares
     suspects: frozenset[int]
     bound: Singles
-    unheard: frozenset[int] = frozenset()
+    unheard: frozenset[int]
+    evidence: "Sequence[_Evidence]"
 
 
 class _Evidence(NamedTuple):
@@ -167,7 +169,7 @@ class Attribution:
                 reflectivity = self._mean(own, images, shares)
         _limit_sums(shares)
         reflectivity = np.minimum(self._mean(evidence, images, shares), bound)
-        return Attributed(reflectivity, shares, suspects, bound, self._unheard)
+        return Attributed(reflectivity, shares, suspects, bound, self._unheard, evidence)
 
     def informed(self, images: Mapping[int, CoarseImage], found: Attributed, shares: Shares) -> Singles:
         """Return the reflectivity of each cell by other shares of the pixels than those found: (cell,) float32.
@@ -179,8 +181,7 @@ class Attribution:
             Result of the attribution.
         shares : Shares
         """
-        evidence = [self._evidence(pair, images[pair.receiver]) for pair in self._pairs]
-        return np.asarray(np.minimum(self._mean(evidence, images, shares), found.bound))
+        return np.asarray(np.minimum(self._mean(found.evidence, images, shares), found.bound))
 
     def single(self, images: Mapping[int, CoarseImage]) -> Singles:
         """Return the mean reflectivity if each sensor takes all echoes for its own: (cell,) float32.

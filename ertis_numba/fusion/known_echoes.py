@@ -7,6 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
 from ertis_numba.fusion.attribution import Shares
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import CoarseImage, Receiver
@@ -97,16 +98,24 @@ def explained_shares(
     """
     lobe, pulse = factors
     sure = is_sure[echoes.reflector]
-    explained = _MARGIN * (lobe[sure].T @ pulse[sure]) ** 2 / (image.power + _TINY)
+    explained = _MARGIN * _sums(lobe[sure], pulse[sure], image.power.shape) ** 2 / (image.power + _TINY)
     np.minimum(explained, 1, out=explained)
     lobe, pulse = lobe**2, pulse**2
-    part = explained / (lobe.T @ pulse + _TINY)
+    part = explained / (_sums(lobe, pulse, image.power.shape) + _TINY)
+    rest = 1 - explained
     found: dict[tuple[int, int], Singles] = {}
     for (emitter, receiver), share in shares.items():
         if receiver == number:
             own = (echoes.emitter == emitter) & echoes.is_ahead
-            known = (lobe[own].T @ pulse[own]) * part
-            found[emitter, receiver] = (known + (1 - explained) * share.reshape(known.shape)).reshape(-1)
+            known = _sums(lobe[own], pulse[own], part.shape) * part
+            found[emitter, receiver] = (known + rest * share.reshape(known.shape)).reshape(-1)
+    return found
+
+
+def _sums(lobe: Singles, pulse: Singles, shape: tuple[int, ...]) -> Singles:
+    """Return the sums of the products of lobes and pulses over echoes: (direction, step) float32."""
+    found = np.zeros(shape, np.float32)
+    kernels.load_fusion().add_lobes(lobe, pulse, found)
     return found
 
 

@@ -17,15 +17,7 @@ from ertis_numba.kernels._contract.fusion import (
     ViewingSensors,
 )
 from ertis_numba.kernels._contract.mapping import MappingKernels
-from ertis_numba.kernels._contract.points import (
-    ABSENT,
-    N_VALUES,
-    BeamErrors,
-    EchoSamples,
-    PointKernels,
-    Pulse,
-    Quadrics,
-)
+from ertis_numba.kernels._contract.points import ABSENT, BeamErrors, PointKernels, Pulse, Quadrics
 from ertis_numba.kernels._contract.steering import SteeringKernels
 from ertis_numba.kernels._device_protocols import Lane, Memory
 from ertis_numba.kernels._dispatch import (
@@ -45,10 +37,8 @@ __all__ = [
     "DEVICES",
     "LAST_PATH_M",
     "NEAREST_M",
-    "N_VALUES",
     "SPREADING_M",
     "BeamErrors",
-    "EchoSamples",
     "FusionKernels",
     "HeardEchoes",
     "KernelSet",

@@ -16,6 +16,7 @@ from ertis_numba.kernels._contract.fusion import (
     LAST_PATH_M,
     LEAST_COSINE,
     NEAREST_M,
+    NEGLIGIBLE,
     SPREADING_M,
     Doubles,
     FusionKernels,
@@ -137,6 +138,11 @@ def add_echoes(
             weight = weight * _between(share, first, second, between)
     out[0, cell] += weight * _between(power, first, second, between) / lifted
     out[1, cell] += weight
+
+
+def add_lobes(lobe: Real, pulse: Real, out: Real) -> None:
+    """Add the products of the lobes and the pulses of echoes."""
+    out += np.einsum("ed,es->ds", np.where(lobe > NEGLIGIBLE, lobe, 0).astype(out.dtype), pulse.astype(out.dtype))
 
 
 def limit_cells(cell: Turns, is_used: Truths, gain: Real, evidence: Real, margin: np.float32, out: Real) -> None:
@@ -307,6 +313,7 @@ KERNELS = FusionKernels(
     share_echoes=share_echoes,
     gather_evidence=gather_evidence,
     add_echoes=add_echoes,
+    add_lobes=add_lobes,
     limit_cells=limit_cells,
     confirm_cells=confirm_cells,
     compare_echoes=compare_echoes,

@@ -20,6 +20,7 @@ __all__ = [
     "LAST_PATH_M",
     "LEAST_COSINE",
     "NEAREST_M",
+    "NEGLIGIBLE",
     "SPREADING_M",
     "FusionKernels",
     "HeardEchoes",
@@ -40,6 +41,8 @@ SPREADING_M: Final = 0.05
 """Distance below which spreading does not increase."""
 NEAREST_M: Final = 1e-9
 """Least distance of a place from a sensor."""
+NEGLIGIBLE: Final = 1e-20
+"""Values of lobes that are left out. Products with them may be denormal, which takes a hundred times as long."""
 LEAST_COSINE: Final = 0.25
 """Directions are less certain beside a flat array, by up to the reciprocal of this factor."""
 
@@ -230,6 +233,23 @@ class AddEchoes(Protocol):
         is_foreign: bool,  # noqa: FBT001  kernels take no keywords
         out: Real,
     ) -> None: ...
+
+
+class AddLobes(Protocol):
+    """Add the products of the lobes and the pulses of echoes.
+
+    Matrix products of BLAS take several times as long, because lobes are narrow, and some use all cores.
+
+    Parameters
+    ----------
+    lobe : (echo, direction) float32
+        Values up to `NEGLIGIBLE` count as 0.
+    pulse : (echo, step) float32
+    out : (direction, step) float32
+        Sums, to which the kernel adds.
+    """
+
+    def __call__(self, lobe: Real, pulse: Real, out: Real) -> None: ...
 
 
 class LimitCells(Protocol):
@@ -570,6 +590,7 @@ class FusionKernels:
     share_echoes: ShareEchoes
     gather_evidence: GatherEvidence
     add_echoes: AddEchoes
+    add_lobes: AddLobes
     limit_cells: LimitCells
     confirm_cells: ConfirmCells
     compare_echoes: CompareEchoes

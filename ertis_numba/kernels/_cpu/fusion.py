@@ -16,6 +16,7 @@ from ertis_numba.kernels._contract.fusion import (
     LAST_PATH_M,
     LEAST_COSINE,
     NEAREST_M,
+    NEGLIGIBLE,
     SPREADING_M,
     FusionKernels,
 )
@@ -146,6 +147,18 @@ def add_echoes(cell, first, second, between, weight, lifted, power, share, is_fo
                 factor *= share[one] + between[entry] * (share[other] - share[one])
         out[0, here] += factor * (low + between[entry] * (high - low)) / lifted[entry]
         out[1, here] += factor
+
+
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan"})
+def add_lobes(lobe, pulse, out):
+    """Add the products of the lobes and the pulses of echoes."""
+    for echo in range(len(lobe)):
+        there = pulse[echo]
+        for d in range(out.shape[0]):
+            here, row = lobe[echo, d], out[d]
+            if here > NEGLIGIBLE:
+                for s in range(out.shape[1]):
+                    row[s] += here * there[s]
 
 
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"nnan"})
@@ -364,6 +377,7 @@ KERNELS = FusionKernels(
     share_echoes=share_echoes,
     gather_evidence=gather_evidence,
     add_echoes=add_echoes,
+    add_lobes=add_lobes,
     limit_cells=limit_cells,
     confirm_cells=confirm_cells,
     compare_echoes=compare_echoes,
