@@ -20,7 +20,7 @@ from ertis_numba.fusion.sensor_echoes import SensorEchoes
 from ertis_numba.fusion.sight import tangents
 from ertis_numba.geometry import Grid
 
-__all__ = ["PointFuser", "joined"]
+__all__ = ["HeardImage", "PointFuser", "joined"]
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +35,23 @@ _ANGLE_SD_RAD: Final = math.radians(0.125)
 _UNKNOWN_RANGE_SD_M: Final = 5e-3
 _UNKNOWN_ANGLE_SD_RAD: Final = math.radians(1.0)
 _NEAREST_M: Final = 0.05
+_N_KEPT: Final = 3  # Images of a sensor that are heard once only: that of the fused pulse, and those that wait.
 _BESIDE: Final = np.arange(-1, 2)
+
+
+class HeardImage(NamedTuple):
+    """Detection threshold of an image, and its echoes, whatever calls caused them.
+
+    Attributes
+    ----------
+    floor : EchoFloor
+        Detection threshold (`_FALSE_ALARM`), infinite in an image of zeros.
+    echoes : _ImageEchoes
+        Echoes above it, strongest first.
+    """
+
+    floor: EchoFloor
+    echoes: "_ImageEchoes"
 
 
 class _ImageEchoes(NamedTuple):
@@ -76,33 +92,32 @@ class PointFuser:
     ) -> None:
         self._number, self._mounting, self._receiver = number, sensors[number], receiver
         self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
-        self._last: tuple[Energyscape, _ImageEchoes] | None = None
+        self._kept: tuple[tuple[Energyscape, HeardImage], ...] = ()
         self._extract = PointExtractor(
             image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP, min_level_db=_MIN_LEVEL_DB
         )
 
-    def floor(self, image: Energyscape) -> EchoFloor:
-        """Return the detection threshold (`_FALSE_ALARM`), infinite in an image of zeros."""
-        if image.amplitude.any():
-            return echo_floor(image, _FALSE_ALARM)
-        by_direction, by_range = (np.full(count, np.inf, np.float32) for count in image.amplitude.shape)
-        return EchoFloor(by_direction, by_range, n_around=1, ratio=1.0, exponent=1.0)
+    def heard(self, image: Energyscape) -> HeardImage:
+        """Return threshold and echoes, found once for each of the latest images. Threads may call it."""
+        for known, heard in self._kept:
+            if known is image:
+                return heard
+        floor = _floor(image)
+        heard = HeardImage(floor, self._echoes(image, floor))
+        self._kept = (*self._kept, (image, heard))[-_N_KEPT:]
+        return heard
 
-    def echoes(self, image: Energyscape, floor: EchoFloor, shares: Shares, late_m: Mapping[int, float]) -> SensorEchoes:
+    def echoes(self, image: Energyscape, shares: Shares, late_m: Mapping[int, float]) -> SensorEchoes:
         """Return the echoes of an image above its noise, strongest first.
 
         Parameters
         ----------
         image : Energyscape
-        floor : EchoFloor
-            Detection threshold, from `floor`.
         shares : Shares
         late_m : mapping of int to float
             Path of sound between the emission of this sensor and that of each emitter.
         """
-        if self._last is None or self._last[0] is not image:  # Explanations of one pulse share its echoes.
-            self._last = image, self._heard(image, floor)
-        heard = self._last[1]
+        heard = self.heard(image).echoes
         emitters = [emitter for emitter, number in shares if number == self._number]
         return SensorEchoes(
             receiver=self._number,
@@ -117,7 +132,7 @@ class PointFuser:
             is_faint=heard.is_faint,
         )
 
-    def _heard(self, image: Energyscape, floor: EchoFloor) -> _ImageEchoes:
+    def _echoes(self, image: Energyscape, floor: EchoFloor) -> _ImageEchoes:
         """Return the echoes of an image above its noise, strongest first, whatever call caused them."""
         if self._is_deaf.any():  # Points are found relative to the strongest one, which direct sound would be.
             image = image.replace(amplitude=np.where(self._is_deaf, np.float32(0), image.amplitude))
@@ -152,6 +167,14 @@ class PointFuser:
         for column, share in enumerate(shares):
             found[:, column] = share[near].max(axis=1, initial=0.0)
         return found
+
+
+def _floor(image: Energyscape) -> EchoFloor:
+    """Return the detection threshold of an image."""
+    if image.amplitude.any():
+        return echo_floor(image, _FALSE_ALARM)
+    by_direction, by_range = (np.full(count, np.inf, np.float32) for count in image.amplitude.shape)
+    return EchoFloor(by_direction, by_range, n_around=1, ratio=1.0, exponent=1.0)
 
 
 def joined(reflectors: Reflectors, image: Energyscape, grid: PolarGrid) -> PointCloud:

@@ -50,9 +50,9 @@ class PulseReflectors(NamedTuple):
     attributed : Attributed
     reflectors : Reflectors
     floor : dict of int to EchoFloor
-        Detection thresholds of each sensor, `PointFuser.floor`.
+        Detection thresholds of each sensor, `HeardImage.floor`.
     without_echo : list of int
-        Numbers of the sensors whose images have no echo above the floor.
+        Sensors whose images have no echo above it.
     unheard : frozenset of int
         Emitters whose calls are not heard.
     apart : frozenset of int
@@ -147,6 +147,11 @@ class FusionTables:
         """Return True if all tables for a group exist."""
         return self.fit(group, diameters_m) and group.keys() <= self._receivers.keys() and _key(group) in self._known
 
+    def prepare(self, number: int, image: Energyscape) -> None:
+        """Find the echoes of an image of a receiver whose tables exist. Threads may call it."""
+        if number in self._points:
+            self._points[number].heard(image)
+
     def coarse(self, number: int, image: Energyscape) -> CoarseImage:
         """Return the powers of an image of a receiver."""
         if number not in self._receivers:
@@ -212,7 +217,7 @@ class FusionTables:
         pulses : tuple of EmissionCounts
             Evidence of the pulses before.
         """
-        floor = {number: self._points[number].floor(each) for number, each in group.items()}
+        floor = {number: self._points[number].heard(each).floor for number, each in group.items()}
         explained = self._explained(group, attributed, floor, unheard)
         every = frozenset(group)
         if attributed.suspects == every and len(every) > 1:
@@ -340,8 +345,7 @@ class FusionTables:
     ) -> "_Explained":
         """Return the reflectors that explain the echoes if some emitters are silent, or heard by their own sensors."""
         echoes = [
-            each.without(unheard - {each.receiver} if own else unheard)
-            for each in self._echoes(group, attributed, floor)
+            each.without(unheard - {each.receiver} if own else unheard) for each in self._echoes(group, attributed)
         ]
         reflectors = Reflectors(echoes, self._sensors, self._receivers, self._emitters, self.grid, attributed.bound)
         late_m = {number: self._heard_m(group, number) for number in group}
@@ -353,12 +357,9 @@ class FusionTables:
         without_echo = [each.receiver for each in echoes if (each.is_faint | ~(each.is_clear | is_any)).all()]
         return _Explained(reflectors, counts, without_echo, reflectors.n_unexplained + n_missed)
 
-    def _echoes(
-        self, group: Mapping[int, Energyscape], attributed: Attributed, floor: Mapping[int, EchoFloor]
-    ) -> list[SensorEchoes]:
+    def _echoes(self, group: Mapping[int, Energyscape], attributed: Attributed) -> list[SensorEchoes]:
         return [
-            self._points[number].echoes(each, floor[number], attributed.shares, self._late_m[number])
-            for number, each in group.items()
+            self._points[number].echoes(each, attributed.shares, self._late_m[number]) for number, each in group.items()
         ]
 
     def _heard_m(self, group: Mapping[int, Energyscape], number: int) -> dict[int, float]:

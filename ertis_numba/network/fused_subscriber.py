@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 
 from ertis_numba.errors import ErtisError
@@ -109,10 +109,12 @@ class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
             "range_step_m": range_step_m,
         }
         load_kernels()
-        self._receiver = PulseReceiver(address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note)
-        super().__init__(self._receiver)
         self._mountings: Mountings = {}
         self._fuser: Fuser | None = None
+        self._receiver = PulseReceiver(
+            address, mountings=mountings, sensors=sensors, keys=keys, on_note=on_note, on_image=self._prepare
+        )
+        super().__init__(self._receiver)
         self._note, self._noted = on_note or (lambda _: None), ""
 
     def _result(self, received: ReceivedPulse) -> FusedArrival | None:
@@ -123,6 +125,12 @@ class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
                 self._noted = str(error)
                 self._note(f"SYNC pulse {next(iter(received.images.values())).stamp.sync_count} is left out: {error}")
             return None
+
+    def _prepare(self, image: Energyscape) -> None:
+        """Find the echoes of an image while others of its pulse are missing."""
+        if (fuser := self._fuser) is not None:
+            with suppress(ErtisError):  # The fusion of its pulse raises it again.
+                fuser.prepare(image)
 
     def _fused(self, received: ReceivedPulse) -> FusedArrival:
         if self._fuser is None or received.mountings != self._mountings:

@@ -64,6 +64,11 @@ class PulseQueue(Generic[Pulse]):
                 self._kept_until_s = -math.inf
             return pulse
 
+    @property
+    def is_empty(self) -> bool:
+        """True if no pulse waits."""
+        return not self._waiting
+
     def fail(self, failure: Exception) -> None:
         """Raise an exception in calls of `take`."""
         with self._changed:

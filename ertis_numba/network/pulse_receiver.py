@@ -80,6 +80,8 @@ class PulseReceiver:
         None on loopback only.
     on_note : callable, optional
         Called by a thread with a line for each change of the connection.
+    on_image : callable, optional
+        Called by the thread with each image that awaits others of its pulse, unless a pulse waits for `receive`.
 
     Attributes
     ----------
@@ -102,6 +104,7 @@ class PulseReceiver:
         sensors: Sequence[str] | None = None,
         keys: ClientKeys | None = None,
         on_note: Callable[[str], None] | None = None,
+        on_image: Callable[[Energyscape], None] | None = None,
     ) -> None:
         wanted = {sensors} if isinstance(sensors, str) else sensors
         self._given = {
@@ -110,7 +113,7 @@ class PulseReceiver:
         self._subscriber: Subscriber[Energyscape] = Subscriber(
             address, products=("energyscape",), sensors=sensors, keys=keys, on_note=on_note, credit=_CREDIT
         )
-        self._note = on_note or (lambda _: None)
+        self._note, self._on_image = on_note or (lambda _: None), on_image or (lambda _: None)
         self.counts: SubscriberCounts = self._subscriber.counts
         self._groups: PulseGroups[_Received] = PulseGroups.of(self._given, self._note)
         self.queue: PulseQueue[dict[str, _Received]] = PulseQueue()
@@ -172,12 +175,20 @@ class PulseReceiver:
                 if image is not None:
                     latest_s = time.monotonic()
                     received = self._received(image)
-                    for group in () if received is None else self._groups.add(received):
-                        self._put(group)
+                    if received is not None:
+                        self._add(received)
                 elif time.monotonic() - latest_s > _PATIENCE_S and (group := self._groups.close()):
                     self._put(group)
         except Exception as error:  # noqa: BLE001  whatever it is, who waits must not do so for ever
             self.queue.fail(error)
+
+    def _add(self, received: _Received) -> None:
+        """Add an image to its group."""
+        groups = self._groups.add(received)
+        for group in groups:
+            self._put(group)
+        if not groups and self.queue.is_empty:
+            self._on_image(received.image)
 
     def _received(self, image: Energyscape) -> _Received | None:
         """Return an image with its mounting; None, with one note, if that is unknown or the image is not finite."""
@@ -192,7 +203,7 @@ class PulseReceiver:
         if mounting is None:
             self._leave_out(
                 sensor,
-                "its mounting is unknown; pass mountings (mountings), or start 'ertis capture' with --mounting",
+                "its mounting is unknown; pass mountings (--mounting FILE), or start 'ertis capture' with --mounting",
             )
             return None
         if not np.isfinite(image.amplitude).all():

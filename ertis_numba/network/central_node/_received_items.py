@@ -51,7 +51,7 @@ class ReceivedItem:
     again : bool
         The number was acknowledged before: stored only if the measurement differs.
     done : bool
-        True if the result of the item was reported.
+        Its result was reported.
     """
 
     run: SensorSession

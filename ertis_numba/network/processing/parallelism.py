@@ -8,8 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from ertis_numba.units import counted
-
 __all__ = ["Choice", "Load", "Mode"]
 
 _BUSY: Final = 0.8  # Share of busy time above which more measurements share the cores, …
@@ -57,7 +55,7 @@ class Mode:
     threads: int
 
     def __str__(self) -> str:
-        threads = counted(self.threads, "thread")
+        threads = "1 thread" if self.threads == 1 else f"{self.threads} threads"
         return f"{self.at_once} at once on {threads} each" if self.at_once > 1 else f"one at a time on {threads}"
 
 
