@@ -56,8 +56,7 @@ def sound_options(command: Any) -> Any:
             "--silence",
             "with_silence",
             is_flag=True,
-            help="Fill the time between two measurements with silence; by default, measurements follow each other "
-            "without a gap.",
+            help="Keep the time between measurements as silence; by default, they follow each other.",
         ),
         click.option(
             "--expand",
@@ -71,7 +70,7 @@ def sound_options(command: Any) -> Any:
             "heterodyne_hz",
             type=click.FloatRange(min=0),
             metavar="HZ",
-            help="Shift the sound down by this frequency, and write it with a sample rate of 48 kHz.",
+            help="Shift the sound down by this frequency, to 48 kHz of samples.",
         ),
         click.option(
             "--listen",
@@ -103,11 +102,9 @@ def require_possible(sound: SoundOptions) -> None:
         if typed(parameter):
             raise click.UsageError(f"{option} is not for sound; remove it", context)
     if sound.direction is None:
-        raise click.UsageError(
-            "a .wav file contains the sound of one direction; choose it with --listen AZ,EL", context
-        )
+        raise click.UsageError("a .wav file has the sound of one direction; give it with --listen AZ,EL", context)
     if sound.heterodyne_hz is not None and sound.expansion is not None:
-        raise click.UsageError("--heterodyne and --expand both lower the sound; choose one of them", context)
+        raise click.UsageError("--heterodyne and --expand both lower the sound; give one of them", context)
 
 
 def export_sound(

@@ -78,7 +78,7 @@ def is_passive(settings: Settings, stamp: Stamp) -> bool:
     Parameters
     ----------
     settings : Settings
-        Settings whose ``processing.mode`` decides if a measurement is passive.
+        Their ``processing.mode`` decides.
     stamp : Stamp
         Stamp of the measurement; its ``behaviour`` decides in the mode ``auto``.
 

@@ -17,12 +17,14 @@ Floats = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 _MIN_SHARE: Final = 0.5  # Share from which the attribution of the images supports an explanation.
+_TOGETHER_M: Final = 0.025  # Difference of paths below which calls arrive together: two widths of the usual pulse.
 _GATE: Final = 16.0  # Squared Mahalanobis distance; four standard deviations along one axis.
 _SAME_M: Final = 0.015  # Distance within which a reflector explains a lone echo, in addition to uncertainties.
 _REFINED_M: Final = 0.005  # Standard deviation that overlapping echoes add to paths, once a reflector is located.
 _ALIKE: Final = 10.0  # Largest ratio of reflectivities between two echoes of a reflector.
 _MIN_SCORE: Final = 0.75  # Sum of the fits of two echoes halfway to the limit of the gate, one of them attributed.
 _N_CONFIRMING: Final = 3  # Echoes required for a reflector that the attribution of the images does not support.
+_N_LIKELY: Final = 2  # The same for one that it supports.
 _USUAL_DB: Final = 6.0  # Reflectivity relative to the usual one, above which a reflector is a surprise, …
 _SURPRISE_DB: Final = 10.0  # … which counts as much as a missing echo for each so many decibels.
 _DISTURBED: Final = 0.25  # Power of overlapping echoes relative to one that they explain.
@@ -85,7 +87,7 @@ class Search:
         self._match = kernels.load_fusion().match_echoes
         self.is_free = ~echoes.is_faint
         candidates = self._candidates()
-        self.found = locator.refined(self._confirmed(candidates))
+        self.found = locator.refined(locator.measured(self._confirmed(candidates)))
         self._add_lone(candidates)
 
     def _candidates(self) -> _Candidates:
@@ -148,8 +150,7 @@ class Search:
         which, echo, emitter, distance = self._fits(candidates, sight, 0.0)
         n_candidates, n_echoes = len(candidates.echo), len(self._echoes.receiver)
         # An echo confirms a candidate once, by the emitter that fits best.
-        _, group = np.unique(which * n_echoes + echo, return_inverse=True)
-        fit = (1 - distance / _GATE) * (1 + self._support(group, echo, emitter)) / 2
+        fit = (1 - distance / _GATE) * (1 + self._support((candidates, sight), which, echo, emitter)) / 2
         order = np.lexsort((-fit, echo, which))
         key = which[order] * n_echoes + echo[order]
         order = order[np.diff(key, prepend=-1) > 0]
@@ -174,9 +175,24 @@ class Search:
                 np.subtract.at(score, which[entries], fit[entries])
         return found
 
-    def _support(self, group: Numbers, echo: Numbers, emitter: Numbers) -> Floats:
-        """Return the share of all emitters in a group: those that fit an echo at one place, where their calls meet."""
-        return np.asarray(np.minimum(np.bincount(group, self._echoes.share[echo, emitter])[group], 1.0))
+    def _support(
+        self, places: tuple[_Candidates, kernels.SeenPlaces], which: Numbers, echo: Numbers, emitter: Numbers
+    ) -> Floats:
+        """Return the share of an echo that emitters have whose calls arrive together over a candidate: (fit,) float64.
+
+        Calls whose difference is unknown, because the place is, do not count as arriving together.
+        """
+        candidates, sight = places
+        n_echoes = len(self._echoes.receiver)
+        _, group = np.unique(which * n_echoes + echo, return_inverse=True)
+        shares = np.zeros((int(group.max(initial=-1)) + 1, len(self._viewers.sensor_m)))
+        shares[group, emitter] = self._echoes.share[echo, emitter]
+        slope_m = np.einsum("psi,pi->ps", sight.toward, candidates.across)
+        late_m = sum(
+            np.abs(each[which] - np.take_along_axis(each[which], emitter[:, None], axis=1))
+            for each in (sight.apart_m, slope_m)
+        )
+        return np.asarray(np.minimum(np.sum(shares[group] * (late_m < _TOGETHER_M), axis=1), 1.0))
 
     def _surprise(self, candidates: _Candidates) -> Floats:
         """Return how much stronger candidates reflect than usual: (candidate,) float64.
@@ -194,13 +210,11 @@ class Search:
 
     def _accepted(self, here: _Candidates, sight: kernels.SeenPlaces) -> tuple[LocatedReflector | None, Numbers]:
         """Return the reflector at a candidate if enough echoes confirm it, and all echoes that it explains."""
-        extra_m, covariance_m2, echo = 0.0, np.empty((3, 3)), np.empty(0, np.int64)
+        extra_m, covariance_m2, echo, reflectivity = 0.0, np.empty((3, 3)), np.empty(0, np.int64), 0.0
         for _ in range(2):
-            _, echo, emitters, distance = self._fits(here, sight, extra_m)
+            fits = _, echo, emitters, distance = self._fits(here, sight, extra_m)
             members, emitter = self._members(echo, emitters, distance)
-            is_own = self._echoes.receiver[echo] == emitters
-            is_likely = np.any(is_own & (self._support(echo, echo, emitters) > _MIN_SHARE))
-            if len(members) < (2 if is_likely else _N_CONFIRMING):
+            if len(members) < _N_CONFIRMING and not (len(members) == _N_LIKELY and self._is_likely(here, sight, fits)):
                 return None, np.empty(0, np.int64)
             place_m, covariance_m2 = self._locator.located(members, emitter, here.place_m[0])
             sight = self._viewers.sight(place_m[None])
@@ -208,8 +222,15 @@ class Search:
             reflectivity = median_of(self._echoes.power[members] / np.maximum(gain, _TINY))
             here = here._replace(place_m=place_m[None], across=np.zeros((1, 3)), reflectivity=np.array([reflectivity]))
             extra_m = _REFINED_M
-        reflectivity = self._locator.reflectivity(sight, members, emitter)
         return LocatedReflector(place_m, covariance_m2, reflectivity, members, emitter), np.unique(echo)
+
+    def _is_likely(
+        self, here: _Candidates, sight: kernels.SeenPlaces, fits: tuple[Numbers, Numbers, Numbers, Floats]
+    ) -> bool:
+        """Return True if the attribution of the images supports an own echo of a candidate."""
+        which, echo, emitter, _ = fits
+        is_own = self._echoes.receiver[echo] == emitter
+        return bool(np.any(is_own & (self._support((here, sight), which, echo, emitter) > _MIN_SHARE)))
 
     def _members(self, echo: Numbers, emitter: Numbers, distance: Floats) -> tuple[Numbers, Numbers]:
         """Return the best echo of each pair, and its emitter; each echo at most once."""
@@ -237,8 +258,8 @@ class Search:
             place_m = self._viewers.sensor_m[sensor[0]] + to_m * self._echoes.direction[echo]
             _, covariance_m2 = self._locator.located(member, sensor, place_m)
             if _is_apart(place_m, covariance_m2, self.found):
-                reflectivity = self._locator.reflectivity(self._viewers.sight(place_m[None]), member, sensor)
-                self.found.append(LocatedReflector(place_m, covariance_m2, reflectivity, member, sensor))
+                lone = LocatedReflector(place_m, covariance_m2, 0.0, member, sensor)
+                self.found += self._locator.measured([lone])
 
     def _is_ambiguous(self, candidates: _Candidates) -> NDArray[np.bool_]:
         """Return True for echoes that another call explains as well, if an image is missing: (echo,) bool.

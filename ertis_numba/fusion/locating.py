@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -64,17 +65,14 @@ class Locator:
         self._locate = kernels.load_fusion().locate_reflector
 
     def located(
-        self,
-        members: Numbers,
-        emitter: Numbers,
-        place_m: Floats,
-        disturbed: Overlap | None = None,
-        beside_m: Floats | None = None,
+        self, members: Numbers, emitter: Numbers, place_m: Floats, added: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """Return the position of a reflector and its covariance: (axis,) and (axis, axis) float64."""
+        """Return the position of a reflector and its covariance: (axis,) and (axis, axis) float64.
+
+        Variances of paths and directions in addition to those of the echoes, (member, 2), may be given.
+        """
         deviation = self._echoes.deviation[members]
-        if disturbed is not None and beside_m is not None:
-            added = np.stack([disturbed.path_m2 + beside_m[emitter] ** 2, disturbed.angle_rad2], axis=1)
+        if added is not None:
             deviation = np.sqrt(deviation**2 + added)
         receiver, axes = self._echoes.receiver[members], self._echoes.axes[members]
         ahead = self._viewers.ahead[receiver]
@@ -98,40 +96,44 @@ class Locator:
         )
         return position_m, covariance_m2
 
-    def reflectivity(self, sight: kernels.SeenPlaces, members: Numbers, emitter: Numbers) -> float:
-        """Return the power at 1 m of a reflector that fits its echoes best, by least squares.
+    def measured(self, found: Sequence[LocatedReflector]) -> list[LocatedReflector]:
+        """Return reflectors with the power at 1 m that fits their echoes best, by least squares.
 
         Calls of emitters at about the same distance arrive together, with unknown phases.
         """
-        apart_m = sight.apart_m[0]
-        together = np.exp(-(((apart_m - apart_m[emitter][:, None]) / _RESOLUTION_M) ** 2))
-        together[~np.isfinite(self._echoes.path_m[members])] = 0.0
-        gain = np.sum(self._viewers.echo_powers(sight, self._echoes.receiver[members]) * together, axis=1)
-        return float(self._echoes.power[members] @ gain / max(gain @ gain, _TINY**2))
+        if not found:
+            return []
+        number, echo, emitter = _members(found)
+        sight = self._viewers.sight(np.array([each.place_m for each in found]))
+        together = np.exp(-((_late_m(sight, number, emitter) / _RESOLUTION_M) ** 2))
+        together[~np.isfinite(self._echoes.path_m[echo])] = 0.0
+        gain = np.sum(self._viewers.echo_powers(sight, number, self._echoes.receiver[echo]) * together, axis=1)
+        squares = np.maximum(np.bincount(number, gain * gain), _TINY**2)
+        reflectivity = np.bincount(number, self._echoes.power[echo] * gain) / squares
+        return [each._replace(reflectivity=float(power)) for each, power in zip(found, reflectivity, strict=True)]
 
     def refined(self, found: list[LocatedReflector]) -> list[LocatedReflector]:
         """Return reflectors located with the errors of echoes that overlap, without those that overlaps explain."""
         if not found:
             return found
         found = sorted(found, key=lambda each: -len(each.echo))
-        echo = np.concatenate([each.echo for each in found])
-        emitter = np.concatenate([each.emitter for each in found])
-        number = np.repeat(np.arange(len(found)), [len(each.echo) for each in found])
+        number, echo, emitter = _members(found)
         sight = self._viewers.sight(np.array([each.place_m for each in found]))
-        overlap, beside_m = self.overlap(found, echo, number, emitter), sight.beside_m
-        ends = np.cumsum([len(each.echo) for each in found])
-        rows = [slice(end - len(each.echo), end) for end, each in zip(ends, found, strict=True)]
+        overlap = self.overlap(found, echo, number)
+        rows = [slice(*ends) for ends in pairwise(np.searchsorted(number, np.arange(len(found) + 1)).tolist())]
         is_kept = np.zeros(len(found), np.bool_)
         for place, row in enumerate(rows):
-            is_kept[place] = median_of(overlap.only(row, is_kept).power) <= _DISTURBED
-        summed_m2 = self._summed_m2(found, sight, number, echo, emitter)
+            is_kept[place] = median_of(overlap.power[row][:, is_kept].sum(axis=1)) <= _DISTURBED
+        disturbed, summed_m2 = overlap.by(is_kept), self._summed_m2(found, sight, number, echo, emitter)
+        path_m2 = disturbed.path_m2 + summed_m2 + sight.beside_m[number, emitter] ** 2
+        added = np.stack([path_m2, disturbed.angle_rad2], axis=1)
+        slope = sight.toward[number, emitter] + sight.toward[number, self._echoes.receiver[echo]]
+        shift = np.sqrt(summed_m2) / (self._echoes.deviation[echo, 0] ** 2 + path_m2)
         refined = []
         for place in np.flatnonzero(is_kept).tolist():
-            each, disturbed, own_m2 = found[place], overlap.only(rows[place], is_kept), summed_m2[rows[place]]
-            disturbed = disturbed._replace(path_m2=disturbed.path_m2 + own_m2)
-            place_m, covariance_m2 = self.located(each.echo, each.emitter, each.place_m, disturbed, beside_m[place])
-            path_m2 = self._echoes.deviation[each.echo, 0] ** 2 + disturbed.path_m2 + beside_m[place, each.emitter] ** 2
-            shift_m = covariance_m2 @ (np.sqrt(own_m2) / path_m2 @ self._slopes(each, place_m))
+            each, row = found[place], rows[place]
+            place_m, covariance_m2 = self.located(each.echo, each.emitter, each.place_m, added[row])
+            shift_m = covariance_m2 @ (shift[row] @ slope[row])
             refined.append(each._replace(place_m=place_m, covariance_m2=covariance_m2 + np.outer(shift_m, shift_m)))
         return refined
 
@@ -147,28 +149,17 @@ class Locator:
 
         These shift the echoes at all receivers alike.
         """
-        apart_m, receiver = sight.apart_m[number], self._echoes.receiver[echo]
-        late_m = np.abs(apart_m - np.take_along_axis(apart_m, emitter[:, None], axis=1))
+        receiver = self._echoes.receiver[echo]
         power = sight.gain[number, receiver] * np.array([each.reflectivity for each in found])[number, None]
         power[~np.isfinite(self._echoes.path_m[echo])] = 0.0
+        late_m = np.abs(_late_m(sight, number, emitter))
         return summed_m2(late_m, power / self._echoes.power[echo, None], self._pulse_m[receiver, None])
 
-    def _slopes(self, each: LocatedReflector, place_m: Floats) -> Floats:
-        """Return the change of the paths of a reflector's echoes with its place: (echo, axis)."""
-        toward = self._viewers.sight(place_m[None]).toward[0]
-        return np.asarray(toward[each.emitter] + toward[self._echoes.receiver[each.echo]])
-
-    def overlap(
-        self,
-        found: Sequence[LocatedReflector],
-        echo: Numbers,
-        number: Numbers | None = None,
-        emitter: Numbers | None = None,
-    ) -> Overlap:
-        """Return how much the echoes of reflectors disturb some echoes, which may be those of reflectors themselves."""
+    def overlap(self, found: Sequence[LocatedReflector], echo: Numbers, number: Numbers | None = None) -> Overlap:
+        """Return how much the echoes of reflectors disturb some echoes, except those of the same reflector."""
         predicted = self.predicted(found)
         is_other = np.ones((len(echo), len(found), len(self._viewers.sensor_m)), np.bool_)
-        if number is not None and emitter is not None:
+        if number is not None:
             is_other[np.arange(len(echo)), number] = False
         return overlap(
             predicted,
@@ -196,3 +187,15 @@ def median_of(values: Floats) -> float:
     """Return the median of some numbers; `numpy.median` takes ten times as long."""
     ordered = np.sort(values)
     return float((ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2)
+
+
+def _members(found: Sequence[LocatedReflector]) -> tuple[Numbers, Numbers, Numbers]:
+    """Return the reflector, echo and emitter of all members."""
+    number = np.repeat(np.arange(len(found)), [len(each.echo) for each in found])
+    return number, np.concatenate([each.echo for each in found]), np.concatenate([each.emitter for each in found])
+
+
+def _late_m(sight: kernels.SeenPlaces, number: Numbers, emitter: Numbers) -> Floats:
+    """Return the paths from all emitters to the reflectors of echoes, relative to the echoes' own: (echo, emitter)."""
+    apart_m = sight.apart_m[number]
+    return np.asarray(apart_m - np.take_along_axis(apart_m, emitter[:, None], axis=1))

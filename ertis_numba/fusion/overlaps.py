@@ -50,9 +50,9 @@ class Overlap(NamedTuple):
     path_m2: Floats
     angle_rad2: Floats
 
-    def only(self, echo: slice, is_kept: NDArray[np.bool_]) -> "Overlap":
-        """Return the sums over some reflectors, for some echoes: (echo,) each."""
-        return Overlap(*(each[echo][:, is_kept].sum(axis=1) for each in self))
+    def by(self, kept: NDArray[np.bool_]) -> "Overlap":
+        """Return the sums over some reflectors: (echo,) each."""
+        return Overlap(*(each[:, kept].sum(axis=1) for each in self))
 
 
 def overlap(

@@ -62,15 +62,15 @@ def mounted_sensors(mountings: Mountings) -> tuple[MountedSensor, ...]:
     """
     if not isinstance(mountings, Mapping):
         raise ArgumentError(
-            f"mountings is of type {type(mountings).__name__}; pass a dictionary with (translation_m, rotation_xyzw) "
-            "for each sensor"
+            f"mountings is of type {type(mountings).__name__}; give a dictionary of (translation_m, rotation_xyzw) by "
+            "sensor"
         )
     if not mountings:
-        raise ArgumentError("mountings is empty; pass the mounting of each sensor on the platform")
+        raise ArgumentError("mountings is empty; give the mounting of each sensor on the platform")
     sensors = []
     for name, given in mountings.items():
         if not isinstance(given, Sequence) or len(given) != 2:
-            raise ArgumentError(f"mounting of sensor {name!r} is {given!r:.80}; pass (translation_m, rotation_xyzw)")
+            raise ArgumentError(f"mounting of sensor {name!r} is {given!r:.80}; give (translation_m, rotation_xyzw)")
         place = mounting(name, *given)
         sensors.append(
             MountedSensor(name, place["translation_m"], Rotation.from_quat(place["rotation_xyzw"]).as_matrix())
@@ -161,14 +161,16 @@ class Emitters:
 
         Parameters
         ----------
-        cosine, to_point_m : (emitter,) float64
+        cosine, to_point_m : (echo, emitter) float64
             Cosine of the angle to the axis of each emitter, and its distance from the reflector.
         from_point_m : (echo,) float64
             Distance of the receiver of each echo.
         """
         there, back = np.maximum(to_point_m, _NEAREST_M), np.maximum(from_point_m, _NEAREST_M)[:, None]
         place = np.rint((cosine + 1) / 2 * (len(self._cosine) - 1)).astype(np.int64)
-        radiated = np.stack([self._radiated[each][at] for each, at in zip(self._diameters_m, place, strict=True)])
+        radiated = np.stack(
+            [self._radiated[each][at] for each, at in zip(self._diameters_m, place.T, strict=True)], axis=1
+        )
         exact = np.exp(self._echo(radiated, (there + back)[..., None]))
         least = np.exp(np.interp(there + back, _PATHS_M, self.lost)) * 10 ** (_STRAY_DB / 10)
         behind = (cosine <= 0) & (np.array(self._diameters_m) > 0)

@@ -12,6 +12,7 @@ from ertis_numba.fusion.rig import Emitters, MountedSensor
 __all__ = ["Viewers", "mirrored", "tangents"]
 
 Floats = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 
 _VERTICAL: Final = 1e-6
 
@@ -60,10 +61,14 @@ class Viewers:
         kernels.load_fusion().see_places(np.ascontiguousarray(place_m), self._sensors, found)
         return found
 
-    def echo_powers(self, sight: kernels.SeenPlaces, receiver: NDArray[np.int64]) -> Floats:
-        """Return the power of echoes of one place after the matched filter: (echo, emitter), by receiver (echo,)."""
-        model = self._models[int(self._sensors.model[receiver[0]])]
-        return model.echo_powers(sight.depth[0], sight.apart_m[0], sight.apart_m[0, receiver])
+    def echo_powers(self, sight: kernels.SeenPlaces, place: Numbers, receiver: Numbers) -> Floats:
+        """Return the power of echoes of places after the matched filter, by place and receiver: (echo, emitter)."""
+        found, of = np.empty((len(place), len(self.sensor_m))), self._sensors.model[receiver]
+        for number, model in enumerate(self._models):
+            rows = np.flatnonzero(of == number)
+            here, apart_m = place[rows], sight.apart_m[place[rows]]
+            found[rows] = model.echo_powers(sight.depth[here], apart_m, sight.apart_m[here, receiver[rows]])
+        return found
 
 
 def mirrored(direction: Floats, ahead: Floats) -> Floats:

@@ -111,7 +111,7 @@ class Waves:
         matrices : (bin, mic, mic) complex64
             Hermitian matrices of all bins.
         powers : (bin, direction) float32
-            Map of the powers by delay-and-sum.
+            Their map of delay-and-sum.
         hollow : bool
             Leave out the diagonal of the matrices.
         """

@@ -75,7 +75,7 @@ class Child(Generic[Kind]):
 
     @property
     def ended(self) -> bool:
-        """True if the process has ended, so that it cannot write to shared memory."""
+        """True if the process is gone, and can write to no memory any more."""
         return self._process.poll() is not None
 
     def interrupt(self) -> None:

@@ -5,7 +5,8 @@ import os
 import pytest
 
 from ertis_numba.errors import DeviceError
-from tests.ptx import launches, offline_compilation
+from ertis_numba.kernels._cuda import offline_compilation
+from tests.ptx import launches
 
 
 @pytest.fixture(scope="session", autouse=True)

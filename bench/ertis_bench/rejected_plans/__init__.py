@@ -1,0 +1,1 @@
+"""Parts of plans that were rejected, and their counts and errors."""
