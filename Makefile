@@ -73,8 +73,6 @@ bench: $(VENV)/ready  ## run the benchmarks and update the tables in the documen
 	$(BIN)/ertis bench paper --update docs/reference/benchmarks.md --update README.md
 	$(BIN)/ertis bench accuracy --update docs/reference/benchmarks.md --update docs/explanation/accuracy.md --plot docs/pictures/front.png
 	$(BIN)/ertis bench beamformers --update docs/explanation/beamformers.md
-	$(BIN)/ertis bench factorisation --update docs/decisions/0016-rejected-plans.md
-	$(BIN)/ertis bench interpolation --update docs/decisions/0016-rejected-plans.md
 	$(BIN)/ertis bench verification --update docs/explanation/accuracy.md
 	$(BIN)/ertis bench points --update docs/explanation/accuracy.md
 	$(BIN)/ertis bench calibration --update docs/how-to/calibrate.md

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ertis_cli.options import FALSE_ALARM
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -25,11 +26,12 @@ PAGE = ROOT / "docs" / "how-to" / "gallery.md"
 PICTURES = ROOT / "docs" / "pictures" / "gallery"
 Takes = dict[str, list[tuple[ertis.Energyscape, list[ertis.Reflector]]]]
 _MIN_LEVELS_DB = (-10.0, -30.0)
-_MAX_MARKS = 8
+_N_PEAKS = 5  # As many as the command marks by default.
+_USUAL_DB = 40.0  # Default of the command.
 _MAX_TAKEN = 6  # measurements of each sensor
 _MAX_BYTES = 150_000  # size limit of a picture
 _SHEET = (1.0, 92)  # share of a figure's width that is shown, and dots per inch
-_FRAME = (0.745, 84)  # the same for figures side by side: without colour bar and list
+_FRAME = (0.765, 84)  # the same for figures side by side: without colour bar and list
 _IN_ORDER = {"microphone_noise": False, "microphone_spread": False, "microphone_faults": False}
 
 
@@ -80,7 +82,7 @@ def main() -> None:
             draw(stems[-1], new, SHOWN[name])
             takes |= {f"{sensor}, as new": shots for sensor, shots in new.items()}
         pictures = [f"![{stem.replace('_', ' ')}](../pictures/gallery/{stem}.png)" for stem in stems]
-        text = "\n\n".join([*pictures, effects_table(plan), errors_table(takes)])
+        text = "\n\n".join([*pictures, command(name, scene, SHOWN[name]), effects_table(plan), errors_table(takes)])
         PAGE.write_text(replaced(PAGE.read_text("utf-8"), f"scene {name}", text), encoding="utf-8")
 
 
@@ -100,19 +102,24 @@ def draw(stem: str, takes: Takes, shown: Shown) -> None:
     """Draw the picture of a scene."""
     figures = []
     for sensor, index in shown.frames:
-        image, truth = takes[sensor][index]
-        reported = ertis.compare(image, truth)
-        reflectors = [*(match.reflector for match in reported.matched), *reported.missed]
-        # Mark objects themselves, not their mirror images in walls.
-        figures.append(_figure(image, [each for each in reflectors if ">" not in each.name], shown.dynamic_range_db))
+        image, _ = takes[sensor][index]
+        peaks = ertis.find_peaks(image, top=_N_PEAKS, false_alarm=FALSE_ALARM)
+        figures.append(ertis.plot(image, dynamic_range_db=shown.dynamic_range_db, peaks=peaks))
     save(figures, PICTURES / f"{stem}.png")
 
 
-def _figure(image: ertis.Energyscape, reflectors: Sequence[ertis.Reflector], dynamic_range_db: float) -> Figure:
-    strongest = sorted(reflectors, key=lambda reflector: -reflector.level_db)[:_MAX_MARKS]
-    places = ("azimuth_deg", "elevation_deg", "range_m", "level_db")
-    marks = [ertis.Peak(**{name: getattr(reflector, name) for name in places}) for reflector in strongest]
-    return ertis.plot(image, dynamic_range_db=dynamic_range_db, peaks=marks)
+def command(name: str, scene: Scene, shown: Shown) -> str:
+    """Return the line with the command that draws the picture of a scene."""
+    sensor, first = shown.frames[0]
+    words = ["ertis plot", f"{name}.energy.h5"]
+    words += ["--sensor", sensor] if len(scene.sensors) > 1 else []
+    words += ["--measurement", str(first)] if first or len(shown.frames) > 1 else []
+    words += ["--dynamic-range", f"{shown.dynamic_range_db:g}"] if shown.dynamic_range_db != _USUAL_DB else []
+    others = [
+        f"`--sensor {each}`" if each != sensor else f"`--measurement {index}`" for each, index in shown.frames[1:]
+    ]
+    more = f"; then with {' and '.join(others)}" if others else ""
+    return f"`{' '.join(words)}`{more}"
 
 
 def save(figures: Sequence[Figure], path: Path) -> None:

@@ -38,7 +38,7 @@ _REMEDIES = {
     errno.EROFS: _PERMISSION_REMEDY,
     errno.ENOENT: _MISSING_FOLDER_REMEDY,
     errno.ENOTDIR: _MISSING_FOLDER_REMEDY,
-    errno.ENAMETOOLONG: "give a shorter name",
+    errno.ENAMETOOLONG: "use a shorter name",
     errno.EDQUOT: _FREE_SPACE_REMEDY,
     errno.EFBIG: _FREE_SPACE_REMEDY,
     errno.ENOSPC: _FREE_SPACE_REMEDY,
@@ -62,15 +62,15 @@ def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -
         ``overwrite`` is False.
     """
     if path.is_dir():
-        raise ArgumentError(f"output {path} is a folder; give the name of a file")
+        raise ArgumentError(f"output {path} is a folder; choose the name of a file")
     if path.is_symlink() or (path.exists() and not path.is_file()):
-        raise ArgumentError(f"output {path} is a link or a device; give the name of a file")
+        raise ArgumentError(f"output {path} is a link or a device; choose the name of a file")
     if not path.parent.is_dir():
-        raise ArgumentError(f"output {path}: folder {path.parent} does not exist; create it or give another")
+        raise ArgumentError(f"output {path}: folder {path.parent} does not exist; create it or choose another")
     if path.exists() and any(source.exists() and source.samefile(path) for source in sources):
-        raise ArgumentError(f"output {path} is the input itself; give another name")
+        raise ArgumentError(f"output {path} is the input itself; choose another name")
     if path.exists() and not overwrite:
-        raise ArgumentError(f"output {path} exists; give another name, or ask to overwrite it (--force)")
+        raise ArgumentError(f"output {path} exists; choose another name, or replace the file (overwrite=True)")
 
 
 def require_writable(folder: Path) -> None:

@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from ertis_numba.errors import ArgumentError
+from ertis_numba.units import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -122,7 +123,7 @@ def _require_order(n_mics: int, order: int) -> None:
     """Check that the order of DMAS does not exceed the number of microphones."""
     if n_mics < order:
         raise ArgumentError(
-            f"processing.dmas_order is {order}, but the array has {n_mics} microphone{'s' * (n_mics != 1)}; "
+            f"processing.dmas_order is {order}, but the array has {counted(n_mics, 'microphone')}; "
             "the order must not exceed the number of microphones. Give a lower order or another processing.beamformer"
         )
 

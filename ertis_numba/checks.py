@@ -37,46 +37,46 @@ _SENSOR_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]{0,254}")
 def finite(name: str, value: float) -> float:
     """Return ``value`` as a float; refuse NaN, infinities and values that are no numbers."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise ArgumentError(f"{name} is {value!r}; give a number")
+        raise ArgumentError(f"{name} is {value!r}; use a number")
     try:
         number = float(value)
     except OverflowError:  # an integer with hundreds of digits
         number = math.inf
     if not math.isfinite(number):
-        raise ArgumentError(f"{name} is {number}; give a finite number")
+        raise ArgumentError(f"{name} is {number}; use a finite number")
     return number
 
 
 def positive(name: str, value: float) -> float:
     """Return ``value`` if it is finite and above zero."""
     if finite(name, value) <= 0:
-        raise ArgumentError(f"{name} is {value:g}; give a number above 0")
+        raise ArgumentError(f"{name} is {value:g}; use a number above 0")
     return float(value)
 
 
 def between(name: str, value: float, low: float, high: float) -> float:
     """Return ``value`` if it lies in ``[low, high]``."""
     if not low <= finite(name, value) <= high:
-        raise ArgumentError(f"{name} is {value:g}; give a number from {low:g} to {high:g}")
+        raise ArgumentError(f"{name} is {value:g}; use a number from {low:g} to {high:g}")
     return float(value)
 
 
 def interval(name: str, value: tuple[float, float], low: float, high: float) -> None:
     """Refuse an interval that is not ``low <= first <= last <= high``."""
     if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
-        raise ArgumentError(f"{name} is {value!r:.80}; give two numbers, the smaller one first")
+        raise ArgumentError(f"{name} is {value!r:.80}; use two numbers, the smaller one first")
     first, last = (between(name, edge, low, high) for edge in value)
     if first > last:
-        raise ArgumentError(f"{name} runs from {first:g} to {last:g}; give the smaller number first")
+        raise ArgumentError(f"{name} runs from {first:g} to {last:g}; use the smaller number first")
 
 
 def integer(name: str, value: int, low: int, high: int | None = None) -> int:
     """Return ``value`` if it is a whole number in ``[low, high]``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise ArgumentError(f"{name} is {value!r}; give a whole number")
+        raise ArgumentError(f"{name} is {value!r}; use a whole number")
     if value < low or (high is not None and value > high):
         wanted = f"of at least {low}" if high is None else f"from {low} to {high}"
-        raise ArgumentError(f"{name} is {value}; give a whole number {wanted}")
+        raise ArgumentError(f"{name} is {value}; use a whole number {wanted}")
     return int(value)
 
 
@@ -117,25 +117,31 @@ def finite_array(name: str, values: NDArray[np.floating]) -> None:
     bad = np.argwhere(~np.isfinite(values))
     if bad.size:
         place = ", ".join(str(i) for i in bad[0])
-        raise ArgumentError(f"{name} holds {values[tuple(bad[0])]} at [{place}]; give finite numbers")
+        raise ArgumentError(f"{name} holds {values[tuple(bad[0])]} at [{place}]; pass finite numbers")
 
 
 def shape(name: str, actual: tuple[int, ...], wanted: tuple[int, ...]) -> None:
     """Refuse an array whose shape is not ``wanted``."""
     if actual != wanted:
-        raise ArgumentError(f"{name} has shape {actual}; give shape {wanted}")
+        raise ArgumentError(f"{name} has shape {actual}; pass shape {wanted}")
 
 
 def instance(name: str, value: object, wanted: type, source: str) -> None:
     """Refuse a value of another type; ``source`` names its origin, such as "Pipeline.process returns"."""
     if not isinstance(value, wanted):
-        raise ArgumentError(f"{name} is of type {type(value).__name__}; give {wanted.__name__}, which {source}")
+        raise ArgumentError(
+            f"{name} is of type {type(value).__name__}; pass {_article(wanted.__name__)}, which {source}"
+        )
+
+
+def _article(noun: str) -> str:
+    return f"{'an' if noun[0] in 'AEIOU' else 'a'} {noun}"
 
 
 def items(name: str, values: Iterable[_ItemType], wanted: type, source: str) -> Iterator[_ItemType]:
     """Yield values and refuse those of another type; refuse an argument that is no iterable."""
     if not isinstance(values, Iterable):
-        raise ArgumentError(f"{name} is of type {type(values).__name__}; give a list of {wanted.__name__}")
+        raise ArgumentError(f"{name} is of type {type(values).__name__}; pass a list of {wanted.__name__}")
     for index, value in enumerate(values):
         instance(f"{name}[{index}]", value, wanted, source)
         yield value
@@ -145,7 +151,7 @@ def sensor_name(name: str) -> str:
     """Return the name of a sensor if files can have a group of this name."""
     if not _SENSOR_NAME.fullmatch(name):
         raise ArgumentError(
-            f"sensor name {name[:80]!r} cannot name a group in a file; give letters, digits and _, after the first "
+            f"sensor name {name[:80]!r} cannot name a group in a file; use letters, digits and _, after the first "
             "also . @ + -; at most 255 characters"
         )
     return name

@@ -85,7 +85,7 @@ def connect(address: str, *, timeout_s: float) -> Client:
     except (OSError, ValueError, TimeoutError) as error:
         reported = " ".join(str(error).split())[:200] or f"no answer within {timeout_s:g} s"
         raise NetworkError(
-            f"no dask scheduler answers at {address} ({reported}); give the address that 'dask scheduler' prints"
+            f"no dask scheduler answers at {address} ({reported}); choose the address that 'dask scheduler' prints"
         ) from error
 
 

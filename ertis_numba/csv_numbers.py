@@ -26,7 +26,7 @@ def csv_rows(source: str, text: str) -> list[list[float]]:
         return [[float(cell) for cell in row.split(",")] for row in rows if row]
     except ValueError as error:
         raise ArgumentError(
-            f"{source}: {error}; give rows of numbers separated by commas, and comments after #"
+            f"{source}: {error}; pass rows of numbers separated by commas, and comments after #"
         ) from error
 
 

@@ -106,7 +106,7 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         """
         if path is not None:
             if value is _NO_VALUE:
-                raise ArgumentError(f"{path!r} has no value; give one, as in replace({path!r}, value)")
+                raise ArgumentError(f"{path!r} has no value; pass a value, as in replace({path!r}, value)")
             changes = {path: value, **changes}
         own: dict[str, Any] = {}
         nested: dict[str, dict[str, Any]] = {}
@@ -119,7 +119,7 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
             elif isinstance(own.get(name, getattr(self, name)), TomlTable):
                 nested.setdefault(name, {})[inner] = new
             else:
-                raise ArgumentError(f"{self.label()} key {key!r} is unknown: {name} is no table; give {name!r}")
+                raise ArgumentError(f"{self.label()} key {key!r} is unknown: {name} is no table; use {name!r}")
         for name, within in nested.items():
             table: TomlTable = own.get(name, getattr(self, name))
             known = {inner.partition(".")[0] for inner in within} <= set(table.__struct_fields__)
@@ -209,7 +209,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
             ) from error
         except ValueError as error:  # a number with thousands of digits
             raise SettingsError(
-                f"{source or cls.label()}: {' '.join(str(error).split())}; give a shorter number"
+                f"{source or cls.label()}: {' '.join(str(error).split())}; use a shorter number"
             ) from error
 
     @classmethod
@@ -225,7 +225,8 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
         if found is not None:
             line = text.count("\n", 0, found.start()) + 1
             raise SettingsError(
-                f"{source or cls.label()}, line {line}: a dotted key has more than {MAX_KEY_PARTS} parts; give fewer"
+                f"{source or cls.label()}, line {line}: a dotted key has more than {MAX_KEY_PARTS} parts; use fewer "
+                "parts"
             )
 
     @classmethod
@@ -341,13 +342,13 @@ def _type_error(table: TomlTable, given: dict[str, Any], error: str) -> str:
         value = value[name or int(place)]
     key = f"{table.label()}{path.rstrip('`')}"
     if expected is None:
-        return f"{key} exceeds the range of floating-point numbers; give a finite number"
+        return f"{key} exceeds the range of floating-point numbers; use a finite number"
     if expected[2]:
-        return f"{key} has shape ({expected[3]},); give shape ({expected[2]},)"
+        return f"{key} has shape ({expected[3]},); pass shape ({expected[2]},)"
     field = next(field for field in msgspec.structs.fields(table) if field.name == _PATH_PART.findall(path)[0][0])
     tables = " or ".join(f"{kind.__name__}(...)" for kind in _tables(field.type))
     wanted = [_TYPE_NAMES.get(name, tables) for name in expected[1].split(" | ")]
-    return f"{key} is {' '.join(reprlib.repr(value).split())}; give {' or '.join(wanted)}"
+    return f"{key} is {' '.join(reprlib.repr(value).split())}; use {' or '.join(wanted)}"
 
 
 def _tables(kind: Any) -> Iterator[type[TomlTable]]:
@@ -376,7 +377,7 @@ def _document_error(kind: type[TomlDocument], source: str | None, error: msgspec
     path = f", {path.strip('.`')}" if path.strip(".`") else ""
     reason = reason.replace("Object contains unknown field", "unknown key")
     if reason.startswith("Object missing required field "):
-        reason = f"{reason.removeprefix('Object missing required field ')} is missing; give it"
+        reason = f"{reason.removeprefix('Object missing required field ')} is missing; add it"
     remedy = "" if ";" in reason else "; correct it or remove it"
     return f"{source or kind.__name__.lower()}{line}{path}: {reason}{remedy}"
 

@@ -34,8 +34,8 @@ __all__ = ["Pipeline"]
 _GPU_BATCH: Final = 16  # measurements; several times as many as a GPU has lanes
 _MAX_BATCH_BYTES: Final = 2**30
 _NO_ATTITUDE: Final = (
-    "no attitude is given; give Pipeline.process the attitude_xyzw of each measurement, or process a recording with "
-    "poses by 'ertis process --level'"
+    "no attitude is passed; pass the attitude_xyzw of each measurement to Pipeline.process, or process a recording "
+    "with poses by 'ertis process --level'"
 )
 
 
@@ -121,12 +121,12 @@ class Pipeline:
     ) -> None:
         checks.choice("plan", plan, PLAN_COSTS)
         if graphs is not None and not isinstance(graphs, bool):
-            raise ArgumentError(f"graphs is {graphs!r}; give True or False, or leave it out")
+            raise ArgumentError(f"graphs is {graphs!r}; pass True, False or None")
         if isinstance(settings, str | Path):
             settings = Settings.load(settings)
         if not isinstance(settings, Settings):
             raise ArgumentError(
-                f"settings is of type {type(settings).__name__}; give Settings, such as those of a recording, or the "
+                f"settings is of type {type(settings).__name__}; pass Settings, such as those of a recording, or the "
                 "path of a TOML file"
             )
         left_bytes = None if max_bytes is None else require_memory(settings, max_bytes)
@@ -140,7 +140,7 @@ class Pipeline:
         if max_error_db is not None and settings.processing.method == "paper":
             raise ArgumentError(
                 f"max_error_db is {max_error_db:g}, but processing.method 'paper' has no error budget; leave it out or "
-                "give method 'fast'"
+                "use method 'fast'"
             )
         if max_error_db is not None:
             settings = settings.replace(accuracy=settings.accuracy.replace(max_error_db=float(max_error_db)))
@@ -207,7 +207,7 @@ class Pipeline:
         >>> bool(image.level_dbfs.max() < 0)
         True
         """
-        checks.instance("measurement", measurement, Measurement, "a recording holds")
+        checks.instance("measurement", measurement, Measurement, "a recording contains")
         self.settings.processing.require_image()
         if attitude_xyzw is not None and not self.settings.processing.level_directions:
             raise ArgumentError(
@@ -282,7 +282,7 @@ class Pipeline:
         self._require_open()
         self.settings.processing.require_image()
         self.settings.processing.require_sensor_frame(_NO_ATTITUDE)
-        batch = list(checks.items("measurements", measurements, Measurement, "a recording holds"))
+        batch = list(checks.items("measurements", measurements, Measurement, "a recording contains"))
         words = [self._words_of(measurement) for measurement in batch]
         amplitudes = [self._chain.new_image() for _ in batch]
         self._chain.process_batch([each for each, _ in words], amplitudes)
@@ -333,7 +333,7 @@ class Pipeline:
         self.settings.processing.require_image()
         self.settings.processing.require_sensor_frame(_NO_ATTITUDE)
         size = self._batch_size() if batch_size is None else checks.integer("batch_size", batch_size, 1)
-        return self._batches(checks.items("measurements", measurements, Measurement, "a recording holds"), size)
+        return self._batches(checks.items("measurements", measurements, Measurement, "a recording contains"), size)
 
     def _batches(self, measurements: Iterator[Measurement], size: int) -> Iterator[Energyscape]:
         while batch := list(itertools.islice(measurements, size)):
@@ -378,7 +378,7 @@ class Pipeline:
         from ertis_numba.stages.signals import matched, signals_of  # noqa: PLC0415  few want them
 
         self._require_open()
-        checks.instance("measurement", measurement, Measurement, "a recording holds")
+        checks.instance("measurement", measurement, Measurement, "a recording contains")
         self._accepted_words.require_sensor(measurement.settings)
         layout, rate_hz = microphones(self.settings.array), self.settings.signal_rate_hz
         demodulated = signals_of(measurement, settings=self.settings)
@@ -424,7 +424,7 @@ class Pipeline:
         """
         self.settings.processing.require_beams("beams are needed")
         self.settings.processing.require_sensor_frame("beams are computed in the frame of the sensor")
-        checks.instance("measurement", measurement, Measurement, "a recording holds")
+        checks.instance("measurement", measurement, Measurement, "a recording contains")
         words, exponent = self._words_of(measurement)
         settings, chain = self._beam_chain
         beam: NDArray[Any] = chain.new_image()
@@ -542,7 +542,7 @@ class Pipeline:
     def _checked_out(self, out: NDArray[np.float32]) -> NDArray[np.float32]:
         wanted = (len(self.grid), len(self.range_m))
         if out.dtype != np.float32 or out.shape != wanted or not out.flags.c_contiguous or not out.flags.writeable:
-            raise ArgumentError(f"out is {out.dtype} of shape {out.shape}; give contiguous float32 of shape {wanted}")
+            raise ArgumentError(f"out is {out.dtype} of shape {out.shape}; use contiguous float32 of shape {wanted}")
         return out
 
 

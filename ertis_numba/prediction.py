@@ -1,11 +1,12 @@
 """Predicted error of the images of a sensor, and the warning if it may exceed the budget."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, TypedDict
 
 import numpy as np
 
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.errors import DataError
 from ertis_numba.forks import ForkSafeLock
 from ertis_numba.frames import Energyscape, Measurement
@@ -40,6 +41,7 @@ MAX_MEMORY_BYTES: Final = 2**28
 
 _MAX_DIRECTIONS: Final = 64
 _SPREAD_DB: Final = 0.25  # Smaller effects of the number of image points are within the uncertainty.
+_FALSE_ALARM: Final = 1e-3
 _FAINTER_RATIO: Final = 0.1
 _ROWS: Final = 16
 
@@ -72,6 +74,8 @@ class Prediction:
         adaptive beamformer; the plan then keeps it for the delay-and-sum beams of the same signals.
     beamformer : str
         Beamformer, and its weighting if it has one.
+    has_echoes : bool
+        False if the budget is exceeded and no echo exceeds the noise of the image; True by default.
     """
 
     predicted_error_db: float
@@ -79,6 +83,7 @@ class Prediction:
     uncertainty_db: float = UNCERTAINTY_DB
     budget_applies_to: BudgetScope = "image"
     beamformer: str = "delay_and_sum"
+    has_echoes: bool = True
 
     def as_dict(self) -> PredictionDict:
         """Return the prediction in the form for files and reports."""
@@ -94,6 +99,11 @@ class Prediction:
         """Warning in one line; empty if the budget is kept."""
         if self.predicted_error_db + self.uncertainty_db <= self.max_error_db:
             return ""
+        if not self.has_echoes:
+            return (
+                f"no echo was heard above the noise; the image shows this noise with an error of up to "
+                f"{self.predicted_error_db + self.uncertainty_db:.1f} dB relative to it"
+            )
         scope = ""
         if self.budget_applies_to == "beams":
             scope = f"; the plan keeps the budget for delay-and-sum beams only, not for images of {self.beamformer}"
@@ -141,8 +151,11 @@ def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet,
     return Planner(settings, kernels, threads=threads, signal_model=signal_model, sensitivity=sensitivity)
 
 
-def predict(planner: Planner) -> Prediction:
-    """Return a planner's prediction for its complete plan, with the budget."""
+def predict(planner: Planner, image: Energyscape | None = None) -> Prediction:
+    """Return a planner's prediction for its complete plan, with the budget.
+
+    If the budget is exceeded, echoes are searched in ``image``: errors relative to an image of noise alone are large.
+    """
     settings = planner.settings
     processing = settings.processing
     uncertainty_db = ADAPTIVE_UNCERTAINTY_DB
@@ -151,13 +164,16 @@ def predict(planner: Planner) -> Prediction:
         spread_db = 10 * math.log10(1 + 3 / math.sqrt(planner.n_independent))
         uncertainty_db = UNCERTAINTY_DB + (round(spread_db, 1) if spread_db > _SPREAD_DB else 0.0)
     weighted = "" if processing.weighting == "none" else f" with {processing.weighting}"
-    return Prediction(
+    found = Prediction(
         predicted_error_db=round(planner.error_db(settings.accuracy), 2),
         max_error_db=settings.accuracy.max_error_db,
         uncertainty_db=uncertainty_db,
         budget_applies_to=planner.budget_scope(settings.accuracy),
         beamformer=f"{processing.beamformer}{weighted}",
     )
+    if image is None or not found.warning:
+        return found
+    return replace(found, has_echoes=bool(find_peaks(image, top=1, false_alarm=_FALSE_ALARM)))
 
 
 def memory_bytes(image: Energyscape) -> int:
@@ -202,5 +218,5 @@ class BudgetMonitor:
             if not level < _FAINTER_RATIO * self._faintest:
                 return None
             self._faintest = level
-            self.prediction = predict(planner_of(image, measurement, self._kernels, threads=self._threads))
+            self.prediction = predict(planner_of(image, measurement, self._kernels, threads=self._threads), image)
             return self.prediction

@@ -49,7 +49,7 @@ class SampleFormat(NamedTuple):
         """
         if len(content) != self.n_bytes:
             raise DataError(
-                f"measurement has {len(content)} bytes, but its settings describe {self.n_bytes}; give the settings "
+                f"measurement has {len(content)} bytes, but its settings describe {self.n_bytes}; use the settings "
                 "that it was recorded with"
             )
         return np.frombuffer(content, self.dtype).reshape(self.shape)
@@ -67,12 +67,12 @@ class SampleFormat(NamedTuple):
         if words.dtype != self.dtype or words.shape not in {shape, rows}:
             raise DataError(
                 f"measurement has {words.dtype} words of shape {words.shape}, but its settings describe "
-                f"{self.dtype.name} of shape {shape}; give the settings that it was recorded with"
+                f"{self.dtype.name} of shape {shape}; use the settings that it was recorded with"
             )
         if self.dtype.kind == "f" and not np.isfinite(words).all():
             sample, channel = np.argwhere(~np.isfinite(words.reshape(rows)))[0].tolist()
             came = words.reshape(rows)[sample, channel]
-            raise DataError(f"measurement holds {came} at sample {sample} of channel {channel}; give finite numbers")
+            raise DataError(f"measurement holds {came} at sample {sample} of channel {channel}; pass finite numbers")
         # Kernels would be compiled again for read-only or unaligned arrays.
         return np.require(words, requirements=["C", "A", "W"]).reshape(rows)
 

@@ -1,9 +1,9 @@
-"""Units of quantities, derived from the suffixes of their names, and conversion of levels to sound pressures."""
+"""Units of quantities, derived from the suffixes of their names, counts, and conversion of levels to pressures."""
 
 import math
 from typing import Final
 
-__all__ = ["sound_pressure_level_db", "unit_of"]
+__all__ = ["counted", "sound_pressure_level_db", "unit_of"]
 
 _REFERENCE_PA: Final = 20e-6
 _FULL_SCALE_SINE_DBFS: Final = 20 * math.log10(math.sqrt(0.5))
@@ -54,3 +54,8 @@ def sound_pressure_level_db(dbfs: float, sensitivity_dbfs: float) -> float:
     """
     pascal_db = 20 * math.log10(1 / _REFERENCE_PA)
     return pascal_db + (dbfs - _FULL_SCALE_SINE_DBFS) - sensitivity_dbfs
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count and its noun, in the plural unless the count is 1."""
+    return f"{count} {noun}{'s' * (count != 1)}"

@@ -304,8 +304,8 @@ def _decimation_taps(
     transition_hz = rate_hz - 2 * pass_hz
     if transition_hz < _MIN_TRANSITION * rate_hz:
         raise ArgumentError(
-            f"decimation {decimation} gives a rate of {rate_hz:g} Hz, too low for signals up to {pass_hz:g} Hz; give a "
-            "smaller one"
+            f"decimation {decimation} gives a rate of {rate_hz:g} Hz, too low for signals up to {pass_hz:g} Hz; use a "
+            "smaller decimation"
         )
     width_rad = 2 * math.pi * transition_hz / sample_rate_hz
     wanted = (stopband_attenuation_db - 7.95) / (2.285 * width_rad)
@@ -360,7 +360,7 @@ def integer_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int
     if change_db > _MAX_ROUNDING_ERROR_DB:
         raise ArgumentError(
             f"decimation filter of {len(taps)} taps is too long for {bits} bits (rounding changes its response by "
-            f"{change_db:.0f} dB); give a smaller processing.decimation"
+            f"{change_db:.0f} dB); use a smaller processing.decimation"
         )
     return np.asarray(whole, np.int16) if bits == 16 else np.asarray(whole, np.int32)
 

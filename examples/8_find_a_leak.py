@@ -15,7 +15,7 @@ import ertis_numba as ertis
 from ertis_numba.storage import RecordingReader
 
 BAND_HZ = (40e3, 80e3)  # Machines are quieter here than leaks.
-USAGE = "give a recording and, optionally, the distance of the leak in metres"
+USAGE = "choose a recording and, optionally, the distance of the leak in metres"
 
 
 def require_sound(recording: RecordingReader) -> None:

@@ -1,4 +1,4 @@
-"""Reference implementation of peak interpolation: parabolas, corrected by their error for a point reflector.
+"""Reference implementation of peak interpolation by parabolas.
 
 Maxima stay within half of the way to each neighbour, and within the loss of the main lobe there.
 """
@@ -21,28 +21,7 @@ def interpolated(image, directions, around, direction, range_index):
     bins = [(direction, range_index + step) for step in (-1, 0, 1)] + [(other, range_index) for other in around]
     measured = np.log(np.maximum([float(image.amplitude[each]) for each in bins], TINY))
     offsets = directions[around] - directions[direction]
-    first = found = parabolas(measured, offsets)
-    last = math.inf
-    for _ in range(8):
-        top = directions[direction] + found[1]
-        top, at_m = top / np.linalg.norm(top), image.range_m[range_index] + found[0] * step_m
-        predicted = np.array(
-            [math.log(amplitude(image.settings, directions[d] - top, image.range_m[r] - at_m)) for d, r in bins]
-        )
-        predicted += found[2]
-        difference = measured - predicted
-        if np.max(np.abs(difference - difference[1])) >= 1:
-            found = first
-            break
-        change = [wanted - again for wanted, again in zip(first, parabolas(predicted, offsets), strict=True)]
-        size = max(np.max(np.abs(part)) for part in change)
-        if size >= last:
-            break
-        found, last = tuple(now + part for now, part in zip(found, change, strict=True)), size
-        if size <= 1e-5:
-            break
-    if max(abs(found[0] - first[0]), abs(found[2] - first[2])) > 0.5:
-        found = first
+    found = parabolas(measured, offsets)
     shift_m = min(0.5, max(-0.5, found[0])) * step_m
     steps = [
         0.5 * offset @ offset / (offset @ found[1]) for offset in offsets if offset @ found[1] > 0.5 * offset @ offset

@@ -392,10 +392,10 @@ def test_octaves_share_each_frequency_once(fraction):
         ({"passive__bands_hz": [[25e3, 20e3]]}, "passive.bands_hz[0]"),
         (
             {"passive__bands_hz": [[40e3, 41e3], [20e3, 30e3], [40e3, 41e3]]},
-            "has overlapping bands 40000 to 41000 Hz and 40000 to 41000 Hz; give bands that share at most an edge",
+            "has overlapping bands 40000 to 41000 Hz and 40000 to 41000 Hz; use bands that share at most an edge",
         ),
         ({"passive__bands_hz": [[25e3, 40e3], [20e3, 26e3]]}, "20000 to 26000 Hz and 25000 to 40000 Hz"),
-        ({"passive__bands_hz": "third_octaves", "passive__limits_hz": [100e3, 101e3]}, "give wider limits"),
+        ({"passive__bands_hz": "third_octaves", "passive__limits_hz": [100e3, 101e3]}, "use wider limits"),
         ({"passive__resolution_hz": 10.0}, "passive.resolution_hz needs blocks of"),
         ({"passive__method": "music", "passive__n_sources": 6}, "6 microphones"),
         ({"passive__method": "capon", "passive__diagonal_removal": True}, "does not support"),

@@ -27,7 +27,7 @@ from tests.test_acoustic_camera import settings_of, sound
 
 BANDS_HZ = np.array([[20e3, 25e3], [25e3, 31.5e3]])
 LOUD_DEG = (24.0, 12.0)
-OTHER_KIND = "does not support maps.h5, a file of acoustic maps; give --kind acoustic_map or spectrum, or its recording"
+OTHER_KIND = "does not support maps.h5, a file of acoustic maps; use --kind acoustic_map or spectrum, or its recording"
 
 
 def acoustic_map(directions="3d:800", *, sensitivity_dbfs=None, method="delay_and_sum"):
@@ -232,12 +232,12 @@ def test_map_lies_over_a_photo_as_a_pinhole_camera_sees_it(photo):
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
-        ({"band_hz": "x"}, ArgumentError, "band_hz is 'x'; give two numbers, the smaller one first"),
-        ({"band_hz": (30e3, "x")}, ArgumentError, r"band_hz is 'x'; give a number"),
+        ({"band_hz": "x"}, ArgumentError, "band_hz is 'x'; use two numbers, the smaller one first"),
+        ({"band_hz": (30e3, "x")}, ArgumentError, r"band_hz is 'x'; use a number"),
         ({"band_hz": (30e3, 20e3)}, ArgumentError, "band_hz runs from 30000 to 20000"),
-        ({"photo": "x.png", "photo_fov_deg": 60}, ArgumentError, "photo_fov_deg is 60; give its width and its height"),
+        ({"photo": "x.png", "photo_fov_deg": 60}, ArgumentError, "photo_fov_deg is 60; use its width and height"),
         ({"band_hz": (1e3, 2e3)}, ArgumentError, "no band lies within 1000 to 2000 Hz"),
-        ({"photo_fov_deg": (60, 40)}, ArgumentError, "photo and photo_fov_deg need each other"),
+        ({"photo_fov_deg": (60, 40)}, ArgumentError, "photo and photo_fov_deg belong together; use"),
         ({"photo": "none.png", "photo_fov_deg": (60, 180)}, ArgumentError, r"photo_fov_deg\[1\] is 180"),
         ({"photo": "none.png", "photo_fov_deg": (60, 40)}, DataError, "none.png: No such file or directory; choose"),
         (
@@ -428,13 +428,13 @@ def test_kinds_of_sound_are_plotted(line, kind):
     [
         ("maps.h5 --kind spectrum --band 1:2", "--band is for --kind acoustic_map; remove it with spectrum", 2),
         ("maps.h5 --peaks 3", "--peaks is for --kind image", 2),
-        ("maps.h5 --photo photo.png --photo-fov 60", "'60' is not a field of view; give two angles", 2),
+        ("maps.h5 --photo photo.png --photo-fov 60", "'60' is not a field of view; use two angles", 2),
         ("maps.h5 --photo photo.png", "--photo needs --photo-fov AZ,EL", 2),
         ("maps.h5 --photo-fov 60,40", "--photo-fov needs --photo PICTURE", 2),
         ("maps.h5 --band 1:2", "no band lies within 1 to 2 Hz", 1),
         ("maps.h5 --kind spectrogram", f"--kind spectrogram {OTHER_KIND}", 2),
         ("maps.h5 --kind polar", f"--kind polar {OTHER_KIND}", 2),
-        ("maps.h5 -m 5", "--measurement is 5; give", 1),
+        ("maps.h5 -m 5", "--measurement is 5; use", 1),
     ],
 )
 def test_plots_of_sound_that_cannot_be_drawn_are_refused(line, message, code):

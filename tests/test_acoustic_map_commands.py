@@ -162,7 +162,7 @@ def test_emission_is_masked_and_reported():
 
 def test_mixed_recording_becomes_images_of_its_calls():
     done = run("process mixed.h5 -o img.h5 --device cpu --json")
-    assert "mixed.h5: 2 of 4 measurements of sensor sensor are passive and left out; give --mode passive" in done.stderr
+    assert "mixed.h5: 2 of 4 measurements of sensor sensor are passive and left out; use mode='passive'" in done.stderr
     assert json.loads(done.stdout)["measurements"] == 2
     with ertis.open_energyscapes("img.h5") as images:
         assert [stamp.sequence for stamp in images.stamps()] == [0, 2]
@@ -208,7 +208,7 @@ def test_finished_maps_are_kept(folder):
     assert "exists and was made with other settings (passive.averages of sensor sensor)" in done.stderr
     with h5py.File(folder / "maps" / "passive.acoustic.h5", "r+") as file:
         file["sensors/sensor/power"][0, 0, 0] += 1.0
-    assert "passive.acoustic.h5 exists and is damaged; give another folder" in run(line, code=1).stderr
+    assert "passive.acoustic.h5 exists and is damaged; choose another folder" in run(line, code=1).stderr
     done = run(f"{line} --force")
     assert "maps/silent.acoustic.h5: exists already, kept" in done.stderr
     assert "2 recordings: 1 made, 1 kept; 3 measurements in " in done.stderr
@@ -230,7 +230,9 @@ def test_failed_recordings_do_not_stop_maps_of_others(folder):
     assert "active.h5: sensor sensor emitted its call in 2 of 2 measurements; maps leave out the first" in done.stderr
     assert names_in(folder / "maps") == ["active.acoustic.h5", "passive.acoustic.h5"]
     done = run("process passive.h5 active.h5 -o images --verify --device cpu", code=1)
-    assert "passive.h5: all measurements become acoustic maps, which have no error budget; leave" in done.stderr
+    assert (
+        "passive.h5: all measurements become acoustic maps, which have no error budget; remove --verify" in done.stderr
+    )
     assert names_in(folder / "images") == ["active.energy.h5"]
     done = run("process passive.h5 silent.h5 -o more --bands 80000:100000 --device cpu", code=1)
     assert done.stderr.count("--bands ends at 100000 Hz, but the record reaches only 90000 Hz") == 2
@@ -246,7 +248,7 @@ def test_progress_of_maps_counts_measurements():
 
 def test_images_of_silent_sensors_are_fused_only_if_asked(folder):
     done = run("process silent.h5 --fuse --device cpu", code=1)
-    assert "silent.h5: all measurements are passive and have no echoes; give recordings of emitted calls" in done.stderr
+    assert "silent.h5: all measurements are passive and have no echoes; use recordings of emitted calls" in done.stderr
     assert not (folder / "silent.fused.h5").exists()
     run("process silent.h5 --fuse --mode active --device cpu")
 
@@ -260,14 +262,14 @@ def test_check_names_the_kind_of_a_file_of_maps():
     ("line", "message"),
     [
         ("active.h5 --average 2", "--average is for acoustic maps, but measurements with a call become images"),
-        ("passive.h5 --range 0.5:1", "--range is for images, but all measurements become acoustic maps; give --mode"),
-        ("passive.h5 --verify", "--verify is for images, but all measurements become acoustic maps; give --mode"),
+        ("passive.h5 --range 0.5:1", "--range is for images, but all measurements become acoustic maps; use --mode"),
+        ("passive.h5 --verify", "--verify is for images, but all measurements become acoustic maps; use --mode"),
         (
             "passive.h5 active.h5 -o out/ --verify --mode passive",
             "--verify is for images, but --mode passive makes acoustic maps; leave out --mode, or leave out --verify",
         ),
         ("active.h5 --verify --mode passive", "--verify is for images, but --mode passive makes acoustic maps; leave"),
-        ("passive.h5 --bands wide", "'wide' is not a list of bands; give third_octaves, octaves, or edges in Hz"),
+        ("passive.h5 --bands wide", "'wide' is not a list of bands; use third_octaves, octaves, or edges in Hz"),
         ("passive.h5 --bands 20000:30000:40000", "is not a list of bands"),
         ("passive.h5 active.h5 -o out/ --focus 2 --mode active", "--focus is for acoustic maps, but --mode active"),
         ("passive.h5 active.h5 -o out/ --range 1:2 --mode passive", "--range is for images, but --mode passive"),
@@ -407,7 +409,7 @@ def test_info_states_no_call_of_maps_of_passive_measurements():
 
 def test_images_of_measurements_without_a_call_are_warned_of(in_test_process):  # noqa: ARG001
     done = run("process mixed.h5 -o images.h5 --mode active --device cpu")
-    assert "no call was emitted for 2 of 4 measurements, so their images show no echoes of one" in done.stderr
+    assert "no call was emitted for 2 of 4 measurements, so their images show no echoes of a call" in done.stderr
     assert json.loads(run("info images.h5 --json").stdout)["call_khz"] is not None
     picture = run("process passive.h5 -o silent_images.h5 --mode active --device cpu")
     assert "no call was emitted for 3 of 3 measurements" in picture.stderr

@@ -592,7 +592,7 @@ def test_archive_refuses_invalid_options(options, message, tmp_path):
 
 
 def test_archive_refuses_a_folder_that_cannot_be_created(tmp_path):
-    with pytest.raises(DataError, match="give a writable folder"):
+    with pytest.raises(DataError, match="choose a writable folder"):
         Archive(tmp_path / "no" / "folder").open()
 
 

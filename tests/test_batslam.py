@@ -432,9 +432,9 @@ def test_unusable_drives_are_explained(tmp_path, name):
 
 
 def test_export_needs_a_drive(tmp_path):
-    with pytest.raises(ArgumentError, match=r"format 'batslam' needs poses and odometry; give drive=Drive"):
+    with pytest.raises(ArgumentError, match=r"format 'batslam' needs poses and odometry; pass drive=Drive"):
         ertis.export(tmp_path / "set.mat", noise())
-    with pytest.raises(ArgumentError, match="odometry is of type int; give a Trajectory of the platform"):
+    with pytest.raises(ArgumentError, match="odometry is of type int; pass a Trajectory of the platform"):
         Drive(poses=straight(), odometry=3)
     with pytest.raises(ArgumentError, match="beam_azimuth_deg is 91"):
         Drive(poses=straight(), odometry=straight(), beam_azimuth_deg=91)
@@ -489,18 +489,18 @@ REFUSED = {
         1,
         "all chosen measurements of sensor left are passive and have no echoes",
     ),
-    "no poses": ("left.h5 -o x.mat", 1, "left.h5 has no poses; give true ones with --poses TRAJ"),
+    "no poses": ("left.h5 -o x.mat", 1, "left.h5 has no poses; add the true poses with --poses TRAJ,"),
     "several sensors": (
         "both.h5 -o x.mat --poses way.tum",
         2,
         "format batslam holds the echoes of one sensor, but there are left, right; choose one (--sensor)",
     ),
     "unknown sensor": ("both.h5 -o x.mat --sensor top", 2, "no recording has sensor 'top'; choose one of left, right"),
-    "same sensor": ("both.h5 left.h5 -o x.mat --sensor left", 2, "have the same sensor 'left'"),
+    "same sensor": ("both.h5 left.h5 -o x.mat --sensor left", 2, "contain the same sensor 'left';"),
     "poses of images": ("left.h5 -o x.csv --poses way.tum", 2, "--poses is for format batslam, not for csv; leave"),
     "ears of images": ("left.h5 -o x.csv --beam-azimuth 3", 2, "--beam-azimuth is for format batslam, not for csv"),
     "ears behind": ("left.h5 -o x.mat --beam-azimuth 95", 2, "-90.0<=x<=90.0"),
-    "several files": ("left.h5 right.h5 -o x.csv", 2, "format csv exports one recording, but 2 are given; give one"),
+    "several files": ("left.h5 right.h5 -o x.csv", 2, "format csv exports one recording, but 2 are given; choose one"),
     "points": (
         "left.h5 -o x.mat --top 3 --poses way.tum --odometry way.tum",
         1,
@@ -510,7 +510,7 @@ REFUSED = {
     "mountings": (
         "both.h5 -o x.mat --poses way.tum --sensor left",
         1,
-        "the mounting of sensor 'left' is unknown; give --mounting FILE",
+        "the mounting of sensor 'left' is unknown; add its mounting with --mounting FILE",
     ),
 }
 

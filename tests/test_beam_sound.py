@@ -154,7 +154,7 @@ def test_command_writes_sound(recording, tmp_path, options, rate_hz, duration_s)
         (["-o", "x.wav"], "--listen AZ,EL"),
         (["-o", "x.wav", "--listen", "20"], "is not a direction"),
         (["-o", "x.wav", "--listen", "0,0", "--top", "3"], "--top is not for sound"),
-        (["-o", "x.wav", "--listen", "0,0", "--expand", "3", "--heterodyne", "3"], "give one of them"),
+        (["-o", "x.wav", "--listen", "0,0", "--expand", "3", "--heterodyne", "3"], "choose one of them"),
         (["-o", "x.npz", "--listen", "0,0"], "--listen is for sound"),
     ],
 )
@@ -167,7 +167,7 @@ def test_command_refuses_impossible_options(recording, arguments, words):
 def test_command_names_its_option_for_a_shift_above_the_sound(recording, tmp_path):
     done = run(recording, "-o", tmp_path / "x.wav", "--listen", "0,0", "--heterodyne", "4e9")
     assert done.exit_code == 2
-    assert "--heterodyne is 4e+09; give a number from 0 to 56250" in done.stderr
+    assert "--heterodyne is 4e+09; use a number from 0 to 56250" in done.stderr
     assert not (tmp_path / "x.wav").exists()
 
 

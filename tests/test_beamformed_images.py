@@ -141,27 +141,27 @@ def test_capon_separates_independent_sources_within_a_beam(device):
     [
         (
             {"beamformer": "coherence_factor"},
-            r"'coherence_factor' is a weighting; give it as processing\.weighting, with",
+            r"'coherence_factor' is a weighting; set it as processing\.weighting, with",
         ),
         ({"weighting": "cf"}, r"processing\.weighting 'cf' is unknown; known are none, coherence_factor"),
         ({"beamformer": "mvdr"}, r"processing\.beamformer 'mvdr' is unknown; known are delay_and_sum, .*capon"),
-        ({"dmas_order": 1}, r"processing\.dmas_order is 1; give a whole number from 2 to 8"),
-        ({"dmas_order": 9}, r"processing\.dmas_order is 9; give a whole number from 2 to 8"),
-        ({"snapshots": 0}, r"processing\.snapshots is 0; give a whole number from 1 to 32"),
-        ({"snapshots": 33}, r"processing\.snapshots is 33; give a whole number from 1 to 32"),
-        ({"diagonal_loading": 0.0}, r"processing\.diagonal_loading is 0; give a number from 1e-06 to 1e\+06"),
-        ({"diagonal_loading": math.nan}, r"processing\.diagonal_loading is nan; give a finite number"),
+        ({"dmas_order": 1}, r"processing\.dmas_order is 1; use a whole number from 2 to 8"),
+        ({"dmas_order": 9}, r"processing\.dmas_order is 9; use a whole number from 2 to 8"),
+        ({"snapshots": 0}, r"processing\.snapshots is 0; use a whole number from 1 to 32"),
+        ({"snapshots": 33}, r"processing\.snapshots is 33; use a whole number from 1 to 32"),
+        ({"diagonal_loading": 0.0}, r"processing\.diagonal_loading is 0; use a number from 1e-06 to 1e\+06"),
+        ({"diagonal_loading": math.nan}, r"processing\.diagonal_loading is nan; use a finite number"),
         (
             {"beamformer": "dmas", "method": "paper"},
-            r"processing\.method is 'paper', which supports only .*'delay_and_sum' .*; give 'fast' with .*'dmas'",
+            r"processing\.method is 'paper', which supports only .*'delay_and_sum' .*; use 'fast' with .*'dmas'",
         ),
         (
             {"beamformer": "capon", "wavefront": "spherical"},
-            r"processing\.wavefront is 'spherical', which .*'capon' does not support; give 'plane', or another",
+            r"processing\.wavefront is 'spherical', which .*'capon' does not support; use 'plane', or another",
         ),
         (
             {"weighting": "coherence_factor", "method": "paper"},
-            r"processing\.method is 'paper', .* give 'fast' with processing\.weighting 'coherence_factor'",
+            r"processing\.method is 'paper', .* 'none'; use 'fast' with processing\.weighting 'coherence_factor'",
         ),
     ],
 )

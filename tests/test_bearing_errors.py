@@ -148,3 +148,44 @@ def test_sources_are_separated_or_as_uncertain_as_they_are_far_apart(apart_deg, 
             found += [min(squares(each, direction) for each in bearings) for direction in (first, second)]
     assert np.mean(np.array(found) < 3**2) > 0.8
     assert np.max(found) < 6**2
+
+
+def crosstalk(settings, snr_db, random):
+    """Return a measurement of white noise of each microphone, and of one white signal in all channels."""
+    n_mics = microphones(settings.array).enabled.sum()
+    samples = random.standard_normal((n_mics, N_SAMPLES)) + 10 ** (snr_db / 20) * random.standard_normal(N_SAMPLES)
+    return ertis.Measurement(np.ascontiguousarray(samples.T, np.float32), settings, ertis.Stamp(behaviour="passive"))
+
+
+@pytest.mark.parametrize("snr_db", [-10, 10, 40])
+def test_equal_channels_may_be_crosstalk(snr_db):
+    settings = settings_of((35e3, 45e3))
+    with AcousticCamera(settings, "cpu", 1) as camera:
+        finder = BearingFinder(camera)
+        for seed in range(3):
+            camera.reset()
+            camera.add(crosstalk(settings, snr_db, np.random.default_rng([11, seed])))
+            (bearing,) = finder.find()
+            assert bearing.may_be_crosstalk
+
+
+@pytest.mark.parametrize(("azimuth_deg", "elevation_deg", "snr_db"), [(1.5, 0, 10), (0, -3, 10), (20, 10, -10)])
+def test_sound_from_aside_is_no_crosstalk(azimuth_deg, elevation_deg, snr_db):
+    settings = settings_of((35e3, 45e3))
+    with AcousticCamera(settings, "cpu", 1) as camera:
+        source = direction_of(azimuth_deg, elevation_deg), 10 ** (snr_db / 20), WIDE
+        camera.add(heard(settings, [source], 1.0, np.random.default_rng(12)))
+        (bearing,) = BearingFinder(camera).find()
+    assert not bearing.may_be_crosstalk
+
+
+def test_crosstalk_of_an_array_that_is_not_flat_is_marked():
+    places_m = np.random.default_rng(13).uniform(-0.01, 0.01, (10, 3))
+    settings = settings_of((20e3, 30e3)).replace(**{"array.positions_m": places_m.tolist()})
+    with AcousticCamera(settings, "cpu", 1) as camera:
+        finder = BearingFinder(camera)
+        camera.add(crosstalk(settings, 0, np.random.default_rng(14)))
+        assert all(bearing.may_be_crosstalk for bearing in finder.find())
+        camera.reset()
+        camera.add(heard(settings, [(direction_of(0, 0), 1.0, WIDE)], 1.0, np.random.default_rng(15)))
+        assert [bearing.may_be_crosstalk for bearing in finder.find()] == [False]

@@ -137,7 +137,7 @@ def test_arguments_outside_their_limits_are_refused(changes, words):
 def test_maps_out_of_order_are_refused():
     tracker = BearingTracker()
     tracker.add([], time_s=1.0)
-    with pytest.raises(ArgumentError, match="give maps in order"):
+    with pytest.raises(ArgumentError, match="add maps in the order"):
         tracker.add([], time_s=1.0)
     with pytest.raises(ArgumentError, match=r"bearings\[0\]"):
         tracker.add([3], time_s=2.0)

@@ -214,6 +214,38 @@ def test_false_alarms_have_the_requested_rate(directions, band_hz, diffuse):
     assert low <= alarms <= high
 
 
+def other_noise(kind, n_mics, n_samples, random):
+    """Return noise of separate microphones that is not white, at 225 kHz."""
+    frequency_hz, time_s = np.fft.rfftfreq(n_samples, 1 / 225e3), np.arange(n_samples) / 225e3
+    white = random.standard_normal((n_mics, n_samples))
+    if kind == "tone":
+        phase = random.uniform(0, 2 * np.pi, (n_mics, 1))
+        return white + np.cos(2 * np.pi * random.uniform(36e3, 44e3) * time_s + phase)
+    if kind == "burst":
+        return white * (1 + 10 * ((time_s > 0.010) & (time_s < 0.015)))
+    if kind == "gains":
+        return white * 10 ** random.normal(0, 3 / 20, (n_mics, 1))
+    low_hz, high_hz = kind
+    is_within = (frequency_hz > low_hz) & (frequency_hz < high_hz)
+    return np.fft.irfft(np.fft.rfft(white) * is_within, n_samples)
+
+
+@pytest.mark.parametrize("kind", [(38e3, 42e3), (39.7e3, 40e3), "tone", "burst", "gains"], ids=str)
+def test_false_alarms_in_other_noise_have_the_requested_rate(kind):
+    settings = passive_bearings.plane_wave_settings()
+    settings = settings.replace(**{"passive.resolution_hz": None, "processing.directions": "3d:600"})
+    asked, n_seeds, alarms = 0.3, 40, 0
+    with AcousticCamera(settings, "cpu", 1) as camera:
+        finder = BearingFinder(camera, false_alarm=asked, top=1)
+        for seed in range(n_seeds):
+            heard = other_noise(kind, 32, settings.recording.n_samples, np.random.default_rng([3, seed]))
+            camera.reset()
+            camera.add(ertis.Measurement(np.ascontiguousarray(heard.T, np.float32), settings))
+            alarms += bool(finder.find())
+    low, high = scipy.stats.binom.interval(0.998, n_seeds, asked)
+    assert low <= alarms <= high
+
+
 def test_errors_are_those_of_the_bound_and_as_stated():
     settings = passive_bearings.plane_wave_settings().replace("processing.directions", "3d:1500")
     with AcousticCamera(settings, "cpu", 1) as camera:
@@ -272,7 +304,7 @@ def test_directions_without_information_are_unknown(level):
 
 @pytest.mark.parametrize("directions", ["2d:90", "3d:10", "3d:30", "3d:1300"])
 def test_levels_never_exceed_the_sound_or_fall_below_the_least_level(directions):
-    """Coarse and planar grids miss the leak; what they find instead must not have impossible levels."""
+    """Coarse and planar grids miss the leak; what they find instead, if anything, has possible levels."""
     scene = ertis.load_scene(Path(__file__).parents[1] / "data" / "synthetic" / "scenes" / "leak.toml")
     changes = {"processing.directions": directions, "passive.limits_hz": (28e3, 71e3)}
     with AcousticCamera(scene.sensors[0].settings().replace(**changes), "cpu") as camera:
@@ -282,7 +314,7 @@ def test_levels_never_exceed_the_sound_or_fall_below_the_least_level(directions)
         finder, matrix = BearingFinder(camera), camera.cross_spectrum().matrix
         found = finder.find()
     power = np.trace(matrix, axis1=1, axis2=2).real / matrix.shape[1]
-    assert found
+    assert found or directions != "3d:1300"  # Sound from elsewhere may fit no direction better than by chance.
     for band_hz, share in zip(camera.band_hz, bin_shares(camera.band_hz, camera.frequency_hz), strict=True):
         levels = [bearing.level_dbfs for bearing in found if bearing.band_hz == tuple(band_hz)]
         assert sum(10 ** (level / 10) for level in levels) <= 10**0.1 * (share @ power)

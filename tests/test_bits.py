@@ -286,9 +286,9 @@ def test_read_only_words_are_accepted_and_unchanged():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"n_samples": 4_095}, r"n_samples is 4095; give a whole number of at least 4096"),
-        ({"pdm_rate_hz": 0.0}, r"pdm_rate_hz is 0; give a number above 0"),
-        ({"enabled": np.ones(8, dtype=bool)}, r"enabled has shape \(8,\); give shape \(32,\)"),
+        ({"n_samples": 4_095}, r"n_samples is 4095; use a whole number of at least 4096"),
+        ({"pdm_rate_hz": 0.0}, r"pdm_rate_hz is 0; use a number above 0"),
+        ({"enabled": np.ones(8, dtype=bool)}, r"enabled has shape \(8,\); pass shape \(32,\)"),
     ],
 )
 def test_pdm_check_refuses_invalid_arguments(change, message):
@@ -299,8 +299,8 @@ def test_pdm_check_refuses_invalid_arguments(change, message):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (np.zeros(SHORT - 1, dtype=np.uint32), r"words has shape \(32767,\); give shape \(32768,\)"),
-        (np.zeros(SHORT, dtype=np.uint16), r"words are uint16; give uint32"),
+        (np.zeros(SHORT - 1, dtype=np.uint32), r"words has shape \(32767,\); pass shape \(32768,\)"),
+        (np.zeros(SHORT, dtype=np.uint16), r"words are uint16; pass uint32"),
     ],
 )
 def test_pdm_check_refuses_other_arrays(words, message):

@@ -204,7 +204,7 @@ def test_process_suggests_verify_unless_it_was_given(tmp_path):
     arguments = ["process", str(tmp_path / "quiet.h5"), "-o", str(tmp_path / "image.h5"), "--force"]
     assert "measure the error with --verify" in CliRunner().invoke(cli, arguments).stderr
     verified = CliRunner().invoke(cli, [*arguments, "--verify"])
-    assert "give a lower --max-error" in verified.stderr
+    assert "use a lower --max-error" in verified.stderr
     assert "--verify" not in verified.stderr
 
 

@@ -171,7 +171,7 @@ def two():
 
 
 def test_too_few_sensors_are_refused(two):
-    with pytest.raises(ArgumentError, match=r"poses of 1 sensor are asked for; give at least two"):
+    with pytest.raises(ArgumentError, match=r"poses of 1 sensor are wanted, but mountings need at least two"):
         calibrate_poses({"front": two["front"]})
 
 
@@ -226,7 +226,7 @@ def test_mounting_file_is_read_by_capture(two, tmp_path, capsys):
     for name, (place_m, quaternion) in mountings(target, ["front", "top"]).items():
         assert np.allclose(place_m, found.poses[name].translation_m, atol=1e-6)
         assert np.allclose(quaternion, found.poses[name].rotation_xyzw, atol=1e-6)
-    with pytest.raises(ArgumentError, match="exists; give another name"):
+    with pytest.raises(ArgumentError, match="exists; choose another name"):
         write_poses([path], None, target)
     write_poses([path], None, None, as_json=True)
     report = json.loads(capsys.readouterr().out)

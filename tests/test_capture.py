@@ -249,7 +249,9 @@ def test_sync_capture_accepts_pulses_before_the_first_sensors(captures):
         capture.session.run(capture.journal)
     with capture.recording("two") as recording:
         assert recording.stamps()[0].sequence == 0
-        assert -5 < recording.stamps()[0].sync_count < 0  # it is armed after the other sensor
+        assert recording.stamps()[0].sync_count == 0
+    with capture.recording("one") as recording:
+        assert (recording.stamps()[0].sequence, recording.stamps()[0].sync_count >= 0) == (0, True)
     assert capture.session.complete >= 4
 
 
@@ -338,10 +340,10 @@ def test_capture_keeps_other_sensors_when_one_is_silent(captures):
     ("options", "message"),
     [
         ({"trigger": "whistle"}, "trigger 'whistle' is unknown; known are command, sync"),
-        ({"rate_hz": 0.0}, "rate is 0; give a number from"),
-        ({"n": 0}, "n is 0; give a whole number"),
-        ({"duration_s": 0.0}, "duration is 0; give a number above 0"),
-        ({"patience_s": -1.0}, "patience is -1; give a number above 0"),
+        ({"rate_hz": 0.0}, "rate is 0; use a number from"),
+        ({"n": 0}, "n is 0; use a whole number"),
+        ({"duration_s": 0.0}, "duration is 0; use a number above 0"),
+        ({"patience_s": -1.0}, "patience is -1; use a number above 0"),
     ],
 )
 def test_capture_session_rejects_invalid_options(captures, options, message):
@@ -351,7 +353,7 @@ def test_capture_session_rejects_invalid_options(captures, options, message):
 
 
 def test_capture_session_rejects_empty_sonars():
-    with pytest.raises(ArgumentError, match="sonars is empty; give at least one sensor"):
+    with pytest.raises(ArgumentError, match="sonars is empty; pass at least one sensor"):
         CaptureSession({}, SETTINGS, trigger="command")
 
 
@@ -465,13 +467,21 @@ def test_capture_dry_run_prints_commands_and_opens_no_port(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message", "code"),
     [
-        (["--port", "{link}", "--name", "a", "--name", "b"], "2 names are given for 1 ports; give one --name", 2),
+        (["--port", "{link}", "--name", "a", "--name", "b"], "2 names are given for 1 ports; use one --name", 2),
         (["--port", "nowhere"], "ertis: error: serial port 'nowhere' does not exist", 1),
-        (["--port", "{link}", "--preset", "default_25_50"], "--preset and --settings exclude each other; give one", 2),
-        (["--port", "{link}", "-o", "settings.toml"], "output settings.toml is the input itself; give another name", 1),
-        (["--port", "{link}", "--port", "{link}"], "is given 2 times; give each sensor once", 2),
-        (["--port", "{link}", "--rate", "0"], "--rate is 0; give a number from", 2),
-        (["--port", "{link}", "--temperature", "99"], "--temperature is 99; give a number from -40 to 60", 2),
+        (
+            ["--port", "{link}", "--preset", "default_25_50"],
+            "--preset and --settings cannot be combined; choose one",
+            2,
+        ),
+        (
+            ["--port", "{link}", "-o", "settings.toml"],
+            "output settings.toml is the input itself; choose another name",
+            1,
+        ),
+        (["--port", "{link}", "--port", "{link}"], "is given 2 times; name each sensor once", 2),
+        (["--port", "{link}", "--rate", "0"], "--rate is 0; use a number from", 2),
+        (["--port", "{link}", "--temperature", "99"], "--temperature is 99; use a number from -40 to 60", 2),
         ([], "Missing option '--port'", 2),
     ],
 )

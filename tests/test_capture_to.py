@@ -166,7 +166,7 @@ def test_capture_output_stores_sensor_mounting(tmp_path):
 def test_capture_to_fails_when_nothing_is_acknowledged(tmp_path):
     code, events, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", "-n", 3, "--patience", "0.1")
     assert code == 1
-    message = "3 measurements not acknowledged by the central node at tcp://127.0.0.1:9"
+    message = "3 measurements not acknowledged raise --spool-size tcp://127.0.0.1:9"
     assert err.splitlines()[-1].startswith(f"ertis: error: {message}, which does not answer; start 'ertis record' or ")
     assert (events[-1]["event"], events[-1]["kept"], events[-1]["unacked"]) == ("captured", 3, 3)
 
@@ -188,8 +188,8 @@ def test_capture_to_sends_spooled_measurements_next_time(tmp_path):
 @pytest.mark.parametrize(
     ("given", "lost", "remedy"),
     [
-        (["--ring"], "overwritten", "give --spool DIR to keep measurements"),
-        (["--spool", "spool", "--spool-size"], "refused", "give the spool more (--spool-size)"),
+        (["--ring"], "overwritten", "add --spool DIR to keep measurements"),
+        (["--spool", "spool", "--spool-size"], "refused", "raise --spool-size"),
     ],
 )
 def test_capture_to_limits_size_of_ring_and_spool(tmp_path, words, given, lost, remedy):
@@ -270,18 +270,18 @@ def test_capture_to_requires_allowed_keys(tmp_path):
         assert (code, events[-1]["kept"], central.taken) == (0, 2, 2), err
         code, _, err = run(tmp_path, *to)
         assert (code, central.taken) == (1, 2)
-        assert "give --key and --server-key" in err
+        assert "set one (keys)" in err
         other, _ = KeyPair.new("other").save(tmp_path / "keys")
         code, _, err = run(tmp_path, *to, "--key", other, "--server-key", theirs.public)
         assert (code, central.taken) == (1, 2)
-        reported = "2 measurements not acknowledged by the central node at tcp://127.0.0.1:"
+        reported = "2 measurements not acknowledged raise --spool-size tcp://127.0.0.1:"
         assert err.splitlines()[-1].startswith(f"ertis: error: {reported}")
         assert err.splitlines()[-1].endswith(": the central node does not know this key; add it there with "
                                              "'ertis keys allow'")  # fmt: skip
 
 
 FOR_APPLICATIONS = (
-    "this address is for applications that receive products; for sensor nodes, poses and 'ertis configure', give the "
+    "this address is for applications that receive products; for sensor nodes, poses and 'ertis configure', use the "
     "first address that 'ertis serve' prints"
 )
 
@@ -323,7 +323,7 @@ def test_capture_to_image_address_suggests_the_other_address(tmp_path):
     remedy = FOR_APPLICATIONS
     assert any(remedy in each.get("text", "") for each in events)
     assert code == 1
-    assert err.splitlines()[-1].endswith(f"not acknowledged by the central node at {publisher.address}: {remedy}")
+    assert err.splitlines()[-1].endswith(f"not acknowledged raise --spool-size {publisher.address}: {remedy}")
 
 
 def test_sensor_nodes_are_warned_of_a_shared_sensor_name(tmp_path):
@@ -335,7 +335,7 @@ def test_sensor_nodes_are_warned_of_a_shared_sensor_name(tmp_path):
             node.append(entries(1, session_id=session_id))
         for reported in notes:
             assert reported.get(timeout=SOON_S) == (
-                "another sensor node sends sensor left, too; give each its own name (--name), or end one"
+                "another sensor node sends sensor left, too; use a different name for each (--name), or end one"
             )
         node.append(entries(1, session_id=7))
         assert node.flush(SOON_S)
@@ -346,23 +346,23 @@ def test_sensor_nodes_are_warned_of_a_shared_sensor_name(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message", "code"),
     [
-        (["--to", "tcp://127.0.0.1:9", "-o", "a.h5"], "--to and --output exclude each other; give one", 2),
+        (["--to", "tcp://127.0.0.1:9", "-o", "a.h5"], "--to and --output cannot be combined; choose one", 2),
         (["--spool", "spool"], "--ring, --fixed-settings, --key and --server-key need a central node; add --to", 2),
         (["--ring", "1"], "--ring, --fixed-settings, --key and --server-key need a central node; add --to", 2),
         (["--to", "tcp://127.0.0.1:9", "--spool-size", "1"], "--spool-size is given without --spool; add --spool", 2),
-        (["--to", "here"], "address 'here' cannot be used; give tcp://HOST:PORT", 2),
+        (["--to", "here"], "address 'here' cannot be used; use tcp://HOST:PORT", 2),
         (["--to", "tcp://10.1.1.1:5601"], "can be reached from other machines, but there are no keys", 1),
         (
             ["--to", "tcp://127.0.0.1:9", "--spool", "settings.toml"],
-            "settings.toml: File exists; give a writable spool folder",
+            "settings.toml: File exists; choose a writable spool folder",
             1,
         ),
         (
             ["--to", "tcp://127.0.0.1:9", "--spool", "/proc"],
-            "/proc: No such file or directory; give a writable spool folder",
+            "/proc: No such file or directory; choose a writable spool folder",
             1,
         ),
-        (["--to", "tcp://127.0.0.1:9", "--ring", "0.1"], "--ring is 0.1 MB, but one measurement has 0.131 MB; give", 1),
+        (["--to", "tcp://127.0.0.1:9", "--ring", "0.1"], "--ring is 0.1 MB, but one measurement has 0.131 MB; use", 1),
         (
             ["--to", "tcp://127.0.0.1:9", "--spool", "s", "--spool-size", "1e-9"],
             "--spool-size is 1e-09 MB, but one measurement has 0.131 MB",
@@ -388,7 +388,7 @@ def test_capture_to_reports_errors_in_one_line(tmp_path, arguments, message, cod
 @pytest.mark.parametrize(
     ("arguments", "message", "code"),
     [
-        (["--duration", "0"], "--duration is 0; give a number above 0", 2),
+        (["--duration", "0"], "--duration is 0; use a number above 0", 2),
         (["--name", "a/b"], "sensor name 'a/b' cannot name a group in a file", 2),
         (["--to", "tcp://127.0.0.1:9", "--spool", "new/spool"], "ertis: error: serial port 'none' does not exist", 1),
     ],

@@ -254,13 +254,13 @@ def test_cfar_detects_nothing_in_silence(method):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"false_alarm": 0.0}, "false_alarm is 0; give a number from 1e-09 to 0.5"),
+        ({"false_alarm": 0.0}, "false_alarm is 0; use a number from 1e-09 to 0.5"),
         ({"method": "median"}, "method 'median' is unknown; known are ordered_statistic, cell_averaging, greatest_of"),
-        ({"n_reference": 5}, "n_reference is 5; give an even number, with half the bins on each side"),
-        ({"n_reference": 2}, "n_reference is 2; give a whole number from 4 to 512"),
+        ({"n_reference": 5}, "n_reference is 5; use an even number, with half the bins on each side"),
+        ({"n_reference": 2}, "n_reference is 2; use a whole number from 4 to 512"),
         (
             {"n_reference": 64},
-            "image has 37 ranges, but 64 reference bins need 69; give an image with a wider range window",
+            "image has 37 ranges, but 64 reference bins need 69; choose an image with a wider range window",
         ),
     ],
 )
@@ -272,7 +272,7 @@ def test_cfar_rejects_invalid_arguments(arguments, match):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        ({"within_db": -1.0}, "within_db is -1; give a number from 0 to 1000"),
+        ({"within_db": -1.0}, "within_db is -1; use a number from 0 to 1000"),
         ({"above_mean_db": -1.0}, "above_mean_db"),
     ],
 )
@@ -282,7 +282,7 @@ def test_clean_rejects_invalid_arguments(arguments, match):
 
 
 def test_find_peaks_rejects_mask_of_wrong_shape():
-    with pytest.raises(ArgumentError, match=r"where has shape \(2, 2\); give shape"):
+    with pytest.raises(ArgumentError, match=r"where has shape \(2, 2\); pass shape"):
         find_peaks(rayleigh(4), where=np.ones((2, 2), dtype=bool))
 
 

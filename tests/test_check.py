@@ -328,11 +328,11 @@ def test_another_layout_deviates(tmp_path):
 
 def test_rate_is_validated(tmp_path):
     path = stored(tmp_path / "a.h5", sound())
-    with pytest.raises(ArgumentError, match="nominal_rate_hz is nan; give a"):
+    with pytest.raises(ArgumentError, match="nominal_rate_hz is nan; use a"):
         check_recording(path, nominal_rate_hz=float("nan"))
-    assert run(path, "--rate", "nan", code=2).stderr.startswith("ertis: error: --rate is nan; give a finite number")
+    assert run(path, "--rate", "nan", code=2).stderr.startswith("ertis: error: --rate is nan; use a finite number")
     assert "-1.0 is not in the range x>0" in run(path, "--rate", "-1", code=2).stderr
-    assert "--rate is 1e+09; give a number from 1e-06 to 1e+06; see" in run(path, "--rate", "1e9", code=2).stderr
+    assert "--rate is 1e+09; use a number from 1e-06 to 1e+06; see" in run(path, "--rate", "1e9", code=2).stderr
 
 
 # Output.
@@ -465,7 +465,7 @@ def test_page_is_not_overwritten_without_force(tmp_path):
     target.write_text("mine")
     done = run(path, "--report", target, code=1)
     assert done.stderr == (
-        f"ertis: error: output {target} exists; give another name, or ask to overwrite it (--force)\n"
+        f"ertis: error: output {target} exists; choose another name, or replace the file (--force)\n"
     )
     assert done.stdout == ""
     assert target.read_text() == "mine"

@@ -28,6 +28,7 @@ MODULE = [sys.executable, "-m", "ertis_cli"]
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 ROOT = Path(__file__).parents[1]
 LAYOUT = ["--layout", "eRTIS_v3D1", "--preset", "short_25_50"]
+DEVIATIONS = ("angle_sd_deg", "range_sd_m", "level_sd_db")
 FAST = ["--range", "0.5:1.2", "--directions", "2d:9"]
 
 
@@ -68,7 +69,7 @@ def test_import_process_peaks_and_plot_raw_samples(tmp_path, raw):
     found = report("peaks", img, "--top", 2, "--all")["peaks"]
     assert [peak["measurement"] for peak in found] == [0, 0, 1, 1]
     places = {"azimuth_deg", "elevation_deg", "range_m"}
-    assert set(found[0]) == {"sensor", "measurement", *places, "level_db", "level_dbfs", "grid_error_deg"}
+    assert set(found[0]) == {"sensor", "measurement", *places, "level_db", "level_dbfs", "grid_error_deg", *DEVIATIONS}
     run("plot", img, "-o", picture, "-m", 1)
     assert picture.read_bytes().startswith(b"\x89PNG")
     with open_recording(rec) as back:
@@ -136,7 +137,7 @@ def test_info_reports_unknown_times_as_null(tmp_path):
 def test_peaks_prints_a_table(images):
     lines = run("peaks", images, "-m", 1, "--top", 1).stdout.splitlines()
     places = ["azimuth_deg", "elevation_deg", "range_m"]
-    assert lines[0].split() == ["sensor", "measurement", *places, "level_db", "level_dbfs"]
+    assert lines[0].split() == ["sensor", "measurement", *places, "level_db", "level_dbfs", *DEVIATIONS]
     assert lines[1].split()[:2] == ["sensor", "1"]
     assert len(lines) == 2
 
@@ -276,7 +277,8 @@ def test_import_help_lists_all_presets():
 
 def test_command_modules_import_libraries_lazily():
     """Modules of commands import only click, the standard library and small tables, so that help appears at once."""
-    tables = {"ertis_numba.beamformers", "ertis_numba.constants"}  # without NumPy, as the next test checks
+    # They load no NumPy, as the next test checks.
+    tables = {"ertis_numba.beamformers", "ertis_numba.constants", "ertis_numba.units"}
     allowed = {*sys.stdlib_module_names, "click", "ertis_cli"}
     for path in Path(options.__file__).parent.glob("*.py"):
         for node in ast.parse(path.read_text()).body:
@@ -401,7 +403,7 @@ def test_command_never_overwrites_its_input(tmp_path, command):
     before = path.read_bytes()
     arguments = [command, path, "-o", path, "--force", *(LAYOUT if command == "import" else [])]
     done = run(*arguments, code=1)
-    assert "is the input itself; give another name" in done.stderr
+    assert "is the input itself; choose another name" in done.stderr
     assert path.read_bytes() == before
 
 

@@ -54,12 +54,12 @@ CASES = {
     "temperature": (
         RAW.format("good.bin") + " --temperature nan",
         2,
-        "--temperature is nan; give a finite number",
+        "--temperature is nan; use a finite number",
     ),
     "sensor name": (
         RAW.format("good.bin") + " --sensor a/b",
         2,
-        "sensor name 'a/b' cannot name a group in a file; give",
+        "sensor name 'a/b' cannot name a group in a file; use",
     ),
     # recordings
     "missing recording": ("process none.h5 -o out.h5", 1, "none.h5: No such file or directory; choose a recording"),
@@ -86,13 +86,13 @@ CASES = {
         "folder: no file in this folder ends in .h5; choose a folder with recordings or results",
     ),
     # processing
-    "no directions": ("process rec.h5 -o out.h5 --directions 2d:0", 2, "count of directions '2d:0' is 0; give a whole"),
+    "no directions": ("process rec.h5 -o out.h5 --directions 2d:0", 2, "count of directions '2d:0' is 0; use a whole"),
     "empty directions": (
         "process rec.h5 -o out.h5 --directions 3d:",
         2,
-        "directions '3d:' has no count; give a number",
+        "directions '3d:' has no count; use a number",
     ),
-    "unknown directions": ("process rec.h5 -o out.h5 --directions 4d:3", 2, "directions '4d:3' is not a grid; give 90"),
+    "unknown directions": ("process rec.h5 -o out.h5 --directions 4d:3", 2, "directions '4d:3' is not a grid; use 90"),
     "empty CSV": (
         "process rec.h5 -o out.h5 --directions empty.csv",
         1,
@@ -100,13 +100,13 @@ CASES = {
     ),
     "missing CSV": ("process rec.h5 -o out.h5 --directions none.csv", 1, "directions none.csv: No such file"),
     "range outside": ("process rec.h5 -o out.h5 --range 1:50", 1, "--range ends at 50 m, but the record"),
-    "range backwards": ("process rec.h5 -o out.h5 --range 3:1", 2, "--range runs from 3 to 1; give the"),
-    "range NaN": ("process rec.h5 -o out.h5 --range nan:1", 2, "--range is nan; give a finite number"),
-    "no range": ("process rec.h5 -o out.h5 --range 3", 2, "'3' is not an interval; give two numbers, as in 0.5:5"),
+    "range backwards": ("process rec.h5 -o out.h5 --range 3:1", 2, "--range runs from 3 to 1; use the"),
+    "range NaN": ("process rec.h5 -o out.h5 --range nan:1", 2, "--range is nan; use a finite number"),
+    "no range": ("process rec.h5 -o out.h5 --range 3", 2, "'3' is not an interval; use two numbers, as in 0.5:5"),
     "limits of a paper grid": (
         "process rec.h5 -o out.h5 --directions 90 --azimuth -9:9",
         2,
-        "directions 90 have fixed limits; give --directions 2d:N or 3d:N with limits; see 'ertis process --help'",
+        "directions 90 have fixed limits; use --directions 2d:N or 3d:N with limits; see 'ertis process --help'",
     ),
     "limits of a CSV": (
         "process rec.h5 -o out.h5 --directions mine.csv --azimuth -9:9",
@@ -116,22 +116,22 @@ CASES = {
     "elevation of a plane": (
         "process rec.h5 -o out.h5 --directions 2d:9 --elevation 20:50",
         2,
-        "directions 2d:9 lie at one elevation; give it as --elevation E, or give --directions 3d:N; see",
+        "directions 2d:9 lie at one elevation; use --elevation E, or --directions 3d:N; see",
     ),
     "one elevation of a solid angle": (
         "process rec.h5 -o out.h5 --directions 3d:9 --elevation 20",
         2,
-        "directions 3d:9 lie between two elevations; give --elevation A:B, or give --directions 2d:N; see",
+        "directions 3d:9 lie between two elevations; use --elevation A:B, or --directions 2d:N; see",
     ),
     "elevation of a paper grid": (
         "process rec.h5 -o out.h5 --directions 90 --elevation 20",
         2,
-        "directions 90 have fixed limits; give --directions 2d:N or 3d:N with limits; see",
+        "directions 90 have fixed limits; use --directions 2d:N or 3d:N with limits; see",
     ),
     "elevation above the zenith": (
         "process rec.h5 -o out.h5 --directions 2d:9 --elevation 91",
         2,
-        "--elevation is 91; give a number",
+        "--elevation is 91; use a number",
     ),
     "unknown device": (
         "process rec.h5 -o out.h5 --device tpu",
@@ -139,7 +139,7 @@ CASES = {
         "'tpu' is not one of 'auto', 'cpu', 'cuda', 'numpy'",
     ),
     "unknown method": ("process rec.h5 -o out.h5 --method quick", 2, "'quick' is not one of 'fast', 'paper'"),
-    "no threads": ("process rec.h5 -o out.h5 --threads 0", 2, "--threads is 0; give a whole number from 1"),
+    "no threads": ("process rec.h5 -o out.h5 --threads 0", 2, "--threads is 0; use a whole number from 1"),
     "unknown key": (
         "process rec.h5 -o out.h5 --settings key.toml",
         1,
@@ -147,22 +147,30 @@ CASES = {
     ),
     "not TOML": ("process rec.h5 -o out.h5 --settings nan.csv", 1, "nan.csv is not TOML; choose a settings file"),
     "missing settings": ("process rec.h5 -o out.h5 --settings none.toml", 1, "none.toml: No such file"),
-    "other length": ("process rec.h5 -o out.h5 --settings long.toml", 1, "give the settings that it was recorded with"),
+    "other length": ("process rec.h5 -o out.h5 --settings long.toml", 1, "use the settings that it was recorded with"),
     # outputs
-    "output exists": ("process rec.h5 -o img.h5", 1, "output img.h5 exists; give another name, or ask to overwrite it"),
-    "output is a folder": ("process rec.h5 -o folder --force", 1, "output folder is a folder; give the name of a file"),
+    "output exists": (
+        "process rec.h5 -o img.h5",
+        1,
+        "output img.h5 exists; choose another name, or replace the file",
+    ),
+    "output is a folder": (
+        "process rec.h5 -o folder --force",
+        1,
+        "output folder is a folder; choose the name of a file",
+    ),
     "no such folder": ("process rec.h5 -o none/out.h5", 1, "output none/out.h5: folder none does not exist; create it"),
-    "output is the input": ("process rec.h5 -o rec.h5 --force", 1, "output rec.h5 is the input itself; give"),
+    "output is the input": ("process rec.h5 -o rec.h5 --force", 1, "output rec.h5 is the input itself; choose"),
     # views of files
-    "no such measurement": ("plot img.h5 -o out.png -m 7", 1, "--measurement is 7; give a whole number from 0 to 0"),
+    "no such measurement": ("plot img.h5 -o out.png -m 7", 1, "--measurement is 7; use a whole number from 0 to 0"),
     "negative measurement": (
         "peaks img.h5 -m -1",
         2,
         "Invalid value for '--measurement' / '-m': -1 is not in the range x>=0",
     ),
-    "no peaks": ("peaks img.h5 --top 0", 2, "--top is 0; give a whole number of at least 1"),
-    "peaks above": ("peaks img.h5 --min-level 3", 2, "--min-level is 3; give a number from -1000 to 0"),
-    "nothing at that level": ("compare truth.h5 --min-level 3", 2, "--min-level is 3; give a number from -1000 to 0"),
+    "no peaks": ("peaks img.h5 --top 0", 2, "--top is 0; use a whole number of at least 1"),
+    "peaks above": ("peaks img.h5 --min-level 3", 2, "--min-level is 3; use a number from -1000 to 0"),
+    "nothing at that level": ("compare truth.h5 --min-level 3", 2, "--min-level is 3; use a number from -1000 to 0"),
     "this folder": ("plot .", 1, ". is a folder; choose a recording, an energyscape file or a file of acoustic maps"),
     "root": (
         "plot / --kind array",
@@ -179,12 +187,12 @@ CASES = {
         1,
         "picture out.bmp ends in '.bmp'; choose a name that ends in .pdf",
     ),
-    "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 2, "--dynamic-range is -5; give a number above 0"),
+    "dynamic range": ("plot img.h5 -o out.png --dynamic-range -5", 2, "--dynamic-range is -5; use a number above 0"),
     # sensors and ground truth
     "which sensor": (
         "plot two.h5 -o out.png",
         1,
-        "two.h5 contains 2 sensors; choose one of left, right (sensor, --sensor)",
+        "two.h5 contains 2 sensors; choose one of left, right (--sensor)",
     ),
     "no such sensor to process": ("process rec.h5 -o out.h5 --sensor x", 1, "has no sensor 'x'; choose one of eRTIS-7"),
     "no such sensor to plot": ("plot two.h5 -o out.png --sensor x", 1, "no sensor 'x'; choose one of left, right"),
@@ -208,7 +216,7 @@ CASES = {
     "part of the truth": (
         "peaks truth.h5 --truth --top 3",
         2,
-        "--top would omit reflectors that --truth compares; give one of them; see 'ertis peaks --help'",
+        "--top would omit reflectors that --truth compares; choose one of them; see 'ertis peaks --help'",
     ),
     # usage
     "unknown command": ("prozess", 2, "No such command 'prozess'"),

@@ -83,9 +83,9 @@ def test_command_decode_error_truncates_long_lines():
     ("arguments", "message"),
     [
         (("Q",), "command 'Q' is unknown; known are Y, G, F"),
-        (("G", -1), "first number of command G is -1; give a whole number from 0 to 4294967295"),
-        (("C", 0, 2**32), "second number of command C is 4294967296; give a whole number from 0 to 4294967295"),
-        (("C", 0, 0, 1.0), "third number of command C is 1.0; give a whole number"),
+        (("G", -1), "first number of command G is -1; use a whole number from 0 to 4294967295"),
+        (("C", 0, 2**32), "second number of command C is 4294967296; use a whole number from 0 to 4294967295"),
+        (("C", 0, 0, 1.0), "third number of command C is 1.0; use a whole number"),
     ],
 )
 def test_command_rejects_unknown_letter_and_invalid_numbers(arguments, message):
@@ -141,7 +141,7 @@ def test_answer_of_wrong_length_is_refused(data):
 
 
 def test_answer_above_32_bits_is_refused():
-    with pytest.raises(ArgumentError, match="answer is 4294967296; give a whole number from 0 to 4294967295"):
+    with pytest.raises(ArgumentError, match="answer is 4294967296; use a whole number from 0 to 4294967295"):
         commands.encode_answer(2**32)
 
 
@@ -156,10 +156,10 @@ def test_block_bytes_are_fixed():
 @pytest.mark.parametrize(
     ("counter", "words", "message"),
     [
-        (-1, np.zeros(1, np.uint32), "counter is -1; give a whole number from 0 to 4294967295"),
-        (0, np.zeros(1, np.int32), r"words are int32 of shape \(1,\); give \(sample,\) uint32"),
-        (0, np.zeros(1, np.uint64), r"words are uint64 of shape \(1,\); give \(sample,\) uint32"),
-        (0, np.zeros((1, 2), np.uint32), r"words are uint32 of shape \(1, 2\); give \(sample,\) uint32"),
+        (-1, np.zeros(1, np.uint32), "counter is -1; use a whole number from 0 to 4294967295"),
+        (0, np.zeros(1, np.int32), r"words are int32 of shape \(1,\); use \(sample,\) uint32"),
+        (0, np.zeros(1, np.uint64), r"words are uint64 of shape \(1,\); use \(sample,\) uint32"),
+        (0, np.zeros((1, 2), np.uint32), r"words are uint32 of shape \(1, 2\); use \(sample,\) uint32"),
     ],
 )
 def test_encode_block_rejects_invalid_counter_and_samples(counter, words, message):
@@ -236,26 +236,29 @@ def _recording(**changes):
 
 
 REFUSED = [
-    (_recording(n_samples=100_000), "recording.n_samples is 100000, but a sensor measures multiples .*; give 98304"),
-    (_recording(n_samples=100), "recording.n_samples is 100, but a sensor measures multiples .*; give 32768"),
-    (_recording(n_samples=2**25), "recording.n_samples is 33554432, but .* up to 16777216; give 16777216"),
+    (_recording(n_samples=100_000), "recording.n_samples is 100000, but a sensor measures multiples .*; use 98304"),
+    (_recording(n_samples=100), "recording.n_samples is 100, but a sensor measures multiples .*; use 32768"),
+    (_recording(n_samples=2**25), "recording.n_samples is 33554432, but .* up to 16777216; use 16777216"),
     (
         _recording(sample_rate_hz=4_000_000.0),
-        "recording.sample_rate_hz is 4000000, but .* are 4500000 and 1125000; give one",
+        "recording.sample_rate_hz is 4000000, but .* clocks are 4500000 and 1125000; choose one",
     ),
-    (_call(sample_rate_hz=450_000.5), "call.sample_rate_hz is 450000.5; give a whole number from 160000 to 2000000"),
-    (_call(sample_rate_hz=159_999.0), "call.sample_rate_hz is 159999; give a whole number from 160000 to 2000000"),
-    (_call(sample_rate_hz=2e6 + 1), "call.sample_rate_hz is 2000001; give a whole number from 160000 to 2000000"),
+    (_call(sample_rate_hz=450_000.5), "call.sample_rate_hz is 450000.5; use a whole number from 160000 to 2000000"),
+    (_call(sample_rate_hz=159_999.0), "call.sample_rate_hz is 159999; use a whole number from 160000 to 2000000"),
+    (_call(sample_rate_hz=2e6 + 1), "call.sample_rate_hz is 2000001; use a whole number from 160000 to 2000000"),
     (
         _call(duration_s=1e-4),
-        "call has 46 samples, .* plays 64 to 65535; give call.delay_s and call.duration_s that add up to 0.00014 to",
+        "call has 46 samples, .* plays 64 to 65535; use call.delay_s and call.duration_s that add up to 0.00014 to",
     ),
     (_call(duration_s=0.15), "call has 67501 samples, but a sensor plays 64 to 65535; .* to 0.146"),
     (
         {"array": Array(layout="wide", positions_m=WIDE)},
-        "array has 33 channels, but a sensor has 32; give at most 32 positions",
+        "array has 33 channels, but a sensor has 32; use at most 32 positions",
     ),
-    ({"array": Array(layout="line", positions_m=LINE_8, word_bits=8)}, "array.word_bits is 8, but .* have 32; give 32"),
+    (
+        {"array": Array(layout="line", positions_m=LINE_8, word_bits=8)},
+        "array.word_bits is 8, but .* words have 32 bits; use 32",
+    ),
 ]
 
 
@@ -276,8 +279,8 @@ def test_setup_accepts_the_shortest_and_longest_call(n_samples):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"pin": 3}, "pin is 3; give a whole number from 1 to 2"),
-        ({"emissions": 0}, "emissions is 0; give a whole number from 1 to"),
+        ({"pin": 3}, "pin is 3; use a whole number from 1 to 2"),
+        ({"emissions": 0}, "emissions is 0; use a whole number from 1 to"),
     ],
 )
 def test_setup_of_settings_rejects_invalid_options(changes, message):
@@ -295,16 +298,16 @@ CODES = call_codes(Call())
             {"n_samples": 100_000},
             r"recording\.n_samples is 100000, but a sensor measures multiples of 32768 up to 16777216",
         ),
-        ({"n_samples": 0}, "n_samples is 0; give a whole number of at least 1"),
-        ({"n_samples": 32_768.0}, "n_samples is 32768.0; give a whole number"),
+        ({"n_samples": 0}, "n_samples is 0; use a whole number of at least 1"),
+        ({"n_samples": 32_768.0}, "n_samples is 32768.0; use a whole number"),
         ({"pdm_rate_hz": 4e6}, "sample_rate_hz is 4000000, but a sensor's clocks are 4500000 and 1125000"),
-        ({"dac_rate_hz": 100_000}, "sample_rate_hz is 100000; give a whole number from 160000 to 2000000"),
+        ({"dac_rate_hz": 100_000}, "sample_rate_hz is 100000; use a whole number from 160000 to 2000000"),
         ({"codes": CODES[:63]}, "call has 63 samples, but a sensor plays 64 to 65535"),
-        ({"codes": CODES.astype(int)}, r"codes are int64 of shape \(1126,\); give \(sample,\) uint16"),
-        ({"codes": CODES[None]}, r"codes are uint16 of shape \(1, 1126\); give \(sample,\) uint16"),
+        ({"codes": CODES.astype(int)}, r"codes are int64 of shape \(1126,\); use \(sample,\) uint16"),
+        ({"codes": CODES[None]}, r"codes are uint16 of shape \(1, 1126\); use \(sample,\) uint16"),
         ({"codes": CODES + np.uint16(2_000)}, r"codes reach \d+, but a sensor's converter accepts 0 to 4095"),
-        ({"emissions": 0}, "emissions is 0; give a whole number from 1 to"),
-        ({"pin": 3}, "pin is 3; give a whole number from 1 to 2"),
+        ({"emissions": 0}, "emissions is 0; use a whole number from 1 to"),
+        ({"pin": 3}, "pin is 3; use a whole number from 1 to 2"),
         (
             {"amplifier": False},
             "active is True with the amplifier off, which emits nothing; switch it on",

@@ -219,7 +219,7 @@ def test_errors_of_no_match_are_none():
 
 
 def test_compare_rejects_invalid_min_level():
-    with pytest.raises(ArgumentError, match="min_level_db is 3; give a number from -1000 to 0"):
+    with pytest.raises(ArgumentError, match="min_level_db is 3; use a number from -1000 to 0"):
         compare(ideal(MIDDLE), [], min_level_db=3.0)
 
 

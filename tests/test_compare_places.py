@@ -193,7 +193,7 @@ def test_joined_keeps_the_strongest_at_each_place():
 @pytest.mark.parametrize("compare", [compare_map, compare_points])
 def test_compare_of_places_refuses_a_positive_level(compare):
     given = (occupancy(), {}) if compare is compare_map else (cloud(), {"is_planar": True})
-    with pytest.raises(ArgumentError, match="min_level_db is 3; give a number from -1000 to 0"):
+    with pytest.raises(ArgumentError, match="min_level_db is 3; use a number from -1000 to 0"):
         compare(given[0], [], NONE, min_level_db=3.0, **given[1])
 
 

@@ -124,9 +124,9 @@ def test_unknown_command_suggests_known_ones(tmp_path, line, message):
         ("[proces]\n", "'proces' is not a command; did you mean 'process'?"),
         ("[process]\nmax_errors = 1\n", "process has no option 'max_errors'; did you mean 'max-error'?"),
         ("[keys.new]\nfoo = 1\n", "keys new has no option 'foo'; choose one of "),
-        ("process = 3\n", "process is 3; give a table of options, as in [process]"),
+        ("process = 3\n", "process is 3; write a table of options, as in [process]"),
         ("[process]\nthreads = 'x'\n", "'x' is not a valid integer (from ertis.toml)"),
-        ("[process\n", "give a readable TOML file (--config)"),
+        ("[process\n", "choose a readable TOML file (--config)"),
     ],
     ids=["command", "option", "of a group", "no table", "value", "no TOML"],
 )
@@ -143,7 +143,7 @@ def test_missing_config_file_is_reported(tmp_path):
     done = ertis("--config", "none.toml", "info", REFLECTORS, folder=tmp_path)
     assert (done.exit_code, done.stderr) == (
         1,
-        "ertis: error: none.toml: No such file or directory; give a readable TOML file (--config)\n",
+        "ertis: error: none.toml: No such file or directory; choose a readable TOML file (--config)\n",
     )
 
 
@@ -155,7 +155,7 @@ def test_help_and_completion_work_without_config_file(tmp_path):
         assert len(done.stdout.splitlines()) > 10
         warned = (
             done.stderr
-            == "ertis: warning: none.toml: No such file or directory; give a readable TOML file (--config)\n"
+            == "ertis: warning: none.toml: No such file or directory; choose a readable TOML file (--config)\n"
         )
         assert warned == (line != "--help")
 

@@ -381,7 +381,7 @@ def test_code_of_the_network_page_configures_a_sensor(tmp_path):
 def test_command_without_settings_is_refused(tmp_path):
     done = configure(tmp_path, "tcp://127.0.0.1:1", "one", "--temperature", "25")
     assert done.exit_code == 2
-    assert "all settings of the sensor are replaced; give them with --preset or --settings" in done.stderr
+    assert "all settings of the sensor are replaced; add --preset or --settings" in done.stderr
 
 
 def test_only_admins_may_change_settings(tmp_path):
@@ -526,17 +526,17 @@ def test_request_ends_at_once_if_the_sensor_node_leaves(tmp_path, says_bye):
 def test_arguments_of_configure_are_validated(tmp_path):
     with answering(tmp_path, None) as client:
         for arguments, message in (
-            ((3, SETTINGS), "sensor is of type int; give the name of a sensor"),
-            (("front", "short_25_50"), "settings is of type str; give Settings, which"),
+            ((3, SETTINGS), "sensor is of type int; choose the name of a sensor"),
+            (("front", "short_25_50"), "settings is of type str; use Settings, which"),
             (("front", None), "settings is of type NoneType"),
-            (("front", SETTINGS, float("nan")), "patience_s is nan; give a finite number"),
-            (("front", SETTINGS, "long"), "patience_s is 'long'; give a number"),
+            (("front", SETTINGS, float("nan")), "patience_s is nan; use a finite number"),
+            (("front", SETTINGS, "long"), "patience_s is 'long'; use a number"),
         ):
             with pytest.raises(ArgumentError, match=message):
                 client.configure(*arguments)
-        with pytest.raises(ArgumentError, match="patience_s is 0; give a number above 0"):
+        with pytest.raises(ArgumentError, match="patience_s is 0; use a number above 0"):
             client.status(0)
-    with pytest.raises(ArgumentError, match="keys is of type str; give ClientKeys"):
+    with pytest.raises(ArgumentError, match="keys is of type str; use ClientKeys"):
         CentralClient("tcp://127.0.0.1:5601", keys="mine")
     with pytest.raises(ArgumentError, match="address 5601 cannot be used"):
         CentralClient(5601)

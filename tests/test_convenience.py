@@ -49,16 +49,16 @@ def test_pipeline_accepts_a_settings_path(tmp_path):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda _: ertis.Pipeline(7), "settings is of type int; give Settings"),
-        (lambda _: ertis.Pipeline(None), "settings is of type NoneType; give Settings"),
+        (lambda _: ertis.Pipeline(7), "settings is of type int; pass Settings,"),
+        (lambda _: ertis.Pipeline(None), "settings is of type NoneType; pass Settings,"),
         (lambda _: ertis.Pipeline("missing.toml"), "missing.toml"),
-        (lambda shown: ertis.find_peaks(shown.amplitude), "image is of type ndarray; give Energyscape"),
+        (lambda shown: ertis.find_peaks(shown.amplitude), "image is of type ndarray; pass an "),
         (lambda shown: ertis.find_peaks(shown, false_alarm=2), "false_alarm is 2"),
-        (lambda shown: shown.replace(amplitude=shown.amplitude[:, 1:]), r"amplitude has shape \(91, \d+\); give shape"),
-        (lambda shown: shown.replace(elevation_rad=np.zeros(3)), r"elevation_rad has shape \(3,\); give shape \(91,\)"),
+        (lambda shown: shown.replace(amplitude=shown.amplitude[:, 1:]), r"amplitude has shape \(91, \d+\); pass shape"),
+        (lambda shown: shown.replace(elevation_rad=np.zeros(3)), r"elevation_rad has shape \(3,\); pass shape \(91,\)"),
         (
             lambda shown: shown.replace(amplitdue=shown.amplitude),
-            r"an image has no field 'amplitdue' \(did you mean 'amplitude'\?\); give some of amplitude",
+            r"an image has no field 'amplitdue' \(did you mean 'amplitude'\?\); choose some of amplitude",
         ),
     ],
 )

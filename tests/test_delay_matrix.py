@@ -151,7 +151,7 @@ def test_delays_are_read_from_a_file_beside_the_settings(tmp_path, suffix):
     [
         (
             {"delay_matrix": ((1.0, 2.0), (3.0,))},
-            "processing.delay_matrix has rows of 1 to 2 numbers; give one for each",
+            "processing.delay_matrix has rows of 1 to 2 numbers; write one number for each",
         ),
         ({"delay_matrix": np.zeros((1000, 32))}, "lists 1000 × 32 numbers; the limit is 20000, so give the name of a"),
         ({"delay_matrix": ((1.0,),), "beamformer": "dmas"}, "is given, which processing.beamformer 'dmas' does not"),
@@ -159,7 +159,7 @@ def test_delays_are_read_from_a_file_beside_the_settings(tmp_path, suffix):
             {"delay_matrix": ((1.0,),), "wavefront": "auto"},
             "is given, which processing.wavefront 'auto' does not support",
         ),
-        ({"delay_rate_hz": 0.0}, "processing.delay_rate_hz is 0; give a number from 1"),
+        ({"delay_rate_hz": 0.0}, "processing.delay_rate_hz is 0; use a number from 1"),
     ],
 )
 def test_unusable_matrices_are_refused_by_settings(changes, message):
@@ -185,16 +185,16 @@ def test_damaged_header_of_an_npy_file_is_refused(tmp_path):
     [
         (
             np.zeros((7, 31)),
-            r"has shape \(7, 31\), but the image has 7 directions and the array 32 channels; give shape",
+            r"has shape \(7, 31\), but the image has 7 directions and the array 32 channels; pass shape",
         ),
-        (np.zeros((32, 7)), r"give shape \(7, 32\), a row for each direction; transpose it"),
-        (np.full((7, 32), np.nan), r"processing.delay_matrix holds nan at \[0, 0\]; give finite numbers"),
+        (np.zeros((32, 7)), r"pass shape \(7, 32\), a row for each direction; transpose it"),
+        (np.full((7, 32), np.nan), r"processing.delay_matrix holds nan at \[0, 0\]; pass finite numbers"),
         (
             np.eye(7, 32) * 1e6,
             "delays of up to 2153 ms relative to the mean of their direction, but the limit is 20 ms",
         ),
         ("none.csv", "processing.delay_matrix none.csv cannot be read"),
-        ("none.txt", "processing.delay_matrix none.txt is not a .csv or .npy file; give one, or a list of rows"),
+        ("none.txt", "processing.delay_matrix none.txt is not a .csv or .npy file; use such a file, or a list of rows"),
     ],
 )
 def test_unusable_matrices_are_refused_by_pipelines(samples, message, tmp_path, monkeypatch):
@@ -215,7 +215,7 @@ def test_unreadable_files_are_refused(tmp_path):
         with pytest.raises(ArgumentError, match=message):
             delay_matrix(given(str(tmp_path / name)), n_directions=2)
     np.save(tmp_path / "flat.npy", np.zeros(3))
-    with pytest.raises(ArgumentError, match=r"flat.npy contains float64 of shape \(3,\); give rows of real numbers"):
+    with pytest.raises(ArgumentError, match=r"flat.npy contains float64 of shape \(3,\); pass rows of real numbers"):
         delay_matrix(given(str(tmp_path / "flat.npy")), n_directions=3)
 
 
@@ -224,6 +224,6 @@ def test_unreadable_files_are_refused(tmp_path):
     [("delay_taps", 2, "0"), ("precision", "int16", "'float32'"), ("oversampling", 2, "1"), ("beam_taps", 2, "0")],
 )
 def test_plans_with_other_delays_are_refused_with_a_matrix(key, value, accepted):
-    message = f"accuracy.{key} is {value!r}, but processing.delay_matrix needs exact delays; leave {key} out or give "
+    message = f"accuracy.{key} is {value!r}, but processing.delay_matrix needs exact delays; leave {key} out or use "
     with pytest.raises(ArgumentError, match=re.escape(message + accepted)):
         given(random_samples(SHORT)).replace(f"accuracy.{key}", value)

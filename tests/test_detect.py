@@ -145,7 +145,7 @@ def test_find_peaks_accepts_silence_and_small_images(shape):
 
 @pytest.mark.parametrize(
     ("arguments", "match"),
-    [({"top": 0}, "top is 0; give a whole number of at least 1"), ({"min_level_db": 3.0}, "min_level_db is 3")],
+    [({"top": 0}, "top is 0; use a whole number of at least 1"), ({"min_level_db": 3.0}, "min_level_db is 3")],
 )
 def test_find_peaks_rejects_invalid_arguments(arguments, match):
     with pytest.raises(ArgumentError, match=match):

@@ -65,7 +65,7 @@ def test_command_disarms_the_sensor(device):
 
 @pytest.mark.parametrize("text", ["", "Y", "!Y,0,0", "!Y,0,0,0\n", "!y,0,0,0", "!Y,-1,0,0", "!Y,0,0,0;", "!Ü,0,0,0"])
 def test_text_that_is_no_command_is_refused(device, text):
-    with SonarDriver.open("mine") as sonar, pytest.raises(ArgumentError, match="give '!X,i,j,k' with a letter X"):
+    with SonarDriver.open("mine") as sonar, pytest.raises(ArgumentError, match="use '!X,i,j,k' with a letter X"):
         sonar.command(text)
     assert device.refused == 0
 
@@ -179,7 +179,7 @@ def test_command_line_sends_commands(device):
     assert json.loads(done.stdout) == {"command": "!Y,0,0,0", "answer": 65536}
     refused = run("command", "--port", "mine", "!K,1,0,0", "nonsense")
     assert (refused.exit_code, device.registers.amplifier) == (1, 0)
-    assert "give '!X,i,j,k'" in refused.stderr
+    assert "use '!X,i,j,k'" in refused.stderr
     refused = run("command", "--port", "mine", f"!B,{2**32},0,0")
     assert (refused.exit_code, device.registers.counter) == (1, 0)
     assert "whole numbers up to 4294967295" in refused.stderr
@@ -201,14 +201,14 @@ def test_command_line_resets_a_sensor(tmp_path):
         refused = run("reset", "--port", "mine", *arguments)
         assert refused.exit_code == 1
         assert message in refused.stderr
-    for arguments, message in ((["--pin", 9, "--hook", "true"], "give one of them"), (["--hook", " "], "is empty")):
+    for arguments, message in ((["--pin", 9, "--hook", "true"], "choose one of them"), (["--hook", " "], "is empty")):
         refused = run("reset", "--port", "mine", *arguments)
         assert refused.exit_code == 2
         assert message in refused.stderr
 
 
 def test_period_of_emissions_is_limited():
-    with pytest.raises(ArgumentError, match=r"emission_period_s is 1 s, .* at most 65535 samples; give at most 0\.146"):
+    with pytest.raises(ArgumentError, match=r"emission_period_s is 1 s, .* at most 65535 samples; use at most 0\.146"):
         Setup.of(SHORT, emissions=2, emission_period_s=1.0)
 
 

@@ -230,7 +230,7 @@ def test_direct_sound_shows_a_broken_emitter(names, diameter_m, direct_sound_db,
 def test_measurement_without_a_mounting_is_refused():
     made = scene()
     check = DirectSoundCheck({"front": mountings(made)["front"]})
-    with pytest.raises(ArgumentError, match="measurements has sensor 'left', but its mounting is unknown"):
+    with pytest.raises(ArgumentError, match="measurements has sensor 'left', whose mounting is unknown"):
         check.add(heard(made))
 
 

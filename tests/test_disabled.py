@@ -74,8 +74,8 @@ def test_settings_omit_empty_disabled_list():
 @pytest.mark.parametrize(
     ("disabled", "message"),
     [
-        ((32,), "array.disabled is 32; give a whole number from 0 to 31"),
-        ((-1,), "array.disabled is -1; give a whole number from 0"),
+        ((32,), "array.disabled is 32; use a whole number from 0 to 31"),
+        ((-1,), "array.disabled is -1; use a whole number from 0"),
         (tuple(range(32)), "array.disabled disables all 32 microphones; name fewer channels"),
     ],
 )
@@ -179,8 +179,8 @@ def test_process_advice_on_faulty_microphones_works(recording, tmp_path):
 @pytest.mark.parametrize(
     ("channels", "message"),
     [
-        ("x", "'x' is not a list of channels; give integers from 0 to 1023, as in 5,12"),
-        ("40", "--without is 40; give a whole number from 0 to 31"),
+        ("x", "'x' is not a list of channels; use integers from 0 to 1023, as in 5,12"),
+        ("40", "--without is 40; use a whole number from 0 to 31"),
     ],
 )
 def test_process_without_rejects_invalid_channels(recording, tmp_path, channels, message):

@@ -200,4 +200,4 @@ def test_doctor_prints_a_table_and_rejects_missing_folder(tmp_path):
     assert any(line.startswith("ok") for line in lines)
     refused = CliRunner().invoke(cli, ["doctor", "--folder", str(tmp_path / "none")])
     assert refused.exit_code == 1
-    assert "is not a folder; give an existing folder" in refused.output
+    assert "is not a folder; choose an existing folder" in refused.output

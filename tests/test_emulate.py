@@ -107,7 +107,7 @@ def test_emulate_unplugs_and_reconnects_its_devices(emulate, recording, tmp_path
         assert ask(port, b"!Y,0,0,0\n") == 0x010000
     second = emulate(recording, "--sensor", "left", "--link", link)
     assert second.communicate(timeout=TIMEOUT_S)[1] == (
-        f"ertis: error: link {link} belongs to a running emulated device; end that one, or give another name\n"
+        f"ertis: error: link {link} belongs to a running emulated device; end that one, or choose another name\n"
     )
     assert second.returncode == 1
     code, out, errors = ended(process, signal.SIGINT)
@@ -184,14 +184,14 @@ range_m = 0.4
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (["--fault", "lose"], 2, "'lose' is not a fault; give a kind and a probability, as in lose=0.01"),
+        (["--fault", "lose"], 2, "'lose' is not a fault; choose a kind and a probability, as in lose=0.01"),
         (["--fault", "loose=1"], 2, "--fault: kind of fault 'loose' is unknown (did you mean 'lose'?)"),
         (["--count", "3"], 2, "--count is for scenes; remove it for a recording"),
         (["--link", "here"], 2, "--link is for one device, but rec.h5 has 2 sensors; choose one with --sensor"),
         (
             ["--sensor", "left", "--link", "none/here"],
             1,
-            "link none/here: folder none does not exist; create it or give",
+            "link none/here: folder none does not exist; create it or choose",
         ),
         (["--sensor", "middle"], 1, "rec.h5 has no sensor 'middle'; choose one of left, right"),
         (["--sync-rate", "0"], 2, "0.0 is not in the range 0.001<=x<=1000.0"),

@@ -106,8 +106,8 @@ def test_unreadable_samples_stop_the_emulator():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "number of measurements to emulate is 0; give a whole number of at least 1"),
-        ([np.zeros(4, np.uint8)], "measurements to emulate are 1-dimensional uint8; give one uint32 word per sample"),
+        ([], "number of measurements to emulate is 0; use a whole number of at least 1"),
+        ([np.zeros(4, np.uint8)], "measurements to emulate are 1-dimensional uint8; use one uint32 word per sample"),
         ([np.zeros((4, 2), np.uint32)], "measurements to emulate are 2-dimensional uint32"),
     ],
 )
@@ -129,7 +129,7 @@ def test_emulator_link_is_exclusive_to_one_device(tmp_path):
     with Emulator(WORDS, link=link) as device:
         assert link.readlink() == Path(device.port)
     link.write_text("precious")
-    with pytest.raises(ArgumentError, match="front exists but is not a link to a port; give another name"):
+    with pytest.raises(ArgumentError, match="front exists but is not a link to a port; choose another name"):
         HeldLink(link)
     assert link.read_text() == "precious"
 

@@ -92,7 +92,7 @@ def test_every_copied_scene_can_be_loaded():
 def test_example_overwrites_only_with_force():
     Path("line.toml").write_text("mine")
     assert (
-        "line.toml exists; give another name, or ask to overwrite it (--force)" in run("example", "line", code=1).stderr
+        "line.toml exists; choose another name, or replace the file (--force)" in run("example", "line", code=1).stderr
     )
     assert Path("line.toml").read_text() == "mine"
     assert not Path("line.h5").exists()
@@ -114,7 +114,7 @@ def test_demo_keeps_files_of_an_earlier_demo():
     folder.mkdir()
     (folder / "image.png").write_text("mine")
     reported = run("demo", code=1).stderr
-    assert "image.png exists; give another folder (--output), or overwrite it (--force)" in reported
+    assert "image.png exists; choose another folder (--output), or overwrite the output (overwrite=True)" in reported
     assert (folder / "image.png").read_text() == "mine"
 
 

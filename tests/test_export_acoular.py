@@ -118,18 +118,18 @@ def test_acoular_files_have_the_documented_content(tmp_path):
 
 def test_acoular_export_refuses_invalid_input(tmp_path, monkeypatch):
     for given, message in (
-        (noise(), "contains signals of one measurement, but more than one measurement was given; give one"),
-        ([], "but no measurement was given"),
-        ([image()], "but an energyscape was given"),
+        (noise(), "contains signals of one measurement, but more than one measurement was passed; choose one"),
+        ([], "but no measurement was passed;"),
+        ([image()], "but an energyscape was passed"),
     ):
         with pytest.raises(ArgumentError, match=message):
             export(tmp_path / "a.h5", given)
     for overwrite in (False, True):
-        with pytest.raises(ArgumentError, match=r"b.xml is also the name of the array's file; give"):
+        with pytest.raises(ArgumentError, match=r"b.xml is also the name of the array's file; choose"):
             export(tmp_path / "b.xml", noise(count=1), file_format="acoular", overwrite=overwrite)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "a.xml").write_text("mine")
-    with pytest.raises(ArgumentError, match=r"a.xml exists; give another name"):
+    with pytest.raises(ArgumentError, match=r"a.xml exists; choose another name"):
         export(tmp_path / "a.h5", noise(count=1))
     assert [item.name for item in tmp_path.iterdir()] == ["a.xml"]
     monkeypatch.setattr("ertis_numba.atomic_files.RESERVED_BYTES", 2**62)

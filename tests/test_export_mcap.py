@@ -369,13 +369,13 @@ def test_mcap_has_no_transform_of_the_platform_to_itself(tmp_path):
 def test_mcap_export_refuses_invalid_input(tmp_path, monkeypatch):
     given = GIVEN[0]
     for items, options, message in (
-        ([], {}, "no energyscape is given"),
+        ([], {}, "no energyscape is passed;"),
         ([given], {"topics": ["cloud"]}, "topic 'cloud' is unknown; known are points, scan, image, sonar_image"),
         ([given.replace(stamp=Stamp(timestamp_ns=2**62))], {}, "outside 1970 to 2038"),
         (
             [given.replace(stamp=Stamp(sensor="a b"))],
             {},
-            "sensor name 'a b' cannot name a group in a file; give letters",
+            "sensor name 'a b' cannot name a group in a file; use letters",
         ),
     ):
         with pytest.raises(ArgumentError, match=message):

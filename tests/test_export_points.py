@@ -151,15 +151,15 @@ def test_unknown_mounting_gives_points_in_the_sensor_frame(tmp_path):
 @pytest.mark.parametrize(
     ("given", "options", "message"),
     [
-        ([], {}, "no energyscape is given; give at least one"),
+        ([], {}, "no energyscape is passed; pass at least one"),
         ([*images("left"), *images("right")], {}, "the mountings of sensors left, right on their platform are unknown"),
         (images(sequence=2**32), {}, "sequence of a measurement is 4294967296, above the limit of the format; use csv"),
         (images(timestamp_ns=-1), {}, "has the time -1 ns, outside 1970 to 2038; use npz or csv"),
         (images(timestamp_ns=2**62), {}, "outside 1970 to 2038"),
-        (images("Grüße"), {}, "sensor name 'Grüße' cannot name a group in a file; give letters, digits and _"),
+        (images("Grüße"), {}, "sensor name 'Grüße' cannot name a group in a file; use letters, digits and _"),
         (images("a\nelement face 9"), {}, r"sensor name 'a\\nelement face 9' cannot name a group in a file"),
-        (images(), {"top": 0}, "top is 0; give a whole number of at least 1"),
-        (images(), {"mounting": {"eRTIS-7": ((0, 0, 0), (0, 0, 0, 2))}}, "has length 2; give a unit quaternion"),
+        (images(), {"top": 0}, "top is 0; use a whole number of at least 1"),
+        (images(), {"mounting": {"eRTIS-7": ((0, 0, 0), (0, 0, 0, 2))}}, "has length 2; use a unit quaternion"),
     ],
 )
 @pytest.mark.parametrize("kind", ["ply", "pcd"])

@@ -88,9 +88,9 @@ def test_empty_block_may_be_damaged():
     ("arguments", "message"),
     [
         ({"kinds": {"loose": 0.1}}, r"kind of fault 'loose' is unknown \(did you mean 'lose'\?\)"),
-        ({"kinds": {"lose": 1.1}}, "probability of lose is 1.1; give a number from 0 to 1"),
-        ({"seed": -1}, "seed is -1; give a whole number of at least 0"),
-        ({"longest_stall_s": -1}, "longest_stall_s is -1; give a number from 0 to 3600"),
+        ({"kinds": {"lose": 1.1}}, "probability of lose is 1.1; use a number from 0 to 1"),
+        ({"seed": -1}, "seed is -1; use a whole number of at least 0"),
+        ({"longest_stall_s": -1}, "longest_stall_s is -1; use a number from 0 to 3600"),
     ],
 )
 def test_unknown_faults_are_refused(arguments, message):

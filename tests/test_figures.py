@@ -134,7 +134,7 @@ def test_caption_names_the_settings(picture):
 
 
 def test_plot_refuses_invalid_arguments():
-    with pytest.raises(ArgumentError, match="dynamic_range_db is 0; give a number above 0"):
+    with pytest.raises(ArgumentError, match="dynamic_range_db is 0; use a number above 0"):
         plot(image(), dynamic_range_db=0)
     with pytest.raises(ArgumentError, match="theme 'drak' is unknown "):
         plot(image(), theme="drak")

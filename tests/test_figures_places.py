@@ -81,7 +81,7 @@ def test_slices_show_a_single_direction_as_a_narrow_beam(azimuth_deg):
 
 
 def test_slices_beside_a_single_direction_show_nothing():
-    with pytest.raises(ArgumentError, match="height_m is 0, where the image shows nothing; give a plane that crosses"):
+    with pytest.raises(ArgumentError, match="height_m is 0, where the image shows nothing; use a plane that crosses"):
         figures.slices(image([0.0], [30.0]))
 
 

@@ -127,7 +127,8 @@ def test_kind_of_names_common_formats(tmp_path, ending):
     path.write_bytes(content)
     assert name.replace("\\", "") in kind_of(path).name
     with pytest.raises(
-        DataError, match=rf"take\.{ending} is {name}.*; if the file contains raw words .*, use --raw \(check"
+        DataError,
+        match=rf"take\.{ending} is {name}.*; if the file contains raw words .*nevertheless, use check_kind=False",
     ):
         ertis.open_raw(path, SETTINGS)
     if not kind_of(path).is_hdf5:
@@ -257,7 +258,7 @@ IMAGES = "choose an energyscape file"
 def test_recordings_are_not_written_under_names_of_other_formats(tmp_path, ending):
     measurement = ertis.Measurement(np.zeros(N_WORDS, np.uint32), SETTINGS, ertis.Stamp())
     with pytest.raises(
-        ertis.ArgumentError, match=rf"take\.{ending} ends in \.{ending}, but the file is HDF5; give a n"
+        ertis.ArgumentError, match=rf"take\.{ending} ends in \.{ending}, but the file is HDF5; choose a n"
     ):
         ertis.write_recording(tmp_path / f"take.{ending}", [measurement])
     assert not [*tmp_path.iterdir()]
@@ -283,7 +284,7 @@ def test_no_command_overwrites_one_of_its_inputs(tmp_path, monkeypatch, command)
         (tmp_path / name).write_text("precious")
     done = invoke(*command.split(), "--force")
     assert done.exit_code == 1
-    assert re.search(r"^ertis: error: output \S+ is the input itself; give another name\n$", done.stderr)
+    assert re.search(r"^ertis: error: output \S+ is the input itself; choose another name\n$", done.stderr)
     assert all(path.read_text() == "precious" for path in tmp_path.iterdir())
 
 

@@ -168,7 +168,7 @@ def test_poses_of_kitti_are_read_with_their_times(tmp_path):
 @pytest.mark.parametrize(
     ("text", "times", "message"),
     [
-        (KITTI, None, r"as poses of KITTI do, but no times; add the file of their times with --times times.txt"),
+        (KITTI, None, r"as poses of KITTI do, but no times; add the file of their times \(times\)"),
         (KITTI, "0\n", r"there are 2 poses, but 1 times; choose the times of the same drive"),
         (KITTI + "1 0 0 0\n", "0\n1\n2\n", r"line 3 has 4 fields; write 12, as in the first line"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "0\n", r"line 1: the matrix is not a rotation"),
@@ -206,7 +206,7 @@ def test_poses_of_kitti_that_do_not_fit_are_refused(tmp_path, text, times, messa
         ("a.txt", "0.0\n0.1\n", r"line 1 has one number, as in the times of KITTI; choose the file of the poses"),
         ("a.tum", rows("1 nan 0 0 0 0 0 1"), r"the file contains no complete pose; 1 of 1 line left out"),
         ("a.tum", rows(START, "2 0 inf 0 0 0 0 1"), r"line 2 has position_m 0 inf 0"),
-        ("a.tum", rows("50000000000 0 0 0 0 0 0 1"), r"choose their unit \(time_unit, --time-unit\): s, ms, us, ns"),
+        ("a.tum", rows("50000000000 0 0 0 0 0 0 1"), r"choose their unit \(time_unit\): s, ms, us, ns"),
         ("a.tum", rows("1 0 0 0 0 0 0 1 5"), r"line 1 has 9 fields; write 8: .* or name all columns in the first line"),
         (
             "a.txt",
@@ -304,7 +304,7 @@ def test_options_that_do_not_fit_are_refused(tmp_path):
         read_trajectory(path, times=tmp_path / "none.txt")
     with pytest.raises(
         ArgumentError,
-        match=r"time_unit \(--time-unit\) is for text, but messages in .* contain times; remove time_unit",
+        match=r"time_unit \(--time-unit\) is for text, but messages in .*a.mcap contain times; remove time_unit",
     ):
         read_trajectory(tmp_path / "a.mcap", time_unit="ms")
 
@@ -382,7 +382,7 @@ def test_transforms_are_read_by_their_frames(tmp_path):
     ]
     path = bag(tmp_path / "a.mcap", {"/tf": (*TRANSFORMS, messages)})
     assert read_trajectory(path, topic="/tf:odom.base_link").position_m[:, 0].tolist() == [0.0, 1.0, 2.0]
-    choices = "choose a transform (topic, --topic): /tf:base_link.camera, /tf:odom.base_link"
+    choices = "choose a transform (topic): /tf:base_link.camera, /tf:odom.base_link"
     for topic in (None, "/tf"):
         with pytest.raises(ArgumentError, match=re.escape(choices)):
             read_trajectory(path, topic=topic)
@@ -441,10 +441,10 @@ def test_angles_of_tables_turn_about_fixed_axes_as_in_ros(tmp_path, names, cells
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        (LEVEL.format("yaw", "1", "1"), "of which yaw would not be read; give .* yaw_deg or yaw_rad"),
-        (LEVEL.format("yaw_deg,pitch", "1,40", "1,40"), "of which pitch would not be read"),
-        ("time_s,x_m,y_m,z_mm,yaw_deg\n1,0,0,400,0\n", "of which z_mm would not be read"),
-        ("time_s,x_m,y_m,altitude,yaw_deg\n1,0,0,400,0\n", "of which altitude would not be read"),
+        (LEVEL.format("yaw", "1", "1"), "yaw, but yaw are unknown; use time_ns .* yaw_deg or yaw_rad"),
+        (LEVEL.format("yaw_deg,pitch", "1,40", "1,40"), "pitch, but pitch are unknown; use time_ns"),
+        ("time_s,x_m,y_m,z_mm,yaw_deg\n1,0,0,400,0\n", "yaw_deg, but z_mm are unknown; use time_ns"),
+        ("time_s,x_m,y_m,altitude,yaw_deg\n1,0,0,400,0\n", "yaw_deg, but altitude are unknown; use time_ns"),
         (LEVEL.format("yaw_rad", "0", "-90"), "yaw in radians reaches 90; if it is in degrees, name it yaw_deg"),
         (LEVEL.replace("1.1", "1_1").format("yaw_deg", "0", "0"), "line 3: time '1_1' is not a number"),
         (LEVEL.replace("1,0,0,{}\n", "1_0,0,0,{}\n").format("yaw_deg", "0", "0"), "line 3: '1_0' is not a number"),
@@ -452,7 +452,7 @@ def test_angles_of_tables_turn_about_fixed_axes_as_in_ros(tmp_path, names, cells
             LEVEL.replace("1.0", "nan").replace("1.1", "").format("yaw_deg", "0", "0"),
             "there are no poses; 2 lines of 2",
         ),
-        ("time,x,y,yaw_deg\n2023-02-30T00:00:00,0,0,0\n", "line 2: '2023-02-30T00:00:00' is no date; give dates as in"),
+        ("time,x,y,yaw_deg\n2023-02-30T00:00:00,0,0,0\n", "line 2: '2023-02-30T00:00:00' is no date; use dates as in"),
         ("time,x,y,yaw_deg\n2023-02-20T00:00:00,0,0,0\n7,0,0,0\n", "line 3: '7' is no date"),
     ],
 )
@@ -489,7 +489,7 @@ def test_rows_without_a_time_are_left_out(tmp_path):
 def test_times_since_a_start_in_nanoseconds_are_doubtful(tmp_path, start_ns):
     text = rows(*(f"{start_ns + 10**8 * number}.0 0 0 0 0 0 0 1" for number in range(20)))
     [note] = read_trajectory(written(tmp_path, "a.tum", text)).notes
-    assert note.endswith("if they have another unit, choose it (time_unit, --time-unit)")
+    assert note.endswith("if they have another unit, choose it (time_unit)")
     assert read_trajectory(tmp_path / "a.tum", time_unit="ns").time_ns[1] - start_ns == 10**8
 
 

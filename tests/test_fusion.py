@@ -448,7 +448,7 @@ def test_close_directions_contain_the_direction_itself():
         (lambda group: [group[0], group[0]], "two of sensor 'front'"),
         (
             lambda group: [group[0].replace(stamp=ertis.Stamp(sensor="roof"))],
-            "images has sensor 'roof', but its mounting is unknown",
+            "images has sensor 'roof', whose mounting is unknown",
         ),
         (
             lambda group: [group[0], group[1].replace(stamp=ertis.Stamp(sensor="left", sync_count=7))],
@@ -703,8 +703,8 @@ def test_process_leaves_out_pulses_without_a_call(recordings, tmp_path):
     ("arguments", "status", "message"),
     [
         (["front.h5", "--fuse"], 2, "--fuse needs at least two sensors, but there is only front"),
-        (["front.h5", "all.h5", "--fuse"], 2, "have the same sensor 'front'"),
-        (["unmounted.h5", "--fuse"], 1, "the mounting of sensor 'front' is unknown; give --mounting"),
+        (["front.h5", "all.h5", "--fuse"], 2, "contain the same sensor 'front'"),
+        (["unmounted.h5", "--fuse"], 1, "the mounting of sensor 'front' is unknown; add its mounting with --mounting"),
         (["all.h5", "--fuse", "--sensor", "left"], 2, "--sensor does not apply to --fuse"),
         (["all.h5", "--fuse", "-o", "all.png"], 2, "all.png is not an energyscape file"),
         (["all.h5", "--emitter-diameter", "0.01"], 2, "--emitter-diameter requires --fuse; add --fuse"),

@@ -117,7 +117,7 @@ def test_sensitivity_of_a_layout_is_kept_unless_the_settings_state_another(tmp_p
     assert written_out(named).sensitivity_dbfs == written_out(written_out(named)).sensitivity_dbfs == -26.0
     assert layout_file(load_layout(path), name="mine").sensitivity_dbfs == -26.0
     assert microphones(Array()).sensitivity_dbfs is None
-    with pytest.raises(ArgumentError, match=r"array.sensitivity_dbfs is 94; give a number from -120 to 20"):
+    with pytest.raises(ArgumentError, match=r"array.sensitivity_dbfs is 94; use a number from -120 to 20"):
         Array(sensitivity_dbfs=94.0)
 
 
@@ -129,7 +129,7 @@ def test_emitter_of_a_layout_is_kept_unless_the_settings_state_another(tmp_path)
     assert microphones(named.replace(emitter_diameter_m=0.0)).emitter_diameter_m == 0.0
     assert written_out(named).emitter_diameter_m == written_out(written_out(named)).emitter_diameter_m == 0.02
     assert layout_file(load_layout(path), name="mine").emitter_diameter_m == 0.02
-    with pytest.raises(ArgumentError, match=r"array.emitter_diameter_m is 12; give a number from 0 to 0.2"):
+    with pytest.raises(ArgumentError, match=r"array.emitter_diameter_m is 12; use a number from 0 to 0.2"):
         Array(emitter_diameter_m=12.0)
 
 
@@ -170,14 +170,14 @@ def test_sound_pressure_level_follows_from_the_sensitivity_of_a_data_sheet():
             b"positions_mm = [[1]]",
             r"layout .*l\.toml: positions_mm does not consist of rows of 2 or 3 numbers",
         ),
-        ("l.toml", b"positions_mm = [[1, nan]]", r"layout .*l\.toml: positions_mm holds nan at \[0, 2\]; give finite"),
+        ("l.toml", b"positions_mm = [[1, nan]]", r"layout .*l\.toml: positions_mm holds nan at \[0, 2\]; pass finite"),
         (
             "l.toml",
             b"colour = 1\npositions_mm = [[1, 2]]",
             r"layout .*l\.toml, line 1: unknown key `colour`; correct it",
         ),
         ("l.toml", b"word_bits = 9\npositions_mm = [[1, 2]]", r"layout .*l\.toml: array\.word_bits '9' is unknown"),
-        ("l.toml", b"disabled = [1]\npositions_mm = [[1, 2]]", r"l\.toml: a disabled channel is 1; give a whole .* 0"),
+        ("l.toml", b"disabled = [1]\npositions_mm = [[1, 2]]", r"l\.toml: a disabled channel is 1; use a whole .* 0"),
         ("l.toml", b"disabled = [0]\npositions_mm = [[1, 2]]", r"l\.toml: array\.enabled is false for all channels"),
         (
             "l.csv",
@@ -192,7 +192,7 @@ def test_sound_pressure_level_follows_from_the_sensitivity_of_a_data_sheet():
         ("l.toml", b"gain = [1.0]\npositions_mm = [[1, 2], [3, 4]]", r"l\.toml: array\.gain has shape \(1,\)"),
         ("l.csv", b"# nothing\n", r"layout .*l\.csv: no positions; write one row per channel, y, z or x, y, z"),
         ("l.csv", b"1, nan\n", r"layout .*l\.csv, line 1: z is nan; use a finite number"),
-        ("l.csv", b"1, 2\n" * 1025, r"layout .*l\.csv: number of array\.positions_m is 1025; give .* from 1 to 1024"),
+        ("l.csv", b"1, 2\n" * 1025, r"layout .*l\.csv: number of array\.positions_m is 1025; use .* from 1 to 1024"),
     ],
 )
 def test_bad_layouts_are_refused(tmp_path, name, text, message):
@@ -236,7 +236,7 @@ def test_planar_grid_at_an_elevation_is_a_cone():
     for name in ("90", "3d:50"):  # whose elevations are fixed, or have limits
         own, other = (direction_grid(Processing(directions=name, elevation_deg=each)) for each in (0.0, 20.0))
         assert own.elevation_rad.tobytes() == other.elevation_rad.tobytes()
-    with pytest.raises(ArgumentError, match=r"processing.elevation_deg is 91; give a number from -90 to 90"):
+    with pytest.raises(ArgumentError, match=r"processing.elevation_deg is 91; use a number from -90 to 90"):
         Processing(directions="2d:5", elevation_deg=91.0)
 
 
@@ -314,23 +314,23 @@ def test_grid_is_read_from_csv(tmp_path):
 @pytest.mark.parametrize(
     ("directions", "text", "message"),
     [
-        ("91", None, r"directions '91' is not a grid; give 90, 1850, 3000, 2d:N, 3d:N or a \.csv file"),
+        ("91", None, r"directions '91' is not a grid; use 90, 1850, 3000, 2d:N, 3d:N or a \.csv file"),
         ("4d:90", None, r"directions '4d:90' is not a grid"),
-        ("2d:", None, r"directions '2d:' has no count; give a number after the colon, such as 2d:181"),
-        ("3d:-1", None, r"directions '3d:-1' has no count; give a number after the colon, such as 3d:181"),
-        ("2d:0", None, r"count of directions '2d:0' is 0; give a whole number from 1 to 1000000"),
-        ("3d:1000001", None, r"count of directions '3d:1000001' is 1000001; give a whole number from 1 to 1000000"),
-        ("none.csv", None, r"directions .*none\.csv: .*; give a readable CSV of azimuth, elevation in degrees"),
+        ("2d:", None, r"directions '2d:' has no count; use a number after the colon, such as 2d:181"),
+        ("3d:-1", None, r"directions '3d:-1' has no count; use a number after the colon, such as 3d:181"),
+        ("2d:0", None, r"count of directions '2d:0' is 0; use a whole number from 1 to 1000000"),
+        ("3d:1000001", None, r"count of directions '3d:1000001' is 1000001; use a whole number from 1 to 1000000"),
+        ("none.csv", None, r"directions .*none\.csv: .*; choose a readable CSV of azimuth, elevation in degrees"),
         (
             "g.csv",
             "",
-            r"directions .*g\.csv does not have two numbers in every row; give azimuth, elevation in degrees",
+            r"directions .*g\.csv does not have two numbers in every row; write azimuth, elevation in degrees",
         ),
         ("g.csv", "1, 2, 3\n", r"directions .*g\.csv does not have two numbers in every row"),
-        ("g.csv", "1, two\n", r"directions .*g\.csv: could not convert .*; give rows of numbers"),
-        ("g.csv", "1, nan\n", r"directions .*g\.csv holds nan at \[0, 1\]; give finite numbers"),
-        ("g.csv", "1, 2\n0, 91\n", r"directions .*g\.csv: elevation in row 1 is 91; give a number from -90 to 90"),
-        ("g.csv", "999, 2\n", r"directions .*g\.csv: azimuth in row 0 is 999; give a number from -360 to 360"),
+        ("g.csv", "1, two\n", r"directions .*g\.csv: could not convert .*; pass rows of numbers"),
+        ("g.csv", "1, nan\n", r"directions .*g\.csv holds nan at \[0, 1\]; pass finite numbers"),
+        ("g.csv", "1, 2\n0, 91\n", r"directions .*g\.csv: elevation in row 1 is 91; use a number from -90 to 90"),
+        ("g.csv", "999, 2\n", r"directions .*g\.csv: azimuth in row 0 is 999; use a number from -360 to 360"),
     ],
 )
 def test_bad_grids_are_refused(tmp_path, directions, text, message):

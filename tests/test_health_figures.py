@@ -54,7 +54,7 @@ def test_band_too_narrow_for_the_record_is_reported(call):
 
 @pytest.mark.parametrize("words", [np.zeros(4000, "u4"), np.zeros((4000, 2), "u1"), np.zeros((4000, 1, 1), "u1")])
 def test_words_of_another_array_are_refused(words):
-    with pytest.raises(ertis.DataError, match=r"its settings describe uint8 of shape \(4000,\); give the settings"):
+    with pytest.raises(ertis.DataError, match=r"its settings describe uint8 of shape \(4000,\); use the settings"):
         health(dataclasses.replace(sound(), data=words))
 
 
@@ -86,9 +86,9 @@ def test_reports_of_several_measurements_are_merged():
     assert merge([quiet, quiet]).unknown == ("dead microphones: no sound exceeds the noise by 9 dB",)
     assert merge([quiet, healthy]).unknown == ()
     assert merge([quiet, healthy]).channels[3].level_db == healthy.channels[3].level_db
-    with pytest.raises(ertis.ArgumentError, match="reports is empty; give at least one"):
+    with pytest.raises(ertis.ArgumentError, match="reports is empty; pass at least one"):
         merge([])
-    with pytest.raises(ertis.ArgumentError, match="reports have different channels; give reports of one array"):
+    with pytest.raises(ertis.ArgumentError, match="reports have different channels; use reports of one array"):
         merge([healthy, health(real())])
 
 

@@ -45,7 +45,7 @@ def test_from_toml_names_the_line_after_thousands_of_blank_lines():
     ],
 )
 def test_from_toml_refuses_keys_of_many_parts(text):
-    with pytest.raises(SettingsError, match=f"line 2: a dotted key has more than {MAX_KEY_PARTS} parts; give fewer"):
+    with pytest.raises(SettingsError, match=f"line 2: a dotted key has more than {MAX_KEY_PARTS} parts; use fewer"):
         Settings.from_toml(f"\n{text}\n")
 
 
@@ -59,7 +59,7 @@ def test_from_toml_accepts_many_numbers_in_a_line():
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("x = " + "9" * 5000, "Exceeds the limit .*; give a shorter number"),
+        ("x = " + "9" * 5000, "Exceeds the limit .*; use a shorter number"),
         ("x = " + "[" * 5000, "nested too deeply"),
         ("\n" * 30_001, "30001 lines and commas; the limit is 30000"),
         (f"x = [{'1,' * 30_001}]", "30001 lines and commas; the limit is 30000"),

@@ -131,10 +131,13 @@ def test_custom_files_of_rtisdev_are_imported(tmp_path):
         ),
         (
             {"ranges": "0.6,0.5"},
-            "does not have two or more ascending ranges; correct it, or remove it and give --range",
+            "does not have two or more ascending ranges; correct it, or remove it and set processing.range_m",
         ),
         ({"ranges": "a,b"}, r"rangesCustom is the file 'ranges.csv', which cannot be read \("),
-        ({"directions": "0,1,2"}, "does not have two numbers in every row; correct it, or remove it and give --direct"),
+        (
+            {"directions": "0,1,2"},
+            "does not have two numbers in every row; correct it, or remove it and set processing.directions",
+        ),
         (
             {"delaymatrix": "1,nan"},
             "does not contain finite numbers only; correct it, or remove it and process with the",
@@ -242,14 +245,17 @@ def test_file_of_many_measurements_is_imported(tmp_path):
             {"names": ("a1.bin", "a01.bin")},
             r"the order of its 2 \.bin files is unknown, because their names are not like NAME<number>\.bin",
         ),
-        ({"recording": None}, "run.1 contains no recording settings of RTIS Dev .*; give --preset"),
-        ({"processing": None}, r"does not name its array \(microphoneLayout\); give --layout"),
+        ({"recording": None}, "run.1 contains no recording settings of RTIS Dev .*; choose a preset"),
+        ({"processing": None}, r"does not name its array \(microphoneLayout\); set it \(layout\)"),
         ({"recording": SHORT | {"callEmissions": 2}}, "callEmissions is 2, but an image shows only 1 emission"),
         (
             {"recording": {"callCustom": "bat.csv"}},
             "callCustom is the file 'bat.csv', which a recording cannot contain",
         ),
-        ({"processing": PLANAR | {"rangesCustom": "r.csv"}}, "rangesCustom is the file 'r.csv', .*give --range when"),
+        (
+            {"processing": PLANAR | {"rangesCustom": "r.csv"}},
+            "rangesCustom is the file 'r.csv', .*set processing.range_m",
+        ),
         ({"processing": PLANAR | {"directionsCustom": "d.csv"}}, "directionsCustom is the file"),
         ({"more": {"z.json": {"callDuration": 3}}}, r"z.json: callDuration is 3, but 2.5 in recording.json; keep one"),
     ],
@@ -262,22 +268,26 @@ def test_folder_import_refuses_invalid_folders(tmp_path, made, message):
 @pytest.mark.parametrize(
     ("recording", "processing", "message"),
     [
-        (SHORT | {"callDuration": "long"}, PLANAR, "run.1: callDuration is 'long'; give a number"),
-        (SHORT | {"microphoneSamples": 0.5}, PLANAR, "microphoneSamples is 0.5; give a whole number"),
+        (SHORT | {"callDuration": "long"}, PLANAR, "run.1: callDuration is 'long'; use a number"),
+        (SHORT | {"microphoneSamples": 0.5}, PLANAR, "microphoneSamples is 0.5; use a whole number"),
         (SHORT | {"callMinimumFrequency": 50_000}, PLANAR, "call.stop_frequency_hz are both 50000"),
         (SHORT, PLANAR | {"microphoneLayout": "eRTIS_v9"}, "layout 'eRTIS_v9' is unknown"),
-        (SHORT, PLANAR | {"elevation2DAngle": 91}, "run.1: elevation2DAngle is 91; give a number from -90 to 90"),
-        (SHORT, PLANAR | {"directions": 1.5}, "directions is 1.5; give a whole number"),
-        (SHORT, PLANAR | {"microphoneLayout": 5}, "run.1: microphoneLayout is 5; give the name of an array"),
-        (SHORT, PLANAR | {"microphoneLayout": ["a"]}, r"run.1: microphoneLayout is \['a'\]; give the name of an array"),
-        (SHORT, PLANAR | {"directionsAzimuth": []}, r"directionsAzimuth is \[\]; give an angle for each direction"),
-        (SHORT, PLANAR | {"directionsAzimuth": 3}, "directionsAzimuth is 3; give an angle for each direction"),
-        (SHORT, PLANAR | {"directionsAzimuth": ["a"]}, "run.1: directionsAzimuth is 'a'; give a number"),
-        (SHORT, PLANAR | {"directionsElevation": 0}, "directionsElevation is 0; give an angle for each direction"),
+        (SHORT, PLANAR | {"elevation2DAngle": 91}, "run.1: elevation2DAngle is 91; use a number from -90 to 90"),
+        (SHORT, PLANAR | {"directions": 1.5}, "directions is 1.5; use a whole number"),
+        (SHORT, PLANAR | {"microphoneLayout": 5}, "run.1: microphoneLayout is 5; correct it to the name of an array,"),
+        (
+            SHORT,
+            PLANAR | {"microphoneLayout": ["a"]},
+            r"run.1: microphoneLayout is \['a'\]; correct it to the name of an array,",
+        ),
+        (SHORT, PLANAR | {"directionsAzimuth": []}, r"directionsAzimuth is \[\]; write an angle for each direction,"),
+        (SHORT, PLANAR | {"directionsAzimuth": 3}, "directionsAzimuth is 3; write an angle for each direction,"),
+        (SHORT, PLANAR | {"directionsAzimuth": ["a"]}, "run.1: directionsAzimuth is 'a'; use a number"),
+        (SHORT, PLANAR | {"directionsElevation": 0}, "directionsElevation is 0; write an angle for each direction,"),
         (
             SHORT | {"microphoneSamples": 11_000},
             PLANAR,
-            "recording.n_samples gives a record of 2.444 ms, but the call ends after 2.5 ms; give more",
+            "recording.n_samples gives a record of 2.444 ms, but the call ends after 2.5 ms; use more",
         ),
     ],
 )
@@ -290,9 +300,9 @@ def test_invalid_or_foreign_json_is_handled(tmp_path):
     folder = folder_of(tmp_path, more={"list.json": [1, 2], "other.json": {"weather": "windy"}})
     assert len(open_rtis_folder(folder)) == 2
     (folder / "bad.json").write_text("{")
-    with pytest.raises(DataError, match=r"bad.json: .*; give readable JSON, or remove the file"):
+    with pytest.raises(DataError, match=r"bad.json: .*; correct the JSON, or remove the file"):
         open_rtis_folder(folder)
-    with pytest.raises(DataError, match="none: No such file or directory; give a folder of raw files"):
+    with pytest.raises(DataError, match="none: No such file or directory; choose a folder of raw files"):
         open_rtis_folder(tmp_path / "none")
 
 
@@ -300,14 +310,16 @@ def test_overlapping_sequence_numbers_are_refused(tmp_path):
     folder = folder_of(tmp_path)
     (folder / "m_0.bin").write_bytes(words(0, 2).tobytes())
     with pytest.raises(
-        DataError, match=r"m_0.bin contains 2 measurements, but the next file is number 1; give the files"
+        DataError, match=r"m_0.bin contains 2 measurements, but the next file is number 1; list the files"
     ):
         open_rtis_folder(folder)
 
 
 @pytest.mark.parametrize("name", ["m_99999999999999999999999.bin", f"m_{2**63}.bin"], ids=["far", "just"])
 def test_unstorable_sequence_numbers_are_refused(tmp_path, name):
-    with pytest.raises(DataError, match=rf"{name} is number \d+, above the limit of recordings; give it a smaller one"):
+    with pytest.raises(
+        DataError, match=rf"{name} is number \d+, above the limit of recordings; rename it with a smaller number"
+    ):
         open_rtis_folder(folder_of(tmp_path, names=("m_0.bin", name)))
 
 

@@ -158,7 +158,7 @@ def test_recording_without_a_call_needs_no_fitting_call(tmp_path):
     command = ["import", str(path), "--settings", str(tmp_path / "ring.toml"), "--length", "0.1"]
     refused = CliRunner().invoke(cli, [*command, "-o", str(tmp_path / "refused.h5")])
     assert refused.exit_code == 1
-    assert "or --passive (passive=True) if no call was emitted" in refused.stderr
+    assert "or --passive if no call was emitted" in refused.stderr
     done = CliRunner().invoke(cli, [*command, "--passive", "-o", str(tmp_path / "rec.h5")])
     assert done.exit_code == 0, done.stderr
     assert "cannot be processed" not in done.stderr
@@ -174,7 +174,7 @@ def test_recording_without_a_call_needs_no_fitting_call(tmp_path):
         assert done.exit_code == 0, (line, done.stderr, done.exception)
     images = CliRunner().invoke(cli, ["process", str(tmp_path / "rec.h5"), "--mode", "active"])
     assert images.exit_code != 0
-    assert "give one that leaves more than twice the call's 50000 Hz" in images.stderr
+    assert "use a decimation that leaves more than twice the call's 50000 Hz" in images.stderr
 
 
 REFUSED = {
@@ -199,12 +199,12 @@ REFUSED = {
         {},
         r"sample rate of 44100 Hz, too low for a call up to 50000 Hz; set the emitted call",
     ),
-    "skip": (lambda folder: write_wav(folder / "a.wav", numbers()), {"skip_s": 1.0}, r"skip less \(--skip\)"),
-    "length": (lambda folder: write_wav(folder / "a.wav", numbers()), {"length_s": 1.0}, r"use a shorter --length"),
+    "skip": (lambda folder: write_wav(folder / "a.wav", numbers()), {"skip_s": 1.0}, r"a shorter skip_s"),
+    "length": (lambda folder: write_wav(folder / "a.wav", numbers()), {"length_s": 1.0}, r"length_s"),
     "length of less than a sample": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
         {"length_s": 1e-7},
-        r"--length is 1e-07 s, less than a sample at 192000 Hz; use a longer --length",
+        r"length_s is 1e-07, less than a sample at 192000 Hz; use a longer length_s",
     ),
     "nan": (
         lambda folder: write_wav(folder / "a.wav", np.where(np.arange(8) == 3, np.nan, numbers()).astype("f4")),
@@ -219,17 +219,17 @@ REFUSED = {
     "skip for ever": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
         {"skip_s": 1e308},
-        r"skip_s is 1e\+308; give",
+        r"skip_s is 1e\+308; use",
     ),
     "last for ever": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
         {"length_s": 1e308},
-        r"length_s is 1e\+308; give",
+        r"length_s is 1e\+308; use",
     ),
     "starts too late": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
         {"start_ns": 2**70},
-        r"start_ns is \d+; give a whole number from 0 to 9223372036854775807",
+        r"start_ns is \d+; use a whole number from 0 to 9223372036854775807",
     ),
     "two rates": (
         lambda folder: [write_wav(folder / "a.wav", numbers()), write_wav(folder / "b.wav", numbers(), 96_000)],
@@ -260,7 +260,7 @@ REFUSED = {
     "shorter than the call": (
         lambda folder: write_wav(folder / "a.wav", numbers()),
         {"length_s": 1e-3},
-        r"has 1 ms, but the call alone lasts 2.5 ms; use a longer --length",
+        r"has 1 ms, but the call alone lasts 2.5 ms; use a longer length_s,",
     ),
 }
 
@@ -317,7 +317,7 @@ def test_acoular_files_are_read_in_slices(tmp_path):
 
 
 def test_wav_without_settings_is_refused(tmp_path):
-    with pytest.raises(ArgumentError, match=r"contains no array and no call; pass settings"):
+    with pytest.raises(ArgumentError, match=r"contains no array and no call; add them"):
         ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers()))
 
 
@@ -351,7 +351,7 @@ def test_acoular_file_without_settings_is_refused(tmp_path):
         file["time_data"].attrs["sample_freq"] = float(RATE_HZ)
     (measurement,) = ertis.open_pcm(tmp_path / "a.h5", PCM)
     assert np.array_equal(measurement.data, given)
-    with pytest.raises(ArgumentError, match="pass settings"):
+    with pytest.raises(ArgumentError, match="add them"):
         ertis.open_pcm(tmp_path / "a.h5")
 
 
@@ -385,10 +385,10 @@ def test_acoular_sample_rate_may_be_an_array_of_one(tmp_path, rate_hz):
 @pytest.mark.parametrize(
     ("rate_hz", "message"),
     [
-        (np.nan, r"a\.h5: recording\.sample_rate_hz is nan; give a finite number"),
-        (np.inf, r"a\.h5: recording\.sample_rate_hz is inf; give a finite number"),
-        (0.0, r"a\.h5: recording\.sample_rate_hz is 0; give a number from 1000 to 1e\+09"),
-        (1e308, r"a\.h5: recording\.sample_rate_hz is 1e\+308; give a number"),
+        (np.nan, r"a\.h5: recording\.sample_rate_hz is nan; use a finite number"),
+        (np.inf, r"a\.h5: recording\.sample_rate_hz is inf; use a finite number"),
+        (0.0, r"a\.h5: recording\.sample_rate_hz is 0; use a number from 1000 to 1e\+09"),
+        (1e308, r"a\.h5: recording\.sample_rate_hz is 1e\+308; use a number"),
         (np.array([1.0, 2.0]), r"a\.h5: sample_freq is \[1\.0, 2\.0\]; store one number, the sample rate in Hz"),
         ("fast", r"sample_freq is not a number; store one number, the sample rate in Hz"),
         (h5py.Empty("f8"), r"sample_freq is not a number; store one"),

@@ -68,7 +68,7 @@ def test_import_poses_replaces_the_recording_by_default(recording, trajectory):
     with open_recording(recording, sensor="left") as posed:
         assert len(posed.trajectory) == 3
     done = run("import-poses", recording, trajectory, code=1)
-    assert "REC.h5 has poses already (source 'file'); keep them, or ask to replace them (--force)" in done.stderr
+    assert "REC.h5 has poses already (source 'file'); keep them, or replace them (replace=True)" in done.stderr
     run("import-poses", recording, trajectory, "--force")
     assert sorted(path.name for path in recording.parent.iterdir()) == ["REC.h5", "TRAJ.tum"]
 
@@ -81,7 +81,7 @@ def test_import_poses_shifts_the_clock_of_the_trajectory(recording, trajectory, 
         assert np.array_equal(a.trajectory.position_m, b.trajectory.position_m)
 
 
-@pytest.mark.parametrize(("offset_s", "remedy"), [("nan", "give a finite number"), ("1e30", "give a number from -4e")])
+@pytest.mark.parametrize(("offset_s", "remedy"), [("nan", "use a finite number"), ("1e30", "use a number from -4e")])
 def test_import_poses_refuses_offsets_of_no_clock(recording, trajectory, offset_s, remedy):
     done = run("import-poses", recording, trajectory, "--offset-s", offset_s, code=2)
     assert done.stderr.startswith(f"ertis: error: --offset-s is {float(offset_s):g}; {remedy}")
@@ -93,8 +93,8 @@ def test_import_poses_reports_both_spans_and_changes_nothing(recording, tmp_path
     done = run("import-poses", recording, late, "-o", tmp_path / "OUT.h5", code=1)
     assert done.stderr == (
         f"ertis: error: {recording}: the poses cover 1700000099.123 to 1700000101.223 s, but the measurements of "
-        "sensor left cover 1700000000.123 to 1700000000.223 s; give poses for this time, or correct the clock offset "
-        "(--offset-s)\n"
+        "sensor left cover 1700000000.123 to 1700000000.223 s; use poses of this time, or correct their clock "
+        "(offset_s)\n"
     )
     assert recording.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["REC.h5", "late.tum"]
@@ -111,7 +111,7 @@ def test_import_poses_adds_to_all_recordings_of_a_folder_or_none(tmp_path, traje
     outputs = [json.loads(line)["output"] for line in done.stdout.splitlines()]
     assert outputs == [str(tmp_path / "POSED" / f"{name}.h5") for name in ("a", "b")]
     done = run("import-poses", folder, trajectory, "-o", tmp_path / "POSED", code=1)
-    assert "exists; give another name" in done.stderr
+    assert "exists; choose another name" in done.stderr
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
     run("import-poses", folder / "b.h5", trajectory)
@@ -137,7 +137,7 @@ def test_import_poses_reads_tables_and_refuses_other_topics(recording, tmp_path)
     first_ns, last_ns = TIMES_NS[0] - SECOND_NS, TIMES_NS[-1] + SECOND_NS
     table.write_text(f"time_ns,x_m,y_m,yaw_deg\n{first_ns},0,0,0\n{last_ns},2.1,0,0\n")
     done = run("import-poses", recording, table, "--topic", "/odom", code=1)
-    assert "topic (--topic) is for .mcap files, but" in done.stderr
+    assert "topic is for .mcap files, but" in done.stderr
     run("import-poses", recording, table)
     with open_recording(recording, sensor="left") as posed:
         np.testing.assert_allclose(posed.trajectory.position_m[:, 0], [1.0, 1.05, 1.1], rtol=0, atol=1e-9)
@@ -159,7 +159,7 @@ def test_import_poses_refuses_a_folder_without_recordings(tmp_path, trajectory):
     folder.mkdir()
     write_energyscapes(folder / "c.h5", [image()])
     done = run("import-poses", folder, trajectory, code=1)
-    assert "contains energyscape files only; give a folder with recordings" in done.stderr
+    assert "contains energyscape files only; choose a folder with recordings" in done.stderr
 
 
 def test_export_writes_poses_that_read_back(recording, trajectory, tmp_path):

@@ -83,7 +83,7 @@ NOT_JOINED = {
     "one file per microphone": (
         {"count": 4},
         {},
-        r"the total of all 4 files; use --join \(join=True\) if the files are",
+        r"the total of all 4 files; use join=True if the files are",
     ),
     "too few files": ({"count": 3}, {"join": True}, r"has 3 channels, but array 'line' has 4; write one row"),
     "rates": (
@@ -204,7 +204,7 @@ def test_usual_levels_need_no_note(tmp_path, samples):
 def test_short_file_among_longer_ones_is_named(tmp_path):
     paths = [write(tmp_path / f"{place}.wav", noise(count)) for place, count in enumerate((90_000, 400, 90_000))]
     reader = ertis.open_pcm(paths, ONE, passive=True)
-    assert any("because 1.wav lasts only 0.002083 s; use --length (length_s)" in note for note in reader.notes)
+    assert any("because 1.wav lasts only 0.002083 s; use length_s" in note for note in reader.notes)
 
 
 # ---- silence of a trigger -------------------------------------------------------------------------

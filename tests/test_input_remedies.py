@@ -66,7 +66,7 @@ CASES = {  # command: exit code and message
     "import a.wav a.bin --passive --layout lay.csv -o o.h5": (2, "some files are PCM (.wav, .h5) and others are raw"),
     "--config a.wav info rec.h5": (1, "a.wav: it is not text in UTF-8 (byte 0x"),
     "info short.csv": (1, "short.csv is a text file; choose a recording, or save its signals as WAV"),
-    "process rec.h5 --preset set.toml -o o.h5": (1, "is the name of a file; use it as settings (--settings set.toml)"),
+    "process rec.h5 --preset set.toml -o o.h5": (1, "is the name of a file; load it as settings (--settings)"),
     "record --output ''": (2, "the path is empty; name a folder"),
     "emulate s.json": (1, "s.json is a text file; choose a recording"),
     "process rec.h5 --settings a.wav -o o.h5": (1, "a.wav is a WAV file; choose a settings file (TOML)"),

@@ -83,7 +83,7 @@ def test_unreadable_raw_paths_are_refused(tmp_path):
         open_raw(tmp_path / "none.bin", SHORT)
     with pytest.raises(DataError, match="is a folder; choose a file of raw words"):
         open_raw(tmp_path, SHORT)
-    with pytest.raises(ArgumentError, match="no raw file is given; give at least one"):
+    with pytest.raises(ArgumentError, match="no raw file is passed; pass at least one"):
         open_raw([], SHORT)
     with pytest.raises(ArgumentError, match="layout 'nothing' is unknown"):
         open_raw(tmp_path, SHORT.replace(array=Array(layout="nothing")))

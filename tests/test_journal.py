@@ -86,7 +86,7 @@ def test_numbers_must_rise_within_a_session(tmp_path):
         for late in (given[2], given[0]):
             with pytest.raises(
                 ArgumentError,
-                match=r"measurement 1[02] of sensor left follows 12; give rising numbers, or another session_id",
+                match=r"measurement 1[02] of sensor left follows 12; pass rising numbers, or another session_id",
             ):
                 journal.append([late])
         journal.append(entries(1, first=0, session_id=9))
@@ -130,32 +130,32 @@ BAD = {
     "entries of it": (lambda journal: list(journal.entries("right")), "sensor 'right' is not in .*; add it first"),
     "gap backwards": (
         lambda journal: journal.note_gap("left", 2, 1, "x", session_id=1),
-        "last missing sequence number is 1; give",
+        "last missing sequence number is 1; use",
     ),
     "gap of no run": (
         lambda journal: journal.note_gap("left", 1, 2, "x", session_id=-1),
-        "session_id is -1; give a whole number from 0",
+        "session_id is -1; use a whole number from 0",
     ),
     "no reason": (
         lambda journal: journal.note_gap("left", 1, 2, "", session_id=1),
-        "reason of a gap is ''; give a line of 1 to 64",
+        "reason of a gap is ''; use a line of 1 to 64",
     ),
     "two lines": (
         lambda journal: journal.note_gap("left", 1, 2, "a\nb", session_id=1),
-        "reason of a gap is .*; give a line",
+        "reason of a gap is .*; use a line",
     ),
     "long reason": (
         lambda journal: journal.note_gap("left", 1, 2, "é" * 33, session_id=1),
-        "reason of a gap is .*; give a line",
+        "reason of a gap is .*; use a line",
     ),
     "sensor twice": (
         lambda journal: journal.add_sensor("left", TINY),
-        r"sensor 'left' is in .* already; give each sensor its own name",
+        r"sensor 'left' is in .* already; use a different name for each sensor",
     ),
     "name": (lambda journal: journal.add_sensor("a/b", TINY), "sensor name 'a/b' cannot name a group in a file"),
     "mounting": (
         lambda journal: journal.add_sensor("b", TINY, rotation_xyzw=(0, 0, 1, 1)),
-        "rotation_xyzw of sensor b has length 1.41421; give a unit quaternion",
+        "rotation_xyzw of sensor b has length 1.41421; use a unit quaternion",
     ),
     "directions": (
         lambda journal: journal.add_sensor("b", TINY.replace(processing=TINY.processing.replace(directions="x.csv"))),
@@ -163,7 +163,7 @@ BAD = {
     ),
     "size": (
         lambda journal: journal.add_sensor("b", Settings(recording=Recording(n_samples=2**28))),
-        "a measurement of sensor b has 1074 MB, but the limit of a journal is 999 MB; give fewer samples",
+        "a measurement of sensor b has 1074 MB, but the limit of a journal is 999 MB; use fewer samples",
     ),
     "settings": (
         lambda journal: journal.append(entries(1, settings=TINY.replace(recording=Recording(n_samples=4097)))),
@@ -171,19 +171,19 @@ BAD = {
     ),
     "shape": (
         lambda journal: journal.append([spoilt(words=np.zeros(7, np.uint8))]),
-        r"a measurement of sensor left has shape \(7,\); give shape \(4096,\)",
+        r"a measurement of sensor left has shape \(7,\); pass shape \(4096,\)",
     ),
     "type": (
         lambda journal: journal.append([spoilt(words=np.zeros(4096, np.int16))]),
-        "a measurement of sensor left contains int16; give uint8",
+        "a measurement of sensor left contains int16; pass uint8",
     ),
     "session_id": (
         lambda journal: journal.append([spoilt(session_id=2**63)]),
-        "session_id is 9223372036854775808; give a whole number from 0",
+        "session_id is 9223372036854775808; use a whole number from 0",
     ),
     "stamp": (
         lambda journal: journal.append([spoilt(timestamp_uncertainty_ns=2**32)]),
-        "timestamp_uncertainty_ns is 4294967296; give a whole number from 0",
+        "timestamp_uncertainty_ns is 4294967296; use a whole number from 0",
     ),
 }
 

@@ -296,9 +296,9 @@ def test_unusable_settings_of_a_journal_are_reported(tmp_path):
 
 
 FOREIGN = {
-    "nothing": (None, "No such file or directory; give a journal left by 'ertis capture'"),
-    "text": (b"abc" * 1000, "is not a journal .*; give a file that 'ertis capture' left"),
-    "empty file of another name": (b"", "give a journal left by 'ertis capture'"),
+    "nothing": (None, "No such file or directory; choose a journal left by 'ertis capture'"),
+    "text": (b"abc" * 1000, "is not a journal .*; choose a file that 'ertis capture' left"),
+    "empty file of another name": (b"", "choose a journal left by 'ertis capture'"),
 }
 
 
@@ -317,7 +317,9 @@ def test_foreign_database_is_not_changed(tmp_path):
     path = tmp_path / "their.journal"
     spoil(path, "CREATE TABLE x (y)")
     before = path.read_bytes()
-    with pytest.raises(DataError, match="is an SQLite file, but not a journal; give one left by 'ertis capture'"):
+    with pytest.raises(
+        DataError, match="is an SQLite file, but not a journal; choose a journal left by 'ertis capture'"
+    ):
         Journal.open(path)
     assert path.read_bytes() == before
 
@@ -350,5 +352,5 @@ def test_newer_journal_version_is_refused(tmp_path):
 
 
 def test_journal_in_an_unwritable_folder_is_refused(tmp_path):
-    with pytest.raises(DataError, match="No such file or directory; give a writable folder"):
+    with pytest.raises(DataError, match="No such file or directory; choose a writable folder"):
         Journal.create(tmp_path / "none" / "rec.h5.journal", target="rec.h5")

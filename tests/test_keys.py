@@ -147,7 +147,7 @@ def test_secret_key_in_a_shared_folder_is_refused(folder):
 
 def test_keys_are_never_overwritten(folder):
     PAIR.save(folder)
-    with pytest.raises(ArgumentError, match="exists; give another name"):
+    with pytest.raises(ArgumentError, match="exists; choose another name"):
         KeyPair.new("robot").save(folder)
     assert KeyPair.load(folder / "robot.secret.toml") == PAIR
 
@@ -203,7 +203,7 @@ def test_key_name_unfit_for_a_file_is_refused(name):
     ids=["none", "word", "no_z85", "too_much", "39", "41"],
 )
 def test_invalid_key_is_refused(key):
-    with pytest.raises(ArgumentError, match="give the 40 characters from 'ertis keys list'"):
+    with pytest.raises(ArgumentError, match="use the 40 characters from 'ertis keys list'"):
         ClientKeys(PAIR, key)
     with pytest.raises(ArgumentError, match="is not a key"):
         _permission(public=key)
@@ -435,7 +435,7 @@ def test_keys_may_be_given_by_file_or_by_name(folder):
 @pytest.mark.parametrize(("key", "server_key"), [("robot", None), (None, "robot")])
 def test_key_without_server_key_is_refused(folder, key, server_key):
     PAIR.save(folder)
-    with pytest.raises(Exception, match="give both, or neither"):
+    with pytest.raises(Exception, match="use both, or neither"):
         _network.client_keys(key, server_key)
 
 

@@ -116,7 +116,7 @@ def test_folder_belongs_to_one_central_node(tmp_path):
     lock.release()
     lock.release()
     Lock(tmp_path).release()
-    with pytest.raises(DataError, match="give a writable folder"):
+    with pytest.raises(DataError, match="choose a writable folder"):
         Lock(tmp_path / "none")
 
 

@@ -250,7 +250,7 @@ def test_pipeline_refuses_graphs_that_it_cannot_record():
     settings = levelled(heard(0.0, 0.0, directions="90"))
     for wrong, message in (
         (True, r"^graphs is True, but with processing\.level_directions"),
-        ("yes", "^graphs is 'yes'; give True or False, or leave it out$"),
+        ("yes", "^graphs is 'yes'; pass True, False or None$"),
     ):
         with pytest.raises(ertis.ArgumentError, match=message):
             ertis.Pipeline(settings, "cpu", graphs=wrong)
@@ -298,9 +298,7 @@ def test_pipeline_requires_an_attitude_for_level_directions(case):
     measurement = heard(0.0, 0.0, directions="90")
     with (
         ertis.Pipeline(levelled(measurement), "cpu", predict=False) as pipeline,
-        pytest.raises(
-            ertis.ArgumentError, match=r"level_directions is true, but no attitude is given; give Pipeline\.process the"
-        ),
+        pytest.raises(ertis.ArgumentError, match=r"level_directions is true, but no attitude is passed; pass the"),
     ):
         MISSING[case](pipeline, measurement)
 
@@ -314,9 +312,9 @@ def test_pipeline_refuses_attitudes_that_cannot_be_used():
         pipeline.process(measurement, attitude_xyzw=UNTURNED)
     with ertis.Pipeline(levelled(measurement), "cpu", predict=False) as pipeline:
         for wrong, message in (
-            ((0, 0, 0, 2), "^attitude_xyzw has length 2; give a unit quaternion$"),
-            ((0, 0, 1), r"^attitude_xyzw has shape \(3,\); give shape \(4,\)$"),
-            ((0, 0, 0, np.nan), r"^attitude_xyzw holds nan at \[3\]; give finite numbers$"),
+            ((0, 0, 0, 2), "^attitude_xyzw has length 2; use a unit quaternion$"),
+            ((0, 0, 1), r"^attitude_xyzw has shape \(3,\); pass shape \(4,\)$"),
+            ((0, 0, 0, np.nan), r"^attitude_xyzw holds nan at \[3\]; pass finite numbers$"),
             ("level", "^attitude_xyzw is not made of numbers"),
             (attitude(0.0, 90.0).as_quat(), "looks straight up or down, so its images have no level"),
         ):
@@ -432,7 +430,10 @@ def test_command_names_measurements_without_pose_once(recording, tmp_path):
     for path, message in (
         (part, "part.h5: sensor front has no pose at 1 of 3 measurements; add poses with 'ertis import-poses'"),
         (none, "none.h5: sensor front has no pose at 3 of 3 measurements; add poses with 'ertis import-poses'"),
-        (unmounted, "unmounted.h5: sensor front has no mounting, so its attitude is unknown; give --mounting"),
+        (
+            unmounted,
+            "unmounted.h5: sensor front has no mounting, so its attitude is unknown; add its mounting (--mounting)",
+        ),
     ):
         done = process(path, "--level", "-o", str(tmp_path / "out.h5"), code=1)
         assert len(re.findall(re.escape(message), done.stderr)) == 1, done.stderr
@@ -450,7 +451,10 @@ def test_levelled_file_has_no_ground_truth_of_another_frame(tmp_path):
     ertis.add_poses(path, ertis.Trajectory([time_ns - 1, time_ns + 10**10], np.zeros((2, 3)), [UNTURNED] * 2))
     process(path, "--level", "-o", str(tmp_path / "img.h5"), "-q")
     for arguments, message in (
-        (["compare"], "but the ground truth is in the frame of the sensor; process again without it (--no-level)"),
+        (
+            ["compare"],
+            "but the ground truth is in the frame of the sensor; process again without it (level_directions)",
+        ),
         (["export", "-o", str(tmp_path / "img.mcap")], "but messages of ROS are in the frame of the sensor"),
     ):
         done = CliRunner().invoke(cli, [arguments[0], str(tmp_path / "img.h5"), *arguments[1:]])

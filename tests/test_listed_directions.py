@@ -102,17 +102,17 @@ def test_settings_file_may_list_directions(tmp_path):
 @pytest.mark.parametrize(
     ("directions", "message"),
     [
-        (np.zeros((4, 3)), r"processing.directions has shape \(4, 3\); give azimuth and elevation"),
-        (np.zeros(4), r"processing.directions has shape \(4,\); give azimuth and elevation"),
-        (np.zeros((2, 2, 2)), r"processing.directions has shape \(2, 2, 2\); give azimuth and elevation"),
-        (np.zeros((0, 2)), "processing.directions lists 0 directions; give 1 to 1000"),
-        (np.zeros((1001, 2)), "processing.directions lists 1001 directions; give 1 to 1000, or more of them in a CSV"),
-        ([[0.0, 0.0], [0.0, math.nan]], r"elevation of processing.directions\[1\] in degrees is nan; give a finite"),
-        ([[math.inf, 0.0]], r"azimuth of processing.directions\[0\] in degrees is inf; give a finite number"),
-        ([[0.0, 91.0]], r"elevation of processing.directions\[0\] in degrees is 91; give a number from -90 to 90"),
-        ([[361.0, 0.0]], r"azimuth of processing.directions\[0\] in degrees is 361; give a number from -360 to 360"),
-        (90, "processing.directions is 90; give text or a list"),
-        ([["0", "1"]], r"processing.directions\[0\]\[0\] is '0'; give a number"),
+        (np.zeros((4, 3)), r"processing.directions has shape \(4, 3\); use azimuth and elevation"),
+        (np.zeros(4), r"processing.directions has shape \(4,\); use azimuth and elevation"),
+        (np.zeros((2, 2, 2)), r"processing.directions has shape \(2, 2, 2\); use azimuth and elevation"),
+        (np.zeros((0, 2)), "processing.directions lists 0 directions; use 1 to 1000"),
+        (np.zeros((1001, 2)), "processing.directions lists 1001 directions; use 1 to 1000, or more of them in a CSV"),
+        ([[0.0, 0.0], [0.0, math.nan]], r"elevation of processing.directions\[1\] in degrees is nan; use a finite"),
+        ([[math.inf, 0.0]], r"azimuth of processing.directions\[0\] in degrees is inf; use a finite number"),
+        ([[0.0, 91.0]], r"elevation of processing.directions\[0\] in degrees is 91; use a number from -90 to 90"),
+        ([[361.0, 0.0]], r"azimuth of processing.directions\[0\] in degrees is 361; use a number from -360 to 360"),
+        (90, "processing.directions is 90; use text or a list"),
+        ([["0", "1"]], r"processing.directions\[0\]\[0\] is '0'; use a number"),
     ],
 )
 def test_unusable_directions_are_refused_in_one_line(directions, message):

@@ -177,7 +177,7 @@ def test_listen_reports_too_few_images_within_its_duration(monkeypatch):
     end_when(monkeypatch, "ertis_cli.listen", lambda: printed)
     done = heard([image(1)], "-n", 2, "--duration", 0.5)
     assert done.exit_code == 1
-    assert "received 1 of 2 products in 0.5 s; give a longer --duration" in done.stderr
+    assert "received 1 of 2 products in 0.5 s; use a longer --duration" in done.stderr
 
 
 def test_unanswered_address_is_reported_once(monkeypatch):
@@ -272,7 +272,7 @@ def test_invalid_output_file_is_refused_at_once(product, folder):
 def test_invalid_duration_and_key_are_refused(tmp_path):
     secret, _ = KeyPair.new("me").save(tmp_path / "keys")
     for arguments, reported, code in (
-        (("--duration", "0"), "--duration is 0; give a number above 0", 2),
+        (("--duration", "0"), "--duration is 0; use a number above 0", 2),
         (("--key", secret, "--server-key", "abc"), "--server-key: 'abc' is neither a public key nor a file with", 1),
     ):
         done = listen("tcp://127.0.0.1:1", *arguments)
@@ -283,7 +283,10 @@ def test_invalid_duration_and_key_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "match"),
     [
-        (("--product", "group", "--save", "x.h5"), "--save writes one product; give only --product energyscape"),
+        (
+            ("--product", "group", "--save", "x.h5"),
+            "--save writes one product; combine it only with --product energyscape",
+        ),
         (("--product", "raw", "--product", "energyscape", "--save", "x.h5"), "--save writes one product"),
         (("--key", "me"), "--key is given without --server-key"),
     ],

@@ -126,7 +126,7 @@ def test_invalid_plan_is_refused(runs, out, monkeypatch):
         return settings.replace(processing=settings.processing.replace(method="paper"))
 
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=on_paper, explain=True))
-    assert "needs a plan, but method 'paper' has none; give 'fast'" in found["a.h5"].error
+    assert "need a plan, but method 'paper' has none; use method 'fast'" in found["a.h5"].error
 
 
 @pytest.mark.usefixtures("made")
@@ -198,7 +198,7 @@ def test_foreign_file_is_not_replaced(runs, out, monkeypatch, content):
     content = (runs / "b.h5").read_bytes() if recording else content
     (out / "a.energy.h5").write_bytes(content)
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(overwrite=recording))
-    stated = "is a recording; give another folder" if recording else "is not a readable energyscape file"
+    stated = "is a recording; choose another folder" if recording else "is not a readable energyscape file"
     assert f"exists and {stated}" in found["a.h5"].error
     assert (out / "a.energy.h5").read_bytes() == content
 

@@ -132,7 +132,7 @@ def test_map_of_space_shows_the_height_of_the_post(folder):
     assert done.exit_code == 0, done.output
     done = CliRunner().invoke(cli, ["info", str(folder / "space.map.h5"), "--json"])
     assert len(json.loads(done.stdout)["cells"]) == 3
-    message = "no point of the images lies within the heights of 100 to 200 m; give --height in the world frame of"
+    message = "no point of the images lies within the heights of 100 to 200 m; correct --height, which refers to"
     done = run(folder, "space.h5 --poses poses.tum --dimensions 3 --height 100:200 -o high.h5", code=1)
     assert f"ertis: error: {message}" in done.stderr
     assert not (folder / "high.h5").exists()
@@ -145,7 +145,7 @@ def test_map_of_space_is_refused_for_planar_images_and_files(folder):
     done = run(folder, "both.h5 --poses poses.tum --dimensions 3 -o space.ply", code=1)
     assert "images include a planar image, but a map of three dimensions needs directions over elev" in done.output
     done = run(folder, "both.h5 --poses poses.tum --dimensions 3 -o space.pgm", code=1)
-    assert "give a name that ends in .h5 or .ply" in done.output
+    assert "choose a name that ends in .h5 or .ply" in done.output
 
 
 @pytest.mark.skipif(not Path("/sys/kernel").is_dir(), reason="only Linux has folders that root cannot write either")
@@ -255,7 +255,7 @@ def test_order_of_recordings_does_not_change_the_map(folder, tmp_path):
     np.testing.assert_allclose(one.log_odds, other.log_odds, atol=1e-5)
     add_poses(folder / "right.h5", poses(x_m=4.0), output=tmp_path / "right.h5", overwrite=True)
     done = run(tmp_path, "right.h5 left.h5 -q -o third.h5", code=1)
-    assert re.search(r"have different poses at \d+ ns; give one trajectory, such as --poses FILE", done.stderr)
+    assert re.search(r"have different poses at \d+ ns; use one trajectory for all \(--poses\)", done.stderr)
 
 
 @pytest.mark.parametrize(
@@ -293,7 +293,10 @@ def test_map_notes_poses_of_a_camera_and_converts_them(folder):
     ertis.write_tum(folder / "camera.tum", of_camera(poses()))
     with pytest.warns(ertis.PoseWarning, match="as that of a camera"):
         add_poses(folder / "both.h5", of_camera(poses()), output=folder / "of_camera.h5")
-    note = "its −y axis points up, as that of a camera does (z forward, y down); use --pose-axes camera "
+    note = (
+        "its −y axis points up, as that of a camera does (z forward, y down); convert them with 'ertis import-poses "
+        "--pose-axes camera'"
+    )
     run(folder, "both.h5 --poses poses.tum -q -o level.h5")
     for number, line in enumerate(("both.h5 --poses camera.tum", "of_camera.h5")):
         done = run(folder, f"{line} -o turned{number}.h5")
@@ -348,7 +351,7 @@ def test_map_refuses_poses_at_other_times(folder):
     ("line", "code", "message"),
     [
         ("both.h5", 2, "contains no poses of the platform; add --poses FILE"),
-        ("both.h5 left.h5 --poses poses.tum", 2, "have the same sensor 'left'"),
+        ("both.h5 left.h5 --poses poses.tum", 2, "contain the same sensor 'left';"),
         (
             "both.h5 --poses poses.tum -o place.tif",
             1,

@@ -524,7 +524,7 @@ def test_grid_keeps_values_as_it_grows_in_all_directions(n_dimensions):
     assert log_odds.shape == (1,) * n_dimensions
     assert log_odds.item() == 3.0
     assert origin_m == pytest.approx((0.0,) * n_dimensions)
-    with pytest.raises(ArgumentError, match=r"give larger cells \(cell_m\), or poses closer"):
+    with pytest.raises(ArgumentError, match=r"use larger cells \(cell_m\), or poses closer"):
         grid.window(np.array([1e5, 0.0, 0.0]), 1.0)
 
 
@@ -535,9 +535,9 @@ def test_map_without_evidence_has_one_unknown_cell():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"cell_m": 0.0}, "cell_m is 0; give a number from 0.005 to 1"),
-        ({"dimensions": 4}, "dimensions is 4; give a whole number from 2 to 3"),
-        ({"half_life_s": 0.0}, "half_life_s is 0; give a number above 0"),
+        ({"cell_m": 0.0}, "cell_m is 0; use a number from 0.005 to 1"),
+        ({"dimensions": 4}, "dimensions is 4; use a whole number from 2 to 3"),
+        ({"half_life_s": 0.0}, "half_life_s is 0; use a number above 0"),
         ({"height_m": (2.0, 1.0)}, "height_m runs from 2 to 1"),
         ({"emitter_diameter_m": 1.0}, "emitter_diameter_m is 1"),
     ],
@@ -550,7 +550,7 @@ def test_mapper_refuses_invalid_options(options, message):
 @pytest.mark.parametrize(
     ("pose", "message"),
     [
-        (3.0, "pose is 3.0; give a position and a unit quaternion, or a Trajectory"),
+        (3.0, "pose is 3.0; pass a position and a unit quaternion, or a Trajectory"),
         (((0.0, 0.0), UNTURNED), "translation_m of sensor platform"),
         (((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0)), "platform"),
     ],
@@ -590,7 +590,7 @@ def test_occupancy_map_places_its_cells_in_the_world():
     assert found.is_free.tolist() == [[True, False, False], [False, False, False]]
     assert found.limits_m == ((-1.0, 0.5), (2.0, 3.0))
     assert found.log_odds_at([[-0.9, 2.1], [0.4, 2.9], [0.6, 2.9], [-1.1, 2.1]]).tolist() == [-3.0, 4.0, 0.0, 0.0]
-    with pytest.raises(ArgumentError, match="give x and y along the last axis"):
+    with pytest.raises(ArgumentError, match="use x and y along the last axis"):
         found.log_odds_at([1.0, 2.0, 3.0])
 
 
@@ -623,7 +623,7 @@ def test_map_of_space_places_its_cells_in_the_world():
     assert voxels().limits_m == pytest.approx(np.array([(-1.0, -0.6), (2.0, 2.3), (0.5, 0.7)]))
     assert voxels().occupied_m == pytest.approx(np.array([[-0.65, 2.25, 0.65]]))
     assert voxels().log_odds_at([[-0.65, 2.25, 0.65], [-0.95, 2.15, 0.55], [-0.65, 2.25, 0.75]]).tolist() == [3, -2, 0]
-    with pytest.raises(ArgumentError, match="give x, y and z along the last axis"):
+    with pytest.raises(ArgumentError, match="use x, y and z along the last axis"):
         voxels().log_odds_at([1.0, 2.0])
 
 
@@ -636,7 +636,7 @@ def test_map_of_space_is_written_as_hdf5_and_ply(tmp_path):
     vertices = PlyData.read(str(tmp_path / "m.ply"))["vertex"]
     assert [vertices[name][0] for name in "xyz"] == pytest.approx([-0.65, 2.25, 0.65])
     for suffix in ("pgm", "mcap"):
-        with pytest.raises(ArgumentError, match=r"but the map has three; give a name that ends in .h5 or .ply"):
+        with pytest.raises(ArgumentError, match=r"but the map has three; choose a name that ends in .h5 or .ply"):
             ertis.write_map(tmp_path / f"m.{suffix}", voxels())
 
 
@@ -655,6 +655,27 @@ def test_figure_of_a_map_of_space_shows_it_from_above_and_from_the_side():
         shown = axes.images[0].get_array()
         assert np.argwhere(shown > 0.5).tolist() == [list(place)]
         assert (shown < 0.5).sum() == 1
+
+
+def test_figure_of_a_map_shows_path_heading_and_sensors():
+    turned = (0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4))  # looks along y
+    trajectory = ertis.Trajectory(
+        time_ns=np.array([0, 10**9]),
+        position_m=np.array([[0.0, 0.0, 0.0], [1.0, 0.5, 0.2]]),
+        rotation_xyzw=np.array([(0.0, 0.0, 0.0, 1.0), turned]),
+    )
+    found = ertis.OccupancyMap(np.zeros((20, 20)), (-1.0, -1.0), 0.1)
+    figure = figures.occupancy(
+        found, trajectory=trajectory, mountings={"front": ((0.1, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
+    )
+    (axes,) = figure.axes
+    path, sensors = axes.lines
+    np.testing.assert_allclose(path.get_xydata(), trajectory.position_m[:, :2])
+    np.testing.assert_allclose(sensors.get_xydata(), [[1.0, 0.6]], atol=1e-12)
+    (arrow,) = axes.texts
+    np.testing.assert_allclose(np.subtract(arrow.xy, arrow.xyann), [0.0, 0.12], atol=1e-12)
+    assert axes.get_xlim() == (-1.0, 1.0)
+    assert "path and last heading" in " ".join(text.get_text() for text in figure.texts)
 
 
 def test_damaged_map_file_is_refused(tmp_path):
@@ -681,7 +702,7 @@ def test_map_and_recording_are_told_apart(tmp_path):
     ertis.write_map(tmp_path / "m.h5", small())
     with pytest.raises(DataError, match=r"m.h5 is an occupancy map; choose a recording"):
         ertis.open_recording(tmp_path / "m.h5")
-    with pytest.raises(DataError, match="not an occupancy map; give one, as from 'ertis map'"):
+    with pytest.raises(DataError, match="not an occupancy map; choose a file of 'ertis map'"):
         ertis.read_map(REFLECTORS)
     with pytest.raises(DataError, match="choose an occupancy map"):
         ertis.read_map(tmp_path / "none.h5")

@@ -99,7 +99,7 @@ def _eventually(scrape):
 
 @pytest.mark.parametrize("address", ["0.0.0.0:9101", "*:9101", "example.org:9101", "192.0.2.1:9101"])
 def test_metrics_are_served_on_loopback_only(address):
-    with pytest.raises(ArgumentError, match=r"can be reached from other machines; give 127\.0\.0\.1:PORT"):
+    with pytest.raises(ArgumentError, match=r"can be reached from other machines; use 127\.0\.0\.1:PORT"):
         Metrics(address, lambda: BUSY)
 
 

@@ -264,10 +264,10 @@ def test_modulator_is_independent_of_threads_and_blocks():
 @pytest.mark.parametrize(
     ("spoiled", "message"),
     [
-        ({"keys": keys_of(4)}, r"keys has shape \(4,\); give shape \(3,\)"),
-        ({"noise_rms": np.zeros(1)}, r"noise_rms has shape \(1,\); give shape \(3,\)"),
-        ({"signals": np.zeros((3, 9))}, r"signals has shape \(3, 9\); give shape \(3, 10\)"),
-        ({"out": np.zeros((10, 1), np.uint16)}, r"out, in bytes, has shape \(10, 2\); give shape \(10, 1\)"),
+        ({"keys": keys_of(4)}, r"keys has shape \(4,\); pass shape \(3,\)"),
+        ({"noise_rms": np.zeros(1)}, r"noise_rms has shape \(1,\); pass shape \(3,\)"),
+        ({"signals": np.zeros((3, 9))}, r"signals has shape \(3, 9\); pass shape \(3, 10\)"),
+        ({"out": np.zeros((10, 1), np.uint16)}, r"out, in bytes, has shape \(10, 2\); pass shape \(10, 1\)"),
     ],
 )
 def test_modulator_refuses_wrong_shapes(spoiled, message):
@@ -281,7 +281,7 @@ def test_modulator_refuses_wrong_shapes(spoiled, message):
 
 
 def test_modulator_refuses_other_orders():
-    with pytest.raises(ArgumentError, match="order is 5; give a whole number from 1 to 4"):
+    with pytest.raises(ArgumentError, match="order is 5; use a whole number from 1 to 4"):
         noise_transfer(5, BAND)
-    with pytest.raises(ArgumentError, match=r"band is 0\.3; give a number from 0 to 0\.25"):
+    with pytest.raises(ArgumentError, match=r"band is 0\.3; use a number from 0 to 0\.25"):
         noise_transfer(4, 0.3)

@@ -324,5 +324,5 @@ def test_measurements_follow_the_rate_of_the_scene():
 
 
 def test_negative_index_is_refused():
-    with pytest.raises(ArgumentError, match="index is -2; give a whole number of at least 0"):
+    with pytest.raises(ArgumentError, match="index is -2; use a whole number of at least 0"):
         heard(scene_of(), index=-2)

@@ -54,8 +54,8 @@ def test_rise_towards_the_end_of_the_image_is_no_echo():
 @pytest.mark.parametrize(
     ("n_ranges", "options", "message"),
     [
-        (401, {"min_level_db": 1.0}, "min_level_db is 1; give"),
-        (2, {}, "the image has 2 ranges; give one with at least 3"),
+        (401, {"min_level_db": 1.0}, "min_level_db is 1; use"),
+        (2, {}, "the image has 2 ranges; use an image with at least 3"),
     ],
 )
 def test_invalid_arguments_are_refused(n_ranges, options, message):

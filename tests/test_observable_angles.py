@@ -143,7 +143,7 @@ def test_plot_of_one_microphone_is_a_curve_over_range(one, tmp_path):
         with pytest.raises(ArgumentError, match=r"has one microphone; .* draw a curve over range"):
             getattr(figures, kind)(image)
     stated = run(f"plot {path} --kind polar -o {tmp_path / 'polar.png'}", code=1).stderr
-    assert "draw a curve over range with 'ertis plot --kind image'" in stated
+    assert "draw a curve over range with ertis.plot ('ertis plot --kind image'" in stated
     assert not (tmp_path / "polar.png").exists()
 
 

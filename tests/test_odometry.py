@@ -155,7 +155,7 @@ def test_odometry_command_names_its_output_after_the_recording(folder, tmp_path)
     code, stdout, stderr = run(recording, "--quiet")
     assert (code, stdout, stderr) == (0, "", "")
     code, _, stderr = run(recording)
-    assert (code, "both.odometry.tum exists; give another name" in stderr) == (1, True), stderr
+    assert (code, "both.odometry.tum exists; choose another name" in stderr) == (1, True), stderr
 
 
 def test_odometry_command_takes_mountings_from_a_file(folder, tmp_path):
@@ -169,20 +169,20 @@ def test_odometry_command_takes_mountings_from_a_file(folder, tmp_path):
 @pytest.mark.parametrize(
     ("names", "status", "message"),
     [
-        (["unmounted.h5"], 1, "the mounting of sensor 'front' is unknown; give --mounting FILE"),
+        (["unmounted.h5"], 1, "the mounting of sensor 'front' is unknown; add its mounting with --mounting FILE"),
         (["both.h5", "--mounting", "front.h5"], 1, "front.h5 does not contain sensor 'back'; add its mounting, or"),
-        (["single.h5"], 1, "single.h5 has only one pulse; give recordings of at least 2"),
-        (["front.h5", "both.h5"], 2, "have the same sensor 'front'"),
-        (["timeless.h5"], 1, "timeless.h5 has different pulses at the same time"),
+        (["single.h5"], 1, "single.h5 contains one pulse; at least two"),
+        (["front.h5", "both.h5"], 2, "contain the same sensor 'front'"),
+        (["timeless.h5"], 1, "timeless.h5 contains several pulses with the same timestamp"),
         (["front.h5", "late.h5"], 1, "no pulse has measurements of two sensors: front has pulses 0 to 2 from 0.000 s"),
         (
             ["front.h5", "other_chain.h5"],
             1,
-            "of SYNC count 1 are 0.7 s apart; give recordings of one SYNC chain, whose",
+            "of SYNC count 1 are 0.7 s apart; use recordings of one SYNC chain, whose",
         ),
         (["slow.h5"], 1, "slow.h5: no two successive pulses have enough echoes in common, at most a second apart"),
         (["front.h5"], 1, "front.h5: no step determines the motion, because standing still, mirrored motion or the"),
-        (["passive.h5"], 1, "passive.h5: all measurements are passive and have no echoes; give recordings of emitted"),
+        (["passive.h5"], 1, "passive.h5: all measurements are passive and have no echoes; use recordings of emitted"),
         (["both.h5", "--preset", "none"], 2, "preset 'none' is unknown"),
     ],
 )
@@ -199,13 +199,13 @@ def test_odometry_command_refuses_settings_without_images(folder, tmp_path):
     (tmp_path / "beams.toml").write_text('[processing]\nlast_stage = "beams"\n')
     code, _, stderr = run(folder / "both.h5", "--settings", tmp_path / "beams.toml", "-o", tmp_path / "path.tum")
     assert code == 2
-    assert 'beams, but echoes come from images; give last_stage = "envelope" in --settings FILE' in stderr
+    assert 'beams, but echoes come from images; set last_stage = "envelope" in --settings FILE' in stderr
 
 
 def test_odometry_command_refuses_another_format_at_once(folder, tmp_path):
     code, _, stderr = run(folder / "both.h5", "-o", tmp_path / "path.csv")
     assert (code, stderr.count("\n")) == (1, 1)
-    assert "path.csv ends in .csv, but the file is text of TUM; give a name in .tum or .txt" in stderr
+    assert "path.csv ends in .csv, but the file is text of TUM; choose a name in .tum or .txt" in stderr
 
 
 def test_odometry_command_notes_steps_without_matches(folder, tmp_path):

@@ -366,7 +366,7 @@ def test_listen_without_pulses_writes_no_trajectory(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--odometry", "--fuse"], "--fuse and --odometry exclude each other"),
+        (["--odometry", "--fuse"], "--fuse and --odometry cannot be combined"),
         (["--odometry", "--product", "points"], "--product applies only without --odometry"),
         (["--odometry", "--save", "a.h5"], "--save applies only without --odometry"),
         (["--fuse", "-o", "a.tum"], "-o applies only with --odometry; --save FILE.h5 saves products"),
@@ -419,4 +419,4 @@ def test_listen_refuses_an_existing_trajectory_at_once(tmp_path):
     target.write_text("mine")
     shown = CliRunner().invoke(cli, ["listen", "tcp://127.0.0.1:1", "--odometry", "-o", str(target)])
     assert (shown.exit_code, target.read_text()) == (1, "mine"), shown.output
-    assert "path.tum exists; give another name" in str(shown.exception) + shown.output
+    assert "path.tum exists; choose another name" in str(shown.exception) + shown.output

@@ -110,7 +110,7 @@ def test_filtered_images_keep_their_error_budget(weighting):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"pre_filter": (0.0,) * 9}, "processing.pre_filter contains only 0; give other taps, or leave it out"),
+        ({"pre_filter": (0.0,) * 9}, "processing.pre_filter contains only 0; choose other taps, or leave it out"),
         ({"post_filter": (1.0,) * 1025}, "processing.post_filter has 1025 taps; the limit is 1024"),
         ({"pre_filter": (1.0, float("nan"))}, r"processing.pre_filter\[1\] is nan"),
         (
@@ -121,17 +121,17 @@ def test_filtered_images_keep_their_error_budget(weighting):
             {"post_filter": (1.0, 2.0), "beamformer": "dmas"},
             "post_filter filters beams, but processing.beamformer 'dmas'",
         ),
-        ({"filter_rate_hz": -1.0}, "processing.filter_rate_hz is -1; give a number from 1 to 1e"),
+        ({"filter_rate_hz": -1.0}, "processing.filter_rate_hz is -1; use a number from 1 to 1e"),
         (
             {"pre_filter": (1.0,), "filter_rate_hz": 90e3},
-            "filter_rate_hz is 90000; give more than twice the call's 50000",
+            "filter_rate_hz is 90000; use more than twice the call's 50000",
         ),
         (
             {
                 "pre_filter": tuple(scipy.signal.firwin(301, 5e3, fs=RATE_HZ, window=("kaiser", 14.0))),
                 "filter_rate_hz": RATE_HZ,
             },
-            "pre_filter and post_filter remove the band of the call, 25000 to 50000 Hz; give filters that pass it",
+            "pre_filter and post_filter remove the band of the call, 25000 to 50000 Hz; use filters that pass it",
         ),
     ],
 )
@@ -164,7 +164,7 @@ def test_taps_are_read_from_a_file_beside_the_settings(tmp_path, suffix):
         assert images.settings.processing.pre_filter == UPWARDS
     with pytest.raises(SettingsError, match=r"processing.pre_filter is 'taps.*, the name of a file; send its taps"):
         received_settings(text, "a sensor")
-    with pytest.raises(ArgumentError, match=r"pre_filter is the file 'taps.*, which has not been read; give its"):
+    with pytest.raises(ArgumentError, match=r"pre_filter is the file 'taps.*, which has not been read; set its"):
         Pipeline(Settings.from_toml(text), "numpy")
 
 

@@ -164,7 +164,7 @@ def test_files_named_in_received_settings_are_not_opened(tmp_path):
         ({"duration_s": 1e-3}, "call.waveform and call.duration_s contradict each other"),
         ({"ramp_fraction": 0.2}, "call.waveform and call.ramp_fraction contradict each other"),
         ({"modulation": "linear"}, "call.waveform and call.modulation are both given"),
-        ({"waveform": (0.0, 1.0)}, "call.waveform has 2 samples; give 17 to 4096, at 450000 Hz 9.1 ms at most"),
+        ({"waveform": (0.0, 1.0)}, "call.waveform has 2 samples; use 17 to 4096, at 450000 Hz 9.1 ms at most"),
         ({"waveform": np.ones(MAX_WAVEFORM_SAMPLES + 1)}, "call.waveform has 4097 samples"),
         ({"waveform": np.zeros(100)}, "call.waveform contains only 0"),
         ({"waveform": (*SAMPLES, np.nan)}, "call.waveform holds nan"),
@@ -182,14 +182,14 @@ def test_call_refuses_invalid_waveforms(changes, message):
 @pytest.mark.parametrize(
     ("name", "write", "message"),
     [
-        ("own.wav", lambda path: wavfile.write(path, 192_000, np.ones((300, 2), np.int16)), "give one channel"),
+        ("own.wav", lambda path: wavfile.write(path, 192_000, np.ones((300, 2), np.int16)), "use one channel"),
         ("own.wav", lambda path: path.write_bytes(b"RIFF"), "is a RIFF file of another form than WAVE"),
         ("own.npy", lambda path: path.write_bytes(b"\x80\x04N."), "cannot be read"),
         ("own.npy", lambda path: path.write_bytes(b""), "cannot be read"),
         ("own.csv", lambda path: path.write_text("a,b"), "cannot be read"),
         ("own.npy", lambda path: np.save(path, np.zeros(2**20)), "the limit is 4194304"),
         ("own.wav", lambda path: path.mkdir(), "no such file"),
-        ("own.mp3", lambda path: path.write_bytes(b""), "give a .wav, .csv or .npy file"),
+        ("own.mp3", lambda path: path.write_bytes(b""), "choose a .wav, .csv or .npy file"),
         ("own.npy", lambda path: np.save(path, np.zeros(100)), "call.waveform contains only 0"),
     ],
 )
@@ -207,5 +207,5 @@ def test_wav_of_another_rate_is_refused(tmp_path):
 
 
 def test_settings_with_an_unread_waveform_are_refused():
-    with pytest.raises(ArgumentError, match=r"the file 'own\.wav', which has not been read; give Call\.from_file"):
+    with pytest.raises(ArgumentError, match=r"the file 'own\.wav', which has not been read; use Call\.from_file"):
         Pipeline(Settings(call=Call(waveform="own.wav")), device="cpu")

@@ -27,8 +27,6 @@ IN_THE_REPOSITORY_ONLY = {
         "passive",
         "peers",
         "platform_trials",
-        "ptx",
-        "rejected_plans",
         "simulation_trials",
     )
 }

@@ -177,12 +177,12 @@ def test_pcm_samples_with_nan_are_refused(value):
     settings = PCM.replace(recording=PCM.recording.replace(encoding="float32"))
     words = np.zeros((3_000, 8), np.float32)
     words[17, 3] = value
-    with pytest.raises(DataError, match=rf"holds {value} at sample 17 of channel 3; give finite numbers"):
+    with pytest.raises(DataError, match=rf"holds {value} at sample 17 of channel 3; pass finite numbers"):
         Pipeline(settings, predict=False).process(ertis.Measurement(words, settings))
 
 
 def test_pdm_sensor_refuses_pcm_settings():
-    with pytest.raises(ArgumentError, match=r"recording\.encoding is 'int16', but a sensor sends bits; give 'pdm'"):
+    with pytest.raises(ArgumentError, match=r"recording\.encoding is 'int16', but a sensor sends bits; use 'pdm'"):
         ertis.Setup.of(Settings().replace(recording=Recording(n_samples=65_536, encoding="int16")))
 
 

@@ -57,7 +57,7 @@ def test_cfar_options_change_the_peaks(images):
     [
         ("--false-alarm 1e-3", 2, "--false-alarm needs --detector cfar; add it"),
         ("--detector cfar --truth", 2, "--truth needs --detector peaks; remove --truth or"),
-        ("--detector cfar --false-alarm 2", 2, "--false-alarm is 2; give a number from 1e-09 to 0.5"),
+        ("--detector cfar --false-alarm 2", 2, "--false-alarm is 2; use a number from 1e-09 to 0.5"),
     ],
 )
 def test_peaks_refuses_invalid_input(images, options, code, match):

@@ -272,5 +272,5 @@ def test_unsuitable_parts_of_a_plan_are_refused(changes, message):
     "changes", [{"beamformer": "dmas"}, {"beamformer": "capon"}, {"weighting": "coherence_factor"}]
 )
 def test_adaptive_beamformers_are_refused(changes):
-    with pytest.raises(ArgumentError, match=r"accuracy\.delay_taps is 0 .* does not support; leave it out or give 1"):
+    with pytest.raises(ArgumentError, match=r"accuracy\.delay_taps is 0 .* does not support; leave it out or use 1"):
         Settings(processing=Processing(**changes), accuracy=Accuracy(delay_taps=0))

@@ -145,8 +145,8 @@ def test_output_array_is_reused_without_allocation():
     ("settings", "device", "threads", "error", "match"),
     [
         (SHORT, "gpu", None, ArgumentError, "device 'gpu' is unknown"),
-        (SHORT, "cpu", 0, ArgumentError, "threads is 0; give a whole number from 1"),
-        (SHORT, "cpu", 4096, ArgumentError, "threads is 4096; give a whole number from 1"),
+        (SHORT, "cpu", 0, ArgumentError, "threads is 0; use a whole number from 1"),
+        (SHORT, "cpu", 4096, ArgumentError, "threads is 4096; use a whole number from 1"),
         (
             SHORT.replace(processing=Processing(range_m=(0.5, 5.0))),
             "cpu",
@@ -249,7 +249,7 @@ def test_pipeline_refuses_samples_of_other_settings(words):
 
 @pytest.mark.parametrize("out", [np.zeros((7, 3), np.float32), np.zeros((7, 131)), np.zeros((131, 7), np.float32).T])
 def test_pipeline_refuses_out_of_another_shape(out):
-    with pytest.raises(ArgumentError, match=r"give contiguous float32 of shape \(7, 131\)"):
+    with pytest.raises(ArgumentError, match=r"use contiguous float32 of shape \(7, 131\)"):
         Pipeline(SHORT, predict=False).process(noise(SHORT), out=out)
 
 

@@ -81,11 +81,11 @@ def test_process_many_yields_the_batches_before_a_measurement_it_refuses(pipelin
 
 def test_process_many_refuses_arguments_at_once():
     with Pipeline(SHORT, "cpu", 1, predict=False) as pipeline:
-        with pytest.raises(ArgumentError, match="batch_size is 0; give a whole number of at least 1"):
+        with pytest.raises(ArgumentError, match="batch_size is 0; use a whole number of at least 1"):
             pipeline.process_many([], batch_size=0)
-        with pytest.raises(ArgumentError, match=r"measurements\[0\] is of type str; give Measurement"):
+        with pytest.raises(ArgumentError, match=r"measurements\[0\] is of type str; pass a "):
             next(pipeline.process_many(["rec.h5"]))
-        with pytest.raises(ArgumentError, match="measurements is of type Measurement; give a list"):
+        with pytest.raises(ArgumentError, match="measurements is of type Measurement; pass a list"):
             next(pipeline.process_many(MEASUREMENTS[0]))
         assert list(pipeline.process_many([])) == []
     with pytest.raises(ArgumentError, match="the pipeline is closed"):

@@ -52,7 +52,7 @@ def test_signals_have_calibrated_gains_removed_and_delays_left_in():
 
 def test_signals_need_an_open_pipeline_and_a_measurement():
     pipeline = Pipeline(SETTINGS, "cpu", 1, predict=False)
-    with pytest.raises(ArgumentError, match="measurement is of type str; give Measurement"):
+    with pytest.raises(ArgumentError, match="measurement is of type str; pass a "):
         pipeline.signals("rec.h5")
     pipeline.close()
     with pytest.raises(ArgumentError, match="the pipeline is closed"):

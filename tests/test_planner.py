@@ -116,10 +116,10 @@ def test_given_precision_is_kept(precision):
 )
 def test_unreachable_budget_is_refused_with_the_smallest_error(pinned, part):
     with pytest.raises(
-        ArgumentError, match=rf"max_error_db is -160, but the smallest error .* due to {part}\); give -\d+ or"
+        ArgumentError, match=rf"max_error_db is -160, but the smallest error .* due to {part}\); use -\d+ or"
     ) as no:
         chosen_for(SMALL, max_error_db=-160.0, **pinned)
-    min_db = float(str(no.value).partition("; give ")[2].split()[0])
+    min_db = float(str(no.value).partition("; use ")[2].split()[0])
     assert chosen_for(SMALL, max_error_db=min_db, **pinned).error_db <= min_db
     with pytest.raises(ArgumentError, match="but the smallest error"):
         chosen_for(SMALL, max_error_db=min_db - 1.01, **pinned)
@@ -200,7 +200,7 @@ def test_spherical_wavefronts_of_adaptive_beamformers_need_16_bits():
         accuracy=Accuracy(precision="float32"),
     )
     with pytest.raises(
-        ArgumentError, match=r"'coherence_factor' needs 16-bit streams .*give processing.wavefront 'pla"
+        ArgumentError, match=r"'coherence_factor' needs 16-bit streams .*use processing.wavefront 'plane',"
     ):
         Planner(settings, CPU, threads=1).choose()
 

@@ -131,7 +131,7 @@ def test_plan_beyond_its_budget_is_refused(recording, tmp_path):
     done = run(recording, "-o", output, "--settings", wishes, code=1)
     last = done.stderr.splitlines()[-1]
     assert last.startswith("ertis: error: accuracy.max_error_db is -35, but the smallest error of these settings is -")
-    assert last.endswith("or leave more of [accuracy] open")
+    assert last.endswith("or remove keys of [accuracy]")
     assert sorted(item.name for item in tmp_path.iterdir()) == ["rec.h5", "wishes.toml"]
 
 
@@ -142,7 +142,7 @@ def test_verify_writes_no_image_beyond_the_budget(recording, tmp_path, monkeypat
     output = tmp_path / "a.h5"
     done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(output), "--verify"])
     assert done.exit_code == 1
-    assert "sensor eRTIS-7 has an error of -30.0 dB, but the limit is -35 dB; give a lower --max-error" in done.stderr
+    assert "sensor eRTIS-7 has an error of -30.0 dB, but the limit is -35 dB; use a lower --max-error" in done.stderr
     assert not output.exists()
 
 
@@ -155,7 +155,7 @@ def test_unreachable_budget_is_refused(recording, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
-        (["--max-error", "good"], "'good' is not an error budget; give dB, as in -40, or draft, standard, fine, exact"),
+        (["--max-error", "good"], "'good' is not an error budget; use dB, as in -40, or draft, standard, fine, exact"),
         (["--method", "paper", "--explain"], "--explain needs --method fast; method 'paper' has no plan"),
         (["--method", "paper", "--max-error", "fine"], "--max-error needs --method fast"),
     ],

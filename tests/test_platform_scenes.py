@@ -141,10 +141,10 @@ def test_trajectory_holds_the_way_points():
 @pytest.mark.parametrize(
     ("waypoints", "message"),
     [
-        ((), "platform has no waypoints; give at least one"),
+        ((), "platform has no waypoints; write at least one"),
         (((0, 0, 0, 0, math.nan),), r"platform.waypoints\[0\] yaw_deg is nan"),
         (((0, 1e9, 0, 0, 0),), r"platform.waypoints\[0\] is 1e\+09"),
-        (((0, 0, 0, 0, 0), (0, 1, 0, 0, 0)), "go from 0 s to 0 s; give strictly increasing times"),
+        (((0, 0, 0, 0, 0), (0, 1, 0, 0, 0)), "go from 0 s to 0 s; pass strictly increasing times"),
         (((0, 0, 0, 0, 0), (1, 1000, 0, 0, 0)), "platform.waypoints speed is 1000"),
         (((0, 0, 0, 0, 0), (0.01, 0, 0, 0, 180)), "platform.waypoints yaw rate is 18000"),
     ],

@@ -80,16 +80,16 @@ def test_plot_without_axes_draws_a_page():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: ertis.plot(image(), ax=Figure()), "ax is of type Figure; give rectilinear Axes"),
-        (lambda: ertis.plot(image(), ax=axes_of(2)), "ax is of type ndarray; give rectilinear Axes"),
+        (lambda: ertis.plot(image(), ax=Figure()), "ax is of type Figure; pass rectilinear Axes"),
+        (lambda: ertis.plot(image(), ax=axes_of(2)), "ax is of type ndarray; pass rectilinear Axes"),
         (
             lambda: ertis.plot(image(), ax=axes_of(subplot_kw={"projection": "polar"})),
-            "ax is polar axes; give rectilinear Axes, such as matplotlib.pyplot.subplots returns",
+            "ax is polar axes; pass rectilinear Axes, such as matplotlib.pyplot.subplots returns",
         ),
-        (lambda: ertis.plot(image().amplitude, ax=axes_of()), "image is of type ndarray; give Energyscape"),
+        (lambda: ertis.plot(image().amplitude, ax=axes_of()), "image is of type ndarray; pass an "),
         (lambda: ertis.plot(image(), ax=axes_of(), theme="blue"), "theme 'blue' is unknown"),
         (lambda: ertis.plot(image(), ax=axes_of(), dynamic_range_db=0), "dynamic_range_db is 0"),
-        (lambda: ertis.plot(3), "image is of type int; give Energyscape"),
+        (lambda: ertis.plot(3), "image is of type int; pass an "),
     ],
 )
 def test_plot_refuses_unusable_arguments_in_one_line(call, message):

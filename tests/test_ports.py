@@ -116,7 +116,7 @@ def test_ports_without_file_or_usb_are_handled(monkeypatch):
 
 def test_several_ports_of_one_serial_number_are_refused(monkeypatch):
     plug_in(monkeypatch, ttyACM0="SN7", ttyACM1="SN7")
-    wanted = re.escape("'SN7' matches 2 ports: /dev/ttyACM0 (SN7), /dev/ttyACM1 (SN7); give the path of one")
+    wanted = re.escape("'SN7' matches 2 ports: /dev/ttyACM0 (SN7), /dev/ttyACM1 (SN7); choose the path of one")
     with pytest.raises(SonarError, match=wanted) as caught:
         resolve("SN7")
     assert caught.value.errno == errno.EINVAL

@@ -417,16 +417,16 @@ def test_flush_reports_an_interrupted_connection_once(tmp_path):
 
 def test_publisher_checks_its_arguments():
     address = "tcp://127.0.0.1:5601"
-    with pytest.raises(ArgumentError, match="sensors is 'left'; give a list of 1 to 32 names"):
+    with pytest.raises(ArgumentError, match="sensors is 'left'; pass a list of 1 to 32 names"):
         PosePublisher(address, "left")
-    with pytest.raises(ArgumentError, match=r"sensors is \[\]; give a list of 1 to 32 names"):
+    with pytest.raises(ArgumentError, match=r"sensors is \[\]; pass a list of 1 to 32 names"):
         PosePublisher(address, [])
-    with pytest.raises(ArgumentError, match="source has 0 characters; give 1 to 64"):
+    with pytest.raises(ArgumentError, match="source has 0 characters; use 1 to 64"):
         PosePublisher(address, ["left"], source="")
     with PosePublisher(address, ["left"]) as publisher:
         with pytest.raises(ArgumentError, match="rotation_xyzw has length 2"):
             publisher.send(5, (0, 0, 0), (0, 0, 0, 2))
-        with pytest.raises(ArgumentError, match=r"timestamp_ns is 1\.5; give a whole number"):
+        with pytest.raises(ArgumentError, match=r"timestamp_ns is 1\.5; use a whole number"):
             publisher.send(1.5, (0, 0, 0), IDENTITY)
 
 

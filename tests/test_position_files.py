@@ -199,7 +199,7 @@ def test_array_that_lies_on_the_ground_has_a_note(tmp_path):
 
 TABLE = lines("{x},{y},{z}", 42)
 REFUSED = {
-    "empty": ("a.csv", b"", r"a\.csv: the file is empty; choose a readable file or one of eRTIS_v2, "),
+    "empty": ("a.csv", b"", r"a\.csv: the file is empty; choose a readable file or one of eRTIS_v2, eRTIS_v2REC, "),
     "large": ("a.csv", b"1,2\n" * 1_100_000, r"a\.csv: more than 4 MB, too large for a layout"),
     "picture": ("a.csv", b"\x89PNG\r\n\x1a\n\0\0\0\r1", r"a\.csv: the file is binary, not text"),
     "empty xml": ("a.xml", b" \n", r"a\.xml: the file is empty"),
@@ -219,7 +219,7 @@ REFUSED = {
     "unit": ("a.csv", b"x_ft,y_ft,z_ft\n" + TABLE.encode(), r"column 'x_ft' has the unit ft; use mm, cm, m, in"),
     "mil": ("a.csv", b"x_mil,y_mil,z_mil\n" + TABLE.encode(), r"column 'x_mil' has the unit mil; use mm"),
     "unit in brackets": ("a.csv", b"x (hl),y (hl),z (hl)\n" + TABLE.encode(), r"has the unit hl; use mm, cm, m, in"),
-    "settings": ("a.toml", b'[array]\nlayout = "eRTIS_v2"\n', r"a\.toml is a file of settings; use it as such"),
+    "settings": ("a.toml", b'[array]\nlayout = "eRTIS_v2"\n', r"a\.toml is a file of settings; load it as settings"),
     "two units": ("a.csv", b"x_m,y_mm,z_m\n" + TABLE.encode(), r"the columns have the units m, mm; use only one unit"),
     "short row": ("a.csv", b"x,y,z\n1,2,3\n1,2\n", r"a\.csv, line 3 has 2 cells, but line 2 has 3; write the same"),
     "short rows": ("a.csv", b"x,y,z\n1,2\n1,2\n", r"a\.csv, line 2 has 2 cells, but the header has 3; write one"),
@@ -340,7 +340,7 @@ def test_numpy_arrays_of_another_shape_are_refused(tmp_path):
         loaded(tmp_path, (tmp_path / "a.npz").read_bytes(), name="a.npy")
     content = io.BytesIO()
     np.save(content, np.where(PLACES == 1, np.nan, PLACES))
-    with pytest.raises(ArgumentError, match=r"holds nan at \[1, 1\]; give finite numbers"):
+    with pytest.raises(ArgumentError, match=r"holds nan at \[1, 1\]; pass finite numbers"):
         loaded(tmp_path, content.getvalue(), name="a.npy")
 
 
@@ -452,7 +452,7 @@ def test_array_given_by_positions_has_a_name_of_its_own(tmp_path):
     assert Settings.load(tmp_path / "named.toml").array.layout == "pair"
     assert Array(positions_m=rows).layout == Array().replace(positions_m=rows).layout == "own array"
     assert Settings().replace("array.positions_m", np.array(rows)).array.layout == "own array"
-    with pytest.raises(ArgumentError, match=r"positions_m\[1\] has shape \(2,\); give shape \(3,\)"):
+    with pytest.raises(ArgumentError, match=r"positions_m\[1\] has shape \(2,\); pass shape \(3,\)"):
         Array().replace(positions_m=[[0.0, 0.0, 0.0], [0.0, 1.0]])
     assert Array().layout == Settings().array.layout == "eRTIS_v3D1"
     assert Array(layout="pair", positions_m=rows).replace(word_bits=8).layout == "pair"

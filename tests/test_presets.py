@@ -71,8 +71,8 @@ def test_preset_text_is_a_settings_file_with_the_keys_of_the_preset():
     ("make", "message"),
     [
         (lambda: Processing.from_preset("2d_180_5m"), r"preset '2d_180_5m' is unknown \(did you mean '2d_181_5m'\?\)"),
-        (lambda: Processing.from_preset("long_20_80"), "'long_20_80', a recording preset; give it to Settings.from"),
-        (lambda: Settings.from_preset("2d_181_5m"), "'2d_181_5m', a processing preset; give it to Processing.from"),
+        (lambda: Processing.from_preset("long_20_80"), "'long_20_80', a recording preset; use it with Settings.from"),
+        (lambda: Settings.from_preset("2d_181_5m"), "'2d_181_5m', a processing preset; use it with Processing.from"),
         (lambda: Settings.from_preset(None), "preset 'None' is unknown; known are short_20_80"),
         (lambda: ertis.presets("call"), "kind 'call' is unknown; known are recording, processing"),
     ],

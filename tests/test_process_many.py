@@ -107,21 +107,21 @@ def test_images_beyond_the_budget_are_not_written(runs, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "code", "stated"),
     [
-        (["runs/a.h5", "runs/b.h5"], 2, "several recordings need an output folder; give one with -o"),
+        (["runs/a.h5", "runs/b.h5"], 2, "several recordings need an output folder; choose one with -o"),
         (["runs"], 2, "several recordings need an output folder"),
         (
             ["runs/a.h5", "--workers", "2"],
             2,
-            "--workers applies to several recordings; give more, a folder or a pattern",
+            "--workers applies to several recordings; add recordings, use a folder or a pattern",
         ),
         (["runs/a.h5", "--scheduler", "tcp://x:1"], 2, "--scheduler applies to several recordings"),
-        (["none/*.h5", "-o", "out"], 1, "no file matches none/*.h5; give another pattern"),
+        (["none/*.h5", "-o", "out"], 1, "no file matches none/*.h5; choose another pattern"),
         (
             ["runs", "-o", "runs/a.h5"],
             2,
             "-o runs/a.h5 names a file, but several recordings need a folder; use -o runs/a/",
         ),
-        (["runs", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], 1, "give one of them"),
+        (["runs", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], 1, "choose one of them"),
         (["runs", "-o", "out", "--directions", "90", "--azimuth", "-9:9"], 2, "directions 90 have fixed limits"),
         (["runs", "-o", "out", "--method", "paper", "--explain"], 2, "--explain needs --method fast"),
     ],

@@ -127,7 +127,7 @@ def test_exact_image_is_compared_with_an_uncleaned_one():
 
 @pytest.mark.parametrize("key", ["clean_within_db", "clean_above_mean_db"])
 def test_levels_out_of_range_are_refused(key):
-    with pytest.raises(ArgumentError, match=rf"processing\.{key} is -1; give a number from 0 to 1000"):
+    with pytest.raises(ArgumentError, match=rf"processing\.{key} is -1; use a number from 0 to 1000"):
         Processing(**{key: -1.0})
 
 

@@ -117,13 +117,13 @@ def test_record_ends_after_its_duration(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message", "code"),
     [
-        (["--rotate-size", "0"], "--rotate-size is 0; give a number from 1 to 1e+09", 2),
-        (["--rotate-every", "0"], "--rotate-every is 0; give a number from 1 to 1e+09", 2),
-        (["--name", "a/b"], "--name 'a/b' cannot name a group in a file; give letters", 2),
-        (["--duration", "0"], "--duration is 0; give a number above 0", 2),
-        (["--metrics", "foo"], "--metrics is 'foo'; give HOST:PORT, such as 127.0.0.1:9101", 2),
-        (["--listen", "nonsense"], "error: --listen 'nonsense' cannot be used; give tcp://HOST:PORT", 2),
-        (["--listen", "{taken}"], "is in use by another program; end that program or give another --listen", 1),
+        (["--rotate-size", "0"], "--rotate-size is 0; use a number from 1 to 1e+09", 2),
+        (["--rotate-every", "0"], "--rotate-every is 0; use a number from 1 to 1e+09", 2),
+        (["--name", "a/b"], "--name 'a/b' cannot name a group in a file; use letters", 2),
+        (["--duration", "0"], "--duration is 0; use a number above 0", 2),
+        (["--metrics", "foo"], "--metrics is 'foo'; use HOST:PORT, such as 127.0.0.1:9101", 2),
+        (["--listen", "nonsense"], "error: --listen 'nonsense' cannot be used; use tcp://HOST:PORT", 2),
+        (["--listen", "{taken}"], "is in use by another program; end that program or choose another --listen", 1),
         (["--metrics", "{taken}"], "cannot listen at", 1),
     ],
 )

@@ -174,7 +174,7 @@ UNUSED = {
 def test_unknown_time_is_noted(tmp_path, name):
     reader = opened(write(tmp_path / "M00123.WAV", *UNUSED[name]))
     assert times_s(reader) == [0]
-    assert reader.notes == ("M00123.WAV contains no time, so its time is unknown; use --start for the first file",)
+    assert reader.notes == ("M00123.WAV contains no time, so its time is unknown; set start_ns for the first file",)
 
 
 @pytest.mark.parametrize("time", ["9999-12-31T23:59:59+00:00", "0001-01-01T00:00:00+14:00", "2262-05-01T00:00:00"])
@@ -209,7 +209,7 @@ def test_start_of_the_first_file_shifts_all(tmp_path):
     paths = [write(tmp_path / f"20240518_04{minute}37.WAV") for minute in (25, 26)]
     reader = opened(*paths, start_ns=10**18)
     assert times_s(reader) == [1e9, 1e9 + 60]
-    assert reader.notes == ("the first file begins at --start; the times between files are from file names",)
+    assert reader.notes == ("the first file begins at start_ns; the times between files are from file names",)
 
 
 def test_start_of_each_file_overrides_names(tmp_path):
@@ -242,7 +242,7 @@ def test_names_of_whole_seconds_never_overlap(tmp_path):
     assert times_s(reader) == pytest.approx([first, first + 0.25], abs=1e-6)
     assert any(
         "times in whole steps of 1 s overlap the previous file by up to 0.25 s; such files begin at the end of the "
-        "previous one; use --join (join=True) if files with the same time are the microphones" in note
+        "previous one; use join=True if files with the same time are the microphones" in note
         for note in reader.notes
     )
 
@@ -292,7 +292,7 @@ def test_clock_that_was_never_set_yields_to_the_name(tmp_path):
 @pytest.mark.parametrize("name", ["M1.WAV", "19700101_000005.WAV", "20000101_000005.WAV"])
 def test_clock_that_was_never_set_is_noted(tmp_path, name):
     reader = opened(write(tmp_path / name, *[comment(UNSET)] * (not name.startswith("2000"))))
-    assert "so the clock of the recorder was probably not set; use --start" in reader.notes[0]
+    assert "so the clock of the recorder was probably not set; use start_ns" in reader.notes[0]
 
 
 ORDERS = {  # name: notes, None if the order is clear
@@ -330,7 +330,7 @@ REFUSED = {
         ["20241027_025900.WAV", "20241027_020100.WAV"],
         {},
         DataError,
-        r"use --start once for each file",
+        r"set start_ns for each file",
     ),
     "twice": (["a.wav", "b.wav", "a.wav"], {}, ArgumentError, r"a\.wav is listed twice; list each file once"),
     "starts backwards": (["a.wav", "b.wav"], {"start_ns": [10, 5]}, DataError, r"b.wav begins at 1970-01-01"),
@@ -338,16 +338,16 @@ REFUSED = {
         ["20240518_042637.WAV", "b.wav"],
         {},
         DataError,
-        r"b.wav contains no time in its metadata or name, but 20240518_042637.WAV does; use --start once for each file",
+        r"b.wav contains no time in its metadata or name, but 20240518_042637.WAV does; set start_ns for each file",
     ),
     "too many starts": (
         ["a.wav", "b.wav"],
         {"start_ns": [1, 2, 3]},
         ArgumentError,
-        r"--start \(start_ns\) is used 3 times for 2 files; use it once for the first file, or once for each",
+        r"start_ns has 3 times for 2 files; set the time of the first file, or that of each",
     ),
-    "before 1970": (["19691231_042637.WAV"], {}, DataError, r"states a time before 1970 \(1969-12-31 04:26:37\); use"),
-    "expansion": (["a.wav"], {"time_expansion": 1e9}, ArgumentError, r"time_expansion is 1e\+09; give a number from"),
+    "before 1970": (["19691231_042637.WAV"], {}, DataError, r"states a time before 1970 \(1969-12-31 04:26:37\); set"),
+    "expansion": (["a.wav"], {"time_expansion": 1e9}, ArgumentError, r"time_expansion is 1e\+09; use a number from"),
 }
 
 
@@ -395,9 +395,9 @@ def test_wildlife_acoustics_time_expansion_is_used(tmp_path):
 
 
 CONTRADICTIONS = {
-    "no whole factor": (("Samplerate: 384000",), r"44100 Hz, .* sample rate of 384000 Hz; .* --time-expansion 8.70748"),
-    "lower": (("Samplerate: 22050",), r"--time-expansion 1 \(time_expansion=1\) if the header is right"),
-    "TE of the true rate": (("TE: 10", "Samplerate: 44100"), r"a time expansion of 10; .* --time-expansion 10 if"),
+    "no whole factor": (("Samplerate: 384000",), r"44100 Hz, .* sample rate of 384000 Hz; .* time_expansion=8.70748"),
+    "lower": (("Samplerate: 22050",), r"time_expansion=1 if the header is right"),
+    "TE of the true rate": (("TE: 10", "Samplerate: 44100"), r"a time expansion of 10; .*, or time_expansion=10 if"),
 }
 
 
@@ -446,9 +446,7 @@ def opened_folder(path):
 
 def test_files_of_other_rates_name_the_expansion(tmp_path):
     paths = [write(tmp_path / "a.wav", guano("TE: 10"), rate_hz=25_000), write(tmp_path / "b.wav", rate_hz=25_000)]
-    with pytest.raises(
-        DataError, match=r"import each file separately, or use --time-expansion \(time_expansion\) if all"
-    ):
+    with pytest.raises(DataError, match=r"import each file separately, or use time_expansion if all"):
         opened(*paths)
     assert opened(*paths, time_expansion=10).settings.recording.sample_rate_hz == 250_000
     with pytest.raises(DataError, match=r"b.wav has 48000 Hz, but a.wav has 250000; import each file separately$"):

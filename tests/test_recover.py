@@ -170,7 +170,8 @@ def test_recover_reports_unsealable_journals(tmp_path):
     crashed(tmp_path, name="b.h5")
     done = run("recover", tmp_path, "--json", "--quiet", code=1)
     assert done.stderr == (
-        f"ertis: error: {tmp_path}/rec.h5 exists with other content than {path}; move it, or give --force\n"
+        f"ertis: error: {tmp_path}/rec.h5 exists with other content than {path}; move it, or replace it "
+        "(overwrite=True)\n"
     )
     reported = json.loads(done.stdout)["journals"]
     assert [(report.get("measurements"), "error" in report) for report in reported] == [(3, False), (None, True)]
@@ -237,7 +238,7 @@ def test_failed_capture_that_cannot_be_sealed_is_reported(tmp_path, capsys):
     path = crashed(tmp_path)
     (tmp_path / "rec.h5").write_text("mine")
     reported = (
-        f"{tmp_path}/rec.h5 exists with other content than {path}; move it, or give --force; "
+        f"{tmp_path}/rec.h5 exists with other content than {path}; move it, or replace it (overwrite=True); "
         f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
     )
     with pytest.raises(SonarError, match="left: it was unplugged"):

@@ -48,9 +48,9 @@ def test_messages_of_a_command_name_its_own_options(name):
 @pytest.mark.parametrize(
     ("message", "strange"),
     [
-        ("give --range, or run 'ertis export --top 3'", set()),
-        ("give --top", {"--top"}),
-        ("give --rnage", {"--rnage"}),
+        ("use --range, or run 'ertis export --top 3'", set()),
+        ("use --top", {"--top"}),
+        ("use --rnage", {"--rnage"}),
     ],
 )
 def test_strange_options_are_found(message, strange):

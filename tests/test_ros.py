@@ -210,8 +210,8 @@ def test_command_publishes_the_images_of_sensors(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["missing.h5"], "file missing.h5 does not exist; give an existing file, an address, or ports"),
-        (["one", "tcp://127.0.0.1:1"], "several sources must all be ports"),
+        (["missing.h5"], "file missing.h5 does not exist; choose an existing file, an address, or ports"),
+        (["one", "tcp://127.0.0.1:1"], "several sources are given, but only ports can be ports"),
         (["one", "one"], "port one is given 2 times"),
         (["one", "--loop"], "--loop is for files; remove it with ports"),
         (["tcp://127.0.0.1:1", "--trigger", "sync"], "--trigger is for ports; remove it with an address"),
@@ -228,7 +228,7 @@ def test_sources_that_do_not_go_together_are_refused(arguments, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"domain": 233}, "domain is 233; give a whole number from 0 to 232"),
+        ({"domain": 233}, "domain is 233; use a whole number from 0 to 232"),
         ({"domain": -1}, "domain is -1"),
         ({"interface": "nothing0"}, r"interface 'nothing0' is unknown.*known are lo"),
         ({"reliability": "both"}, "reliability 'both' is unknown"),
@@ -245,7 +245,7 @@ def test_domain_comes_from_the_environment(monkeypatch):
     with Participant() as participant:
         assert participant.domain == DOMAIN
     monkeypatch.setenv("ROS_DOMAIN_ID", "x")
-    with pytest.raises(ArgumentError, match="ROS_DOMAIN_ID is 'x'; give a number from 0 to 232"):
+    with pytest.raises(ArgumentError, match="ROS_DOMAIN_ID is 'x'; use a number from 0 to 232"):
         Participant()
 
 
@@ -253,7 +253,7 @@ def test_domain_comes_from_the_environment(monkeypatch):
     ("options", "message"),
     [
         ({"topics": ["cloud"]}, "topic 'cloud' is unknown"),
-        ({"namespace": "9a"}, "namespace '9a' is not allowed in ROS; give names"),
+        ({"namespace": "9a"}, "namespace '9a' is not allowed in ROS; choose names"),
         ({"namespace": "a//b"}, "namespace 'a//b' is not allowed"),
     ],
 )
@@ -283,7 +283,7 @@ def test_command_reports_that_no_central_node_answers(monkeypatch):
     assert done.exit_code == 1
     assert f"waiting for {address}: no answer; is 'ertis serve' running?\n" in done.stderr
     assert done.stderr.endswith(
-        f"error: nothing arrived from {address}; start 'ertis serve', and give the address at which it publishes\n"
+        f"error: nothing arrived from {address}; start 'ertis serve', and use the address at which it publishes\n"
     )
 
 

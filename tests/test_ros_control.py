@@ -27,7 +27,7 @@ from tests.test_ros import equal, stamped
     [
         ("min_level_db = 3", "min_level_db is 3"),
         ("floor_dbfs = -2000", "floor_dbfs is -2000"),
-        ("range_m = [3, 1]", "give the smaller number first"),
+        ("range_m = [3, 1]", "use the smaller number first"),
         ("speed = 0", "speed is 0"),
         ("[max_rate_hz]\ncloud = 1", "topic 'cloud' is unknown"),
         ("[max_rate_hz]\npoints = 0", "max_rate_hz is 0"),
@@ -160,7 +160,7 @@ def test_file_waits_while_it_is_paused(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--min-level", "-3"], "--min-level and --control exclude each other; give it in the file"),
+        (["--min-level", "-3"], "--min-level and --control cannot be combined; set the value in the file"),
         (["--rate", "2"], "--rate and --control exclude each other"),
         (["--max-rate", "points=2"], "--max-rate and --control exclude each other"),
     ],

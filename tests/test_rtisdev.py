@@ -437,12 +437,12 @@ def test_unknown_names_and_wrong_shapes_are_refused(caplog):
     shape = settings.nDirections, settings.nspses
     for arguments, message in (
         ((raw, 1, *shape, "other"), r"configuration 'other' is not preloaded; .* \(preloaded are: 'test'\)"),
-        ((raw[:-1], 1, *shape, "test"), r"is uint32 of shape \(163839,\); give 163840 words of uint32"),
-        ((raw.astype(np.int64), 1, *shape, "test"), r"is int64 of shape \(163840,\); give 163840 words of uint32"),
+        ((raw[:-1], 1, *shape, "test"), r"is uint32 of shape \(163839,\); use 163840 words of uint32"),
+        ((raw.astype(np.int64), 1, *shape, "test"), r"is int64 of shape \(163840,\); use 163840 words of uint32"),
         ((raw.astype(np.float32), 1, *shape, "test"), "the measurement is float32"),
         ((raw, 1, 31, 7, "test"), r"configuration 'test' gives 31 × \d+ numbers, but 31 × 7 are wanted"),
-        ((np.zeros((3, 7), np.float32), 0, *shape, "test"), r"the data has shape \(3, 7\); give 32 rows"),
-        ((np.zeros((32, 7), np.float32), 0, *shape, "test"), "signals have 7 samples; give 16384"),
+        ((np.zeros((3, 7), np.float32), 0, *shape, "test"), r"the data has shape \(3, 7\); use 32 rows"),
+        ((np.zeros((32, 7), np.float32), 0, *shape, "test"), "signals have 7 samples; use 16384"),
     ):
         caplog.clear()
         with pytest.raises(ArgumentError, match=message):
@@ -467,20 +467,20 @@ def test_data_of_earlier_stages_that_are_no_finite_numbers_are_refused():
     settings = prepared(directions=5, minRange=1.0, maxRange=1.3, **off)
     signals = np.zeros((32, 16_384))
     for bad, message in (
-        (np.where(np.arange(16_384) == 7, np.nan, signals), r"the data holds nan at \[0, 7\]; give finite numbers"),
+        (np.where(np.arange(16_384) == 7, np.nan, signals), r"the data holds nan at \[0, 7\]; pass finite numbers"),
         (signals + 1e39, r"the data holds inf at \[0, 0\]"),
-        (signals * 1j, "the data is of complex128; give an array of real numbers"),
-        (None, "the data is of type NoneType; give an array of real numbers"),
-        ([[1, 2], [3]], "the data is not an array; give rows of equal length"),
-        (signals[0], r"the data has shape \(16384,\); give 32 rows"),
-        (signals[:, :0], r"the data has shape \(32, 0\); give 32 rows"),
+        (signals * 1j, "the data is of complex128; pass an array of real numbers"),
+        (None, "the data is of type NoneType; pass an array of real numbers"),
+        ([[1, 2], [3]], "the data differ in length; pass rows of equal length"),
+        (signals[0], r"the data has shape \(16384,\); use 32 rows"),
+        (signals[:, :0], r"the data has shape \(32, 0\); use 32 rows"),
     ):
         with pytest.raises(ArgumentError, match=message):
             rtiscuda.processing(bad, 0, settings.nDirections, settings.nspses, "test")
     for name in (None, ["test"], 3):
-        with pytest.raises(ArgumentError, match=r"name is of type .*; give a text"):
+        with pytest.raises(ArgumentError, match=r"name is of type .*; pass a text"):
             rtiscuda.processing(signals, 0, 5, settings.nspses, name)
-        with pytest.raises(ArgumentError, match=r"name is of type .*; give a text"):
+        with pytest.raises(ArgumentError, match=r"name is of type .*; pass a text"):
             rtiscuda.unloadone(name)
 
 
@@ -496,43 +496,46 @@ def arguments_of_preload():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"delay_matrix": np.zeros((31, 32), int)}, r"the delay matrix has shape \(31, 32\); give \(32, 31\)"),
+        ({"delay_matrix": np.zeros((31, 32), int)}, r"the delay matrix has shape \(31, 32\); use \(32, 31\)"),
         ({"delay_matrix": np.full((32, 31), -1)}, "the delay matrix holds -1"),
         ({"delay_matrix": np.full((32, 31), np.nan)}, "delay_matrix holds nan"),
-        ({"delay_matrix": np.full((32, 31), 1.5)}, "delay_matrix holds fractions; give whole numbers"),
-        ({"delay_matrix": np.full((32, 31), 1e12)}, r"delay_matrix holds 1e\+12; give numbers of samples within"),
-        ({"delay_matrix": np.full((32, 31), 20_000)}, "matrix holds 20000, but signals have 16384 samples; give"),
-        ({"delay_matrix": None}, "delay_matrix is of type NoneType; give an array of real numbers"),
+        ({"delay_matrix": np.full((32, 31), 1.5)}, "delay_matrix holds fractions; use whole numbers"),
+        ({"delay_matrix": np.full((32, 31), 1e12)}, r"delay_matrix holds 1e\+12; pass numbers of samples within"),
+        ({"delay_matrix": np.full((32, 31), 20_000)}, "matrix holds 20000, but signals have 16384 samples; use"),
+        ({"delay_matrix": None}, "delay_matrix is of type NoneType; pass an array of real numbers"),
         (
             {"matched_filter_real": np.zeros((32, 7)), "matched_filter_imag": np.zeros((32, 7))},
-            r"the matched filter has shape \(32, 7\); give \(32, 8193\)",
+            r"the matched filter has shape \(32, 7\); use \(32, 8193\)",
         ),
-        ({"matched_filter_real": np.zeros((32, 7))}, r"matched_filter_real has shape \(32, 7\), but .*; give equal"),
+        (
+            {"matched_filter_real": np.zeros((32, 7))},
+            r"matched_filter_real has shape \(32, 7\), but .*8193\); pass equal",
+        ),
         ({"matched_filter_imag": np.full((32, 8193), np.nan)}, r"matched_filter_imag holds nan at \[0, 0\]"),
-        ({"pdm_filter": [1.0, np.nan]}, r"pdm_filter holds nan at \[1\]; give finite numbers"),
-        ({"pdm_filter": []}, r"pdm_filter has shape \(0,\); give a row of taps"),
-        ({"pdm_filter": "low"}, "pdm_filter is of <U3; give an array of real numbers"),
-        ({"envelope_filter": np.ones((2, 2))}, r"envelope_filter has shape \(2, 2\); give a row of taps"),
+        ({"pdm_filter": [1.0, np.nan]}, r"pdm_filter holds nan at \[1\]; pass finite numbers"),
+        ({"pdm_filter": []}, r"pdm_filter has shape \(0,\); pass a row of taps"),
+        ({"pdm_filter": "low"}, "pdm_filter is of <U3; pass an array of real numbers"),
+        ({"envelope_filter": np.ones((2, 2))}, r"envelope_filter has shape \(2, 2\); pass a row of taps"),
         ({"envelope_filter": [np.inf]}, "envelope_filter holds inf"),
         ({"pre_filter": [np.nan], "pre_filter_enable": 1}, "pre_filter holds nan"),
-        ({"post_filter": [[1.0], [2.0, 3.0]], "post_filter_enable": 1}, "post_filter is not an array; give rows"),
-        ({"dmas_order": 6}, "dmasOrder is 6; give 0 to 5"),
-        ({"dmas_order": -1}, "dmasOrder is -1; give a whole number of at least 0"),
+        ({"post_filter": [[1.0], [2.0, 3.0]], "post_filter_enable": 1}, "post_filter differ in length; pass rows"),
+        ({"dmas_order": 6}, "dmasOrder is 6; use 0 to 5"),
+        ({"dmas_order": -1}, "dmasOrder is -1; use a whole number of at least 0"),
         ({"last_range": 10}, "the image has ranges 131 to 10"),
-        ({"last_range": 2000}, "the image ends at range 2000, but the record has 1639; give a smaller last_range"),
-        ({"n_microphones": 33}, "n_microphones is 33; give a whole number from 1 to 32"),
-        ({"n_microphones": "32"}, "n_microphones is of <U2; give an array of real numbers"),
-        ({"n_samples": 163_840.5}, "n_samples is 163840.5; give a whole number"),
-        ({"n_samples": [1, 2]}, r"n_samples has shape \(2,\); give one whole number"),
-        ({"n_samples": 5}, "5 words give no signal after decimation by 10; give more words"),
-        ({"pdm_subsample_factor": 0}, "pdm_subsample_factor is 0; give a whole number of at least 1"),
-        ({"n_directions": 0}, "n_directions is 0; give a whole number of at least 1"),
-        ({"envelope_subsample_factor": 0}, "envelope_subsample_factor is 0; give a whole number of at least 1"),
-        ({"beamforming_drop": 20_000}, "beamforming_drop is 20000; give a whole number from 0 to 16383"),
-        ({"mean_multiplier": np.nan}, "mean_multiplier is nan; give a finite number"),
-        ({"max_multiplier": "half"}, "max_multiplier is 'half'; give a number"),
+        ({"last_range": 2000}, "the image ends at range 2000, but the record has 1639; use a smaller last_range"),
+        ({"n_microphones": 33}, "n_microphones is 33; use a whole number from 1 to 32"),
+        ({"n_microphones": "32"}, "n_microphones is of <U2; pass an array of real numbers"),
+        ({"n_samples": 163_840.5}, "n_samples is 163840.5; use a whole number"),
+        ({"n_samples": [1, 2]}, r"n_samples has shape \(2,\); pass one whole number"),
+        ({"n_samples": 5}, "5 words give no signal after decimation by 10; use more words"),
+        ({"pdm_subsample_factor": 0}, "pdm_subsample_factor is 0; use a whole number of at least 1"),
+        ({"n_directions": 0}, "n_directions is 0; use a whole number of at least 1"),
+        ({"envelope_subsample_factor": 0}, "envelope_subsample_factor is 0; use a whole number of at least 1"),
+        ({"beamforming_drop": 20_000}, "beamforming_drop is 20000; use a whole number from 0 to 16383"),
+        ({"mean_multiplier": np.nan}, "mean_multiplier is nan; use a finite number"),
+        ({"max_multiplier": "half"}, "max_multiplier is 'half'; use a number"),
         ({"disabled_microphones": np.arange(32)}, "all 32 microphones are disabled"),
-        ({"disabled_microphones": [-1]}, "disabled_microphones is -1; give a whole number of at least 0"),
+        ({"disabled_microphones": [-1]}, "disabled_microphones is -1; use a whole number of at least 0"),
     ],
 )
 def test_arguments_that_do_not_fit_together_are_refused(changes, message):
@@ -555,19 +558,19 @@ def test_arguments_of_stages_that_are_off_are_not_used():
 
 
 def test_names_of_configurations_are_texts():
-    with pytest.raises(ArgumentError, match="name is of type list; give a text"):
+    with pytest.raises(ArgumentError, match="name is of type list; pass a text"):
         rtiscuda.preload(**(arguments_of_preload() | {"name": ["a"]}))
 
 
 def test_serial_arguments_of_wrong_types_are_refused(caplog):
-    with pytest.raises(ArgumentError, match="port is of type NoneType; give a text"):
+    with pytest.raises(ArgumentError, match="port is of type NoneType; pass a text"):
         rtisserial.connect(None, 115_200)
     parent, child = os.openpty()
     rtisserial.connect(os.ttyname(child), 115_200)
     try:
-        with pytest.raises(ArgumentError, match="command is of type bytes; give a text"):
+        with pytest.raises(ArgumentError, match="command is of type bytes; pass a text"):
             rtisserial.command(b"!Y,0,0,0\n", wants_answer=True)
-        with pytest.raises(ArgumentError, match="n_bytes is -1; give a whole number of at least 0"):
+        with pytest.raises(ArgumentError, match="n_bytes is -1; use a whole number of at least 0"):
             rtisserial.getdata(-1)
     finally:
         rtisserial.close()
@@ -683,7 +686,7 @@ def test_rtisdev_command_needs_the_package(monkeypatch, tmp_path):
     [
         ("def f():\n    raise KeyError('x')\nf()\n", 2, "KeyError: 'x'"),
         ("open('none.bin')\n", 1, "FileNotFoundError: [Errno 2] No such file or directory: 'none.bin'"),
-        ("import rtiscuda\nrtiscuda.unloadone(3)\n", 2, "ertis_numba.errors.ArgumentError: name is of type int; give"),
+        ("import rtiscuda\nrtiscuda.unloadone(3)\n", 2, "ertis_numba.errors.ArgumentError: name is of type int; pass"),
         ("x = (\n", 1, "SyntaxError: '(' was never closed"),
     ],
     ids=["own", "system", "package", "syntax"],

@@ -102,7 +102,7 @@ def test_missing_journal_is_refused(tmp_path):
     write_recording(tmp_path / "rec.h5", [entry.measurement for entry in entries()])
     (tmp_path / "text.h5").write_text("mine")
     for name in ("typo.h5", "rec.h5", "text.h5", "none.h5"):
-        with pytest.raises(DataError, match=f"{name}.journal: No such file or directory; give a journal"):
+        with pytest.raises(DataError, match=f"{name}.journal: No such file or directory; choose a journal"):
             seal(tmp_path / f"{name}.journal")
 
 
@@ -225,7 +225,7 @@ def test_sealing_without_free_space_is_refused(tmp_path, monkeypatch, capsys):
 def test_sealing_into_an_unwritable_folder_is_refused(tmp_path):
     create(tmp_path).close()
     (tmp_path / "rec.h5").mkdir()
-    with pytest.raises(ArgumentError, match=r"output .* is a folder; give"):
+    with pytest.raises(ArgumentError, match=r"output .*rec.h5 is a folder; choose"):
         seal(tmp_path / "rec.h5.journal")
     assert (tmp_path / "rec.h5.journal").exists()
 
@@ -265,7 +265,7 @@ def test_sealing_runs_in_its_own_process(tmp_path):
     assert (done.returncode, done.stdout) == (1, "")
     assert (
         done.stderr
-        == f"{tmp_path / 'none.journal'}: No such file or directory; give a journal left by 'ertis capture'\n"
+        == f"{tmp_path / 'none.journal'}: No such file or directory; choose a journal left by 'ertis capture'\n"
     )
 
 
@@ -340,7 +340,7 @@ def test_gaps_are_counted_per_session():
 @pytest.mark.parametrize(
     ("sensor", "reason", "message"),
     [
-        ("left", "x" * 65, "reason of a gap is .*; give a line of 1 to 64 bytes"),
+        ("left", "x" * 65, "reason of a gap is .*; use a line of 1 to 64 bytes"),
         ("right", "x", "a gap is given for sensor 'right', which has no measurement"),
     ],
 )

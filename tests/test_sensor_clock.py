@@ -31,7 +31,7 @@ def test_rate_jitter_and_drift_are_measured():
     assert clock.jitter_s == pytest.approx(1e-4, rel=0.2)
     assert clock.drift_ppm == pytest.approx(-30, abs=4 * clock.rate_sd_ppm)
     assert (clock.faults, clock.drift_fault, clock.drift_unknown) == ((), "", "")
-    assert check_clock(stamps, 0.04).drift_unknown == "the nominal rate is not known; give it as --rate"
+    assert check_clock(stamps, 0.04).drift_unknown == "the nominal rate is not known; add it with --rate"
 
 
 def test_fast_clock_is_a_fault():

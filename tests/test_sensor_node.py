@@ -235,18 +235,18 @@ def test_sensor_node_counts_match_a_model_for_random_events():  # noqa: C901  on
 
 
 BAD = {
-    "address": (lambda _: SensorNode("here"), "address 'here' cannot be used; give tcp://HOST:PORT"),
+    "address": (lambda _: SensorNode("here"), "address 'here' cannot be used; use tcp://HOST:PORT"),
     "no keys": (
         lambda _: SensorNode("tcp://10.0.0.1:5601"),
         r"address tcp://10\.0\.0\.1:5601 can be reached from other machines, but there are no keys",
     ),
     "ring": (
         lambda _: SensorNode("tcp://127.0.0.1:1", ring_bytes=0),
-        "ring_bytes is 0; give a whole number of at least 1",
+        "ring_bytes is 0; use a whole number of at least 1",
     ),
     "limit without spool": (
         lambda _: SensorNode("tcp://127.0.0.1:1", spool_bytes=1),
-        "spool_bytes is given without a spool; give its folder with spool",
+        "spool_bytes is given without a spool; set its folder with spool",
     ),
     "unknown sensor": (
         lambda node: node.append(entries(1, sensor="right")),
@@ -258,28 +258,28 @@ BAD = {
     ),
     "gap backwards": (
         lambda node: node.note_gap("left", 2, 1, "x", session_id=1),
-        "last missing sequence number is 1; give",
+        "last missing sequence number is 1; use",
     ),
     "number": (
         lambda node: node.append(entries(1, first=2**48 + 1)),
-        f"sequence is {2**48 + 1}; give a whole number from 0 to {2**48}",
+        f"sequence is {2**48 + 1}; use a whole number from 0 to {2**48}",
     ),
     "number of a gap": (
         lambda node: node.note_gap("left", 20, 2**48 + 1, "x", session_id=EPOCH),
-        f"last missing sequence number is {2**48 + 1}; give a whole number from 0 to {2**48}",
+        f"last missing sequence number is {2**48 + 1}; use a whole number from 0 to {2**48}",
     ),
     "half a number": (
         lambda node: node.note_gap("left", 20, 21.5, "x", session_id=EPOCH),
-        "last missing sequence number is 21.5; give a whole number",
+        "last missing sequence number is 21.5; use a whole number",
     ),
     "session_id": (
         lambda node: node.note_gap("left", 1, 2, "x", session_id=-1),
-        "session_id is -1; give a whole number from 0",
+        "session_id is -1; use a whole number from 0",
     ),
     "name": (lambda node: node.add_sensor("a" * 65, TINY), "sensor name 'a{65}' has 65 characters; the limit is 64"),
     "longer than the memory": (
         lambda node: node.add_sensor("b", TINY.replace(recording=Recording(n_samples=200_000))),
-        r"a measurement of sensor b has 200000 bytes, but the memory has room for 100000; give a larger ring_bytes",
+        r"a measurement of sensor b has 200000 bytes, but the memory has room for 100000; use a larger ring_bytes",
     ),
     "settings": (
         lambda node: node.append(entries(1, settings=TINY.replace(recording=Recording(n_samples=4097)))),

@@ -285,21 +285,25 @@ def test_keys_grant_each_node_its_listed_permissions(tmp_path):
     ("options", "reported", "code"),
     [
         (("--publish", "tcp://0.0.0.0:0"), "there are no keys", 1),
-        (("--quarantine", "missing/folder"), "missing/folder: No such file or directory; give a folder", 1),
-        (("--record", "missing", "--rotate-size", "0"), "--rotate-size is 0; give a number from 1", 2),
-        (("--metrics", "foo"), "--metrics is 'foo'; give HOST:PORT", 2),
-        (("--duration", "0"), "--duration is 0; give a number above 0", 2),
-        (("--deadline", "0"), "--deadline is 0; give a number above 0", 2),
+        (("--quarantine", "missing/folder"), "missing/folder: No such file or directory; choose a folder", 1),
+        (("--record", "missing", "--rotate-size", "0"), "--rotate-size is 0; use a number from 1", 2),
+        (("--metrics", "foo"), "--metrics is 'foo'; use HOST:PORT", 2),
+        (("--duration", "0"), "--duration is 0; use a number above 0", 2),
+        (("--deadline", "0"), "--deadline is 0; use a number above 0", 2),
         (("--range", "5:1"), "--range runs from 5 to 1", 2),
-        (("--listen", "nonsense"), "error: --listen 'nonsense' cannot be used; give tcp://HOST:PORT", 2),
-        (("--publish", "nonsense"), "error: --publish 'nonsense' cannot be used; give tcp://HOST:PORT", 2),
+        (("--listen", "nonsense"), "error: --listen 'nonsense' cannot be used; use tcp://HOST:PORT", 2),
+        (("--publish", "nonsense"), "error: --publish 'nonsense' cannot be used; use tcp://HOST:PORT", 2),
         (("--publish", "tcp://[1::2::3]:1"), "error: --publish 'tcp://[1::2::3]:1' cannot be used", 2),
-        (("--directions", "foo"), "directions 'foo' is not a grid; give 90", 2),
-        (("--directions", "3x:5"), "directions '3x:5' is not a grid; give 90", 2),
-        (("--directions", "2d:0"), "count of directions '2d:0' is 0; give a whole number from 1", 2),
-        (("--directions", "2d:1000001"), "count of directions '2d:1000001' is 1000001; give a whole number from 1", 2),
-        (("--directions", "2d:99999999999"), "directions '2d:99999999999' has a count of 11 digits; give at most", 2),
-        (("--directions", "missing.csv"), "directions missing.csv: No such file or directory; give a readable CSV", 1),
+        (("--directions", "foo"), "directions 'foo' is not a grid; use 90", 2),
+        (("--directions", "3x:5"), "directions '3x:5' is not a grid; use 90", 2),
+        (("--directions", "2d:0"), "count of directions '2d:0' is 0; use a whole number from 1", 2),
+        (("--directions", "2d:1000001"), "count of directions '2d:1000001' is 1000001; use a whole number from 1", 2),
+        (("--directions", "2d:99999999999"), "directions '2d:99999999999' has a count of 11 digits; use at most", 2),
+        (
+            ("--directions", "missing.csv"),
+            "directions missing.csv: No such file or directory; choose a readable CSV",
+            1,
+        ),
     ],
 )
 def test_serve_refuses_invalid_options_in_one_line(options, reported, code):
@@ -327,5 +331,5 @@ def test_refused_serve_leaves_no_files(tmp_path):
         folders = ("--record", str(tmp_path / "new"), "--quarantine", str(tmp_path / "q"))
         done = CliRunner().invoke(cli, ["serve", "--listen", "tcp://127.0.0.1:0", *publish, *folders])
     assert done.exit_code == 1
-    assert "is in use by another program; end that program or give another --publish" in done.stderr.splitlines()[-1]
+    assert "is in use by another program; end that program or choose another --publish" in done.stderr.splitlines()[-1]
     assert not list(tmp_path.iterdir())

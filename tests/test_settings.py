@@ -129,89 +129,89 @@ def test_settings_are_immutable():
         ("[airs]", r"s, line 1: unknown key `airs`"),
         ("[air]\ntemperature = 3", r"s, line 2, air: unknown key `temperature`"),
         ("[air]\ntemperature_c = 'cold'", r"s, line 2, air\.temperature_c: Expected `float`, got `str`"),
-        ("[air]\ntemperature_c = nan", r"air\.temperature_c is nan; give a finite number"),
-        ("[air]\ntemperature_c = -41", r"air\.temperature_c is -41; give a number from -40 to 60"),
-        ("[air]\nhumidity_percent = 101", r"air\.humidity_percent is 101; give a number from 0 to 100"),
-        ("[air]\npressure_pa = 1013", r"air\.pressure_pa is 1013; give a number from 10000 to 200000"),
+        ("[air]\ntemperature_c = nan", r"air\.temperature_c is nan; use a finite number"),
+        ("[air]\ntemperature_c = -41", r"air\.temperature_c is -41; use a number from -40 to 60"),
+        ("[air]\nhumidity_percent = 101", r"air\.humidity_percent is 101; use a number from 0 to 100"),
+        ("[air]\npressure_pa = 1013", r"air\.pressure_pa is 1013; use a number from 10000 to 200000"),
         ("[array]\nword_bits = 12", r"array\.word_bits '12' is unknown.*known are 8, 16, 32, 64"),
         ("[array]\nword_bits = 8.0", r"s, line 2, array\.word_bits: Expected `int`, got `float`"),
-        ("[array]\nenabled = [true]", r"array\.enabled is given without array\.positions_m; give both or neither"),
-        ("[array]\ngain = [1]", r"array\.gain is given without array\.positions_m; give both or neither"),
-        ("[array]\ndelay_s = [0]", r"array\.delay_s is given without array\.positions_m; give both or neither"),
-        ("[array]\npositions_m = []", r"number of array\.positions_m is 0; give a whole number from 1 to 1024"),
+        ("[array]\nenabled = [true]", r"array\.enabled is given without array\.positions_m; use both or neither"),
+        ("[array]\ngain = [1]", r"array\.gain is given without array\.positions_m; use both or neither"),
+        ("[array]\ndelay_s = [0]", r"array\.delay_s is given without array\.positions_m; use both or neither"),
+        ("[array]\npositions_m = []", r"number of array\.positions_m is 0; use a whole number from 1 to 1024"),
         ("[array]\npositions_m = [[0, 0]]", r"s, line 2, array\.positions_m\[0\]: Expected `array` of length 3, got 2"),
-        ("[array]\npositions_m = [[0, 0, nan]]", r"array\.positions_m holds nan at \[0, 2\]; give finite numbers"),
+        ("[array]\npositions_m = [[0, 0, nan]]", r"array\.positions_m holds nan at \[0, 2\]; pass finite numbers"),
         (
             "[array]\npositions_m = [[0, 0, 0]]\nenabled = [true, true]",
-            r"array\.enabled has shape \(2,\); give shape \(1,\)",
+            r"array\.enabled has shape \(2,\); pass shape \(1,\)",
         ),
         ("[array]\npositions_m = [[0, 0, 0]]\nenabled = [false]", r"array\.enabled is false for all channels; enable"),
-        ("[array]\npositions_m = [[0, 0, 0]]\ngain = [1, 1]", r"array\.gain has shape \(2,\); give shape \(1,\)"),
-        ("[array]\npositions_m = [[0, 0, 0]]\ngain = [0]", r"array\.gain\[0\] is 0; give a number from 0\.001 to 1000"),
-        ("[array]\npositions_m = [[0, 0, 0]]\ngain = [nan]", r"array\.gain\[0\] is nan; give a finite number"),
-        ("[array]\npositions_m = [[0, 0, 0]]\ndelay_s = []", r"array\.delay_s has shape \(0,\); give shape \(1,\)"),
-        ("[array]\npositions_m = [[0, 0, 0]]\ndelay_s = [1]", r"array\.delay_s\[0\] is 1; give a number from -0\.001"),
-        ("[call]\nstart_frequency_hz = 0", r"call\.start_frequency_hz is 0; give a number above 0"),
+        ("[array]\npositions_m = [[0, 0, 0]]\ngain = [1, 1]", r"array\.gain has shape \(2,\); pass shape \(1,\)"),
+        ("[array]\npositions_m = [[0, 0, 0]]\ngain = [0]", r"array\.gain\[0\] is 0; use a number from 0\.001 to 1000"),
+        ("[array]\npositions_m = [[0, 0, 0]]\ngain = [nan]", r"array\.gain\[0\] is nan; use a finite number"),
+        ("[array]\npositions_m = [[0, 0, 0]]\ndelay_s = []", r"array\.delay_s has shape \(0,\); pass shape \(1,\)"),
+        ("[array]\npositions_m = [[0, 0, 0]]\ndelay_s = [1]", r"array\.delay_s\[0\] is 1; use a number from -0\.001"),
+        ("[call]\nstart_frequency_hz = 0", r"call\.start_frequency_hz is 0; use a number above 0"),
         (
             "[call]\nstop_frequency_hz = 225e3",
-            r"call\.stop_frequency_hz is 225000; give less than half of call\.sample",
+            r"call\.stop_frequency_hz is 225000; use less than half of call\.sample",
         ),
         (
             "[call]\nstop_frequency_hz = 5e4",
-            r"call.start_frequency_hz and call.stop_frequency_hz are both 50000; give two different frequencies",
+            r"call.start_frequency_hz and call.stop_frequency_hz are both 50000; choose two different frequencies",
         ),
-        ("[call]\nduration_s = 0", r"call\.duration_s is 0; give a number from 3\.55556e-05 to 1"),
-        ("[call]\nsample_rate_hz = -1", r"call\.sample_rate_hz is -1; give a number above 0"),
-        ("[call]\nramp_fraction = 0.6", r"call\.ramp_fraction is 0\.6; give a number from 0 to 0\.5"),
-        ("[recording]\nsample_rate_hz = 0", r"recording\.sample_rate_hz is 0; give a number from 1000 to 1e\+09"),
-        ("[recording]\nn_samples = 0", r"recording\.n_samples is 0; give a whole number from 1 to 268435456"),
+        ("[call]\nduration_s = 0", r"call\.duration_s is 0; use a number from 3\.55556e-05 to 1"),
+        ("[call]\nsample_rate_hz = -1", r"call\.sample_rate_hz is -1; use a number above 0"),
+        ("[call]\nramp_fraction = 0.6", r"call\.ramp_fraction is 0\.6; use a number from 0 to 0\.5"),
+        ("[recording]\nsample_rate_hz = 0", r"recording\.sample_rate_hz is 0; use a number from 1000 to 1e\+09"),
+        ("[recording]\nn_samples = 0", r"recording\.n_samples is 0; use a whole number from 1 to 268435456"),
         (
             "[processing]\nmethod = 'slow'",
             r"s, line 2, processing\.method: value 'slow' is unknown; known are fast",
         ),
-        ("[processing]\ndecimation = 0", r"processing\.decimation is 0; give a whole number from 1 to 1000"),
-        ("[processing]\nrange_decimation = 0", r"processing\.range_decimation is 0; give a whole number from 1"),
+        ("[processing]\ndecimation = 0", r"processing\.decimation is 0; use a whole number from 1 to 1000"),
+        ("[processing]\nrange_decimation = 0", r"processing\.range_decimation is 0; use a whole number from 1"),
         (
             "[processing]\ndecimation = 7",
-            r"processing\.decimation is 7; give a divisor of processing\.range_decimation",
+            r"processing\.decimation is 7; use a divisor of processing\.range_decimation",
         ),
         ("[processing]\noversampling = 10", r"s, line 2, processing: unknown key `oversampling`"),
-        ("[accuracy]\nmax_error_db = 3", r"accuracy\.max_error_db is 3; give a number from -200 to 0"),
+        ("[accuracy]\nmax_error_db = 3", r"accuracy\.max_error_db is 3; use a number from -200 to 0"),
         (
             "[accuracy]\nprecision = 'int8'",
             r"s, line 2, accuracy\.precision: value 'int8' is unknown \(did",
         ),
-        ("[accuracy]\noversampling = 65", r"accuracy\.oversampling is 65; give a whole number from 1 to 64"),
+        ("[accuracy]\noversampling = 65", r"accuracy\.oversampling is 65; use a whole number from 1 to 64"),
         ("[accuracy]\ninterpolation = 'linear'", r"s, line 2, accuracy: unknown key `interpolation`"),
-        ("[accuracy]\ndelay_taps = 9", r"accuracy\.delay_taps is 9; give a whole number from 0 to 8"),
+        ("[accuracy]\ndelay_taps = 9", r"accuracy\.delay_taps is 9; use a whole number from 0 to 8"),
         ("[accuracy]\nbeam_taps = 3", r"accuracy\.beam_taps '3' is unknown.*known are 0, 2, 4, 6"),
-        ("[accuracy]\nbeam_density = 1", r"accuracy\.beam_density is 1; give a number from 1\.1 to 8"),
-        ("[accuracy]\nstop_band_db = 30", r"accuracy\.stopband_attenuation_db is 30; give a number from 40 to 140"),
-        ("[accuracy]\nfocal_zones = 0", r"accuracy\.focal_zones is 0; give a whole number from 1 to"),
+        ("[accuracy]\nbeam_density = 1", r"accuracy\.beam_density is 1; use a number from 1\.1 to 8"),
+        ("[accuracy]\nstop_band_db = 30", r"accuracy\.stopband_attenuation_db is 30; use a number from 40 to 140"),
+        ("[accuracy]\nfocal_zones = 0", r"accuracy\.focal_zones is 0; use a whole number from 1 to"),
         (
             "[processing]\nmethod = 'paper'\nwavefront = 'spherical'",
-            r"processing\.wavefront is 'spherical', but .* 'paper' supports only plane wavefronts; give 'plane'",
+            r"processing\.wavefront is 'spherical', but .* 'paper' supports only plane wavefronts; use 'plane'",
         ),
-        ("[processing]\nrange_m = [2, 1]", r"processing\.range_m runs from 2 to 1; give the smaller number first"),
-        ("[processing]\nrange_m = [-1, 1]", r"processing\.range_m is -1; give a number from 0 to 10000"),
-        ("[processing]\nazimuth_limits_deg = [-181, 0]", r"processing\.azimuth_limits_deg is -181; give a number from"),
-        ("[processing]\nelevation_limits_deg = [0, 91]", r"processing\.elevation_limits_deg is 91; give a number from"),
+        ("[processing]\nrange_m = [2, 1]", r"processing\.range_m runs from 2 to 1; use the smaller number first"),
+        ("[processing]\nrange_m = [-1, 1]", r"processing\.range_m is -1; use a number from 0 to 10000"),
+        ("[processing]\nazimuth_limits_deg = [-181, 0]", r"processing\.azimuth_limits_deg is -181; use a number from"),
+        ("[processing]\nelevation_limits_deg = [0, 91]", r"processing\.elevation_limits_deg is 91; use a number from"),
         (
             "[processing]\nband_edges_hz = [25000, 60000]",
-            r"band_edges_hz is 25000 to 60000 Hz, but .*; give a lower edge of at most 24900 and an upper edge",
+            r"band_edges_hz is 25000 to 60000 Hz, but .*; use a lower edge of at most 24900 and an upper edge",
         ),
         (
             "[processing]\nband_edges_hz = [5000, 120000]\ndecimation = 20",
-            r"processing\.band_edges_hz ends at 120000 Hz, but signals at 225000 Hz reach only 112500 Hz; give",
+            r"processing\.band_edges_hz ends at 120000 Hz, but signals at 225000 Hz reach only 112500 Hz; use",
         ),
         (
             "[processing]\nmethod = 'paper'\nband_edges_hz = [20000, 55000]",
             r"processing\.band_edges_hz is not supported by processing.method 'paper'; leave it out",
         ),
-        ("[processing]\nband_edges_hz = [-1, 55000]", r"processing\.band_edges_hz is -1; give a number from 0 to"),
+        ("[processing]\nband_edges_hz = [-1, 55000]", r"processing\.band_edges_hz is -1; use a number from 0 to"),
         (
             "[processing]\ndecimation = 50",
-            r"processing\.decimation 50 leaves signals at 90000 Hz; give one that leaves",
+            r"processing\.decimation 50 leaves signals at 90000 Hz; use a decimation that leaves",
         ),
     ],
 )
@@ -224,28 +224,28 @@ def test_bad_settings_are_refused(text, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Array(word_bits="32"), r"array\.word_bits is '32'; give a whole number"),
-        (lambda: Array(positions_m=((0.0, 0.0),)), r"array\.positions_m\[0\] has shape \(2,\); give shape \(3,\)"),
-        (lambda: Array(positions_m=((0.0,) * 3,) * 1025), r"number of array\.positions_m is 1025; give .* 1 to 1024"),
-        (lambda: Array(positions_m=TWO, enabled=(1, 0)), r"array\.enabled\[0\] is 1; give true or false"),
-        (lambda: Array(positions_m=TWO, enabled=("yes", "no")), r"array\.enabled\[0\] is 'yes'; give true or false"),
-        (lambda: Array(positions_m=5), r"array\.positions_m is 5; give a list or None"),
-        (lambda: Array(layout=3), r"array\.layout is 3; give text"),
-        (lambda: Accuracy(focal_zones=1.5), r"accuracy\.focal_zones is 1\.5; give a whole number or None"),
-        (lambda: Processing(range_m="12"), r"processing\.range_m is '12'; give a list"),
-        (lambda: Processing(range_m=(1, 2, 3)), r"processing\.range_m has shape \(3,\); give shape \(2,\)"),
+        (lambda: Array(word_bits="32"), r"array\.word_bits is '32'; use a whole number"),
+        (lambda: Array(positions_m=((0.0, 0.0),)), r"array\.positions_m\[0\] has shape \(2,\); pass shape \(3,\)"),
+        (lambda: Array(positions_m=((0.0,) * 3,) * 1025), r"number of array\.positions_m is 1025; use .* 1 to 1024"),
+        (lambda: Array(positions_m=TWO, enabled=(1, 0)), r"array\.enabled\[0\] is 1; use true or false"),
+        (lambda: Array(positions_m=TWO, enabled=("yes", "no")), r"array\.enabled\[0\] is 'yes'; use true or false"),
+        (lambda: Array(positions_m=5), r"array\.positions_m is 5; use a list or None"),
+        (lambda: Array(layout=3), r"array\.layout is 3; use text"),
+        (lambda: Accuracy(focal_zones=1.5), r"accuracy\.focal_zones is 1\.5; use a whole number or None"),
+        (lambda: Processing(range_m="12"), r"processing\.range_m is '12'; use a list"),
+        (lambda: Processing(range_m=(1, 2, 3)), r"processing\.range_m has shape \(3,\); pass shape \(2,\)"),
         (
             lambda: Processing(range_m=(1, 10**400)),
-            r"processing\.range_m\[1\] exceeds the range of .*; give a finite number",
+            r"processing\.range_m\[1\] exceeds the range of .*; use a finite number",
         ),
-        (lambda: Processing(method=3), r"processing\.method is 3; give text"),
-        (lambda: Settings(processing="90"), r"settings\.processing is '90'; give Processing\(\.\.\.\)"),
-        (lambda: Settings(air={"pressure_pa": "low"}), r"settings\.air\.pressure_pa is 'low'; give a number"),
-        (lambda: Settings(air={"pressure_pa": 1}), r"^air\.pressure_pa is 1; give a number from 10000 to 200000$"),
+        (lambda: Processing(method=3), r"processing\.method is 3; use text"),
+        (lambda: Settings(processing="90"), r"settings\.processing is '90'; use Processing\(\.\.\.\)"),
+        (lambda: Settings(air={"pressure_pa": "low"}), r"settings\.air\.pressure_pa is 'low'; use a number"),
+        (lambda: Settings(air={"pressure_pa": 1}), r"^air\.pressure_pa is 1; use a number from 10000 to 200000$"),
         (lambda: Processing(method="slow"), r"processing\.method 'slow' is unknown; known are fast, paper"),
-        (lambda: Air(temperature_c="warm"), r"air\.temperature_c is 'warm'; give a number"),
+        (lambda: Air(temperature_c="warm"), r"air\.temperature_c is 'warm'; use a number"),
         (lambda: Air().replace(temperature=3), r"air key 'temperature' is unknown .did you mean 'temperature_c'"),
-        (lambda: Air().replace(temperature_c=99), r"air\.temperature_c is 99; give a number from -40 to 60"),
+        (lambda: Air().replace(temperature_c=99), r"air\.temperature_c is 99; use a number from -40 to 60"),
         (lambda: Settings.from_preset("defualt_25_50"), r"preset 'defualt_25_50' is unknown .did you mean 'default_25"),
     ],
 )
@@ -340,7 +340,7 @@ def test_decimation_is_checked_for_method_and_band(preset, method, decimation):
 
 
 def test_range_decimation_without_a_useful_divisor_is_refused():
-    with pytest.raises(ArgumentError, match=r"range_decimation 101 has no divisor near 20, .*; give a multiple of 20"):
+    with pytest.raises(ArgumentError, match=r"range_decimation 101 has no divisor near 20, .*; use a multiple of 20"):
         Settings(processing=Processing(range_decimation=101))
 
 
@@ -349,7 +349,7 @@ def test_distant_microphones_are_refused():
         ArgumentError, match=r"array.positions_m spans 40 m, more than 25 m; if the numbers are millimetres, divide"
     ):
         Array(positions_m=((0.0, 0.0, 0.0), (40.0, 0.0, 0.0)))
-    with pytest.raises(ArgumentError, match=r"array.positions_m\[1\] is 4e\+07; give a number from -1e\+07 to 1e\+07"):
+    with pytest.raises(ArgumentError, match=r"array.positions_m\[1\] is 4e\+07; use a number from -1e\+07 to 1e\+07"):
         Array(positions_m=((0.0, 0.0, 0.0), (4e7, 0.0, 0.0)))
     assert Array(positions_m=((5e5, 5e6, 0.0), (5e5, 5e6 + 20, 0.0)), enabled=(True, True)).layout == "own array"
 
@@ -401,7 +401,7 @@ def test_settings_file_updates_only_its_keys(tmp_path, monkeypatch):
 def test_inconsistent_settings_file_is_refused(tmp_path):
     (tmp_path / "s.toml").write_text("[processing]\nrange_decimation = 50\n")
     known = Settings(processing=Processing(decimation=20))
-    with pytest.raises(SettingsError, match=r"s\.toml: processing\.decimation is 20; give a divisor of .* \(50\)"):
+    with pytest.raises(SettingsError, match=r"s\.toml: processing\.decimation is 20; use a divisor of .* \(50\)"):
         known.updated_from_file(tmp_path / "s.toml")
 
 
@@ -434,6 +434,6 @@ def test_range_window_ends_where_the_whole_echo_fits():
     assert window_m(2_810, range_m=(0.2, 9.0)) == (0.2, 9.0)
     with pytest.raises(
         ArgumentError,
-        match=r"recording.n_samples gives a record of 2\.5 ms, but the call ends after 2\.5 ms; give more samples",
+        match=r"recording.n_samples gives a record of 2\.5 ms, but the call ends after 2\.5 ms; use more samples",
     ):
         window_m(2_500)

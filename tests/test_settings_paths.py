@@ -21,7 +21,7 @@ def test_several_paths_are_changed_and_checked_together():
     assert Settings().replace(**changes) == Settings(
         processing=Processing(decimation=15, range_decimation=150), accuracy=Accuracy(max_error_db=-50)
     )
-    with pytest.raises(ArgumentError, match=r"processing.decimation is 15; give a divisor"):
+    with pytest.raises(ArgumentError, match=r"processing.decimation is 15; use a divisor"):
         Settings().replace("processing.decimation", 15)
 
 
@@ -47,7 +47,7 @@ def test_path_value_may_be_none():
         ("procesing.range_m", "did you mean 'processing.range_m'?"),
         ("accuracy.zzz", "settings key 'accuracy.zzz' is unknown; known in 'accuracy' are max_error_db, precision"),
         ("zzz", "settings key 'zzz' is unknown; known are array, call, recording, air, processing, accuracy"),
-        ("processing.range_m.first", "processing key 'range_m.first' is unknown: range_m is no table; give 'range_m'"),
+        ("processing.range_m.first", "processing key 'range_m.first' is unknown: range_m is no table; use 'range_m'"),
     ],
 )
 def test_unknown_path_is_refused_with_similar_paths(path, message):
@@ -58,7 +58,7 @@ def test_unknown_path_is_refused_with_similar_paths(path, message):
 
 
 def test_values_of_paths_are_checked():
-    with pytest.raises(ArgumentError, match=r"accuracy.max_error_db is 3; give a number from -200 to 0"):
+    with pytest.raises(ArgumentError, match=r"accuracy.max_error_db is 3; use a number from -200 to 0"):
         Settings().replace("accuracy.max_error_db", 3)
     with pytest.raises(ArgumentError, match=r"processing.range_m is 3"):
         Settings().replace("processing.range_m", 3)

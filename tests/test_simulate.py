@@ -61,7 +61,7 @@ def test_simulate_writes_beside_the_scene_and_overwrites_with_force(scene_file):
     assert scene_file.with_suffix(".h5").exists()
     refused = simulate(scene_file)
     assert refused.exit_code == 1
-    assert "scene.h5 exists; give another name, or ask to overwrite it (--force)" in refused.stderr
+    assert "scene.h5 exists; choose another name, or replace the file (--force)" in refused.stderr
     assert simulate(scene_file, "--force").exit_code == 0
 
 
@@ -139,7 +139,7 @@ def test_tolerance_selects_the_effects(scene_file):
         ("sede = 1", (), 1, r"scene\.toml.*unknown key `sede`; correct it or remove it"),
         ("[[sensors]]\narray.layout = 'eRTIS'", (), 1, "layout 'eRTIS' is unknown"),
         ("seed = 1", ("--sensor", "left"), 1, "sensor 'left' is unknown; known are sensor"),
-        ("seed = 1", ("--tolerance-db", "-1"), 2, "--tolerance-db is -1; give a number from 0 to 60"),
+        ("seed = 1", ("--tolerance-db", "-1"), 2, "--tolerance-db is -1; use a number from 0 to 60"),
         ("seed = 1", ("--count", "0"), 2, "--count"),
         ("seed = 1", ("--seed", "-1"), 2, "--seed"),
     ],
@@ -169,5 +169,5 @@ def test_simulate_refuses_devices_and_links_as_output(scene_file, tmp_path):
     for target in ("/dev/null", link):
         refused = simulate(scene_file, "-o", target, "--force")
         assert refused.exit_code == 1
-        assert "is a link or a device; give the name of a file" in refused.stderr
+        assert "is a link or a device; choose the name of a file" in refused.stderr
     assert link.is_symlink()

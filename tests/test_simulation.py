@@ -247,7 +247,7 @@ def test_memory_is_independent_of_the_record_length():
 
 
 def test_invalid_measurement_index_is_refused():
-    with pytest.raises(ArgumentError, match="index is -1; give a whole number of at least 0"):
+    with pytest.raises(ArgumentError, match="index is -1; use a whole number of at least 0"):
         render(SCENE, -1)
 
 

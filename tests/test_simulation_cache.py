@@ -65,5 +65,5 @@ def test_cache_keeps_a_result_larger_than_its_limit_alone():
 
 
 def test_cache_refuses_results_of_unknown_size():
-    with pytest.raises(TypeError, match="size of set is unknown; give it a property nbytes"):
+    with pytest.raises(TypeError, match="size of set is unknown; add a property nbytes"):
         Cache().once("key", lambda: {1, 2})

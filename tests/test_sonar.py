@@ -152,7 +152,7 @@ def test_port_in_use_is_refused(device):
 
 def test_path_other_than_a_serial_port_is_refused(tmp_path):
     (tmp_path / "file.txt").touch()
-    with pytest.raises(SonarError, match=r"file\.txt is not a usable serial port \(.*; give another"):
+    with pytest.raises(SonarError, match=r"file\.txt is not a usable serial port \(.*; choose another"):
         SonarDriver.open(str(tmp_path / "file.txt"))
 
 
@@ -539,7 +539,7 @@ def test_listening_with_another_record_length_is_reported(device):
         with (
             impatient(2.0),
             pytest.raises(
-                SonarError, match=r"\d+ bytes arrived within .* no complete measurement of 65536 samples; give"
+                SonarError, match=r"\d+ bytes arrived within .* no complete measurement of 65536 samples; use"
             ),
         ):
             list(sonar.listen(stop=lambda: False, timeout_s=0.1))

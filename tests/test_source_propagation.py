@@ -309,13 +309,13 @@ def test_simulated_recording_holds_the_sources_of_its_scene(tmp_path):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Noise(range_m=1.0, spectrum="leak"), "give noise.orifice_m with spectrum"),
-        (lambda: Noise(range_m=1.0, orifice_m=1e-3), "give noise.orifice_m with spectrum"),
-        (lambda: Noise(range_m=1.0, spectrum=((2e4, 0.0), (2e4, 0.0))), "give them in increasing order"),
+        (lambda: Noise(range_m=1.0, spectrum="leak"), "use noise.orifice_m with spectrum"),
+        (lambda: Noise(range_m=1.0, orifice_m=1e-3), "use noise.orifice_m with spectrum"),
+        (lambda: Noise(range_m=1.0, spectrum=((2e4, 0.0), (2e4, 0.0))), "sort them in increasing order"),
         (lambda: Noise(range_m=1.0, spectrum=()), "levels of noise.spectrum"),
-        (lambda: Tone(range_m=1.0, frequency_hz=1e4, modulation_depth=0.5), "give tone.modulation_hz"),
+        (lambda: Tone(range_m=1.0, frequency_hz=1e4, modulation_depth=0.5), "add tone.modulation_hz"),
         (lambda: Tone(range_m=1.0, frequency_hz=1e4, modulation_hz=2e4), "tone.modulation_hz"),
-        (lambda: Tone(range_m=1.0, frequency_hz=1e4, facing_deg=(0.0, 0.0)), "give tone.diameter_m"),
+        (lambda: Tone(range_m=1.0, frequency_hz=1e4, facing_deg=(0.0, 0.0)), "add tone.diameter_m"),
         (lambda: Sonar(range_m=1.0, diameter_m=0.3), "sonar.diameter_m"),
     ],
 )

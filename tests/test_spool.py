@@ -233,7 +233,7 @@ def test_journal_of_a_capture_in_the_spool_is_sent(tmp_path):
 def test_missing_spool_folder_is_refused(tmp_path):
     (tmp_path / "file").touch()
     with (
-        pytest.raises(NetworkError, match=r"give a writable spool folder \(--spool\)"),
+        pytest.raises(NetworkError, match=r"choose a writable spool folder \(spool\)"),
         Node(NOBODY, spool=tmp_path / "file"),
     ):
         pass

@@ -87,7 +87,7 @@ def test_result_is_that_of_the_last_stage(stage, kind):
         assert type(result) is kind
         if stage == "envelope":
             return
-        refusal = rf"processing.last_stage is '{stage}', which yields no image; give 'envelope', or call"
+        refusal = rf"processing.last_stage is '{stage}', which yields no image; use 'envelope', or call"
         for call in (pipeline.process, lambda each: pipeline.process_batch([each]), pipeline.process_many):
             with pytest.raises(ArgumentError, match=refusal):
                 call(noise(FINE))
@@ -105,7 +105,7 @@ def test_result_is_that_of_the_last_stage(stage, kind):
         ),
         (
             lambda: Processing(last_stage="beams", method="paper"),
-            "processing.last_stage is 'beams', but processing.method 'paper' returns none; give method 'fast'",
+            "processing.last_stage is 'beams', but processing.method 'paper' returns none; use method 'fast'",
         ),
         (
             lambda: Pipeline(SHORT.replace("processing.method", "paper"), "numpy").beams(noise(SHORT)),
@@ -161,7 +161,7 @@ def test_process_command_writes_the_results_of_a_stage(recording, tmp_path, stag
         (
             ("-o", "x.npz"),
             2,
-            "-o x.npz is for signals and beams; give --last-stage, or export images with",
+            "-o x.npz is for signals and beams; add --last-stage, or export images with",
         ),
         (("-o", "x.npz", "--last-stage", "beams", "--verify"), 2, "--verify is for images; remove it with -o x.npz"),
         (
@@ -195,7 +195,7 @@ def test_results_of_different_stages_cannot_share_a_file(tmp_path):
     measurement = noise(FINE)
     with Pipeline(FINE, "cpu", predict=False) as pipeline:
         beams, signals = pipeline.beams(measurement), pipeline.signals(measurement)
-    with pytest.raises(ArgumentError, match="Beams and MicrophoneSignals cannot share one npz; give results of one"):
+    with pytest.raises(ArgumentError, match="Beams and MicrophoneSignals cannot share one npz; pass results of one"):
         ertis.export(tmp_path / "a.npz", [beams, signals])
     other = Beams(beams.beam, beams.azimuth_rad, beams.elevation_rad, beams.range_m, beams.settings, Stamp(sensor="b"))
     with pytest.raises(ArgumentError, match="cannot share the axes of one npz; choose one"):

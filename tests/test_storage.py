@@ -291,7 +291,7 @@ def spoilt(**settings):
             [Measurement(noise()[0].data, SMALL, Stamp(sensor="a/b"))],
             "sensor name 'a/b' cannot name a group in a file",
         ),
-        ([Measurement(noise()[0].data[1:], SMALL)], r"measurement 0 has shape \(40959,\); give shape \(40960,\)"),
+        ([Measurement(noise()[0].data[1:], SMALL)], r"measurement 0 has shape \(40959,\); pass shape \(40960,\)"),
         (
             [Measurement(noise()[0].data, SMALL, Stamp(timestamp_uncertainty_ns=2**32))],
             "timestamp_uncertainty_ns is 4294967296",
@@ -308,15 +308,15 @@ def test_unstorable_measurements_are_refused(tmp_path, measurements, message):
 @pytest.mark.parametrize(
     ("stamp", "message"),
     [
-        (Stamp(sequence=2**63), "sequence is 9223372036854775808; give a whole number from 0"),
-        (Stamp(sequence=-1), "sequence is -1; give a whole number from 0"),
-        (Stamp(sequence=1.0), "sequence is 1.0; give a whole number"),
+        (Stamp(sequence=2**63), "sequence is 9223372036854775808; use a whole number from 0"),
+        (Stamp(sequence=-1), "sequence is -1; use a whole number from 0"),
+        (Stamp(sequence=1.0), "sequence is 1.0; use a whole number"),
         (
             Stamp(timestamp_ns=2**63),
-            "timestamp_ns is 9223372036854775808; give a whole number from -9223372036854775808",
+            "timestamp_ns is 9223372036854775808; use a whole number from -9223372036854775808",
         ),
-        (Stamp(sync_count=-(2**63) - 1), "sync_count is -9223372036854775809; give"),
-        (Stamp(session_id=2**63), "session_id is 9223372036854775808; give"),
+        (Stamp(sync_count=-(2**63) - 1), "sync_count is -9223372036854775809; use"),
+        (Stamp(session_id=2**63), "session_id is 9223372036854775808; use"),
     ],
     ids=["sequence", "negative sequence", "half a sequence", "time", "pulse", "session_id"],
 )
@@ -339,7 +339,7 @@ def numbered(*numbers, session_id=0):
     ids=["at once", "rising", "falling", "highest", "late"],
 )
 def test_sequence_numbers_are_unique_within_a_session(tmp_path, numbers, place):
-    message = rf"measurement {place} has sequence {numbers[place]} of session 0, like an earlier one; give each"
+    message = rf"measurement {place} has sequence {numbers[place]} of session 0, like an earlier one; use for each"
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", numbered(*numbers))
     given = [*numbered(*numbers[:place]), *numbered(*numbers[place:], session_id=1)]
@@ -376,9 +376,7 @@ PCM_OF = {
 )
 def test_samples_of_another_type_are_refused(tmp_path, settings, dtype):
     words = sample_format(settings)
-    message = (
-        rf"measurement 0 contains {dtype} samples, but its settings give {words.dtype.name}; convert them, or give"
-    )
+    message = rf"measurement 0 contains {dtype} samples, but its settings state {words.dtype.name}; convert them"
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", [Measurement(np.zeros(words.shape, dtype), settings)])
 
@@ -396,7 +394,7 @@ def test_nan_and_infinity_are_not_recorded(tmp_path, number):
     settings = PCM_OF["float32"]
     words = np.zeros(sample_format(settings).shape, np.float32)
     words[7, 2] = number
-    with pytest.raises(ArgumentError, match=rf"measurement 0 holds {number} at \[7, 2\]; give finite numbers"):
+    with pytest.raises(ArgumentError, match=rf"measurement 0 holds {number} at \[7, 2\]; pass finite numbers"):
         write_recording(tmp_path / "rec.h5", [Measurement(words, settings)])
 
 
@@ -417,9 +415,9 @@ def test_unstorable_energyscapes_are_refused(tmp_path, other, message):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("there.h5", "there.h5 exists; give another name, or ask to overwrite it"),
+        ("there.h5", "there.h5 exists; choose another name, or replace the file"),
         ("nowhere/rec.h5", "does not exist"),
-        ("folder", "folder is a folder; give the name of a file"),
+        ("folder", "folder is a folder; choose the name of a file"),
     ],
 )
 def test_unwritable_paths_are_refused(tmp_path, name, message):

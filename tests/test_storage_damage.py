@@ -188,7 +188,7 @@ def test_unusable_settings_are_damage(path):
     with h5py.File(path, "r+") as file:
         text = file[f"{GROUP}/settings"]
         text[()] = text[()].replace(b"duration_s = 0.0025", b"duration_s = nan")
-    with pytest.raises(DataError, match=r"rec.h5: settings, call: call.duration_s is nan; give a finite number"):
+    with pytest.raises(DataError, match=r"rec.h5: settings, call: call.duration_s is nan; use a finite number"):
         open_recording(path)
 
 
@@ -251,7 +251,7 @@ def test_scalar_words_are_refused(tmp_path):
 def test_sensor_of_several_must_be_chosen(path):
     with h5py.File(path, "r+") as file:
         file.copy(GROUP, file["sensors"], name="other")
-    with pytest.raises(ArgumentError, match=r"choose one of eRTIS-7, other \(sensor, --sensor\)"):
+    with pytest.raises(ArgumentError, match=r"choose one of eRTIS-7, other \(sensor\)"):
         open_recording(path)
     with pytest.raises(ArgumentError, match="has no sensor 'none'; choose one of eRTIS-7, other"):
         open_recording(path, sensor="none")

@@ -161,7 +161,7 @@ def test_sensors_without_mounting_are_not_combined(tmp_path):
         assert "frame base_link" in plyfile.PlyData.read(tmp_path / "a.ply").comments
     done = CliRunner().invoke(cli, [*command, "--mounting", str(path), "--force"])
     assert done.exit_code == 1
-    assert "rec.h5 contains no mounting of a sensor; give a scene" in done.stderr
+    assert "rec.h5 contains no mounting of a sensor; use a scene" in done.stderr
 
 
 @pytest.mark.parametrize(("sensors", "count"), [(("left",), 0), (("left", "right"), 1)])

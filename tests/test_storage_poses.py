@@ -163,7 +163,7 @@ def test_added_poses_equal_written_ones(plain, tmp_path):
 @pytest.mark.parametrize("covariance", [True, False])
 def test_poses_can_be_replaced(plain, tmp_path, covariance):
     ertis.add_poses(plain, drive(source="first"))
-    with pytest.raises(ArgumentError, match=r"plain.h5 has poses already \(source 'first'\); keep them, or ask to rep"):
+    with pytest.raises(ArgumentError, match=r"plain.h5 has poses already \(source 'first'\); keep them, or rep"):
         ertis.add_poses(plain, drive())
     ertis.add_poses(plain, drive(covariance=covariance, source="second"), replace=True)
     written = tmp_path / "written.h5"
@@ -212,7 +212,7 @@ def test_uncovered_measurements_are_refused_with_both_spans(plain):
     before = plain.read_bytes()
     late = drive(begin_ns=TIMES_NS[1])
     spans = r"the poses cover 1700000000\.173 to 1700000001\.223 s, but the measurements of sensor {} cover "
-    with pytest.raises(ArgumentError, match=spans.format("left") + r"1700000000\.123 to 1700000000\.223 s; give poses"):
+    with pytest.raises(ArgumentError, match=spans.format("left") + r"1700000000\.123 to 1700000000\.223 s; use poses"):
         ertis.add_poses(plain, late)
     assert plain.read_bytes() == before
     writer = RecordingWriter(plain.parent / "new.h5", poses=late)
@@ -248,8 +248,8 @@ def test_links_in_the_place_of_poses_and_axes_are_refused(plain, tmp_path):
 
 
 WRONG = {
-    "poses are of type list; give a Trajectory": [1, 2],
-    "poses are of type str; give a Trajectory": {"eRTIS-7": "a.tum"},
+    "poses are of type list; pass a Trajectory, or a dictionary with a Trajectory": [1, 2],
+    "poses are of type str; pass a Trajectory, or a dictionary with a Trajectory": {"eRTIS-7": "a.tum"},
     "the source of poses has 1025 bytes; the limit is 1024": drive(source="x" * 1025),
 }
 
@@ -262,13 +262,13 @@ def test_writer_refuses_other_things_than_poses(tmp_path, message):
 
 
 def test_add_poses_refuses_other_things_than_a_trajectory(plain):
-    with pytest.raises(ArgumentError, match="trajectory is of type str; give a Trajectory"):
+    with pytest.raises(ArgumentError, match="trajectory is of type str; pass a Trajectory"):
         ertis.add_poses(plain, "a.tum")
 
 
 def test_add_poses_never_overwrites_without_request(plain, tmp_path):
     (tmp_path / "old.h5").write_bytes(b"old")
-    with pytest.raises(ArgumentError, match=r"old.h5 exists; give another name"):
+    with pytest.raises(ArgumentError, match=r"old.h5 exists; choose another name"):
         ertis.add_poses(plain, drive(), output=tmp_path / "old.h5")
     with pytest.raises(ArgumentError, match=r"plain.h5 is the input itself"):
         ertis.add_poses(plain, drive(), output=plain, overwrite=True)
@@ -394,10 +394,10 @@ def test_trajectory_of_a_platform_refuses_recordings_of_different_drives(tmp_pat
     files = [write_recording(tmp_path / f"{name}.h5", sensors(name)) for name in ("front", "left")]
     ertis.add_poses(files[0], drive())
     ertis.add_poses(files[1], drive(source="other"))
-    with pytest.raises(ArgumentError, match=r"front.h5 from 'file' and .*left.h5 from 'other'; give one trajectory"):
+    with pytest.raises(ArgumentError, match=r"front.h5 from 'file' and .*left.h5 from 'other'; use one trajectory"):
         platform_trajectory(files)
     ertis.add_poses(files[1], drive().replace(position_m=drive().position_m + 1), replace=True)
-    with pytest.raises(ArgumentError, match=r"front.h5 and .*left.h5 have different poses at \d+ ns; give one traj"):
+    with pytest.raises(ArgumentError, match=r"front.h5 and .*left.h5 have different poses at \d+ ns; use one traj"):
         platform_trajectory(files)
 
 
@@ -445,5 +445,5 @@ def test_part_of_a_pose_cannot_be_missing(tmp_path):
 
 def test_poses_that_cover_no_measurement_are_refused(plain):
     far = drive(begin_ns=TIMES_NS[-1] + 9 * SECOND_NS, end_ns=TIMES_NS[-1] + 19 * SECOND_NS).replace(max_gap_s=1.0)
-    with pytest.raises(ArgumentError, match="no measurement of sensor left is within the poses; give poses for this"):
+    with pytest.raises(ArgumentError, match="no measurement of sensor left is within the poses; use poses for this"):
         ertis.add_poses(plain, far)

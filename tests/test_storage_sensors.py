@@ -131,16 +131,16 @@ def test_mounting_is_kept(tmp_path):
     [
         (
             {"settings": SMALL},
-            "settings are given for one sensor, but there are measurements of right and left; give none",
+            "settings are given for one sensor, but there are measurements of right and left; remove settings,",
         ),
         (
             {"mounting": {"a": ((0, 0, 0), TURNED)}},
             "mounting is given for sensor 'a', which has no measurement",
         ),
-        ({"mounting": {"left": ((0, 0), TURNED)}}, r"translation_m of sensor left has shape \(2,\); give shape \(3,\)"),
-        ({"mounting": {"left": ((0, 0, np.inf), TURNED)}}, r"translation_m of sensor left holds inf at \[2\]; give"),
-        ({"mounting": {"left": ((0, 0, 0), (0, 0, 1))}}, r"rotation_xyzw of sensor left has shape \(3,\); give shape"),
-        ({"mounting": {"left": ((0, 0, 0), (0, 0, 1, 1))}}, "rotation_xyzw of sensor left has length 1.41421; give a"),
+        ({"mounting": {"left": ((0, 0), TURNED)}}, r"translation_m of sensor left has shape \(2,\); pass shape \(3,\)"),
+        ({"mounting": {"left": ((0, 0, np.inf), TURNED)}}, r"translation_m of sensor left holds inf at \[2\]; pass"),
+        ({"mounting": {"left": ((0, 0, 0), (0, 0, 1))}}, r"rotation_xyzw of sensor left has shape \(3,\); pass shape"),
+        ({"mounting": {"left": ((0, 0, 0), (0, 0, 1, 1))}}, "rotation_xyzw of sensor left has length 1.41421; use a"),
     ],
 )
 def test_options_for_other_sensors_are_refused(tmp_path, options, message):

@@ -110,7 +110,9 @@ def test_changed_sources_are_refused(tmp_path):
 def test_other_sources_in_a_later_measurement_are_refused(tmp_path):
     with GroundTruthLog("", 5, folder=tmp_path) as log:
         log.append((), SOURCES[0])
-        with pytest.raises(ArgumentError, match=r"measurement 1 has the sources \['noises\[0\]'\]; give \['noises\[0"):
+        with pytest.raises(
+            ArgumentError, match=r"measurement 1 has the sources \['noises\[0\]'\]; pass \['noises\[0\]',"
+        ):
             log.append((), SOURCES[1][:1])
 
 
@@ -205,7 +207,7 @@ def test_truth_of_another_recording_is_refused(path, tmp_path):
 def test_truth_of_another_length_is_refused(tmp_path):
     with pytest.raises(
         ArgumentError,
-        match="the truth of sensor eRTIS-7 has 2 measurements, but the file has 3; give the reflectors of each",
+        match="the truth of sensor eRTIS-7 has 2 measurements, but the file has 3; pass the reflectors of each",
     ):
         write_recording(tmp_path / "rec.h5", noise(), truth={SENSOR: truth(ROWS[:2])})
     assert not list(tmp_path.iterdir())
@@ -219,13 +221,13 @@ def test_truth_of_an_absent_sensor_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"seed": -1}, "seed is -1; give a whole number from 0 to 9223372036854775807"),
-        ({"reflectors": ((reflector(range_m=np.nan),),)}, r"range_m of the true reflectors holds nan at \[0\]; give"),
+        ({"seed": -1}, "seed is -1; use a whole number from 0 to 9223372036854775807"),
+        ({"reflectors": ((reflector(range_m=np.nan),),)}, r"range_m of the true reflectors holds nan at \[0\]; pass"),
         (
             {"reflectors": ((reflector(), reflector(level_db=-np.inf)),)},
-            r"level_db of the true reflectors holds -inf at \[1\]; give finite numbers",
+            r"level_db of the true reflectors holds -inf at \[1\]; pass finite numbers",
         ),
-        ({"sources": SOURCES}, "the truth has sources of 3 measurements, but reflectors of 0; give both of each"),
+        ({"sources": SOURCES}, "the truth has sources of 3 measurements, but reflectors of 0; pass both for each"),
     ],
 )
 def test_invalid_truth_is_refused(changes, message):

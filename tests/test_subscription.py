@@ -157,7 +157,7 @@ def test_subscriber_waits_for_a_publisher():
 @pytest.mark.usefixtures("hasty")
 def test_first_refusal_raises(publisher):
     def refuse():
-        publisher.tell_all(messages.Refused(code="role", reason="key 'x' is of a sensor; give one of an application"))
+        publisher.tell_all(messages.Refused(code="role", reason="key 'x' is of a sensor; choose one of an application"))
         publisher.peers.clear()
         return came()
 
@@ -172,7 +172,7 @@ def test_first_refusal_raises(publisher):
     with Subscriber(publisher.address) as subscriber:
         publisher.answers = False
         publisher.pump(refuse)
-        assert f"{publisher.address}: key 'x' is of a sensor; give one of an application" in str(raised[0])
+        assert f"{publisher.address}: key 'x' is of a sensor; choose one of an application" in str(raised[0])
         with pytest.raises(RefusedError):
             subscriber.receive()
 
@@ -204,8 +204,8 @@ def test_subscriber_with_keys_receives_products(keys):
     ("who", "match"),
     [
         ("unknown", "the central node does not know this key"),
-        ("none", "requires a key[;,] give --key and --server-key"),
-        ("wrong server", "server-key"),
+        ("none", "requires a key[;,] set one"),
+        ("wrong server", "server_key"),
     ],
 )
 @pytest.mark.usefixtures("hasty")

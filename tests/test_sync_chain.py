@@ -67,7 +67,7 @@ def test_pulse_numbers_start_at_the_first_pulse():
 
 
 def test_invalid_pulse_rate_is_refused():
-    with pytest.raises(ArgumentError, match=r"rate_hz is 0; give a number from 0\.001 to 1000"):
+    with pytest.raises(ArgumentError, match=r"rate_hz is 0; use a number from 0\.001 to 1000"):
         SyncChain([], 0.0)
 
 

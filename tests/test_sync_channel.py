@@ -120,9 +120,7 @@ def test_doubtful_loopbacks_are_noted(tmp_path):
 def test_channel_of_a_microphone_is_noted(tmp_path, channel):
     path = write(tmp_path / "a.wav", record([3e-3, 33e-3], 0.06))
     notes = " ".join(ertis.open_pcm(path, SETTINGS, sync_channel=channel).notes)
-    expected = (
-        r"channel 8 contains the call 6\.9\d ms before channel 0, and louder; use --sync-channel 8 \(sync_channel\)"
-    )
+    expected = r"channel 8 contains the call 6\.9\d ms before channel 0, and louder; use sync_channel=8"
     assert bool(re.search(expected, notes)) == (channel == 0)
 
 
@@ -208,13 +206,13 @@ REFUSED = {
         record([1e-3], 0.02),
         {"sync_channel": 9},
         ArgumentError,
-        r"sync_channel is 9; give a whole number from 0 to 8",
+        r"sync_channel is 9; use a whole number from 0 to 8",
     ),
     "no channel left": (
         record([1e-3], 0.02)[:, 1:],
         {"sync_channel": 7},
         DataError,
-        r"has 8 channels, but array 'ring' and --sync-channel need 8 \+ 1",
+        r"has 8 channels, but array 'ring' and sync_channel need 8 \+ 1;",
     ),
     "not finite": (
         np.where(np.arange(9) == 8, np.nan, record([1e-3], 0.02)),
@@ -226,14 +224,14 @@ REFUSED = {
         record([1e-3], 0.02),
         {"skip_s": 0.001},
         ArgumentError,
-        r"--skip and --sync-channel cannot be combined; remove one",
+        r"skip_s and sync_channel cannot be combined; remove one",
     ),
-    "passive": (record([1e-3], 0.02), {"passive": True}, ArgumentError, r"--passive and --sync-channel cannot be"),
+    "passive": (record([1e-3], 0.02), {"passive": True}, ArgumentError, r"passive=True and sync_channel cannot be"),
     "long": (
         record([1e-3, 31e-3], 0.07),
         {"length_s": 0.05},
         DataError,
-        r"is followed by the next one or by the end after 0\.03 s, but --length is 0\.05 s; use a shorter",
+        r"is followed by the next one or by the end after 0\.03 s, but length_s is 0\.05; use a shorter",
     ),
 }
 

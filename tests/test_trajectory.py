@@ -85,17 +85,17 @@ def test_replace_changes_a_field():
 
 
 REFUSED = {
-    "gap": ({"max_gap_s": 0.0}, "max_gap_s is 0; give a number above 0"),
-    "huge covariance": ({"covariance": np.full((2, 6, 6), 1e17)}, r"covariance reaches 1e\+17; give square metres"),
+    "gap": ({"max_gap_s": 0.0}, "max_gap_s is 0; use a number above 0"),
+    "huge covariance": ({"covariance": np.full((2, 6, 6), 1e17)}, r"covariance reaches 1e\+17; pass square metres"),
     "huge quaternion": ({"rotation_xyzw": [[1e300] * 4] * 2}, r"rotation_xyzw has length inf at \[0\]"),
-    "no pose": ({"time_ns": []}, "time_ns has no time"),
+    "no pose": ({"time_ns": []}, "time_ns is empty; pass"),
     "times": ({"time_ns": [0, 0]}, "time_ns does not increase: 0 at "),
     "far future": (
         {"time_ns": [0, 2**62 + 1]},
-        "time_ns runs from 0 to 4611686018427387905; give nanoseconds since 1970",
+        "time_ns runs from 0 to 4611686018427387905; use nanoseconds since 1970",
     ),
-    "far past": ({"time_ns": [-(2**62) - 1, 0]}, "time_ns runs from -4611686018427387905 to 0; give nanoseconds since"),
-    "seconds": ({"time_ns": [0.5, 1.5]}, "give one dimension of whole nanoseconds"),
+    "far past": ({"time_ns": [-(2**62) - 1, 0]}, "time_ns runs from -4611686018427387905 to 0; use nanoseconds since"),
+    "seconds": ({"time_ns": [0.5, 1.5]}, "pass one dimension of whole nanoseconds"),
     "shape": ({"position_m": np.zeros((2, 2))}, "position_m has shape"),
     "text": ({"position_m": [["x"] * 3] * 2}, "position_m is not an array of numbers"),
     "nan": ({"position_m": np.full((2, 3), np.nan)}, "position_m holds nan at "),
@@ -136,8 +136,8 @@ def test_arrays_of_a_trajectory_are_read_only_copies():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        (np.eye(6) + np.eye(6, k=1) * 0.1, r"covariance is not symmetric at \[1\]; give"),
-        (np.diag([1.0, 1, 1, 1, 1, -0.1]), r"covariance has a negative eigenvalue at \[1\]; give positive"),
+        (np.eye(6) + np.eye(6, k=1) * 0.1, r"covariance is not symmetric at \[1\]; use"),
+        (np.diag([1.0, 1, 1, 1, 1, -0.1]), r"covariance has a negative eigenvalue at \[1\]; use positive"),
     ],
 )
 def test_covariances_must_be_symmetric_and_positive_semidefinite(wrong, message):

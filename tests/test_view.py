@@ -260,7 +260,7 @@ def test_nothing_is_drawn_beyond_the_image():
 @pytest.mark.parametrize(
     ("changes", "reported"),
     [
-        ({"threshold_db": 3.0}, "threshold_db is 3; give a number from -60 to 0"),
+        ({"threshold_db": 3.0}, "threshold_db is 3; use a number from -60 to 0"),
         ({"dynamic_range_db": 5.0}, "dynamic_range_db is 5"),
         ({"range_m": (3.0, 1.0)}, "range_m runs from 3 to 1"),
         ({"decay_s": -1.0}, "decay_s is -1"),
@@ -273,7 +273,7 @@ def test_invalid_choices_are_refused(changes, reported):
 
 
 def test_invalid_picture_sizes_are_refused():
-    with pytest.raises(ArgumentError, match="width_px is 50; give at least"):
+    with pytest.raises(ArgumentError, match="width_px is 50; use at least"):
         Polar(image(), width_px=50)
     with pytest.raises(ArgumentError, match="the image ends at range 0"):
         Polar(image(range_m=[0.0]))

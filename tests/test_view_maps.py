@@ -349,8 +349,8 @@ def measured(camera, original):
         (("REC", "--images", "--band", "30000"), "--band is for acoustic maps; remove it with images"),
         (("IMG", "--max-level", "-30"), "--max-level is for acoustic maps; remove it with images"),
         (("tcp://127.0.0.1:5602", "--band", "30000"), "--band is for acoustic maps; remove it with images"),
-        (("REC", "--band", "0"), "--band is 0; give a number from 1 to"),
-        (("REC", "--max-level", "199"), "--max-level is 199; give a number from -160 to 160"),
+        (("REC", "--band", "0"), "--band is 0; use a number from 1 to"),
+        (("REC", "--max-level", "199"), "--max-level is 199; use a number from -160 to 160"),
     ],
 )
 def test_options_without_effect_are_refused(tmp_path, arguments, reported):

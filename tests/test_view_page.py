@@ -27,7 +27,7 @@ def test_occupied_port_is_refused(tmp_path):
         other.bind(("127.0.0.1", 0))
         other.listen()
         with pytest.raises(
-            NetworkError, match=r"cannot serve the page at 127\.0\.0\.1:\d+ .*; give another host or port"
+            NetworkError, match=r"cannot serve the page at 127\.0\.0\.1:\d+ .*; choose another host or port"
         ):
             Viewer(playback, port=other.getsockname()[1])
     with Playback(path) as playback, pytest.raises(NetworkError, match=r"cannot serve the page at 203\.0\.113\.1"):
@@ -305,7 +305,7 @@ def test_unwritable_recording_is_reported(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", stamped(1))
     with Playback(path) as playback, Viewer(playback, port=0) as view:
         view._page.show = lambda *_: (tmp_path / "page.html").touch()  # noqa: SLF001  somebody was faster
-        with pytest.raises(ArgumentError, match="exists; give another name"):
+        with pytest.raises(ArgumentError, match="exists; choose another name"):
             view.record(tmp_path / "page.html")
         assert view.recorded is None
 

@@ -231,7 +231,8 @@ def test_filter_response_matches_the_taps():
 def test_decimation_below_the_signal_bandwidth_is_refused(decimation):
     rate_hz = 4.5e6 / decimation
     with pytest.raises(
-        ArgumentError, match=f"decimation {decimation} gives a rate of {rate_hz:g} Hz, too low .*; give a smaller one"
+        ArgumentError,
+        match=f"decimation {decimation} gives a rate of {rate_hz:g} Hz, too low .*Hz; use a smaller decimation",
     ):
         decimation_taps(sample_rate_hz=4.5e6, decimation=decimation, pass_hz=0.499 * rate_hz)
 
@@ -307,8 +308,8 @@ def test_delay_does_not_change_ranges():
 @pytest.mark.parametrize(
     ("delay_s", "message"),
     [
-        (-1e-3, r"call\.delay_s is -0\.001; give a number from 0 to 1"),
-        (1.5, r"call\.delay_s is 1\.5; give a number from 0 to 1"),
+        (-1e-3, r"call\.delay_s is -0\.001; use a number from 0 to 1"),
+        (1.5, r"call\.delay_s is 1\.5; use a number from 0 to 1"),
         (float("nan"), r"call\.delay_s is nan"),
     ],
 )

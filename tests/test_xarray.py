@@ -176,10 +176,10 @@ def test_azimuth_limits_are_circular():
         ({"azimuth_deg": (100, 110)}, r"no direction lies within azimuth_deg \(100, 110\).* azimuths from -90 to 90"),
         ({"elevation_deg": (1, 2)}, "no direction lies within .* elevations from 0 to 0 degrees"),
         ({"range_m": (6, 7)}, r"no range lies within range_m \(6, 7\); the image has ranges from 0.5 to 5 m"),
-        ({"range_m": (2, 1)}, "range_m runs from 2 to 1; give two numbers, the smaller one first"),
+        ({"range_m": (2, 1)}, "range_m runs from 2 to 1; use two numbers, the smaller one first"),
         ({"range_m": (math.nan, 1)}, "range_m runs from nan to 1"),
-        ({"range_m": 3}, "range_m is 3; give a pair of numbers"),
-        ({"azimuth_deg": ("a", "b")}, "azimuth_deg is .* give a pair of numbers"),
+        ({"range_m": 3}, "range_m is 3; use a pair of numbers"),
+        ({"azimuth_deg": ("a", "b")}, "azimuth_deg is .* use a pair of numbers"),
     ],
 )
 def test_unusable_limits_are_refused_in_one_line(limits, message):

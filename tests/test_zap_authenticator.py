@@ -45,14 +45,14 @@ def test_unknown_key_is_refused_counted_and_reported(door):
 
 def test_node_expecting_another_server_key_sends_nothing(door):
     client = door.knock(ROBOT, server=STRANGER.public)
-    assert "its key differs from --server-key, or it has none" in door.reported(client)
+    assert "its key is not the expected one, or it has none" in door.reported(client)
     assert door.until(lambda: door.gate.refused["no key"])
     assert not door.came
 
 
 def test_node_without_a_key_is_refused_and_counted(door):
     client = door.knock(None)
-    assert door.reported(client).endswith("give --key and --server-key")
+    assert door.reported(client).endswith("set one (keys)")
     assert door.until(lambda: door.gate.refused["no key"])
     assert not door.came
 

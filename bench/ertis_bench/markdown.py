@@ -48,11 +48,11 @@ def around(path: Path, marker: str) -> tuple[str, str]:
     try:
         content = path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ArgumentError(f"{path}: {checks.reason_unreadable(error)}; give a readable Markdown file") from error
+        raise ArgumentError(f"{path}: {checks.reason_unreadable(error)}; choose a readable Markdown file") from error
     head, found, rest = content.partition(begin)
     _, closed, tail = rest.partition(end)
     if not (found and closed):
-        raise ArgumentError(f"{path} has no place for this table; give a file with the lines {begin} and {end}")
+        raise ArgumentError(f"{path} has no place for this table; choose a file with the lines {begin} and {end}")
     return head + begin, end + tail
 
 

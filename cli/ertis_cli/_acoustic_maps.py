@@ -48,7 +48,7 @@ class _Bands(click.ParamType):  # type: ignore[type-arg]  # generic since click 
             if all(len(band) == 2 for band in bands):
                 return bands
         return self.fail(
-            f"{value!r} is not a list of bands; give third_octaves, octaves, or edges in Hz, as in "
+            f"{value!r} is not a list of bands; use third_octaves, octaves, or edges in Hz, as in "
             "20000:30000,30000:40000",
             param,
             ctx,
@@ -133,7 +133,7 @@ def require_none(reason: str) -> None:
 def _require_maps() -> None:
     """Raise an error for options of images, which have no effect on acoustic maps."""
     context = click.get_current_context()
-    reason = "all measurements become acoustic maps; give --mode active for images"
+    reason = "all measurements become acoustic maps; use --mode active for images"
     if context.params.get("mode") == "passive":  # also of measurements with a call
         reason = "--mode passive makes acoustic maps; leave out --mode"
     for parameter in context.command.params:

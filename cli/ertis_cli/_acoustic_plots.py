@@ -32,7 +32,7 @@ class _FieldOfView(click.ParamType):  # type: ignore[type-arg]  # generic since 
         if comma:
             with suppress(ValueError):
                 return float(horizontal), float(vertical)
-        return self.fail(f"{value!r} is not a field of view; give two angles in degrees, as in 60,40", param, ctx)
+        return self.fail(f"{value!r} is not a field of view; use two angles in degrees, such as 60,40", param, ctx)
 
 
 FIELD_OF_VIEW = _FieldOfView()
@@ -88,7 +88,7 @@ def require_fitting(kind: str, path: Path) -> None:
     with suppress(ErtisError):  # Reading the file reports the error.
         if kind not in _OF_MAPS and file_kind(path) == "acoustic_map":
             raise click.UsageError(
-                f"--kind {kind} does not support {path}, a file of acoustic maps; give --kind {' or '.join(_OF_MAPS)}, "
+                f"--kind {kind} does not support {path}, a file of acoustic maps; use --kind {' or '.join(_OF_MAPS)}, "
                 "or its recording",
                 click.get_current_context(),
             )

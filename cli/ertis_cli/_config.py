@@ -133,7 +133,7 @@ def _take(ctx: click.Context, path: Path) -> None:
         from ertis_numba import checks
 
         reason = checks.reason_unreadable(error) if isinstance(error, OSError | UnicodeDecodeError) else error
-        raise click.ClickException(f"{path}: {reason}; give a readable TOML file (--config)") from error
+        raise click.ClickException(f"{path}: {reason}; choose a readable TOML file (--config)") from error
     ctx.default_map = _defaults(ctx, cast("click.Group", ctx.command), tables, f"{path}: ")
     ctx.meta[_FILE] = path
 
@@ -147,7 +147,7 @@ def _defaults(ctx: click.Context, group: click.Group, tables: Mapping[str, Any],
         if command is None:
             raise click.ClickException(f"{where}{name!r} is not a command; {instead(name, names)}")
         if not isinstance(table, dict):
-            raise click.ClickException(f"{where}{name} is {table!r}; give a table of options, as in [{name}]")
+            raise click.ClickException(f"{where}{name} is {table!r}; write a table of options, as in [{name}]")
         if isinstance(command, click.Group):
             found[name] = _defaults(ctx, command, table, f"{where}{name} ")
             continue

@@ -137,7 +137,9 @@ def _processor(_folder: Path) -> Iterator[InstallationFinding]:
             times_s.append(time.perf_counter() - begun_s)
         n_directions = len(pipeline.grid)
     yield InstallationFinding(
-        "processing", "good", f"an image of {n_directions} directions takes {1e3 * min(times_s):.1f} ms"
+        "processing",
+        "good",
+        f"an image of {n_directions} directions takes {1e3 * min(times_s):.1f} ms",
     )
     layer = _threading_layer()
     slow = layer == "workqueue"

@@ -157,7 +157,7 @@ class Replayed(Sequence["NDArray[np.uint32]"]):
         return (
             f"{name} was recorded with a call of {_described(call)} and {recording.n_samples} samples at "
             f"{recording.sample_rate_hz / 1e6:g} MHz. It received other settings and does not measure; "
-            f"give 'ertis capture' {_remedy(call, recording)}"
+            f"start 'ertis capture' with {_remedy(call, recording)}"
         )
 
 

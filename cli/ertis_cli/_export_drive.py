@@ -34,7 +34,8 @@ def drive_options(command: Any) -> Any:
             default=30.0,
             show_default=True,
             metavar="DEG",
-            help="Azimuth of the virtual ears for BatSLAM in °, each to its own side; 0 is the front.",
+            help="Azimuth of the two virtual ears for BatSLAM in °: the left ear to the left, the right ear to the "
+            "right; 0 is ahead.",
         ),
         click.option("--scene", type=options.FILE, metavar="SCENE.toml", help="Scene with the reflectors for BatSLAM."),
         click.option(
@@ -47,7 +48,8 @@ def drive_options(command: Any) -> Any:
             "--poses",
             type=options.FILE,
             metavar="TRAJ",
-            help="True poses of the platform for BatSLAM, such as a TUM file; those of the recording by default.",
+            help="File with the true poses of the platform for BatSLAM, such as a TUM file; by default, the poses "
+            "in the recording.",
         ),
     ):
         command = option(command)
@@ -63,7 +65,9 @@ def require_fitting(name: str, paths: "Sequence[Path]") -> None:
         if typed(option):
             raise click.UsageError(f"--{spelling} is for format batslam, not for {name}; leave it out", context)
     if len(paths) > 1:
-        raise click.UsageError(f"format {name} exports one recording, but {len(paths)} are given; give one", context)
+        raise click.UsageError(
+            f"format {name} exports one recording, but {len(paths)} are given; choose one of them", context
+        )
 
 
 def open_ears(
@@ -103,7 +107,7 @@ def drive_of(
     readers : sequence of RecordingReader
         Recordings of all sensors of the platform.
     ears : RecordingReader
-        Recording of the sensor with ears.
+        Recording of the sensor whose microphones act as ears.
     chosen : sequence of int
         Indices of its measurements with a call.
     known : mapping of str to Mounting
@@ -127,7 +131,7 @@ def drive_of(
     true = ears.trajectory if poses is None else _poses.trajectory_of(poses, quiet=quiet)
     if true is None:
         raise ArgumentError(
-            f"{ears.path} has no poses; give true ones with --poses TRAJ, or without ground truth the output of "
+            f"{ears.path} has no poses; add the true poses with --poses TRAJ, or without ground truth the output of "
             "'ertis odometry'"
         )
     simulated = None if scene is None else load_scene(scene)
@@ -177,5 +181,5 @@ def _measured(
 
 
 def _as_recorded(settings: "Settings") -> "Settings":
-    _results.require_image(settings, "odometry needs images; give --odometry TRAJ")
+    _results.require_image(settings, "odometry needs images; add its result with --odometry TRAJ")
     return settings

@@ -56,7 +56,8 @@ def sound_options(command: Any) -> Any:
             "--silence",
             "with_silence",
             is_flag=True,
-            help="Keep the time between measurements as silence; by default, they follow each other.",
+            help="Fill the time between two measurements with silence; by default, measurements follow each other "
+            "without a gap.",
         ),
         click.option(
             "--expand",
@@ -70,7 +71,7 @@ def sound_options(command: Any) -> Any:
             "heterodyne_hz",
             type=click.FloatRange(min=0),
             metavar="HZ",
-            help="Shift the sound down by this frequency, to 48 kHz of samples.",
+            help="Shift the sound down by this frequency, and write it with a sample rate of 48 kHz.",
         ),
         click.option(
             "--listen",
@@ -102,9 +103,11 @@ def require_possible(sound: SoundOptions) -> None:
         if typed(parameter):
             raise click.UsageError(f"{option} is not for sound; remove it", context)
     if sound.direction is None:
-        raise click.UsageError("a .wav file has the sound of one direction; give it with --listen AZ,EL", context)
+        raise click.UsageError(
+            "a .wav file contains the sound of one direction; choose it with --listen AZ,EL", context
+        )
     if sound.heterodyne_hz is not None and sound.expansion is not None:
-        raise click.UsageError("--heterodyne and --expand both lower the sound; give one of them", context)
+        raise click.UsageError("--heterodyne and --expand both lower the sound; choose one of them", context)
 
 
 def export_sound(

@@ -160,8 +160,8 @@ def _unheard(sensor: str, count: int, n_pulses: int) -> str:
 def _require_several(readers: "Sequence[RecordingReader]") -> None:
     if len(readers) < 2:
         raise click.UsageError(
-            f"--fuse needs at least two sensors, but there is only {', '.join(each.sensor for each in readers)}; give "
-            "more recordings, or leave out --fuse",
+            f"--fuse needs at least two sensors, but there is only {', '.join(each.sensor for each in readers)}; add "
+            "more recordings, or remove --fuse",
             click.get_current_context(),
         )
 

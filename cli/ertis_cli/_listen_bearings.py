@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 __all__ = ["listen_bearings"]
 
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'band':>15}  {'azimuth':>14}  {'elevation':>14}  {'level':>9}"
+_CROSSTALK = (
+    "a source marked 'may be crosstalk' has the same signal in all channels, as electrical crosstalk has; cover the "
+    "microphones: crosstalk remains, and sound does not"
+)
 
 
 def listen_bearings(
@@ -38,6 +42,7 @@ def listen_bearings(
     subscribers: list[AcousticMapSubscriber] = []
     checked: set[str] = set()
     outside: set[str] = set()
+    doubtful: set[str] = set()
 
     def connect(on_note: Callable[[str], None]) -> AcousticMapSubscriber:
         wanted = {"passive.averages": average, "processing.directions": directions}
@@ -57,6 +62,9 @@ def listen_bearings(
         if subscribers[0].band_note is not None and sensor not in outside:
             outside.add(sensor)
             options.warn_of(sensor, subscribers[0].band_note)
+        if sensor not in doubtful and any(each.may_be_crosstalk for each in subscribers[0].bearings):
+            doubtful.add(sensor)
+            options.note(f"sensor {sensor}: {_CROSSTALK}")
         _show(found, subscribers[0].bearings, _age_ms(subscribers[0]), as_json=as_json)
 
     def report_active(subscriber: AcousticMapSubscriber) -> None:
@@ -113,7 +121,8 @@ def _show(found: "AcousticMap", bearings: "Sequence[Bearing]", age_ms: float | N
         band = f"{each.band_hz[0] / 1e3:.1f}-{each.band_hz[1] / 1e3:.1f} kHz"
         azimuth, elevation = _angle(each.azimuth_deg, each.sideways_deg), _angle(each.elevation_deg, each.upwards_deg)
         level, unit = each.level
-        click.echo(f"{start}  {band:>15}  {azimuth:>14}  {elevation:>14}  {level:.1f} {unit}")
+        doubt = "  may be crosstalk" if each.may_be_crosstalk else ""
+        click.echo(f"{start}  {band:>15}  {azimuth:>14}  {elevation:>14}  {level:.1f} {unit}{doubt}")
 
 
 def _numbers(bearing: "Bearing") -> dict[str, object]:
@@ -124,6 +133,7 @@ def _numbers(bearing: "Bearing") -> dict[str, object]:
         **{name: _finite(getattr(bearing, name)) for name in ("sideways_deg", "upwards_deg")},
         **{name: _rounded(getattr(bearing, name)) for name in ("level_dbfs", "level_db", "source_level_db")},
         "snr_db": round(bearing.snr_db, 3),
+        "may_be_crosstalk": bearing.may_be_crosstalk,
     }
 
 

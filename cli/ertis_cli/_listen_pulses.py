@@ -104,7 +104,7 @@ def listen_pulses(
         sys.exit(0 if n is None and duration is None else 128 + signals.came[0])
     heard.require_answer(address, time.monotonic() - begun_s)
     if n is not None and received < n:
-        raise click.ClickException(f"received {received} of {n} {of[0]}s in {duration:g} s; give a longer --duration")
+        raise click.ClickException(f"received {received} of {n} {of[0]}s in {duration:g} s; use a longer --duration")
 
 
 def _summarise(

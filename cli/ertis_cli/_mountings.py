@@ -38,7 +38,7 @@ def mountings(path: Path | None, sensors: Iterable[str] | None) -> dict[str, Mou
 
     known = _of_scene(path) if path.suffix.lower() == ".toml" else _of_file(path)
     if not known:
-        raise ArgumentError(f"{path} contains no mounting of a sensor; give a scene, or its [[sensors]]")
+        raise ArgumentError(f"{path} contains no mounting of a sensor; use a scene, or its [[sensors]]")
     wanted = [*known] if sensors is None else [*sensors]
     for name in wanted:
         if name not in known:

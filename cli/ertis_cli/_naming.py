@@ -11,9 +11,9 @@ import click
 from ertis_cli._config import long_name
 from ertis_cli._pipes import require_no_pipes
 
-__all__ = ["name_options", "named"]
+__all__ = ["name_options", "named", "with_options"]
 
-_UNITS: Final = ("", "_bytes", "_c", "_db", "_deg", "_hz", "_limits_deg", "_m", "_ms", "_s")
+_UNITS: Final = ("", "_bytes", "_c", "_db", "_deg", "_hz", "_limits_deg", "_m", "_ms", "_ns", "_s")
 _KEY: Final = r"(?P<section>(?:accuracy|air|array|passive|processing)\.)?(?P<name>[a-z_]+)"
 _NAMED: Final = re.compile(
     rf"(?P<before>option |parameter of )?(?P<quote>'?){_KEY}(?P=quote)(?:\[\d+\])?"
@@ -24,9 +24,25 @@ _OF_MAPS: Final = "passive_"
 """Parameters of acoustic maps begin with it, and their keys with ``passive.``"""
 _KEYS: Final = {"without": "disabled"}
 """Keys of settings whose option has another name."""
+_PYTHON: Final = {
+    "attitude_xyzw": "level",
+    "check_kind": "raw",
+    "keys": "key",
+    "level_directions": "no-level",
+    "mountings": "mounting",
+    "overwrite": "force",
+    "replace": "force",
+}
+"""Parameters of the package whose option has another name."""
+_PARAMETER: Final = re.compile(
+    r"(?<![\w.'/-])(?:(?P<name>[a-z]+(?:_[a-z]+)*)(?:=(?P<value>True|False|'[^']*'|[\d.]+))|"
+    r"(?P<words>[a-z]+(?:_[a-z]+)+)|\((?P<hints>[a-z_]+(?:, [a-z_]+)*)\))(?![\w'(=/]|\.\w)"
+)
+"""Parameters in messages of the package: ``overwrite=True``, ``length_s``, or ``(sensor)`` after a remedy."""
 _TYPED: Final = re.compile(
     r"(?:parameter of )?--(?P<name>[a-z-]+) "
-    r"(?:'.*?' (?:cannot|is unknown)\b|(?:[a-z]+ )?(?:is|has|holds|lists|runs from) [^,;]*; give\b)"
+    r"(?:'.*?' (?:cannot|is unknown)\b|(?:[a-z]+ )?(?:is|has|holds|lists|runs from) [^,;]*; "
+    r"(?:add|choose|pass|set|use|write)\b)"
 )
 """Messages about a value that is wrong by itself: other reasons follow a comma."""
 _QUOTED: Final = re.compile(
@@ -55,14 +71,14 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
         require_no_pipes(options)
         try:
             return callback(*arguments, **options)
-        except ValueError as error:  # a builtin, so that the package need not be imported
-            from ertis_numba.errors import ArgumentError
+        except Exception as error:
+            from ertis_numba.errors import ArgumentError, ErtisError
 
-            if not isinstance(error, ArgumentError):
+            if not isinstance(error, ErtisError) or not error.args:
                 raise
             ctx = click.get_current_context()
-            message = named(str(error), ctx)
-            option = _refused(message, ctx)
+            message = with_options(named(str(error), ctx) if isinstance(error, ArgumentError) else str(error))
+            option = _refused(message, ctx) if isinstance(error, ArgumentError) else None
             if option is not None and max(option.opts, key=len) not in _OF_FILES:
                 raise _usage_error(message, option, ctx) from error
             error.args = (message, *error.args[1:])
@@ -77,7 +93,7 @@ def _require_values(ctx: click.Context) -> None:
         value, name = ctx.params.get(str(option.name)), _typed_name(option)
         for each in value if isinstance(value, tuple) else (value,):
             if isinstance(each, float) and not math.isfinite(each):
-                raise _usage_error(f"{name} is {each}; give a finite number", option, ctx)
+                raise _usage_error(f"{name} is {each}; use a finite number", option, ctx)
             if each == "":
                 raise _usage_error(f"{name} is empty; write a value, or leave it out", option, ctx)
 
@@ -108,6 +124,37 @@ def named(message: str, ctx: click.Context) -> str:
         return names.get(_key(other), other[0]) if is_key else other[0]
 
     return f"{found['before'] or ''}{names[_key(found)]}{_AGAIN.sub(again, message[found.end() :])}"
+
+
+def with_options(message: str) -> str:
+    """Return a message of the package with the options of the running command in place of parameters of Python.
+
+    ``overwrite=True`` becomes ``--force``, ``length_s`` becomes ``--length``, and ``(sensor)`` becomes ``(--sensor)``.
+    """
+    ctx = click.get_current_context(silent=True)
+    if ctx is None:
+        return message
+    options = dict(_options_by_parameter(ctx.command))
+
+    def typed(found: re.Match[str]) -> str:
+        if found["hints"]:
+            names = found["hints"].split(", ")
+            return f"({', '.join(options[name] for name in names)})" if options.keys() >= {*names} else found[0]
+        option = options.get(found["name"] or found["words"])
+        value = (found["value"] or "").strip("'")
+        return found[0] if option is None else option if value in {"", "True", "False"} else f"{option} {value}"
+
+    return _PARAMETER.sub(typed, message)
+
+
+def _options_by_parameter(command: click.Command) -> Iterator[tuple[str, str]]:
+    """Yield the parameters of the package for which the options of a command stand."""
+    for option in command.params:
+        if isinstance(option, click.Option):
+            typed = {name.lstrip("-") for name in (*option.opts, *option.secondary_opts)}
+            for name in {long_name(option).replace("-", "_"), str(option.name)}:
+                yield from ((f"{name}{unit}", f"--{long_name(option)}") for unit in _UNITS)
+            yield from ((name, f"--{other}") for name, other in _PYTHON.items() if other in typed)
 
 
 def _may_be_typed(found: re.Match[str], ctx: click.Context) -> bool:

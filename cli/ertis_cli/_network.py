@@ -77,7 +77,7 @@ def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
     if key is None or server_key is None:
         given, other = ("--server-key", "--key") if key is None else ("--key", "--server-key")
         raise click.UsageError(
-            f"{given} is given without {other}; give both, or neither for a central node on this machine"
+            f"{given} is given without {other}; use both, or neither for a central node on this machine"
         )
     pair = KeyPair.load(key_file(key, "secret"))
     try:
@@ -103,7 +103,7 @@ def metrics(given: str | None, latest: "Callable[[], Status]") -> "Metrics | Non
     try:
         endpoint(f"tcp://{given}")
     except ArgumentError as error:
-        raise ArgumentError(f"--metrics is {given!r}; give HOST:PORT, such as 127.0.0.1:9101") from error
+        raise ArgumentError(f"--metrics is {given!r}; use HOST:PORT, such as 127.0.0.1:9101") from error
     return Metrics(given, latest)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from ertis_cli import _output, _tables, options
+from ertis_cli._naming import with_options
 
 __all__ = ["files_of", "overview"]
 
@@ -39,8 +40,8 @@ def overview(paths: Iterable[Path], read: Callable[[Path], _Sections], *, as_jso
         try:
             about, sections = read(path)
         except (ErtisError, OSError) as error:
-            click.echo(f"ertis: error: {error}", err=True)
-            reported.append({"file": str(path), "error": str(error)})
+            click.echo(f"ertis: error: {with_options(str(error))}", err=True)
+            reported.append({"file": str(path), "error": with_options(str(error))})
         else:
             reported.append({**about, "sensors": list(sections)})
     if as_json:

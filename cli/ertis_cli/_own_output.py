@@ -39,7 +39,7 @@ def _require_own_output(ctx: click.Context) -> None:
     outputs = [path for each, value in parameters if _is_output(each) for path in _files(value)]
     for output in outputs:
         if any(output.samefile(path) for path in inputs):
-            raise ArgumentError(f"output {output} is the input itself; give another name")
+            raise ArgumentError(f"output {output} is the input itself; choose another name")
 
 
 def _files(value: Any) -> Iterator[Path]:

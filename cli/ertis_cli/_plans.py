@@ -95,7 +95,7 @@ def _explained(sensor: str, plan: dict[str, Any]) -> Iterator[str]:
     if plan["predicted_db"] > accuracy.max_error_db:
         yield (
             f"  warning: this recording is quieter than planned for, and the error of its images may exceed "
-            f"{accuracy.max_error_db:g} dB; give a lower --max-error"
+            f"{accuracy.max_error_db:g} dB; use a lower --max-error"
         )
 
 

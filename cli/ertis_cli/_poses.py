@@ -32,7 +32,8 @@ def reading(command: "Callable[..., Any]") -> "Callable[..., Any]":
         click.option(
             "--time-unit",
             type=click.Choice(("s", "ms", "us", "ns")),
-            help="Unit of the times, if the file of poses states none; chosen by their magnitude by default.",
+            help="Unit of the times, if the file of poses does not state one; by default, it follows from the size "
+            "of the numbers.",
         ),
         click.option(
             "--topic",

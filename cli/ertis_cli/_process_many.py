@@ -51,7 +51,7 @@ def process_many(
 
     context = click.get_current_context()
     if target is None:
-        raise click.UsageError("several recordings need an output folder; give one with -o", context)
+        raise click.UsageError("several recordings need an output folder; choose one with -o", context)
     if Path(target).suffix and not target.endswith((os.sep, "/")) and not Path(target).is_dir():
         raise click.UsageError(
             f"-o {target} names a file, but several recordings need a folder; use -o {Path(target).with_suffix('')}/",
@@ -141,7 +141,7 @@ class _Report:
 
         if not isinstance(event, RecordingEnded):
             return
-        error = _named(event)
+        error = _naming.with_options(_named(event))
         self._totals[event.outcome] += 1
         self._measurements += event.made.get("measurements", 0)
         found = [_plane_error(row) for row in event.made.get("sensors", ())]
@@ -150,7 +150,7 @@ class _Report:
             if not self._quiet:
                 shown.say(line)
         for warning in event.made.get("warnings", ()):
-            shown.say(f"ertis: warning: {warning}")
+            shown.say(f"ertis: warning: {_naming.with_options(warning)}")
         if error:
             shown.say(f"ertis: failed: {error}")
             self._failed.append(str(event.recording))

@@ -197,7 +197,7 @@ def _of_group(item: "Group") -> tuple[dict[str, Any], str]:
 
 def _of_status(item: "Status") -> tuple[dict[str, Any], str]:
     received = sum(each.received for each in item.sensors.values())
-    text = f"{item.state}, {len(item.sensors)} sensors, {received} received"
+    text = f"{item.state}, {options.counted(len(item.sensors), 'sensor')}, {received} received"
     return {"state": item.state, "received": received}, text
 
 

@@ -88,11 +88,11 @@ def open_sensors(paths: "Sequence[Path]", stack: ExitStack, *, images: bool = Fa
         for name in sensor_names(path, wanted):
             if is_image and name == PLATFORM:
                 raise click.UsageError(
-                    f"{path} has fused images; give recordings, or images of each sensor", click.get_current_context()
+                    f"{path} has fused images; use recordings, or images of each sensor", click.get_current_context()
                 )
             if name in found:
                 raise click.UsageError(
-                    f"{path} and {found[name].path} have the same sensor {name!r}; give recordings of other sensors",
+                    f"{path} and {found[name].path} contain the same sensor {name!r}; choose one of them",
                     click.get_current_context(),
                 )
             found[name] = stack.enter_context(opened(path, sensor=name))
@@ -154,7 +154,7 @@ def _mounting(reader: "RecordingReader") -> "Mounting":
 
     if reader.translation_m is None or reader.rotation_xyzw is None:
         raise ArgumentError(
-            f"{reader.path}: the mounting of sensor {reader.sensor!r} is unknown; give --mounting FILE with it"
+            f"{reader.path}: the mounting of sensor {reader.sensor!r} is unknown; add its mounting with --mounting FILE"
         )
     return reader.translation_m.tolist(), reader.rotation_xyzw.tolist()
 
@@ -207,7 +207,7 @@ def _require_one_chain(places: "Sequence[StampedIndex]", groups: "Sequence[dict[
                 apart_s = abs(first.timestamp_ns - repeats[0].timestamp_ns) / 1e9
                 raise DataError(
                     f"sensors {one[0]} and {other[0]} belong to different SYNC chains: their measurements of SYNC "
-                    f"count {count} are {apart_s:.3g} s apart; give recordings of one SYNC chain, whose clocks agree "
+                    f"count {count} are {apart_s:.3g} s apart; use recordings of one SYNC chain, whose clocks agree "
                     "within half a second"
                 )
 
@@ -251,7 +251,7 @@ def active_groups(
     ]
     if groups and not active:
         raise DataError(
-            f"{readers[0].path}: all measurements are passive and have no echoes; give recordings of emitted calls"
+            f"{readers[0].path}: all measurements are passive and have no echoes; use recordings of emitted calls"
         )
     if len(active) < len(groups):
         left_out = f"{len(groups) - len(active)} of {options.counted(len(groups), 'pulse')}"
@@ -264,7 +264,7 @@ def image_settings(settings_file: "Path | None", preset: str | None) -> "Callabl
 
     def changed(recorded: "Settings") -> "Settings":
         settings = options.settings_with(recorded, settings_file=settings_file, preset=preset)
-        _results.require_image(settings, 'echoes come from images; give last_stage = "envelope" in --settings FILE')
+        _results.require_image(settings, 'echoes come from images; set last_stage = "envelope" in --settings FILE')
         return settings
 
     return changed
@@ -324,8 +324,8 @@ class PipelinesBySensor:
             for name, option in (("preset", "--preset"), ("settings_file", "--settings")):
                 if typed(name):
                     raise click.UsageError(
-                        f"{option} applies to recordings, but images keep their settings; give the recording, or leave "
-                        "it out",
+                        f"{option} applies to recordings, but images keep their settings; use the recording, or remove "
+                        f"{option}",
                         click.get_current_context(),
                     )
             return measurement

@@ -58,7 +58,7 @@ def settings_from(
     from ertis_numba.settings import Air, Array, Call, Settings
 
     if settings_file is not None and preset is not None:
-        raise click.UsageError("--preset and --settings exclude each other; give one of them")
+        raise click.UsageError("--preset and --settings cannot be combined; choose one of them")
     settings = Settings.load(settings_file) if settings_file else Settings.from_preset(preset or "default_25_50")
     if layout is not None:
         settings = settings.replace(array=Array(layout=layout))

@@ -29,7 +29,7 @@ def is_results_file(target: str | None) -> bool:
 
 def require_image(
     settings: "Settings",
-    reason: str = "an energyscape file holds images; give -o FILE.npz, or --last-stage envelope",
+    reason: str = "an energyscape file holds images; use -o FILE.npz, or --last-stage envelope",
 ) -> None:
     """Raise an error with a reason and a remedy if the last stage yields no image."""
     stage = settings.processing.last_stage
@@ -84,7 +84,7 @@ def write_results(
         stage = changed(recording.settings).processing.last_stage
         if stage == "envelope":
             raise click.UsageError(
-                f"-o {target} is for signals and beams; give --last-stage, or export images with 'ertis export'",
+                f"-o {target} is for signals and beams; add --last-stage, or export images with 'ertis export'",
                 click.get_current_context(),
             )
         results = _Results(recording, lambda each: without.applied(changed(each), names[0]), device, quiet=quiet)

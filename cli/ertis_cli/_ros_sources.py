@@ -76,7 +76,7 @@ def publish_node(
             on_published()
     if subscriber.latest is None:
         raise NetworkError(
-            f"nothing arrived from {address}; start 'ertis serve', and give the address at which it publishes"
+            f"nothing arrived from {address}; start 'ertis serve', and use the address at which it publishes"
         )
 
 
@@ -186,7 +186,7 @@ def publish_ports(
         finally:
             if sink.superseded:
                 count = options.counted(sink.superseded, "measurement")
-                on_note(f"{count} not published, because newer ones had arrived; give a lower --trigger-rate")
+                on_note(f"{count} not published, because newer ones had arrived; use a lower --trigger-rate")
 
 
 class _ImageSink:

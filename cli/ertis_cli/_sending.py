@@ -202,8 +202,9 @@ class Sending:
         """Return the cause of lost measurements, if known, and the remedy."""
         if self._node.refusal:  # contains the remedy
             return f": {self._node.refusal}"
-        larger = "a larger disk" if "spool_bytes" not in self._sizes else "more (--spool-size)"
-        keep = f"give the spool {larger}" if self._spool else "give --spool DIR to keep measurements on disk"
+        keep = "raise --spool-size" if "spool_bytes" in self._sizes else "keep the spool on a larger disk"
+        if not self._spool:
+            keep = "add --spool DIR to keep measurements on disk"
         if self._node.central == "away":
             return f", which does not answer; start 'ertis record' or 'ertis serve' there, or {keep}"
         return f"; {keep}"
@@ -219,5 +220,5 @@ def _require_room(option: str, size_mb: float, settings: "Settings") -> None:
     min_mb = 1e-6 * JournalSensor.from_settings("any", settings).n_bytes
     if size_mb < min_mb:
         raise ArgumentError(
-            f"{option} is {size_mb:g} MB, but one measurement has {min_mb:.3g} MB; give a larger size, or remove it"
+            f"{option} is {size_mb:g} MB, but one measurement has {min_mb:.3g} MB; use a larger size, or remove it"
         )

@@ -29,9 +29,9 @@ def require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
     """Refuse a port that is given twice, and names that are not those of all ports."""
     for port in ports:
         if ports.count(port) > 1:
-            raise click.UsageError(f"port {port} is given {ports.count(port)} times; give each sensor once")
+            raise click.UsageError(f"port {port} is given {ports.count(port)} times; name each sensor once")
     if names and len(names) != len(ports):
-        raise click.UsageError(f"{len(names)} names are given for {len(ports)} ports; give one --name per --port")
+        raise click.UsageError(f"{len(names)} names are given for {len(ports)} ports; use one --name for each --port")
     from ertis_numba import checks
 
     for name in names:
@@ -89,7 +89,7 @@ def named_sensors(
     chosen = list(names) or [re.sub(r"[^A-Za-z0-9_.@+-]", "_", name) for name in known]
     for name in chosen:
         if chosen.count(name) > 1:
-            raise click.UsageError(f"{chosen.count(name)} sensors are named {name!r}; give each a different --name")
+            raise click.UsageError(f"{chosen.count(name)} sensors are named {name!r}; use a different --name for each")
     return dict(zip(chosen, opened, strict=True))
 
 

@@ -42,7 +42,7 @@ class Life(NamedTuple):
     reason : str
         End of the process before it, such as SIGABRT.
     addresses : mapping of str to str
-        Addresses that the process before it listened at: ``address``, and ``publish`` if images are published.
+        Addresses of the former process: ``address`` for sensors, and ``publish`` for applications.
     elapsed_s : float
         Seconds since the first process was started.
     report_fd : int

@@ -159,7 +159,7 @@ def costs(*, count: int, targets: tuple[Path, ...], units: tuple[str, ...], quie
             markdown.around(target, benchmark.MARKER)
         elif target.name != "nominal_costs.py":
             raise click.BadParameter(
-                f"{target} is not nominal_costs.py; give that of ertis_numba/stages, or a Markdown file",
+                f"{target} is not nominal_costs.py; choose ertis_numba/stages/nominal_costs.py, or a Markdown file",
                 param_hint="--update",
             )
     report = benchmark.run(count=count, say=lambda text: options.say(text, quiet=quiet), units=units or benchmark.UNITS)
@@ -433,7 +433,7 @@ def simulation(*, verdicts: int | None, **given: Any) -> None:
     default=5,
     show_default=True,
     metavar="N",
-    help="Rounds over all cases, in turn.",
+    help="Number of times to measure each case; all cases take turns.",
 )
 @_update
 @options.quiet
@@ -444,42 +444,6 @@ def many(**given: Any) -> None:
     Compares all output files.
     """
     _run("many", _in_source_folder("many", "cpu_times.campaign_scaling"), **given)
-
-
-@bench.command()
-@_update
-@options.quiet
-@options.as_json
-def factorisation(**given: Any) -> None:
-    """Count multiplications with and without sub-arrays.
-
-    Nothing is timed.
-    """
-    _run("factorisation", _in_source_folder("factorisation", "rejected_plans.factorisation"), **given)
-
-
-@bench.command()
-@_update
-@options.quiet
-@options.as_json
-def interpolation(**given: Any) -> None:
-    """Compare fitted and textbook weights for delays.
-
-    Nothing is timed.
-    """
-    _run("interpolation", _in_source_folder("interpolation", "rejected_plans.delay_interpolation"), **given)
-
-
-@bench.command()
-@_update
-@options.quiet
-@options.as_json
-def ptx(**given: Any) -> None:
-    """Estimate the time of GPU kernels without a GPU.
-
-    Compiles them for an H200; nothing is timed.
-    """
-    _run("ptx", _in_source_folder("ptx"), **given)
 
 
 @bench.command("health")

@@ -33,7 +33,7 @@ class _Place(click.ParamType):  # type: ignore[type-arg]  # generic since click 
         with suppress(ValueError):
             azimuth, elevation, range_m = (float(part) for part in str(value).split(":"))
             return azimuth, elevation, range_m
-        return self.fail(f"{value!r} is not a place; give azimuth, elevation and range, as in 30:15:1.2", param, ctx)
+        return self.fail(f"{value!r} is not a place; use azimuth, elevation and range, as in 30:15:1.2", param, ctx)
 
 
 _PLACE = _Place()
@@ -55,7 +55,7 @@ _PLACE = _Place()
     "--layout",
     metavar="NAME|FILE",
     shell_complete=options.complete_layouts,
-    help="Layout in use; that of the first recording by default.",
+    help="Layout to calibrate, by name or file; by default, the layout in the first recording.",
 )
 @options.sensor("Sensor to calibrate; required if a recording contains several.")
 @click.option(
@@ -105,7 +105,7 @@ _PLACE = _Place()
 @click.option(
     "--sensors",
     type=options.NAMES,
-    help="Sensors for --poses in the order of the SYNC chain, as in front,left; all sensors by default.",
+    help="With --poses: names of the sensors in the order of the SYNC chain, as in front,left; all sensors by default.",
 )
 @options.force
 @options.quiet
@@ -177,7 +177,8 @@ def calibrate(
     before_db, after_db = made.contrast_db
     is_better = after_db > before_db - _MAX_LOSS_DB
     if target is not None and is_better:
-        text = f"ertis calibrate, {len(made.source_m)} measurements of a {source}, from layout {made.former.name}"
+        count = options.counted(len(made.source_m), "measurement")
+        text = f"ertis calibrate, {count} of a {source}, from layout {made.former.name}"
         content = layout_file(made.layout, name=target.stem, source=text).to_toml()
         with atomic_write(target, overwrite=force) as partial:
             partial.write_text(content, "utf-8")

@@ -101,7 +101,7 @@ __all__ = ["capture"]
     "emission_period_s",
     type=float,
     metavar="S",
-    help="Interval between the emissions of a measurement in seconds; without a pause by default.",
+    help="Time between two emissions of a measurement, in s; no pause by default.",
 )
 @recording_settings
 @click.option("--name", "names", multiple=True, metavar="NAME", help="Name of a sensor; repeat in the order of --port.")
@@ -283,7 +283,7 @@ def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
 
 
 def _note_mounting(path: Path | None, sensors: "Sequence[str]", *, quiet: bool) -> None:
-    remedy = "give --mounting FILE to combine their images"
+    remedy = "add --mounting FILE to combine their images"
     _mountings.note_unknown(sensors if path is None and len(sensors) > 1 else [], remedy, quiet=quiet)
 
 
@@ -293,7 +293,7 @@ def _require_one_place(address: str | None, target: Path | None, *, for_address:
             "--spool, --spool-size, --ring, --fixed-settings, --key and --server-key need a central node; add --to"
         )
     if address is not None and target is not None:
-        raise click.UsageError("--to and --output exclude each other; give one of them")
+        raise click.UsageError("--to and --output cannot be combined; choose one of them")
 
 
 def _require_spool(spool: Path | None, spool_mb: float | None) -> None:

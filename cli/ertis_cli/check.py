@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import _tables, options
+from ertis_cli._naming import with_options
 
 if TYPE_CHECKING:
     from ertis_numba.sensor_check import RecordingCheck, SensorCheck
@@ -83,9 +84,9 @@ def check(
                 found.append(check_recording(path, settings=used, without=without, nominal_rate_hz=nominal_rate_hz))
         except (ErtisError, OSError) as error:
             found.append(uncheckable_recording(path, error))
-            click.echo(f"ertis: error: {error}", err=True)
+            click.echo(f"ertis: error: {with_options(str(error))}", err=True)
             if as_json:
-                options.print_json(_report(found[-1]) | {"error": str(error)})
+                options.print_json(_report(found[-1]) | {"error": with_options(str(error))})
             continue
         if as_json:
             options.print_json(_report(found[-1]))

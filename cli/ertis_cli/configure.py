@@ -41,7 +41,7 @@ def configure(
     ADDRESS is the address that sensors send to. Give the new settings with --preset or --settings; they replace all
     former ones. The settings apply to all sensors of the same 'ertis capture --to', between two measurements. If one
     sensor cannot use them, all keep their former settings. A central node that computes images refuses settings from
-    which it cannot compute any. If the central node uses keys, give the key of an admin.
+    which it cannot compute any. If the central node uses keys, use the key of an admin.
     """
     from ertis_numba import checks
     from ertis_numba.network.central_client import CentralClient
@@ -49,7 +49,7 @@ def configure(
     checks.positive("--patience", patience_s)
     checks.sensor_name(sensor)
     if given["preset"] is None and given["settings_file"] is None:
-        raise click.UsageError("all settings of the sensor are replaced; give them with --preset or --settings")
+        raise click.UsageError("all settings of the sensor are replaced; add --preset or --settings")
     settings = settings_from(**given)
     warn_without_images(settings)
     with CentralClient(address, keys=_network.client_keys(key, server_key)) as central:

@@ -113,7 +113,7 @@ def _make(folder: Path, *, force: bool) -> None:
 
     there = [folder / name for name in _WRITTEN if (folder / name).exists() or (folder / name).is_symlink()]
     if there and not force:
-        raise ArgumentError(f"output {there[0]} exists; give another folder (--output), or overwrite it (--force)")
+        raise ArgumentError(f"output {there[0]} exists; choose another folder (--output), or overwrite it (--force)")
     for path in there:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)

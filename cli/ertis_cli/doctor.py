@@ -46,7 +46,7 @@ def doctor(
     checks = {"ROS": lambda _: ros_findings(domain, interface or "lo")} if ros else CHECKS
 
     if not folder.is_dir():
-        raise ArgumentError(f"--folder {folder} is not a folder; give an existing folder")
+        raise ArgumentError(f"--folder {folder} is not a folder; choose an existing folder")
     found: list[InstallationFinding] = []
     with options.note_when_slow("checking ...", quiet=False):
         for name, look in checks.items():

@@ -41,7 +41,7 @@ class _Fault(click.ParamType):  # type: ignore[type-arg]  # generic since click 
         try:
             return kind, float(share if equals else "")
         except ValueError:
-            return self.fail(f"{value!r} is not a fault; give a kind and a probability, as in lose=0.01", param, ctx)
+            return self.fail(f"{value!r} is not a fault; choose a kind and a probability, as in lose=0.01", param, ctx)
 
 
 class _Absence(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -50,7 +50,7 @@ class _Absence(click.ParamType):  # type: ignore[type-arg]  # as above
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
         at_s, for_s = options.INTERVAL.convert(value, param, ctx)
         if not (0 <= at_s < math.inf and 0 <= for_s < math.inf):
-            self.fail(f"{value!r} is not an absence; give two times of at least 0 s, as in 2:5", param, ctx)
+            self.fail(f"{value!r} is not an absence; use two times of at least 0 s, as in 2:5", param, ctx)
         return at_s, for_s
 
 
@@ -152,7 +152,7 @@ def emulate(
                 ctx=click.get_current_context(),
             )
         if link is not None and not link.parent.is_dir():
-            raise ArgumentError(f"link {link}: folder {link.parent} does not exist; create it or give another")
+            raise ArgumentError(f"link {link}: folder {link.parent} does not exist; create it or choose another")
         links = {name: link or emulated_folder() / name for name in names}
         for each in links.values():  # refuse a taken link before rendering
             HeldLink(each).release()

@@ -35,7 +35,7 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
             places = int(first), int(last if colon else first)
             if min(places) >= 0:
                 return places
-        return self.fail(f"{value!r} is not a measurement; give one number, or two as in 2:5", param, ctx)
+        return self.fail(f"{value!r} is not a measurement; use one number, or two as in 2:5", param, ctx)
 
 
 @click.command()
@@ -69,7 +69,7 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
     "topics",
     type=click.Choice(TOPICS),
     multiple=True,
-    help="Topic to write to MCAP; repeatable; all by default.",
+    help="Topic to write to an MCAP file; repeat for several; all topics by default.",
 )
 @click.option("--top", type=int, metavar="N", help="Largest number of points per image; 256 by default.")
 @click.option(
@@ -162,7 +162,7 @@ def export(
         )
     if known is not None:
         unknown = [reader.sensor for reader in readers if reader.sensor not in known]
-        remedy = "the export uses the frame of the sensor; give --mounting FILE for the frame of the platform"
+        remedy = "the export uses the frame of the sensor; add --mounting FILE for the frame of the platform"
         _mountings.note_unknown(unknown, remedy, quiet=quiet)
     if name == "mcap" and sum(len(sensor_names(path)) for path in paths) > 1 and "scan" in (topics or TOPICS):
         options.note(
@@ -306,6 +306,6 @@ def _between(places: tuple[int, int] | None, count: int) -> range:
     first, last = (options.place(place, count) for place in places)
     if first > last:
         raise click.UsageError(
-            f"--measurement runs from {first} to {last}; give the smaller number first", click.get_current_context()
+            f"--measurement runs from {first} to {last}; use the smaller number first", click.get_current_context()
         )
     return range(first, last + 1)

@@ -27,7 +27,7 @@ _MAX_OFFSET_S = 4e9  # Covers clocks that count from another year; times remain 
     default=0.0,
     show_default=True,
     metavar="S",
-    help="Seconds to add to the times of the trajectory, if its clock differs from that of the recording.",
+    help="Time in s to add to the poses, if their clock differs from the clock of the recording.",
 )
 @_poses.reading
 @click.option(
@@ -122,7 +122,7 @@ def _recordings(path: Path) -> list[Path]:
         return [path]
     recordings = [each.path for each in find_recordings([path]) if file_kind(each.path) == "recording"]
     if not recordings:
-        raise DataError(f"folder {path} contains energyscape files only; give a folder with recordings")
+        raise DataError(f"folder {path} contains energyscape files only; choose a folder with recordings")
     return recordings
 
 

@@ -183,7 +183,7 @@ def listen(
     heard.require_answer(address, time.monotonic() - begun_s)
     if n is not None and subscriber.counts.received < n:
         raise click.ClickException(
-            f"received {subscriber.counts.received} of {n} products in {duration:g} s; give a longer --duration"
+            f"received {subscriber.counts.received} of {n} products in {duration:g} s; use a longer --duration"
         )
 
 
@@ -212,7 +212,7 @@ def _listen_specially(
 
 def _require_one_product(target: Path | None, products: tuple[str, ...]) -> None:
     if target is not None and (len(products) > 1 or products[0] not in FILED):
-        raise click.UsageError(f"--save writes one product; give only --product {' or '.join(FILED)}")
+        raise click.UsageError(f"--save writes one product; combine it only with --product {' or '.join(FILED)}")
 
 
 def _require_options_of(outputs: dict[str, bool]) -> None:
@@ -220,7 +220,7 @@ def _require_options_of(outputs: dict[str, bool]) -> None:
     context = click.get_current_context()
     chosen = [name for name, is_chosen in outputs.items() if is_chosen]
     if len(chosen) > 1:
-        raise click.UsageError(f"{' and '.join(chosen)} exclude each other; run the command twice", context)
+        raise click.UsageError(f"{' and '.join(chosen)} cannot be combined; run the command once with each", context)
     for name, option in (("products", "--product"), ("target", "--save")) if chosen else ():
         if typed(name):
             raise click.UsageError(f"{option} applies only without {chosen[0]}", context)

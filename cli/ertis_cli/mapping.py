@@ -52,7 +52,7 @@ __all__ = ["mapping"]
     "half_life_s",
     type=click.FloatRange(0.0, min_open=True),
     metavar="S",
-    help="Time in which evidence decays to one half, for places where things move; none by default.",
+    help="Time in s after which old echoes count half, for places where things move; by default, they count for ever.",
 )
 @click.option(
     "--height",
@@ -175,8 +175,8 @@ def _report_heights(occupancy: "OccupancyMap", height_m: tuple[float, float], *,
 
     low_m, high_m = height_m
     reason = (
-        f"no point of the images lies within the heights of {low_m:g} to {high_m:g} m; give --height in the world "
-        "frame of the poses, or leave it out"
+        f"no point of the images lies within the heights of {low_m:g} to {high_m:g} m; correct --height, which refers "
+        "to the world frame of the poses, or remove it"
     )
     if not occupancy.log_odds.any():
         raise DataError(reason)
@@ -225,7 +225,7 @@ def _located(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajector
         first_ns, last_ns = trajectory.time_ns[[0, -1]].tolist()
         raise DataError(
             f"all pulses lie outside of the time of the poses: pulses from {min(times_ns) / 1e9:.3f} s to "
-            f"{max(times_ns) / 1e9:.3f} s, poses from {first_ns / 1e9:.3f} s to {last_ns / 1e9:.3f} s; give poses of "
+            f"{max(times_ns) / 1e9:.3f} s, poses from {first_ns / 1e9:.3f} s to {last_ns / 1e9:.3f} s; use poses of "
             "these recordings, with times in seconds since 1970-01-01 UTC"
         )
     return located

@@ -163,16 +163,17 @@ def _require_times(readers: "Sequence[RecordingReader]", groups: "Sequence[Mappi
     from ertis_numba.errors import DataError
 
     if len(groups) < 2:
-        raise DataError(f"{readers[0].path} has only one pulse; give recordings of at least 2, on a moving platform")
+        raise DataError(f"{readers[0].path} contains one pulse; at least two are needed, from a moving platform")
     times_ns = [next(iter(group.values())).stamp.timestamp_ns for group in groups]
     if any(later <= earlier for earlier, later in pairwise(times_ns)):
         raise DataError(
-            f"{readers[0].path} has different pulses at the same time; give recordings whose timestamps increase"
+            f"{readers[0].path} contains several pulses with the same timestamp; use recordings whose timestamps "
+            "increase"
         )
     if len(readers) > 1 and all(len(group) == 1 for group in groups):
         spans = ", ".join(_span(reader) for reader in readers)
         raise DataError(
-            f"no pulse has measurements of two sensors: {spans}; give recordings of the same SYNC pulses, whose clocks "
+            f"no pulse has measurements of two sensors: {spans}; use recordings of the same SYNC pulses, whose clocks "
             "agree within half a second"
         )
 

@@ -14,8 +14,10 @@ import click
 from click.shell_completion import CompletionItem
 
 from ertis_cli import _progress
+from ertis_cli._naming import with_options
 from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerOption
 from ertis_numba.constants import MAX_MICROPHONES
+from ertis_numba.units import counted
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
@@ -91,7 +93,7 @@ class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since cli
         if colon:
             with suppress(ValueError):
                 return float(first), float(last)
-        return self.fail(f"{value!r} is not an interval; give two numbers, as in 0.5:5", param, ctx)
+        return self.fail(f"{value!r} is not an interval; use two numbers, as in 0.5:5", param, ctx)
 
 
 class _Elevation(_Interval):
@@ -119,7 +121,7 @@ class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
             if all(0 <= channel < MAX_MICROPHONES for channel in channels):
                 return (sensor_name(name) if ":" in str(value) else ""), channels
         wanted = f"integers from 0 to {MAX_MICROPHONES - 1}, as in 5,12, or those of one sensor, as in left:5,12"
-        return self.fail(f"{value!r} is not a list of channels; give {wanted}", param, ctx)
+        return self.fail(f"{value!r} is not a list of channels; use {wanted}", param, ctx)
 
 
 def _excluded_channels(
@@ -140,7 +142,7 @@ class _Names(click.ParamType):  # type: ignore[type-arg]  # as above
         names = tuple(str(value).split(","))
         if all(names):
             return names
-        return self.fail(f"{value!r} is not a list of names; give them as in front,left", param, ctx)
+        return self.fail(f"{value!r} is not a list of names; write them as in front,left", param, ctx)
 
 
 class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -154,7 +156,7 @@ class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
                 if all(-_MAX_DEG <= angle_deg <= _MAX_DEG for angle_deg in angles_deg):
                     return angles_deg
         wanted = f"azimuth and elevation, each from -{_MAX_DEG:g} to {_MAX_DEG:g}, as in 30:0"
-        return self.fail(f"{value!r} is not a direction; give {wanted}", param, ctx)
+        return self.fail(f"{value!r} is not a direction; use {wanted}", param, ctx)
 
 
 class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
@@ -168,7 +170,7 @@ class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
         with suppress(ValueError):
             return float(value)
         return self.fail(
-            f"{value!r} is not an error budget; give dB, as in -40, or {', '.join(ERROR_PRESETS_DB)}", param, ctx
+            f"{value!r} is not an error budget; use dB, as in -40, or {', '.join(ERROR_PRESETS_DB)}", param, ctx
         )
 
 
@@ -448,17 +450,17 @@ def settings_with(
     kind = str(directions).partition(":")[0]
     if kind == "2d" and "elevation_limits_deg" in limits:
         raise click.UsageError(
-            f"directions {directions} lie at one elevation; give it as --elevation E, or give --directions 3d:N",
+            f"directions {directions} lie at one elevation; use --elevation E, or --directions 3d:N",
             ctx=click.get_current_context(),
         )
     if kind == "3d" and "elevation_deg" in limits:
         raise click.UsageError(
-            f"directions {directions} lie between two elevations; give --elevation A:B, or give --directions 2d:N",
+            f"directions {directions} lie between two elevations; use --elevation A:B, or --directions 2d:N",
             ctx=click.get_current_context(),
         )
     if limits and kind not in {"2d", "3d"}:
         raise click.UsageError(
-            f"directions {directions} have fixed limits; give --directions 2d:N or 3d:N with limits",
+            f"directions {directions} have fixed limits; use --directions 2d:N or 3d:N with limits",
             ctx=click.get_current_context(),
         )
     settings = settings.replace(processing=settings.processing.replace(**given))
@@ -576,12 +578,12 @@ def say(text: str, *, quiet: bool) -> None:
 
 def note(text: str, *, quiet: bool = False) -> None:
     """Print a note on stderr, unless ``quiet``: results are right, and this may matter."""
-    say(f"note: {text}", quiet=quiet)
+    say(f"note: {with_options(text)}", quiet=quiet)
 
 
 def warn(text: str) -> None:
     """Print a warning on stderr: results may be wrong or incomplete."""
-    click.echo(f"ertis: warning: {text}", err=True)
+    click.echo(f"ertis: warning: {with_options(text)}", err=True)
 
 
 def warn_of(sensor: str, text: str | None) -> None:
@@ -597,11 +599,6 @@ def warn_of_spacing(sensor: str, settings: "Settings", grid: "DegreesFromRadians
 
     if sensor != PLATFORM:
         warn_of(sensor, spacing_warning(settings, grid))
-
-
-def counted(count: int, noun: str) -> str:
-    """Return a count and its noun, in the plural unless the count is 1."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def print_json(report: dict[str, Any]) -> None:

@@ -36,7 +36,11 @@ _SOURCE_COLUMNS: dict[str, _tables.Side] = {
     **dict.fromkeys(("map", "band_khz", "azimuth_deg", "elevation_deg"), "right"),
 }
 _OF_IMAGES = ("detector", "false_alarm", "everything", "truth")
-_DIGITS = dict.fromkeys((*_PLACE, "angle_deg", "level_dbfs", "grid_error_deg"), 4) | {"range_m": 6}
+_DIGITS = dict.fromkeys((*_PLACE, "angle_deg", "level_dbfs", "grid_error_deg", "angle_sd_deg", "level_sd_db"), 4) | {
+    "range_m": 6,
+    "range_sd_m": 7,
+}
+_SD = {"angle_sd_deg": ".2g", "range_sd_m": ".2g", "level_sd_db": ".2g"}
 
 
 @click.command()
@@ -46,7 +50,8 @@ _DIGITS = dict.fromkeys((*_PLACE, "angle_deg", "level_dbfs", "grid_error_deg"), 
     "--top",
     type=int,
     metavar="N",
-    help=f"Largest number per measurement, or per band of a map; {_TOP} by default, all with --truth.",
+    help=f"Largest number of rows per measurement, or per band of an acoustic map; {_TOP} by default, all with "
+    f"--truth.",
 )
 @click.option(
     "--min-level",
@@ -91,9 +96,10 @@ def peaks(
 
     There is one entry per reflector, the strongest of each measurement first. level_db is relative to the strongest
     peak, and level_dbfs to a full-scale echo in every microphone. Maxima that noise alone may cause in
-    one of 1000 images are omitted unless --all is given. This limit exists only for delay-and-sum. grid_error_deg is
-    the standard deviation of directions that cannot be interpolated, as at the edge of the grid; other directions have
-    0. It is -, and null in JSON, where the source may lie beyond the edge. No level is more than 1 dB above its image
+    one of 1000 images are omitted unless --all is given. This limit exists only for delay-and-sum. angle_sd_deg,
+    range_sd_m and level_sd_db are standard deviations of single echoes, if the noise is known. grid_error_deg is the
+    part of angle_sd_deg from directions that cannot be interpolated; other directions have 0. It is -, and null in
+    JSON, where the source may lie beyond the edge of the grid. No level is more than 1 dB above its image
     or map. Angles that the array cannot observe are shown as –, and as null in JSON: both for one microphone, the
     elevation for microphones on a horizontal line.
 
@@ -124,7 +130,7 @@ def peaks(
 
     if truth and top is not None:
         raise click.UsageError(
-            "--top would omit reflectors that --truth compares; give one of them", click.get_current_context()
+            "--top would omit reflectors that --truth compares; choose one of them", click.get_current_context()
         )
     if detector == "cfar" and truth:
         raise click.UsageError(
@@ -165,6 +171,7 @@ def peaks(
         rows = [row for name in sensors for row in _found(path, name, find, measurement)]
         report = {"peaks": rows}
         more = {"level_dbfs": ".1f"} | ({"grid_error_deg": ".2f"} if _has_grid_errors(rows) else {})
+        more |= _SD if any(row["range_sd_m"] is not None for row in rows) else {}
         cells = [(*_cells(row, row), *_formatted(row, more)) for row in rows]
         table = _tables.TextTable(_COLUMNS | dict.fromkeys(more, "right"), cells)
     options.note_unlisted_directions(path, sensors)
@@ -309,7 +316,7 @@ def _note_left_out(sensor: str, count: int) -> None:
 def _note_unconfirmed(sensor: str, count: int) -> None:
     """Print a note on points of a fusion that are not listed."""
     if count:
-        points = "1 point" if count == 1 else f"{count} points"
+        points = options.counted(count, "point")
         options.note(
             f"sensor {sensor}: {points} left out because too few pairs of emitter and receiver confirm them: they may "
             "be ghosts, or reflectors that few sensors hear; the file contains them with point_confirmed = 0"

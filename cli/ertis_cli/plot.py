@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _acoustic_plots, options
+from ertis_cli import _acoustic_plots, _mountings, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ertis_numba.calibration import Calibration
-    from ertis_numba.frames import Energyscape, Measurement
+    from ertis_numba.frames import Energyscape, Measurement, OccupancyMap
     from ertis_numba.settings import Settings
 
 __all__ = ["plot"]
@@ -49,6 +49,8 @@ _ONLY = {
     "band": ("acoustic_map",),
     "photo": ("acoustic_map",),
     "photo-fov": ("acoustic_map",),
+    "poses": ("map",),
+    "mounting": ("map",),
     "dynamic-range": tuple(kind for kind in _KINDS if kind != "map"),
 }
 """Kinds that support each of these options."""
@@ -70,7 +72,7 @@ _ONLY = {
     "--dynamic-range",
     type=click.FloatRange(max=1000.0),
     metavar="DB",
-    help="Range of the colours; 40 by default, and 20 for acoustic maps.",
+    help="Dynamic range of the colour scale, in dB below the maximum; 40 by default, and 20 for acoustic maps.",
 )
 @click.option(
     "--theme",
@@ -114,6 +116,12 @@ _ONLY = {
     help="Direction of beam patterns, of a spectrum or of a spectrogram in degrees.",
 )
 @_acoustic_plots.plot_options
+@click.option(
+    "--poses", type=options.FILE, metavar="TRAJ", help="Trajectory of the platform, to draw its path into a map."
+)
+@click.option(
+    "--mounting", type=options.FILE, metavar="FILE", help="Mountings of the sensors, to draw them at the last pose."
+)
 @options.force
 @options.quiet
 @options.as_json
@@ -138,6 +146,8 @@ def plot(
     band_hz: tuple[float, float] | None,
     photo: Path | None,
     photo_fov_deg: tuple[float, float] | None,
+    poses: Path | None,
+    mounting: Path | None,
     force: bool,
     quiet: bool,
     as_json: bool,
@@ -163,6 +173,8 @@ def plot(
         "band": band_hz,
         "photo": photo,
         "photo-fov": photo_fov_deg,
+        "poses": poses,
+        "mounting": mounting,
         "dynamic-range": dynamic_range,
     }
     if not typed("kind"):
@@ -197,7 +209,7 @@ def plot(
         figure = figures.calibration(made, settings, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, **look)
         reported = f"calibration with {path}"
     elif kind == "map":
-        figure, reported = figures.occupancy(read_map(path), **look), f"map of {path}"
+        figure, reported = _map(read_map(path), poses, mounting, look), f"map of {path}"
     else:
         row, index = _acoustic_plots.row_name(path), measurement or 0
         if kind in _OF_RECORDINGS:
@@ -251,6 +263,17 @@ def _require_supported(kind: str, path: Path, given: "Mapping[str, object]") -> 
     _acoustic_plots.require_fitting(kind, path)
 
 
+def _map(found: "OccupancyMap", poses: Path | None, mounting: Path | None, look: dict[str, Any]) -> "Figure":
+    """Draw a map, with the path of the platform and its sensors if they are given."""
+    from ertis_numba import figures
+    from ertis_numba.interop.trajectory_files import read_trajectory
+
+    if mounting is not None and poses is None:
+        raise click.UsageError("--mounting requires --poses; add --poses TRAJ", click.get_current_context())
+    trajectory = None if poses is None else read_trajectory(poses)
+    return figures.occupancy(found, trajectory=trajectory, mountings=_mountings.mountings(mounting, None), **look)
+
+
 def _calibrated(path: Path, sensor: str | None) -> "tuple[Calibration, Settings]":
     from ertis_numba.calibration import calibrate
     from ertis_numba.storage import open_recording
@@ -301,7 +324,7 @@ def _require_no_array(path: Path) -> None:
 
     if path.suffix.lower() in LAYOUT_SUFFIXES or (str(path) in layout_names() and not path.exists()):
         raise click.UsageError(
-            f"{path} contains no measurement; give --kind array, or a recording, an energyscape file or a file of "
+            f"{path} contains no measurement; use --kind array, or a recording, an energyscape file or a file of "
             "acoustic maps",
             click.get_current_context(),
         )
@@ -318,7 +341,7 @@ def _settings(path: Path, sensor: str | None) -> "Settings":
     is_layout = is_name or (suffix in LAYOUT_SUFFIXES and (suffix != ".toml" or _is_layout(path)))
     if sensor is not None and (is_layout or suffix == ".toml"):
         raise click.UsageError(
-            "--sensor is for files with several sensors; remove it with settings or a layout",
+            "--sensor chooses a sensor in a file; remove it, because settings and layouts have no sensors",
             click.get_current_context(),
         )
     if is_layout:

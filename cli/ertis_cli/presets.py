@@ -20,7 +20,7 @@ def presets(*, name: str | None, as_json: bool) -> None:
 
     Recording presets define the record length and the call. Give their names with --preset to 'ertis capture' and
     'ertis import'. Processing presets define directions and ranges. Give their names with --preset to 'ertis process'
-    and 'ertis serve'. To make your own preset, save the output to a file, edit it, and give the file with --settings.
+    and 'ertis serve'. To make your own preset, save the output to a file, edit it, and choose the file with --settings.
     """
     from ertis_numba.settings import preset_text
 

@@ -199,7 +199,7 @@ def process(
         )
         settings = _acoustic_maps.with_map_options(settings, keys)
         if fuse:
-            _results.require_image(settings, "--fuse needs images; give --last-stage envelope")
+            _results.require_image(settings, "--fuse needs images; use --last-stage envelope")
         elif not _results.is_results_file(target):
             _results.require_image(settings)
         _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
@@ -250,7 +250,7 @@ def process(
     _require_options_of_one(target)
     path = Path(paths[0])
     if target is not None and _results.is_results_file(target):
-        _acoustic_maps.require_none(f"{target} holds signals or beams; give a .h5 file")
+        _acoustic_maps.require_none(f"{target} contains signals or beams; choose a .h5 file")
         _results.write_results(
             path,
             Path(target),
@@ -276,7 +276,7 @@ def process(
             as_json=as_json,
         )
         return
-    _acoustic_maps.require_none("measurements with a call become images; give --mode passive")
+    _acoustic_maps.require_none("measurements with a call become images; use --mode passive")
     target_file = Path(target) if target else path.with_suffix(".energy.h5")
     report = _process_one(path, target_file, wanted, quiet=quiet, as_json=as_json)
     _note_mountings(target_file, quiet=quiet)
@@ -295,7 +295,7 @@ def _require_options_of(*, fuse: bool, target: str | None) -> None:
     if not fuse and typed("emitter_diameter_m"):
         raise click.UsageError("--emitter-diameter requires --fuse; add --fuse, or remove it", context)
     if fuse and target is not None and (_results.is_results_file(target) or Path(target).suffix in _PICTURES):
-        raise click.UsageError(f"-o {target} is not an energyscape file; give a .h5 file for --fuse", context)
+        raise click.UsageError(f"-o {target} is not an energyscape file; choose a .h5 file for --fuse", context)
 
 
 def _require_options_of_one(target: str | None) -> None:
@@ -304,12 +304,13 @@ def _require_options_of_one(target: str | None) -> None:
     for name in ("workers", "scheduler"):
         if typed(name):
             raise click.UsageError(
-                f"--{name} applies to several recordings; give more, a folder or a pattern, or an -o that ends in /",
+                f"--{name} applies to several recordings; add recordings, use a folder or a pattern, or end -o with /",
                 context,
             )
     if target is not None and Path(target).suffix.lower() in _PICTURES:
         raise click.UsageError(
-            f"-o {target} is a picture, but process writes energyscapes; give a .h5 file and plot it with 'ertis plot'",
+            f"-o {target} is a picture, but process writes energyscapes; choose a .h5 file and plot it with 'ertis "
+            "plot'",
             context,
         )
 
@@ -323,7 +324,7 @@ def _note_mountings(path: Path, *, quiet: bool) -> None:
             if images.translation_m is None:
                 unknown.append(name)
     _mountings.note_unknown(
-        unknown, "images use the frame of their sensor; give --mounting FILE for the frame of the platform", quiet=quiet
+        unknown, "images use the frame of their sensor; add --mounting FILE for the frame of the platform", quiet=quiet
     )
 
 

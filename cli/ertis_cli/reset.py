@@ -36,7 +36,7 @@ def reset(*, port: str, pin: int | None, hook: str | None, within_s: float, quie
     from ertis_numba.devices.reset_pin import RESET_PIN, pulse_reset_pin
 
     if hook is not None and pin is not None:
-        raise click.UsageError("--hook and --pin are both given; give one of them")
+        raise click.UsageError("--hook and --pin are both given; choose one of them")
     if hook is not None and not hook.strip():
         raise click.UsageError("--hook is empty; name a program")
     pulse = partial(pulse_reset_pin, pin or RESET_PIN) if hook is None else _runner(hook)

@@ -110,14 +110,19 @@ class _MaxRate(click.ParamType[Any]):
     metavar="DBFS",
     help="Lowest absolute level of echoes in scans; without it, noise counts as an echo in images without echoes.",
 )
-@click.option("--use-sim-time", "sim_time", is_flag=True, help="Keep the times of a file, and publish them on /clock.")
+@click.option(
+    "--use-sim-time",
+    "sim_time",
+    is_flag=True,
+    help="Use the recorded timestamps instead of the current time, and publish them on /clock.",
+)
 @click.option(
     "--rate",
     type=click.FloatRange(0.01, 100),
     default=1.0,
     show_default=True,
     metavar="X",
-    help="Speed of a file relative to the recording.",
+    help="Speed of playback relative to real time; 1 by default.",
 )
 @click.option(
     "--control",
@@ -195,7 +200,9 @@ def ros(
             if kind != wanted and value not in {None, False}:
                 raise click.UsageError(f"{name} is for {wanted}s; remove it with {_KINDS[kind]}")
     if kind == "port" and sensors:
-        raise click.UsageError("--sensor selects sensors of a file or an address; give only the ports of the sensors")
+        raise click.UsageError(
+            "--sensor selects sensors of a file or an address; name the ports of the sensors instead"
+        )
     _network.require_duration(duration)
     settings = settings_from(**given_settings) if kind == "port" else None
     watched, publishing = _publishing(
@@ -302,7 +309,7 @@ def _publishing(control: Path | None, **given: Any) -> "tuple[_Control | None, P
     for name in ("min_level", "floor_dbfs", "max_rates", "rate"):
         if context.get_parameter_source(name) not in {ParameterSource.DEFAULT, None}:
             option = next(each for each in context.command.params if each.name == name).opts[0]
-            raise click.UsageError(f"{option} and --control exclude each other; give it in the file")
+            raise click.UsageError(f"{option} and --control cannot be combined; set the value in the file")
     watched = WatchedSettings(control)
     return _Control(watched), watched.settings
 
@@ -312,9 +319,11 @@ def _kind(sources: tuple[str, ...]) -> str:
     kinds = {"address" if "://" in each else "file" if Path(each).is_file() else "port" for each in sources}
     kind = kinds.pop()
     if kinds or (kind != "port" and len(sources) > 1):
-        raise click.UsageError("several sources must all be ports; give one address, one file, or ports")
+        raise click.UsageError(
+            "several sources are given, but only ports can be combined; use one address, one file, or ports"
+        )
     if kind == "port" and any(Path(each).suffix == ".h5" for each in sources):
-        raise click.UsageError(f"file {sources[0]} does not exist; give an existing file, an address, or ports")
+        raise click.UsageError(f"file {sources[0]} does not exist; choose an existing file, an address, or ports")
     return kind
 
 

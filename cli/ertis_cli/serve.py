@@ -192,4 +192,4 @@ def _make(folder: Path) -> None:
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise DataError(f"{folder}: {error.strerror}; give a folder that can be written") from error
+        raise DataError(f"{folder}: {error.strerror}; choose a folder that can be written") from error

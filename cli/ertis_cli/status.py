@@ -55,14 +55,14 @@ def status(
     """Show the status of a central node.
 
     ADDRESS is the address that sensors send to, or the address at which the central node publishes. On a terminal, the
-    display is refreshed every second. If the central node uses keys, give the key of an application or an admin. If
+    display is refreshed every second. If the central node uses keys, use the key of an application or an admin. If
     the node disappears, the command waits for it.
     """
     from ertis_numba import checks
     from ertis_numba.network.central_client import CentralClient
 
     if once and watch:
-        raise click.UsageError("--once and --watch exclude each other; give one of them")
+        raise click.UsageError("--once and --watch cannot be combined; choose one of them")
     checks.positive("--patience", patience)
     with CentralClient(address, keys=_network.client_keys(key, server_key)) as node:
         if as_json or once or not _progress.is_drawn_on(sys.stdout):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
+from ertis_cli._naming import with_options
 
 if TYPE_CHECKING:
     from ertis_numba.storage.verify import SensorReport
@@ -38,8 +39,8 @@ def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json:
         try:
             reports = verified(path)
         except (ErtisError, OSError) as error:
-            click.echo(f"ertis: error: {error}", err=True)
-            files.append({"file": str(path), "error": str(error)})
+            click.echo(f"ertis: error: {with_options(str(error))}", err=True)
+            files.append({"file": str(path), "error": with_options(str(error))})
             code = _FAILED
             continue
         whole = all(report.is_intact for report in reports)

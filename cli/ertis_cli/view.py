@@ -100,13 +100,13 @@ _ONLY = {
     "--dynamic-range",
     type=float,
     metavar="DB",
-    help="Range of the colours; 40 by default, and 20 for acoustic maps.",
+    help="Dynamic range of the colour scale, in dB below the maximum; 40 by default, and 20 for acoustic maps.",
 )
 @click.option(
     "--max-level",
     type=float,
     metavar="DB",
-    help="Level of the brightest colour of acoustic maps; that of the loudest direction, rounded up, by default.",
+    help="Level of the brightest colour of acoustic maps; by default, the level of the loudest direction, rounded up.",
 )
 @click.option(
     "--band",
@@ -248,7 +248,7 @@ def _is_address(location: str) -> bool:
     host_port = None if live or Path(location).exists() else _HOST_PORT.fullmatch(location)
     if host_port:
         raise click.UsageError(
-            f"{location!r} is not a file; for the address of a central node, give tcp://{host_port[2]}"
+            f"{location!r} is not a file; for the address of a central node, use tcp://{host_port[2]}"
         )
     return live
 

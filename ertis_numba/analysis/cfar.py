@@ -129,7 +129,7 @@ def threshold_factor(method: Method, n_reference: int, false_alarm: float) -> fl
     checks.choice("method", method, METHODS)
     checks.between("false_alarm", false_alarm, 1e-9, 0.5)
     if checks.integer("n_reference", n_reference, 4, 512) % 2:
-        raise ArgumentError(f"n_reference is {n_reference}; give an even number, with half the bins on each side")
+        raise ArgumentError(f"n_reference is {n_reference}; use an even number, with half the bins on each side")
     if method == "cell_averaging":
         return float(n_reference * (false_alarm ** (-1 / n_reference) - 1))
     log_of = _log_ordered if method == "ordered_statistic" else _log_greatest
@@ -167,8 +167,8 @@ def _reference(image: Energyscape, n_reference: int) -> NDArray[np.intp]:
     needed = step * (n_reference + 2) + 2 * guard + 1
     if n_ranges < needed:
         raise ArgumentError(
-            f"image has {n_ranges} ranges, but {n_reference} reference bins need {needed}; give an image with a wider "
-            "range window, or a smaller n_reference"
+            f"image has {n_ranges} ranges, but {n_reference} reference bins need {needed}; choose an image with a "
+            "wider range window, or a smaller n_reference"
         )
     here = np.arange(n_ranges)
     before, behind = (np.maximum(room - guard, 0) // step for room in (here, n_ranges - 1 - here))

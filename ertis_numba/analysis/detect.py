@@ -9,11 +9,12 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba import checks
-from ertis_numba.analysis.noise import threshold_of
+from ertis_numba.analysis.noise import noise_of, threshold_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
-from ertis_numba.analysis.peak_interpolation import PeakInterpolator, listed
+from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.side_lobes import EdgeFloor, SideLobes
+from ertis_numba.analysis.uncertainty import PositionUncertainty
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak, PointCloud
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
@@ -94,7 +95,10 @@ def _observed(peak: Peak, seen: ObservableAngles, *, is_planar: bool) -> Peak:
     angles_rad = seen.observed_rad(peak.azimuth_rad, peak.elevation_rad, is_planar=is_planar)
     azimuth_deg, elevation_deg = map(math.degrees, angles_rad)
     error_deg = math.nan if math.isnan(azimuth_deg) and math.isnan(elevation_deg) else peak.grid_error_deg
-    return replace(peak, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, grid_error_deg=error_deg)
+    sd_deg = math.nan if math.isnan(error_deg) else peak.angle_sd_deg
+    return replace(
+        peak, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, grid_error_deg=error_deg, angle_sd_deg=sd_deg
+    )
 
 
 def peaks_of_grid(
@@ -123,7 +127,7 @@ def peaks_of_grid(
         where = np.asarray(where)
         checks.shape("where", where.shape, image.amplitude.shape)
         if where.dtype != np.bool_:
-            raise ArgumentError(f"where has dtype {where.dtype}; give bool, such as image.amplitude > 0.01")
+            raise ArgumentError(f"where has dtype {where.dtype}; use bool, such as image.amplitude > 0.01")
     edges = EdgeFloor(directions, PointSpread(image.settings))(image)
     places = _local_maxima(image.amplitude, neighbours, np.maximum(floor, edges), where)
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
@@ -132,7 +136,8 @@ def peaks_of_grid(
     interpolate = PeakInterpolator(image.settings, directions, neighbours, only=places[:, 0])
     found: list[tuple[NDArray[np.float64], float, float]] = []
     errors_rad: list[float] = []
-    is_limited = has_outside(image.settings, directions)
+    each_top: list[Tops] = []
+    is_limited, noise = has_outside(image.settings, directions), noise_of(image)
     for k in order:
         if len(found) == top:
             break
@@ -140,7 +145,7 @@ def peaks_of_grid(
         # prediction of a side lobe is several decibels off if its reflector is half a bin off.
         if side_lobes.explain(directions[places[k, 0]], int(places[k, 1]), levels[k]):
             continue
-        tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1])
+        tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1], noise=noise)
         found.append((tops.direction[0], float(tops.range_m[0]), float(tops.amplitude[0])))
         outside = outside_of(image, directions, found[-1][1]) if is_limited else None
         is_beside_open = is_limited and any(
@@ -149,22 +154,35 @@ def peaks_of_grid(
         )
         is_open = outside is not None or is_beside_open  # Side lobes of reflectors beyond the grid are not predicted.
         errors_rad.append(math.inf if is_open else float(tops.width_rad[0]) / math.sqrt(12))
+        each_top.append(tops._replace(width_rad=np.array([math.inf])) if is_open else tops)
         if outside is not None:  # Its side lobes are in the image.
             side_lobes.add(outside.direction, found[-1][1], max(math.sqrt(outside.power), found[-1][2]))
         else:
             side_lobes.add(*found[-1])
-    levels = listed(np.array([level for *_, level in found]), image)
+    return _peaks(image, each_top, errors_rad, noise)
+
+
+def _peaks(image: Energyscape, each_top: list[Tops], errors_rad: list[float], noise: float) -> list[Peak]:
+    """Return interpolated maxima as peaks, strongest first."""
+    if not each_top:
+        return []
+    tops = Tops(*(np.concatenate(column) for column in zip(*each_top, strict=True)))
+    levels = listed(tops.amplitude, image)
+    uncertainty = PositionUncertainty(image.settings, is_planar=image.is_planar)(image, tops, noise=noise)
+    level_sd = np.hypot(uncertainty.level, np.log(tops.amplitude / levels))
     return [
         Peak(
-            azimuth_deg=math.degrees(math.atan2(direction[1], direction[0])),
-            elevation_deg=math.degrees(math.asin(max(-1.0, min(1.0, direction[2])))),
-            range_m=range_m,
+            azimuth_deg=math.degrees(math.atan2(tops.direction[k, 1], tops.direction[k, 0])),
+            elevation_deg=math.degrees(math.asin(max(-1.0, min(1.0, tops.direction[k, 2])))),
+            range_m=float(tops.range_m[k]),
             level_db=20 * math.log10(levels[k] / levels.max()),
             level_dbfs=20 * math.log10(levels[k]),
             grid_error_deg=math.degrees(errors_rad[k]),
+            angle_sd_deg=math.degrees(uncertainty.across_m[k] / tops.range_m[k]),
+            range_sd_m=float(uncertainty.range_m[k]),
+            level_sd_db=20 / math.log(10) * float(level_sd[k]),
         )
-        for k in sorted(range(len(found)), key=lambda k: -levels[k])
-        for direction, range_m, _ in found[k : k + 1]
+        for k in np.argsort(-levels, kind="stable").tolist()
     ]
 
 
@@ -181,7 +199,7 @@ def left_out_at_edges(
     peaks : sequence of Peak
         Reflectors of the image, from `find_peaks` with the same arguments.
     min_level_db, false_alarm
-        As for `find_peaks`.
+        Lowest level relative to the strongest in dB, and the probability of a false alarm, as for `find_peaks`.
     """
     if image.points is not None:
         return 0

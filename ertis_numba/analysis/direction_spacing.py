@@ -302,7 +302,8 @@ def spacing_warning(settings: Settings, grid: DegreesFromRadians) -> str | None:
         f"{check.loss_db(lobe)} dB too weak{narrower}; "
         + (
             remedy
-            or f"no grid of up to {LARGEST_GRID} directions suffices, so use narrower limits (--azimuth, --elevation), "
+            or f"no grid of up to {LARGEST_GRID} directions suffices, so use narrower limits "
+            "(azimuth_limits_deg, elevation_limits_deg), "
             "or delay_and_sum"
         )
     )

@@ -53,7 +53,7 @@ def nearest_echo(
     """
     checks.between("min_level_db", min_level_db, -1000.0, 0.0)
     if len(image.range_m) < 3:
-        raise ArgumentError(f"the image has {len(image.range_m)} ranges; give one with at least 3")
+        raise ArgumentError(f"the image has {len(image.range_m)} ranges; use an image with at least 3")
     amplitude = image.amplitude
     profile = amplitude.max(axis=0, initial=0.0)
     lowest = max(profile.max() * 10 ** (min_level_db / 20), 10 ** (floor_dbfs / 20), np.finfo(np.float32).tiny)

@@ -7,15 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.analysis.echo_fits import EchoFits
+from ertis_numba.analysis.plan_errors import plan_error
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.frames import Energyscape
 from ertis_numba.settings import Settings
-from ertis_numba.stages.plan_response import deviation_of
 
 __all__ = ["PeakInterpolator", "Tops", "listed"]
 
-_MAX_CORRECTIONS = 8  # Number of corrections of the parabola error; coarse grids need more than fine ones.
+_MODEL = 3e-4  # Least error of a predicted sample, relative to the amplitude.
 _EDGE_OF_LOBE = 0.5  # Amplitude relative to the maximum, below which a sample is not part of the main lobe.
 _NOISE = 10 ** (0.5 / 20)  # Noise may raise a maximum above a main lobe through its strongest sample.
 _NARROWER = 3.0  # The main lobe of adaptive beamformers in decibels, relative to that of delay-and-sum, is at most so.
@@ -33,12 +34,18 @@ class Tops(NamedTuple):
     width_rad : (place,) float64
         Spacing of the grid where the direction, or one of its angles, is that of the bin; 0 if it is interpolated. It
         is infinite at an edge of the grid beyond which the maximum may lie: see `QuadricFits.are_open`.
+    range_sd_m, across_sd_rad, level_sd : (place,) float64
+        Standard deviations of fitted echoes: of the range, of the direction along its least certain axis, and of the
+        level in nepers. NaN for other maxima.
     """
 
     direction: NDArray[np.float64]
     range_m: NDArray[np.float64]
     amplitude: NDArray[np.float64]
     width_rad: NDArray[np.float64]
+    range_sd_m: NDArray[np.float64]
+    across_sd_rad: NDArray[np.float64]
+    level_sd: NDArray[np.float64]
 
 
 def listed(amplitude: NDArray[np.float64], image: Energyscape) -> NDArray[np.float64]:
@@ -54,12 +61,12 @@ def listed(amplitude: NDArray[np.float64], image: Energyscape) -> NDArray[np.flo
 
 
 class PeakInterpolator:
-    """Interpolator of maxima by parabolas through the logarithm of the amplitude, with a correction of their bias.
+    """Interpolator of maxima between the bins of an image.
 
-    A main lobe is not a parabola. The interpolator therefore predicts the samples of a reflector at the found position
-    from array and call. It interpolates them as well, and subtracts the error of that interpolation. The correction
-    applies to delay-and-sum of the fast method, and to maxima whose samples match a single reflector. Other maxima keep
-    the result of the parabolas. At 60 dB above the noise, the correction reduces errors from about 4 mm to 0.1 mm.
+    Parabolas through the logarithm of the amplitude locate a maximum. A main lobe is not a parabola, and a coarse grid
+    has no bins within it. For delay-and-sum of the fast method, the image of a single reflector is therefore fitted to
+    the bins: see `ertis_numba.analysis.echo_fits.EchoFits`. The fit includes the curvature of spherical waves that
+    beams for plane waves do not expect.
 
     A maximum never leaves the cell of its direction, which ends half-way to each neighbour. It exceeds its bin by at
     most the loss of the main lobe over this distance. Lists of maxima also limit it by `listed`.
@@ -89,12 +96,13 @@ class PeakInterpolator:
         self._row[wanted] = np.arange(len(wanted))
         self._fits = QuadricFits.of(directions, neighbours, wanted)
         self._spread = PointSpread(settings)
-        self._is_predicted = settings.processing.method == "fast"
-        deviation = deviation_of(settings, directions)
-        self._pulse = self._spread.pulse if deviation is None else self._spread.tilted_pulse
-        self._beams = self._spread.beams(np.ascontiguousarray(directions), deviation)
+        is_predicted = settings.processing.method == "fast" and not settings.processing.is_adaptive
+        self._echoes = EchoFits(settings, directions, self._spread) if is_predicted else None
+        self._model = math.hypot(_MODEL, plan_error(settings)) if is_predicted else 0.0
 
-    def __call__(self, image: Energyscape, directions: NDArray[np.int64], ranges: NDArray[np.int64]) -> Tops:
+    def __call__(
+        self, image: Energyscape, directions: NDArray[np.int64], ranges: NDArray[np.int64], *, noise: float
+    ) -> Tops:
         """Return the interpolated maxima near given bins of an image.
 
         Parameters
@@ -102,36 +110,44 @@ class PeakInterpolator:
         image : Energyscape
         directions, ranges : (place,) int64
             Indices of the bins. Maxima at the first and the last range are not interpolated along the range.
+        noise : float
+            Root mean square of the noise of the image; 0 if it is unknown.
         """
         step_m = float(image.range_m[1] - image.range_m[0]) if len(image.range_m) > 1 else 0.0
         rows, columns = _bins(directions, self._neighbours[directions], ranges, last=len(image.range_m) - 1)
         measured = np.log(np.maximum(image.amplitude[rows, columns].astype(np.float64), np.finfo(np.float32).tiny))
-        is_corrected = self._is_predicted and not image.settings.processing.is_adaptive
         found = np.empty((len(measured), 5))
-        kernels.load_points().interpolate_tops(
-            self._pulse,
-            self._fits.quadrics,
-            self._beams,
-            rows,
-            self._row[directions],
-            measured,
-            step_m * (columns - columns[:, 1:2]).astype(np.float64),
-            step_m,
-            self._spread.scale(image.settings.air),
-            _MAX_CORRECTIONS if is_corrected else 0,
-            found,
-        )
-        shift_m, offset = found[:, 0].clip(-0.5, 0.5) * step_m, found[:, 1:4]
-        offset, width_rad = self._fits.within_cells(self._row[directions], offset)
-        rises = _filled(measured)[:, 3:] - measured[:, 1:2]
-        is_open = self._fits.are_open(self._row[directions], rows[:, 3:], rises)
+        kernels.load_points().interpolate_tops(self._fits.quadrics, self._row[directions], measured, found)
+        shift_m, offset, level, sd = found[:, 0] * step_m, found[:, 1:4], found[:, 4], np.full((3, len(found)), np.nan)
+        row, is_sparse = self._row[directions], np.zeros(len(found), np.bool_)
+        is_fitted = self._echoes is not None
+        if self._echoes is not None:
+            shift_m, offset, level, *sds, is_sparse = self._echoes(
+                image, rows, columns, found, noise=noise, model=self._model
+            )
+            sd = np.array(sds)
+        within_m = shift_m.clip(-0.5 * step_m, 0.5 * step_m)
+        sd[0], shift_m = np.hypot(sd[0], shift_m - within_m), within_m
+        beyond_rad = np.zeros(len(found))
+        if is_fitted:
+            offset, beyond_rad = self._fits.within_limits(row, rows[:, 3:], offset)
+        offset, width_rad = self._fits.within_cells(row, offset, is_fitted=is_fitted)
+        is_open = self._fits.are_open(row, rows[:, 3:], _filled(measured)[:, 3:] - measured[:, 1:2])
+        is_open |= beyond_rad > 0.5 * self._fits.width_rad[row]
+        width_rad = np.hypot(width_rad, math.sqrt(12) * beyond_rad)
+        width_rad = np.where(is_sparse, self._fits.width_rad[row], width_rad)
         top = self._directions[directions] + offset
         top /= np.linalg.norm(top, axis=1)[:, None]
+        highest = self._highest(image, directions, measured[:, 1], top, shift_m)
+        amplitude = np.minimum(np.exp(level), highest)
         return Tops(
             direction=top,
             range_m=image.range_m[ranges] + shift_m,
-            amplitude=np.minimum(np.exp(found[:, 4]), self._highest(image, directions, measured[:, 1], top, shift_m)),
+            amplitude=amplitude,
             width_rad=np.where(is_open, np.inf, width_rad),
+            range_sd_m=sd[0],
+            across_sd_rad=sd[1],
+            level_sd=np.hypot(sd[2], level - np.log(amplitude)),
         )
 
     def _highest(

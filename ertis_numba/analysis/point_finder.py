@@ -17,7 +17,7 @@ class PointFinder:
     Parameters
     ----------
     top, min_level_db : optional
-        As for `ertis_numba.analysis.points.PointExtractor`.
+        Largest number of points, and their lowest level relative to the strongest in dB.
     """
 
     def __init__(self, *, top: int | None = None, min_level_db: float | None = None) -> None:
@@ -39,9 +39,9 @@ class PointFinder:
 
 
 def _suits(image: Energyscape, other: Energyscape) -> bool:
-    """Return True if two images can share an extractor; their air and processing may differ."""
+    """Return True if two images can share an extractor; their air may differ."""
     ours, theirs = image.settings, other.settings
-    return ours.array == theirs.array and ours.call == theirs.call and same_directions(image, other)
+    return (ours == theirs or ours.replace(air=theirs.air) == theirs) and same_directions(image, other)
 
 
 def same_directions(image: Energyscape | AcousticMap, other: Energyscape | AcousticMap) -> bool:

@@ -1,6 +1,5 @@
 """Point-spread function: image of a single reflector, computed from array and call."""
 
-import functools
 import math
 
 import numpy as np
@@ -69,11 +68,12 @@ class PointSpread:
         self._shares, self._wave_1_m = shares, wave_1_m
         self.pulse = kernels.Pulse(
             self._table(shares),
-            np.empty(0, np.complex128),
+            self._table(shares * (wave_1_m - self._carrier_1_m) * self._speed_m_s / (2 * math.pi)),
             float(path_m[1]),
             self._carrier_1_m,
             np.ascontiguousarray(self._positions_m),
             np.array(self._weights, np.float64),
+            self._speed_m_s,
         )
 
     @property
@@ -117,12 +117,6 @@ class PointSpread:
             return kernels.BeamErrors(directions, none, none)
         centre_hz = self._carrier_1_m * self._speed_m_s / (2 * math.pi) - deviation.centre_hz
         return kernels.BeamErrors(directions, 1 + deviation.mean + deviation.slope_s * centre_hz, deviation.slope_s)
-
-    @functools.cached_property
-    def tilted_pulse(self) -> kernels.Pulse:
-        """Table that includes the pulse with the spectrum weighted by the frequency relative to the carrier."""
-        offset_hz = (self._wave_1_m - self._carrier_1_m) * self._speed_m_s / (2 * math.pi)
-        return self.pulse._replace(tilted_hz=self._table(self._shares * offset_hz))
 
     def _table(self, spectrum: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the pulse of a spectrum, relative to its carrier: (path,) complex128."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba import checks
 from ertis_numba.analysis.detect import neighbours_of
+from ertis_numba.analysis.noise import noise_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
 from ertis_numba.analysis.point_spread import PointSpread
@@ -33,12 +34,11 @@ class PointExtractor:
     """Extractor of the local maxima of images as points, with tables computed once for a grid.
 
     A point is a local maximum over directions and ranges that exceeds the possible side lobes of the strongest
-    reflector at about the same range. Position and amplitude are interpolated by parabolas through the logarithm of the
-    amplitude, as in `ertis_numba.find_peaks`. The latter is slower and predicts side lobes from the array. It finds
-    weak reflectors beside strong ones at the same range, which this class discards.
+    reflector at about the same range. Position and amplitude are interpolated as in `ertis_numba.find_peaks`. The
+    latter is slower and predicts side lobes from the array. It finds weak reflectors beside strong ones at the same
+    range, which this class discards.
 
-    Main lobes are not parabolas, so the extractor predicts the error of the parabolas from array and call, and
-    subtracts it. Each point has standard deviations of its position: see
+    Each point has standard deviations of its position: see
     `ertis_numba.analysis.uncertainty.PositionUncertainty`. Microphones in one place observe no directions, and hence
     yield no points.
 
@@ -72,7 +72,7 @@ class PointExtractor:
     def __init__(
         self, settings: Settings, grid: Grid | None = None, *, top: int = TOP, min_level_db: float = MIN_LEVEL_DB
     ) -> None:
-        checks.instance("settings", settings, Settings, "an image or a recording holds")
+        checks.instance("settings", settings, Settings, "an image or a recording contains")
         self._has_directions = any(observable_angles(settings.array)[:2])
         self._top = checks.integer("top", top, 1)
         self._smallest = 10 ** (checks.between("min_level_db", min_level_db, -1000.0, 0.0) / 20)
@@ -96,14 +96,16 @@ class PointExtractor:
         amplitude = image.amplitude
         checks.shape("amplitude", amplitude.shape, (len(self._directions), len(image.range_m)))
         directions, ranges = self._maxima(image)
-        tops = self._interpolator(image, directions, ranges)
+        noise = noise_of(image) if len(directions) else 0.0
+        tops = self._interpolator(image, directions, ranges, noise=noise)
         position_m, levels = (
             (tops.direction * tops.range_m[:, None]).astype(np.float32),
             listed(tops.amplitude, image).astype(np.float32),
         )
         order = np.argsort(-levels, kind="stable")
         width_rad = np.where(self._are_open(image, tops), math.pi, tops.width_rad)
-        uncertainty_m = self._uncertainty(image, position_m, levels, width_rad)
+        found = self._uncertainty(image, tops._replace(width_rad=width_rad), noise=noise)
+        uncertainty_m = np.stack([found.range_m, found.across_m], axis=1).astype(np.float32)
         return PointCloud(
             position_m[order], levels[order], image.settings, image.stamp, uncertainty_m=uncertainty_m[order]
         )

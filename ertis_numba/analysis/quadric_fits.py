@@ -112,7 +112,9 @@ class QuadricFits:
         kernels.load_points().find_tops(self.quadrics, directions, np.ascontiguousarray(rises, np.float64), found)
         return found[:, :3], found[:, 3]
 
-    def within_cells(self, directions: NDArray[np.int64], offset: Floats) -> tuple[Floats, Floats]:
+    def within_cells(
+        self, directions: NDArray[np.int64], offset: Floats, *, is_fitted: bool = False
+    ) -> tuple[Floats, Floats]:
         """Return offsets that end within their cells, (place, axis) float64, and the width of cells: (place,) float64.
 
         A width is 0 if the direction is interpolated along as many axes as the grid has, and less than that
@@ -123,6 +125,8 @@ class QuadricFits:
         directions : (place,) int64
         offset : (place, axis) float64
             Result of `tops`; longer ones are shortened.
+        is_fitted : bool
+            True for offsets from fits, which also interpolate beside an edge of the grid.
         """
         here = self.grid.data[self.wanted[directions]]
         share = np.ones(len(offset))
@@ -135,10 +139,32 @@ class QuadricFits:
             if not is_beyond.any():
                 break
             share[is_beyond] = half[is_beyond] / along[is_beyond]
-        is_between = offset.any(axis=1) & (share > _BESIDE) & (self.quadrics.n_axes[directions] >= self.n_axes_of_grid)
+        is_between = (share > _BESIDE) & np.isfinite(self.width_rad[directions])
+        if not is_fitted:
+            is_between &= offset.any(axis=1) & (self.quadrics.n_axes[directions] >= self.n_axes_of_grid)
         cut_rad = (1 - share) * np.linalg.norm(offset, axis=1)  # The error is about as large: that of a wider cell.
         width_rad = self.width_rad[directions]
         return offset * share[:, None], np.where(is_between, np.minimum(math.sqrt(12) * cut_rad, width_rad), width_rad)
+
+    def within_limits(
+        self, directions: NDArray[np.int64], neighbours: NDArray[np.int64], offset: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return offsets that do not leave the grid at its edges, (place, axis), and how far they did: (place,).
+
+        Parameters
+        ----------
+        directions : (place,) int64
+        neighbours : (place, neighbour) int64
+        offset : (place, axis) float64
+        """
+        offset, beyond_rad = offset.copy(), np.zeros(len(offset))
+        for place in np.flatnonzero(self.quadrics.n_axes[directions] < self.n_axes_of_grid):
+            inwards = _inwards(self.grid.data[neighbours[place]] - self.grid.data[self.wanted[directions[place]]])
+            if inwards is not None:
+                beyond_rad[place] = max(0.0, -float(offset[place] @ inwards))
+                is_far = beyond_rad[place] > 0.5 * self.width_rad[directions[place]]
+                offset[place] = 0.0 if is_far else offset[place] + beyond_rad[place] * inwards
+        return offset, beyond_rad
 
     def are_open(
         self, directions: NDArray[np.int64], neighbours: NDArray[np.int64], rises: Floats | None = None
@@ -202,18 +228,26 @@ def _line_through(offsets: Floats, first: int, second: int) -> tuple[Floats, Flo
     return axis, inverse
 
 
+def _inwards(offsets: Floats) -> Floats | None:
+    """Return the unit vector away from the edge of the grid; None if other directions lie on both sides."""
+    inwards = offsets.sum(axis=0)
+    size = float(np.linalg.norm(inwards))
+    is_one_sided = size > _ONE_SIDED * float(np.linalg.norm(offsets, axis=1).sum())
+    return inwards / size if is_one_sided else None
+
+
 def _is_open(offsets: Floats, rises: Floats | None, width_rad: float) -> bool:
     """Return True unless the maximum of values on one side of a direction lies in the cell of the direction."""
-    distance = np.linalg.norm(offsets, axis=1)
-    is_other = distance > _SAME
-    offsets, inwards = offsets[is_other], offsets.sum(axis=0)
-    size = float(np.linalg.norm(inwards))
-    if size <= _ONE_SIDED * distance.sum():  # Other directions lie on both sides.
+    inwards = _inwards(offsets)
+    if inwards is None:
         return False
     if rises is None:
         return True
-    x = offsets @ inwards / size
-    beside = offsets - x[:, None] * (inwards / size)
+    distance = np.linalg.norm(offsets, axis=1)
+    is_other = distance > _SAME
+    offsets = offsets[is_other]
+    x = offsets @ inwards
+    beside = offsets - x[:, None] * inwards
     y = beside @ np.linalg.svd(beside)[2][0]
     terms = np.stack([x, x * x, y, y * y, x * y], axis=1) / distance.max() ** np.array([1, 2, 1, 2, 2])
     used = next((each for each in _ONE_SIDED_TERMS if _is_determined(terms[:, each])), None)

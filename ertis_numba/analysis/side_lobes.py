@@ -21,6 +21,7 @@ The side lobes of eRTIS_v3D1 at 25–50 kHz reach -12.3 dB. At ranges that diffe
 -28 dB.
 """
 
+_STEEPNESS: Final = 14  # Further dB per dB below the floor of side lobes in pictures.
 _MARGIN: Final = 10 ** (3.0 / 20)  # Factor by which a reflector must exceed predicted side lobes of stronger ones.
 _FALSE_ALARM: Final = 0.01
 _N_DIRECTIONS: Final = 64  # Number of directions in which the prediction and the image are compared.
@@ -260,8 +261,13 @@ def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) 
 
 
 def without_side_lobes(image: Energyscape) -> Energyscape:
-    """Return a copy of an image in which amplitudes below `side_lobe_floor` are 0."""
+    """Return a copy of an image in which amplitudes below `side_lobe_floor` are much weaker, for pictures.
+
+    A level of 1 dB below the limit becomes 15 dB. Main lobes therefore fade at their rims. Amplitudes of 0 would cut
+    them along the borders of the directions.
+    """
     if len(image.range_m) < 2:
         return image
     floor = side_lobe_floor(image.amplitude.max(axis=0, initial=0.0), image.range_m)
-    return image.replace(amplitude=np.where(image.amplitude >= floor, image.amplitude, np.float32(0)))
+    share = np.divide(image.amplitude, floor, out=np.ones_like(image.amplitude), where=floor > 0)
+    return image.replace(amplitude=image.amplitude * np.minimum(share, 1) ** _STEEPNESS)

@@ -1,49 +1,50 @@
 """Standard deviations of the positions of points."""
 
-import functools
 import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import kernels
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.noise import noise_of
+from ertis_numba.analysis.peak_interpolation import Tops
 from ertis_numba.frames import Energyscape
-from ertis_numba.geometry import array_weights, effective_count, microphones, unit_vectors
+from ertis_numba.geometry import array_weights, microphones, unit_vectors
 from ertis_numba.settings import Settings
-from ertis_numba.stages.error_model import SignalModel
-from ertis_numba.stages.planner import Planner
 from ertis_numba.waveform import matched_noise_spectrum
 
-__all__ = ["PositionUncertainty"]
+__all__ = ["PositionUncertainty", "Uncertainty"]
 
 _WAVES = 64  # Number of frequencies of the call's band from which its widths are computed.
 _FLAT = 1e-12  # Relative variance of an array below which its extent counts as zero.
 _UNIFORM = 0.34  # A uniform distribution has 68 % of its values within this share of its width around the middle.
 
-# Interpolation subtracts the predicted errors of a plan. This share of their root mean square remains, because errors
-# are approximated as linear over frequency, and samples are rounded. `ertis bench points` measures it.
-_OF_PREDICTED = 0.02
-# With spherical wavefronts, fractional delays depend on the range and are not predicted. Their errors are alike in
-# neighbouring bins, so they shift a maximum by less than noise of the same power.
-_OF_DELAYS, _OF_ONE_TAP = 0.1, 0.22
 
+class Uncertainty(NamedTuple):
+    """Standard deviations of points.
 
-class _PlanError(NamedTuple):
-    """Errors of a plan along the range and across, as root-mean-square noise relative to an echo."""
+    Attributes
+    ----------
+    range_m, across_m : (point,) float64
+        Along the range, and across it, in the direction that is least certain.
+    level : (point,) float64
+        Of the level in nepers.
+    """
 
-    along: float
-    across: float
+    range_m: NDArray[np.float64]
+    across_m: NDArray[np.float64]
+    level: NDArray[np.float64]
 
 
 class PositionUncertainty:
-    """Estimator of position errors of points, from noise, from the plan, and from a coarse grid.
+    """Estimator of the errors of points, from noise, from the plan, and from the grid.
 
-    Noise contributes the Cramér-Rao bounds of a single echo in white noise
+    `ertis_numba.analysis.echo_fits.EchoFits` states the errors of fitted echoes: the inverse of the Fisher information
+    of the bins that were fitted. It contains the noise, the remaining errors of the plan, other places that explain the
+    bins nearly as well, and the deviation of the bins from the image of a single echo. For images of the method
+    ``paper``, the errors are the Cramér-Rao bounds of a single echo in white noise
 
-    ``σ_range = c / (4π β √(2ρ))`` and ``σ_across = r / (k √(λ 2ρ))``,
+    ``σ_range = c / (4π β √(2ρ))``, ``σ_across = r / (k √(λ 2ρ))`` and ``σ_level = 1 / √(2ρ)`` nepers,
 
     with these quantities:
 
@@ -60,14 +61,12 @@ class PositionUncertainty:
     square. The estimate is the lower tercile, because side lobes of strong echoes raise the others. If echoes fill an
     image, they count as noise.
 
-    Interpolation subtracts the predicted errors of a complete plan. A measured share of these errors remains, and the
-    plan contributes it as noise. A direction that could not be interpolated, for example at the edge of a grid,
-    contributes the spacing of the grid.
+    A direction that was not interpolated, or that ends at the border of its cell, contributes the spacing of the grid.
+    Where the reflector may lie beyond an edge, the direction is unknown, and its standard deviation is 1 rad.
 
     A value is infinite if the array cannot resolve that direction. It is NaN if the noise is unknown: for beamformers
     other than delay-and-sum, whose noise is not Rayleigh-distributed, and if most of the image is 0, as after `clean`.
-    Errors of layout, temperature and near-field curvature are not included. Interference between echoes at the same
-    position is not included either.
+    Errors of layout and temperature are not included.
 
     Parameters
     ----------
@@ -86,59 +85,34 @@ class PositionUncertainty:
         self._frequency_hz = math.sqrt(mean_square)
         self._covariance_m2 = _effective_covariance_m2(positions_m, array_weights(settings))
 
-    def __call__(
-        self,
-        image: Energyscape,
-        position_m: NDArray[np.float32],
-        amplitude: NDArray[np.float32],
-        resolution_rad: NDArray[np.float64],
-    ) -> NDArray[np.float32]:
-        """Return the standard deviations of points along the range and across, in metres.
+    def __call__(self, image: Energyscape, tops: Tops, *, noise: float) -> Uncertainty:
+        """Return the standard deviations of points; NaN if the noise is unknown.
 
         Parameters
         ----------
         image : Energyscape
-        position_m : (point, axis) float32
-            Positions in metres.
-        amplitude : (point,) float32
-        resolution_rad : (point,) float64
-            Spacing of the directions around points whose direction is not interpolated; 0 for others.
-
-        Returns
-        -------
-        (point, 2) float32
-            NaN if the noise is unknown.
+        tops : Tops
+            Points. Widths of π or infinity mark unknown directions.
+        noise : float
+            Root mean square of the noise of the image; 0 if it is unknown.
         """
-        noise = noise_of(image) if len(amplitude) else 0.0
         if not noise:
-            return np.full((len(amplitude), 2), np.nan, dtype=np.float32)
-        plan = self._plan_error
-        relative = noise / amplitude.astype(np.float64)
+            unknown = np.full(len(tops.range_m), np.nan)
+            return Uncertainty(unknown, unknown, unknown)
+        relative = noise / tops.amplitude / math.sqrt(2)
         speed_m_s = sound_speed_m_s(image.settings.air)
-        along_m = speed_m_s / (4 * math.pi * self._width_hz) * np.hypot(relative, plan.along) / math.sqrt(2)
-        reach_m = np.sqrt(self._min_variance_m2(position_m.astype(np.float64)))
+        along_m = speed_m_s / (4 * math.pi * self._width_hz) * relative
+        reach_m = np.sqrt(self._min_variance_m2(tops.direction))
         wave_1_m = 2 * math.pi * self._frequency_hz / speed_m_s
-        range_m = np.linalg.norm(position_m, axis=1)
-        across_m = np.full(len(amplitude), np.inf)
-        spread_m2 = range_m * np.hypot(relative, plan.across) / math.sqrt(2) / wave_1_m
-        np.divide(spread_m2, reach_m, out=across_m, where=reach_m > 0)
-        across_m = np.hypot(across_m, _UNIFORM * resolution_rad * range_m)
-        return np.stack([along_m, across_m], axis=1).astype(np.float32)
-
-    @functools.cached_property
-    def _plan_error(self) -> _PlanError:
-        accuracy = self._settings.accuracy
-        plan = (accuracy.oversampling, accuracy.delay_taps, accuracy.beam_taps)
-        if self._settings.processing.method != "fast" or None in plan or accuracy.precision == "auto":
-            return _PlanError(0.0, 0.0)
-        echo = SignalModel.echo(self._settings, effective_count(array_weights(self._settings)))
-        parts = Planner(self._settings, kernels.load("numpy"), threads=1, signal_model=echo).parts(accuracy)
-        # Half of the power of an error changes a magnitude, and so does half of the power of noise.
-        delays, beams = (math.sqrt(2 * parts[name]) for name in ("delays", "beams"))
-        share = _OF_PREDICTED
-        if self._settings.processing.wavefront == "spherical":
-            share = _OF_ONE_TAP if accuracy.delay_taps == 1 else _OF_DELAYS
-        return _PlanError(along=share * delays, across=math.hypot(share * delays, _OF_PREDICTED * beams))
+        across_rad = np.full(len(relative), np.inf)
+        np.divide(relative / wave_1_m, reach_m, out=across_rad, where=reach_m > 0)
+        is_fitted = np.isfinite(tops.across_sd_rad)
+        across_rad = np.where(is_fitted & (reach_m > 0), tops.across_sd_rad, across_rad)
+        return Uncertainty(
+            np.where(is_fitted, tops.range_sd_m, along_m),
+            tops.range_m * np.hypot(across_rad, _UNIFORM * tops.width_rad),
+            np.where(is_fitted, tops.level_sd, relative),
+        )
 
     def _min_variance_m2(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the least variance of the array across the lines of sight: (point,) float64."""

@@ -116,7 +116,7 @@ def beamform(
     given = np.asarray(signals)
     if given.ndim != 2 or given.dtype.kind not in "cfiu" or not given.size:
         raise ArgumentError(
-            f"signals holds {given.dtype} of shape {given.shape}; give real or complex numbers of shape (mic, sample)"
+            f"signals holds {given.dtype} of shape {given.shape}; pass real or complex numbers of shape (mic, sample)"
         )
     checks.finite_array("signals", given)
     places_m = numbers_of("positions_m", positions_m, (len(given), 3))
@@ -126,7 +126,7 @@ def beamform(
     if range_m[-1] > record_m:
         raise ArgumentError(
             f"ranges_m ends at {range_m[-1]:g} m, but signals of {1e3 * given.shape[1] / rate_hz:.4g} ms reach "
-            f"{record_m:.4g} m; give smaller ranges or longer signals"
+            f"{record_m:.4g} m; use smaller ranges or longer signals"
         )
     own_s = np.zeros(len(given)) if delay_s is None else numbers_of("delay_s", delay_s, (len(given),))
     amplitudes = weights_of(weights, len(given))
@@ -174,7 +174,7 @@ def _delay_fit(output_rate_hz: float, spectrum: Spectrum) -> tuple[DelayFit, int
             return fit, n_phases
     raise ArgumentError(
         f"ranges_m has a step of {1e3 / output_rate_hz:.3g} ms in echo time, too long for signals up to "
-        f"{spectrum.frequency_hz[-1]:g} Hz; give ranges that are closer together"
+        f"{spectrum.frequency_hz[-1]:g} Hz; use ranges that are closer together"
     )
 
 

@@ -118,7 +118,7 @@ def _rows_of(data: NDArray[Any]) -> tuple[NDArray[Any], int, float | None]:
             rows = np.require(columns.astype(dtype, copy=False), requirements=["C", "A", "W"])
             return rows, columns.shape[1], 32_768.0 if kind == "i" else 1.0
     raise ArgumentError(
-        f"data holds {data.dtype} of shape {data.shape}; give PDM words (uint8 to uint64), PDM bits (bool) or PCM "
+        f"data holds {data.dtype} of shape {data.shape}; use PDM words (uint8 to uint64), PDM bits (bool) or PCM "
         "(int16, float32, float64), of shape (sample,) or (sample, column)"
     )
 
@@ -130,7 +130,7 @@ def _channels(channels: Sequence[int] | None, n_channels: int) -> NDArray[np.int
         return np.arange(n_channels, dtype=np.int32)
     found = [checks.integer(f"channels[{index}]", each, 0, n_channels - 1) for index, each in enumerate(channels)]
     if not found:
-        raise ArgumentError("channels is empty; give at least one channel, or leave it out for all")
+        raise ArgumentError("channels is empty; pass at least one channel, or None for all")
     return np.array(found, dtype=np.int32)
 
 

@@ -118,7 +118,7 @@ def _call(call: Call | ArrayLike, rate_hz: float) -> Call:
     waveform = np.asarray(call)
     if waveform.ndim != 1 or waveform.dtype.kind not in "fiu":
         raise ArgumentError(
-            f"call holds {waveform.dtype} of shape {waveform.shape}; give a Call, or a waveform of shape (sample,)"
+            f"call holds {waveform.dtype} of shape {waveform.shape}; use a Call, or a waveform of shape (sample,)"
         )
     try:
         return Call(waveform=tuple(waveform.tolist()), sample_rate_hz=rate_hz)
@@ -130,7 +130,7 @@ def _call_settings(call: Call, rate_hz: float, decimation: int, band_edges_hz: t
     """Return settings whose signals have a rate, so that the matched filter is that of a pipeline."""
     if rate_hz <= 2 * call.high_frequency_hz:
         raise ArgumentError(
-            f"sample_rate_hz is {rate_hz:g}; give more than twice the call's highest frequency of "
+            f"sample_rate_hz is {rate_hz:g}; use more than twice the call's highest frequency of "
             f"{call.high_frequency_hz:g} Hz"
         )
     edges_hz = None if band_edges_hz is None else band_of("band_edges_hz", band_edges_hz)
@@ -148,7 +148,7 @@ def _real(name: str, signals: ArrayLike) -> NDArray[Any]:
     given = np.asarray(signals)
     if not given.ndim or given.dtype.kind not in "fiu" or not given.size:
         raise ArgumentError(
-            f"{name} holds {given.dtype} of shape {given.shape}; give real numbers of shape (..., sample)"
+            f"{name} holds {given.dtype} of shape {given.shape}; pass real numbers of shape (..., sample)"
         )
     checks.finite_array(name, given)
     return given

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.calibration.wavefronts import Target
 from ertis_numba.errors import DataError
+from ertis_numba.units import counted
 
 __all__ = ["how_to_record", "not_observable", "require_directions"]
 
@@ -40,10 +41,10 @@ def require_directions(source_m: NDArray[np.float64], target: Target) -> None:
     DataError
         There are fewer than 4 recordings, or they are all from about the same direction.
     """
-    remedy = "or keep the positions of the layout (--position-tolerance 0)"
+    remedy = "or keep the positions of the layout (position_tolerance_m=0)"
     if len(source_m) < _MIN_RECORDS:
         raise DataError(
-            f"{len(source_m)} usable recording{'s' * (len(source_m) > 1)} cannot tell positions from delays; record at "
+            f"{counted(len(source_m), 'usable recording')} cannot tell positions from delays; record at "
             f"least {_MIN_RECORDS}, better 20, with the {target} at different places, {remedy}"
         )
     unit = source_m / np.linalg.norm(source_m, axis=1, keepdims=True)

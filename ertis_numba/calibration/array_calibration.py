@@ -233,7 +233,7 @@ def _of_other_targets(job: _Prepared, seen: Observations, fit: ArrayFit) -> dict
         if np.median(_misfit(tried.residual_s, seen)) < np.median(misfit) / 2:
             raise DataError(
                 f"the times fit a {other} better than a {job.target}, by a factor of "
-                f"{np.median(misfit) / np.median(_misfit(tried.residual_s, seen)):.0f}; give --target {other}"
+                f"{np.median(misfit) / np.median(_misfit(tried.residual_s, seen)):.0f}; use target={other!r}"
             )
     found = {}
     for record in np.flatnonzero(misfit > _MISFIT).tolist():
@@ -262,7 +262,7 @@ def _require_plausible(job: _Prepared, fit: ArrayFit) -> None:
         raise DataError(
             f"microphones would move by {1e3 * moved:.1f} mm and be delayed by {1e6 * later:.1f} µs (RMS), over "
             f"{_MAX_CHANGE:g} times the tolerances, so layout {job.heard.former.name} is probably not that of this "
-            "sensor; give its layout, or larger tolerances"
+            "sensor; use the layout of this array, or larger tolerances"
         )
 
 
@@ -427,8 +427,8 @@ def _with_place(made: Calibration, job: _Prepared, place: ReflectorPlace | None)
         return made
     if first != 0:
         raise DataError(
-            f"the first recording, whose place is given, cannot be used: {job.heard.rejected[0]}; make it again, or "
-            "give the place of another one and name that recording first"
+            f"the first recording, whose place is given, cannot be used: {job.heard.rejected[0]}; repeat this "
+            "recording, or begin with another recording whose place is known"
         )
     speed = speed_from_distance(made.source_m[0], place, speed_m_s, job.target)
     if abs(speed.speed_m_s / speed_m_s - 1) > _MAX_SPEED:

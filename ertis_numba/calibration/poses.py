@@ -19,6 +19,7 @@ from ertis_numba.calibration.pose_start import MIN_REFLECTORS, place_sensors, to
 from ertis_numba.calibration.wave_finder import Wave, find_waves
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
+from ertis_numba.units import counted
 
 __all__ = ["calibrate_poses"]
 
@@ -85,7 +86,8 @@ def calibrate_poses(
     """
     if len(measurements) < 2:
         raise ArgumentError(
-            f"poses of {len(measurements)} sensor{'s' * (len(measurements) != 1)} are asked for; give at least two"
+            f"poses of {counted(len(measurements), 'sensor')} are wanted, but mountings need at "
+            "least two sensors; add recordings"
         )
     names = list(measurements)
     reference = names[0] if reference is None else reference
@@ -134,7 +136,7 @@ def _heard(
         heard[name] = {}
         seen: Counter[int] = Counter()
         problem = ""
-        for measurement in checks.items(f"measurements of {name}", each, Measurement, "a recording holds"):
+        for measurement in checks.items(f"measurements of {name}", each, Measurement, "a recording contains"):
             pulse = measurement.stamp.sync_count
             speeds_m_s.append(sound_speed_m_s(measurement.settings.air))
             try:

@@ -51,7 +51,7 @@ class OtherLayoutError(DataError):
             f"layout {given} does not fit the recordings ({share:.0%} of the microphones), but layout {layout} does"
         )
         self.layout = layout
-        super().__init__(f"{self.finding}; use it with --layout {layout}")
+        super().__init__(f"{self.finding}; use layout={layout!r}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,14 +89,14 @@ def hear_all(
     rejected: dict[int, str] = {}
     copies: dict[int, int] = {}
     for number, measurement in enumerate(_measurements(recordings)):
-        checks.instance("recordings", measurement, Measurement, "a recording holds")
+        checks.instance("recordings", measurement, Measurement, "a recording contains")
         own = microphones(measurement.settings.array)
         if former is None:
             former = own if layout is None else load_layout(str(layout))
         if len(own.enabled) != len(former.enabled):
             raise ArgumentError(
                 f"recording {number + 1} has {len(own.enabled)} channels, but layout {former.name} has "
-                f"{len(former.enabled)}; give the layout of the sensor"
+                f"{len(former.enabled)}; choose the layout of the sensor"
             )
         channels = np.flatnonzero(former.enabled)
         try:
@@ -107,7 +107,7 @@ def hear_all(
         if on_progress is not None:
             on_progress(number + 1)
     if former is None:
-        raise ArgumentError("there are no measurements to calibrate with; give at least one recording")
+        raise ArgumentError("there are no measurements to calibrate with; use at least one recording")
     heard = Heard(sounds, rejected, copies, former)
     require_sounds(heard, target)
     return heard
@@ -179,7 +179,7 @@ def ordered(
         if found is None:
             raise DataError(
                 f"layout {heard.former.name} does not fit the recordings: one wavefront fits {usual:.0%} of the "
-                f"microphones; give the layout of this sensor, or {how_to_record(target)}"
+                f"microphones; choose the layout of this sensor, or {how_to_record(target)}"
             )
         order, positions_m = found
         if order.startswith("layout "):

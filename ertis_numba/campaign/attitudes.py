@@ -48,7 +48,8 @@ class Attitudes:
         place = recording.rotation_xyzw if rotation_xyzw is None else rotation_xyzw
         if place is None:
             raise DataError(
-                f"{name} has no mounting, so its attitude is unknown; give --mounting FILE, or leave out --level"
+                f"{name} has no mounting, so its attitude is unknown; add its mounting "
+                "(mounting), or process without levelled directions (level_directions)"
             )
         times_ns = np.unique([stamp.timestamp_ns for stamp in stamps])
         n_missing = len(stamps)
@@ -57,7 +58,7 @@ class Attitudes:
         if recording.trajectory is None or n_missing:
             raise DataError(
                 f"{name} has no pose at {n_missing} of {len(stamps)} measurements; add poses with 'ertis "
-                "import-poses', or leave out --level"
+                "import-poses', or process without levelled directions (level_directions)"
             )
         poses = recording.trajectory.at(times_ns)
         self.note = "; ".join(pose_doubts(poses)) or None

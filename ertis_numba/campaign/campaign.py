@@ -98,7 +98,7 @@ class Campaign:
             checks.integer("workers", workers, 1)
             if scheduler is not None:
                 raise ArgumentError(
-                    "workers and scheduler exclude each other, because a scheduler has its own workers; give one of "
+                    "workers and scheduler cannot be combined, because a scheduler has its own workers; choose one of "
                     "them"
                 )
         self.folder, self._options = Path(folder), options or CampaignOptions()
@@ -272,7 +272,9 @@ class Campaign:
         if made is not None and not differs:
             yield from self._handle_existing(case, made["sensors"])
         elif made is not None and (made.get("recording") or not self._options.overwrite):
-            remedy = "give another folder" + ("" if made.get("recording") else ", or ask to replace it (--force)")
+            remedy = "choose another folder" + (
+                "" if made.get("recording") else ", or replace the output (overwrite=True)"
+            )
             yield case.ended("failed", error=f"output {case.target} exists and {differs}; {remedy}")
         else:
             yield from self._advance(case)

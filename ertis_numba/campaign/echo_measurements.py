@@ -21,7 +21,7 @@ class EchoMeasurements(Sequence[Measurement]):
     ----------
     recording : RecordingReader
     settings : Settings
-        Their ``processing.mode`` decides, as for `is_passive`.
+        Settings whose ``processing.mode`` decides if a measurement is passive.
 
     Attributes
     ----------
@@ -73,8 +73,8 @@ class EchoMeasurements(Sequence[Measurement]):
         if not self._n_silent:
             return ""
         return (
-            f"no call was emitted for {self._n_silent} of {len(self)} measurements, so their images show no echoes of "
-            "one; for maps of their sound, use --mode auto or passive (processing.mode)"
+            f"no call was emitted for {self._n_silent} of {len(self)} measurements, so their images show no echoes "
+            "of a call; use mode='auto' or 'passive' for maps of their sound"
         )
 
     @property
@@ -94,8 +94,8 @@ def passive_note(path: Path, sensor: str, n_images: int, n_measurements: int) ->
         return ""
     count = f"{n_measurements - n_images} of {n_measurements}"
     return (
-        f"{path}: {count} measurements of sensor {sensor} are passive and left out; give --mode passive for acoustic "
-        "maps, or --mode active for images of all"
+        f"{path}: {count} measurements of sensor {sensor} are passive and left out; use "
+        "mode='passive' for acoustic maps, or mode='active' for images of all"
     )
 
 
@@ -109,6 +109,6 @@ def require_images(path: Path, n_images: int) -> None:
     """
     if not n_images:
         raise DataError(
-            f"{path}: all measurements are passive and have no images; make acoustic maps, or give --mode active for "
-            "images"
+            f"{path}: all measurements are passive and have no images; make acoustic maps, or use "
+            "mode='active' for images"
         )

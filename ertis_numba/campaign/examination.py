@@ -60,7 +60,7 @@ def examine(
     settings = pipeline.settings
     if settings.processing.method == "paper":
         raise ArgumentError(
-            "--explain or --verify needs a plan, but method 'paper' has none; give 'fast', or leave it out"
+            "explain=True and verify=True need a plan, but method 'paper' has none; use method 'fast', or remove them"
         )
     kernel_set = kernels.load(pipeline.device)
     n_threads = kernel_set.max_threads if threads is None else threads
@@ -138,7 +138,7 @@ def _require_budget(sensor: str, error_db: float, settings: Settings) -> None:
     if not error_db <= allowed_db:
         raise DataError(
             f"image of sensor {sensor} has an error of {error_db:.1f} dB, but the limit is {allowed_db:g} dB; "
-            "give a lower --max-error, or leave more of [accuracy] open"
+            "use a lower max_error_db, or remove keys of [accuracy]"
         )
 
 

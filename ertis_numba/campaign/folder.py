@@ -38,7 +38,7 @@ def exclusive_folder(folder: Path) -> Iterator[None]:
         except OSError as error:
             if error.errno in {errno.EWOULDBLOCK, errno.EACCES}:
                 raise ArgumentError(
-                    f"output folder {folder} is in use by another campaign; wait for it, or give another folder"
+                    f"output folder {folder} is in use by another campaign; wait for it, or choose another folder"
                 ) from None
             # Some network file systems have no locks. The campaign then runs without one.
         yield

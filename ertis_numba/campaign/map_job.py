@@ -87,6 +87,7 @@ class _MapsOfSensor:
         recording, camera = self._recording, self._camera
         settings, n_left, elapsed_s = camera.settings, len(recording), 0.0
         as_recorded = settings.air == recording.settings.air
+        self._compile()
         for measurement in recording:
             if as_recorded:
                 require_same_air(measurement, settings)
@@ -112,6 +113,12 @@ class _MapsOfSensor:
                 f"measurements; maps leave out the first {1e3 * self._masked_s:.1f} ms of each, but contain echoes of "
                 "the call"
             )
+
+    def _compile(self) -> None:
+        """Load or compile the kernels with one map, so that times of maps do not include this."""
+        self._camera.add(replace(self._recording[0], settings=self._camera.settings))
+        self._camera.map()
+        self._camera.reset()
 
     def _add(self, found: AcousticMap, elapsed_s: float) -> None:
         """Add a map to the mean, and the time that its measurements took."""
@@ -216,7 +223,7 @@ def check_maps(
     settings : mapping of str to Settings
         Settings with which its maps were made, by sensor.
     warn : callable
-        As for `prepare_maps`.
+        Receiver of warnings, as for `prepare_maps`.
 
     Raises
     ------

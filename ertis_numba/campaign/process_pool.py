@@ -126,7 +126,7 @@ class ProcessPool:
         if not worker.begun:
             self.submit(task)
             return []
-        text = f"{_path(task)}: its worker process {how}; if memory runs out, give fewer --workers"
+        text = f"{_path(task)}: its worker process {how}; if memory runs out, use fewer processes (workers)"
         return [TaskUpdate(task.number, result={"error": text, "by_chance": True})]
 
     def _end(self, worker: _WorkerProcess, timeout_s: float = 0.0) -> str:

@@ -184,7 +184,7 @@ def check_recording(
     settings : mapping of str to Settings
         Settings with which its energyscapes were made, by sensor.
     pipelines, warn : callable
-        As for `prepare_recording`.
+        Source of pipelines, and receiver of warnings, as for `prepare_recording`.
 
     Raises
     ------
@@ -305,14 +305,15 @@ def _check_sensor(
     if run.pipeline.settings.processing.method != "paper":
         kernel_set = kernels.load(run.pipeline.device)
         threads = kernel_set.max_threads if options.threads is None else options.threads
-        heard = planner_of(unlevelled_image(run.pipeline, first), first, kernel_set, threads=threads)
-        run.prediction = predict(heard)
+        image = unlevelled_image(run.pipeline, first)
+        heard = planner_of(image, first, kernel_set, threads=threads)
+        run.prediction = predict(heard, image)
         run.reported |= _wavefront(heard, recording, show)
         if run.prediction.warning:
-            remedy = "give a lower --max-error"
+            remedy = "use a lower max_error_db"
             if not options.verify:
-                remedy = f"measure the error with --verify, or {remedy}"
-            warn(f"{place}: {run.prediction.warning}; {remedy}")
+                remedy = f"measure the error (verify=True), or {remedy}"
+            warn(f"{place}: {run.prediction.warning}{f'; {remedy}' if run.prediction.has_echoes else ''}")
     if not (options.explain or options.verify):
         return
     from ertis_numba.campaign.examination import examine  # noqa: PLC0415  slow to import and rarely used

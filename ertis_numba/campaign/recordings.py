@@ -68,14 +68,14 @@ def _expand(text: str) -> Sequence[RecordingFile]:
     if path.is_dir():
         paths = sorted(each for each in path.glob("*.h5") if _is_candidate(each))
         if not paths:
-            raise DataError(f"folder {path} contains no *.h5; give a folder with recordings, or a pattern")
+            raise DataError(f"folder {path} contains no *.h5; choose a folder with recordings, or a pattern")
     elif path.exists() or not glob.has_magic(text):
         return [RecordingFile(path)]
     else:
         every = map(Path, glob.glob(text, recursive=True))  # noqa: PTH207
         paths = sorted(each for each in every if _is_candidate(each))
         if not paths:
-            raise DataError(f"no file matches {text}; give another pattern")
+            raise DataError(f"no file matches {text}; choose another pattern")
     return [RecordingFile(each, named=False) for each in paths]
 
 
@@ -105,9 +105,9 @@ def output_paths(recordings: Sequence[RecordingFile], folder: Path) -> list[Path
         created.
     """
     if folder.exists() and not folder.is_dir():
-        raise ArgumentError(f"output {folder} is a file, but several recordings need a folder; give another name")
+        raise ArgumentError(f"output {folder} is a file, but several recordings need a folder; choose another name")
     if not folder.parent.is_dir():
-        raise ArgumentError(f"output {folder}: folder {folder.parent} does not exist; create it or give another")
+        raise ArgumentError(f"output {folder}: folder {folder.parent} does not exist; create it or choose another")
     # Files found by patterns may be results of processing.
     named = {os.path.realpath(found.path) for found in recordings if found.named}
     taken: dict[str, Path] = {}
@@ -122,7 +122,7 @@ def output_paths(recordings: Sequence[RecordingFile], folder: Path) -> list[Path
         for output in (target, map_path(target)):
             if os.path.realpath(output) in named:
                 raise ArgumentError(
-                    f"{found.path} would become {output}, which is itself to be processed; give another folder"
+                    f"{found.path} would become {output}, which is itself to be processed; choose another folder"
                 )
         taken[name] = found.path
         targets.append(target)

@@ -106,8 +106,8 @@ class CampaignOptions:
         for name in ("explain", "verify"):
             if getattr(self, name):
                 raise DataError(
-                    f"{path}: all measurements become acoustic maps, which have no error budget; leave "
-                    f"out --{name}, or give --mode active for images"
+                    f"{path}: all measurements become acoustic maps, which have no error budget; "
+                    f"remove {name}=True, or use mode='active' for images"
                 )
 
     @property

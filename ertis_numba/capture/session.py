@@ -131,7 +131,7 @@ class CaptureSession:
     ) -> None:
         checks.choice("trigger", trigger, ("command", "sync"))
         if not sonars:
-            raise ArgumentError("sonars is empty; give at least one sensor")
+            raise ArgumentError("sonars is empty; pass at least one sensor")
         self._sonars, self._settings, self._mounting = dict(sonars), settings, dict(mounting or {})
         self._synced = trigger == "sync"
         self._rate_hz = checks.between("rate", rate_hz, 1e-3, 1e3)
@@ -151,6 +151,7 @@ class CaptureSession:
         )
         self.counts = {sensor: CaptureCounts() for sensor in sonars}
         self.complete = self.incomplete = 0
+        self._armed_ns = 0  # From this time on, all sensors receive every pulse.
 
     def _reset(self, settings: Settings, session_id: int) -> None:
         """Begin to count measurements with these settings."""
@@ -163,6 +164,7 @@ class CaptureSession:
         self._groups: dict[int, int] = {}
         self._closed = -(2**63)  # Latest closed group.
         self._ended: set[str] = set(self._errors)
+        self._first_pulse: int | None = None  # First pulse that all sensors could receive.
 
     def change(self, change: SettingsChange) -> None:
         """Request other settings for all sensors; any thread may call this.
@@ -204,6 +206,7 @@ class CaptureSession:
             for sonar in self._sonars.values():
                 if not sonar.listen_only:
                     sonar.arm()
+            self._armed_ns = time.monotonic_ns()
         try:
             while True:
                 self._measure(sink, end_s)
@@ -262,6 +265,7 @@ class CaptureSession:
             for sensor in working:
                 self._register(sink, sensor, change.settings)
                 registered.append(sensor)
+            self._armed_ns = time.monotonic_ns()
         except (ArgumentError, SonarError) as error:
             failure = error
             for sensor in working:
@@ -405,6 +409,9 @@ class CaptureSession:
         track, block = self._sequence_states[event.sensor], event.block
         sequence = event.count
         if self._synced:
+            number = self._counted(event, number)
+            if number < 0:
+                return None
             if track.first_pulse is None:
                 track.first_pulse = number
             sequence = number - track.first_pulse
@@ -427,6 +434,14 @@ class CaptureSession:
         )
         measurement = Measurement(block.data, self._settings, stamp)
         return JournalEntry(measurement=measurement, monotonic_ns=block.arrived.monotonic_ns)
+
+    def _counted(self, event: BlockArrived, number: int) -> int:
+        """Return the number of a pulse since all sensors are armed, or a negative one for an earlier pulse."""
+        if self._first_pulse is None:
+            if event.block.arrived.monotonic_ns - self._record_ns < self._armed_ns:
+                return -1
+            self._first_pulse = number
+        return number - self._first_pulse
 
     def _record_gap_before(self, sink: MeasurementSink, sensor: str, stop: int, why: str) -> None:
         """Store a gap for the missing numbers below ``stop``."""

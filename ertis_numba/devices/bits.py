@@ -102,7 +102,7 @@ class BitCheck:
         """
         checks.shape("words", words.shape, (self._n_samples,))
         if words.dtype != np.uint32:
-            raise ArgumentError(f"words are {words.dtype}; give uint32")
+            raise ArgumentError(f"words are {words.dtype}; pass uint32")
         self._words[:, 0] = words  # This copy avoids another compilation of the kernels for read-only arrays.
         np.bitwise_xor(self._words[1:], self._words[:-1], out=self._changes[1:])
         mean, change = self._means(self._words[:, 0]), self._means(self._changes[:, 0])

@@ -227,7 +227,7 @@ class BlockReceiver:
 
     @property
     def rejected(self) -> Counter[str]:
-        """Rejected bytes by reason: those of `BlockParser`, ``counter``, and those of the bit check."""
+        """Number of rejected bytes by reason: the reasons of `BlockParser` and of the bit check, and ``counter``."""
         whole = Counter({reason: count * self.n_bytes for reason, count in self._rejected_blocks.items()})
         return self._parser.rejected + whole
 

@@ -88,6 +88,6 @@ def encode_block(counter: int, words: NDArray[np.uint32]) -> bytes:
     """
     counter = checks.integer("counter", counter, 0, COUNTERS - 1)
     if words.dtype.kind != "u" or words.dtype.itemsize != 4 or words.ndim != 1:
-        raise ArgumentError(f"words are {words.dtype} of shape {words.shape}; give (sample,) uint32")
+        raise ArgumentError(f"words are {words.dtype} of shape {words.shape}; use (sample,) uint32")
     payload = words.astype("<u4", copy=False).tobytes()
     return HEADER.to_bytes(4, "little") + counter.to_bytes(4, "little") + payload + FOOTER.to_bytes(4, "little")

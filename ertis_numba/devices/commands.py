@@ -158,7 +158,7 @@ class CustomCommand:
         match = _LINE.fullmatch(self.text.encode())
         if match is None or "\n" in self.text or max(map(int, match.groups()[1:])) > MAX_NUMBER:
             raise ArgumentError(
-                f"command is {self.text!r}; give '!X,i,j,k' with a letter X and whole numbers up to {MAX_NUMBER}, "
+                f"command is {self.text!r}; use '!X,i,j,k' with a letter X and whole numbers up to {MAX_NUMBER}, "
                 "such as '!Y,0,0,0'"
             )
         if match[1] == b"A":

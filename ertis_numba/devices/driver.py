@@ -501,7 +501,7 @@ class SonarDriver:
             return SonarError(f"{self.port}: nothing arrived within {timeout_s:g} s; check the trigger and its cable")
         return SonarError(
             f"{self.port}: {read} bytes arrived within {timeout_s:g} s, but no complete measurement of "
-            f"{setup.n_samples} samples; give the length that the sensor is set to"
+            f"{setup.n_samples} samples; use the length to which the sensor is set"
         )
 
 

@@ -242,6 +242,6 @@ def _opened(path: str) -> serial.Serial:
             path, _BAUD, timeout=_SLICE_S, write_timeout=_WRITE_S, exclusive=True if os.name == "posix" else None
         )
     except _CANNOT_OPEN as error:
-        unknown = (errno.EINVAL, f"is not a usable serial port ({error}); give another one")
+        unknown = (errno.EINVAL, f"is not a usable serial port ({error}); choose another one")
         code, text = _OPEN_ERRORS.get(getattr(error, "errno", None) or 0, unknown)
         raise sonar_error(f"{path} {text}", code) from error

@@ -79,7 +79,7 @@ class HeldLink:
         require_terminals()
         self.path = path
         if os.path.lexists(path) and not (path.is_symlink() and str(path.readlink()).startswith("/dev/")):
-            raise ArgumentError(f"link {path} exists but is not a link to a port; give another name")
+            raise ArgumentError(f"link {path} exists but is not a link to a port; choose another name")
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._lock_path = path.with_name(f".{path.name}.lock")
         self._lock = self._locked()
@@ -99,7 +99,7 @@ class HeldLink:
                 if time.monotonic() > latest_s:
                     os.close(lock)
                     raise ArgumentError(
-                        f"link {self.path} belongs to a running emulated device; end that one, or give another name"
+                        f"link {self.path} belongs to a running emulated device; end that one, or choose another name"
                     ) from None
                 time.sleep(_RETRY_S)  # `is_held` holds the lock for an instant.
             os.close(lock)

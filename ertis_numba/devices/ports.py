@@ -71,7 +71,9 @@ def resolve(port: str) -> Port:
     found = find_ports()
     named = [item for item in found if port in item.names]
     if len({item.path for item in named}) > 1:
-        raise sonar_error(f"{port!r} matches {len(named)} ports: {_listed(named)}; give the path of one", errno.EINVAL)
+        raise sonar_error(
+            f"{port!r} matches {len(named)} ports: {_listed(named)}; choose the path of one", errno.EINVAL
+        )
     if named:
         return named[0]
     path = os.path.realpath(port)

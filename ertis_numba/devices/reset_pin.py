@@ -39,5 +39,5 @@ def pulse_reset_pin(pin: int = RESET_PIN) -> None:
     except Exception as error:  # The library raises plain exceptions, also on other computers.
         raise SonarError(
             f"pin {pin} cannot be pulsed ({error}); on a Jetson, install Jetson.GPIO; elsewhere, name a program that "
-            "resets the sensor (--hook), or unplug it and plug it in again"
+            "resets the sensor (hook), or unplug it and plug it in again"
         ) from error

@@ -103,7 +103,7 @@ class Setup:
         if self.pdm_rate_hz not in PDM_RATES_HZ:
             raise ArgumentError(
                 f"recording.sample_rate_hz is {self.pdm_rate_hz:.10g}, but a sensor's clocks are "
-                f"{PDM_RATES_HZ[0]:.0f} and {PDM_RATES_HZ[1]:.0f}; give one of them"
+                f"{PDM_RATES_HZ[0]:.0f} and {PDM_RATES_HZ[1]:.0f}; choose one of them"
             )
         object.__setattr__(self, "dac_rate_hz", _dac_rate_hz(self.dac_rate_hz))
         _check_codes(self.codes, self.dac_rate_hz)
@@ -111,7 +111,7 @@ class Setup:
         checks.integer("pin", self.pin, *PINS)
         if self.active and not self.amplifier:
             raise ArgumentError(
-                "active is True with the amplifier off, which emits nothing; switch it on, or give active=False"
+                "active is True with the amplifier off, which emits nothing; switch it on, or use active=False"
             )
 
     @classmethod
@@ -140,7 +140,7 @@ class Setup:
         recording, call = settings.recording, settings.call
         _check_array(settings.array)
         if not recording.is_pdm:
-            raise ArgumentError(f"recording.encoding is {recording.encoding!r}, but a sensor sends bits; give 'pdm'")
+            raise ArgumentError(f"recording.encoding is {recording.encoding!r}, but a sensor sends bits; use 'pdm'")
         return cls(
             n_samples=recording.n_samples,
             pdm_rate_hz=recording.sample_rate_hz,
@@ -183,11 +183,12 @@ def _with_silence(codes: NDArray[np.uint16], rate_hz: float, period_s: float | N
     n_samples = round(checks.positive("emission_period_s", period_s) * rate_hz)
     if n_samples < len(codes):
         raise ArgumentError(
-            f"emission_period_s is {period_s:g} s, but the call lasts {len(codes) / rate_hz:.3g} s; give at least that"
+            f"emission_period_s is {period_s:g} s, but the call lasts {len(codes) / rate_hz:.3g} s; use at least this "
+            "period"
         )
     if n_samples > DAC_SAMPLES[1]:
         raise ArgumentError(
-            f"emission_period_s is {period_s:g} s, but a sensor plays at most {DAC_SAMPLES[1]} samples; give at most "
+            f"emission_period_s is {period_s:g} s, but a sensor plays at most {DAC_SAMPLES[1]} samples; use at most "
             f"{DAC_SAMPLES[1] / rate_hz:.3g} s"
         )
     return np.pad(codes, (0, n_samples - len(codes)), constant_values=2048)
@@ -199,7 +200,7 @@ def _check_length(n_samples: int) -> None:
         near = min(max(round(n_samples / LENGTH_STEP), 1) * LENGTH_STEP, MAX_WORDS)
         raise ArgumentError(
             f"recording.n_samples is {n_samples}, but a sensor measures multiples of {LENGTH_STEP} up to "
-            f"{MAX_WORDS}; give {near}"
+            f"{MAX_WORDS}; use {near}"
         )
 
 
@@ -207,11 +208,11 @@ def _check_array(array: Array) -> None:
     layout = microphones(array)
     if layout.word_bits != CHANNELS:
         raise ArgumentError(
-            f"array.word_bits is {layout.word_bits}, but a sensor's words have {CHANNELS}; give {CHANNELS}"
+            f"array.word_bits is {layout.word_bits}, but a sensor's words have {CHANNELS} bits; use {CHANNELS}"
         )
     if len(layout.enabled) > CHANNELS:
         raise ArgumentError(
-            f"array has {len(layout.enabled)} channels, but a sensor has {CHANNELS}; give at most {CHANNELS} positions"
+            f"array has {len(layout.enabled)} channels, but a sensor has {CHANNELS}; use at most {CHANNELS} positions"
         )
 
 
@@ -220,21 +221,21 @@ def _dac_rate_hz(rate_hz: float) -> int:
     slowest_hz, fastest_hz = DAC_RATES_HZ
     if not (float(rate_hz).is_integer() and slowest_hz <= rate_hz <= fastest_hz):
         raise ArgumentError(
-            f"call.sample_rate_hz is {rate_hz:.10g}; give a whole number from {slowest_hz} to {fastest_hz}"
+            f"call.sample_rate_hz is {rate_hz:.10g}; use a whole number from {slowest_hz} to {fastest_hz}"
         )
     return int(rate_hz)
 
 
 def _check_codes(codes: NDArray[np.uint16], rate_hz: int) -> None:
     if codes.dtype != np.uint16 or codes.ndim != 1:
-        raise ArgumentError(f"codes are {codes.dtype} of shape {codes.shape}; give (sample,) uint16")
+        raise ArgumentError(f"codes are {codes.dtype} of shape {codes.shape}; use (sample,) uint16")
     fewest, largest = DAC_SAMPLES
     if not fewest <= len(codes) <= largest:
         raise ArgumentError(
-            f"call has {len(codes)} samples, but a sensor plays {fewest} to {largest}; give call.delay_s and "
+            f"call has {len(codes)} samples, but a sensor plays {fewest} to {largest}; use call.delay_s and "
             f"call.duration_s that add up to {(fewest - 1) / rate_hz:.3g} to {(largest - 1) / rate_hz:.3g}"
         )
     if codes.max() > DAC_CODE_MAX:
         raise ArgumentError(
-            f"codes reach {codes.max()}, but a sensor's converter accepts 0 to {DAC_CODE_MAX}; give smaller ones"
+            f"codes reach {codes.max()}, but a sensor's converter accepts 0 to {DAC_CODE_MAX}; use smaller codes"
         )

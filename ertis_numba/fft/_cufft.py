@@ -56,7 +56,7 @@ class CufftTransforms:
         except (cupy.cuda.memory.OutOfMemoryError, cupy.cuda.runtime.CUDARuntimeError, cufft.CuFFTError) as error:
             raise DeviceError(
                 f"device 'cuda' has too little memory for transforms of {n_rows} rows of {n_out} samples "
-                f"({error}); give a shorter processing.range_m or a lower accuracy.oversampling, or use device 'cpu'"
+                f"({error}); use a shorter processing.range_m or a lower accuracy.oversampling, or use device 'cpu'"
             ) from error
 
     def forward(self, *, threads: int) -> NDArray[np.complex64]:  # noqa: ARG002

@@ -5,7 +5,7 @@ Figures do not use pyplot, so they need no window system. As x is forward, y lef
 return a figure, or the axes given as ``ax``; `save` writes a figure to a file. Only the live view also uses Matplotlib.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Unpack, overload
 
@@ -35,7 +35,7 @@ from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import compose
 from ertis_numba.figures._pareto_front import Rated
 from ertis_numba.figures.style import StyleOptions, parameters, style_of
-from ertis_numba.frames import AcousticMap, Energyscape, Measurement, OccupancyMap, Peak
+from ertis_numba.frames import AcousticMap, Energyscape, Measurement, OccupancyMap, Peak, Trajectory
 from ertis_numba.geometry import observable_angles
 from ertis_numba.settings import Array, Settings
 
@@ -139,7 +139,7 @@ def plot(
     """
     if ax is not None and (not isinstance(ax, Axes) or ax.name != "rectilinear"):
         name = f"{ax.name} axes" if isinstance(ax, Axes) else f"of type {type(ax).__name__}"
-        raise ArgumentError(f"ax is {name}; give rectilinear Axes, such as matplotlib.pyplot.subplots returns")
+        raise ArgumentError(f"ax is {name}; pass rectilinear Axes, such as matplotlib.pyplot.subplots returns")
     if ax is not None:
         look = {"theme": "light", **look}
     canvas = _canvas_of(image, dynamic_range_db, look, peaks)
@@ -209,7 +209,7 @@ def slices(
     left_m : float, optional
         Position y of the vertical section in metres; 0 by default.
     dynamic_range_db, peaks, **look
-        As for `plot`.
+        Range of the colours in dB, marked reflectors and the style, as for `plot`.
 
     Raises
     ------
@@ -241,14 +241,14 @@ def signals(
     microphone : int, optional
         Channel of the only microphone to draw; all by default.
     dynamic_range_db, **look
-        As for `plot`.
+        Range of the colours in dB and the style, as for `plot`.
 
     Raises
     ------
     ArgumentError
         An argument is invalid, or there is no such microphone.
     """
-    checks.instance("measurement", measurement, Measurement, "a recording holds")
+    checks.instance("measurement", measurement, Measurement, "a recording contains")
     return _signals.draw(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
 
 
@@ -263,7 +263,7 @@ def matched_filter(
 
     Arguments are those of `signals`.
     """
-    checks.instance("measurement", measurement, Measurement, "a recording holds")
+    checks.instance("measurement", measurement, Measurement, "a recording contains")
     return _signals.draw_echoes(_canvas(dynamic_range_db, look), measurement, microphone=microphone)
 
 
@@ -293,7 +293,7 @@ def acoustic_map(
     dynamic_range_db : float, default 20
         Range of the colours in decibels.
     **look
-        As for `plot`.
+        Style of the figure, as for `plot`.
 
     Raises
     ------
@@ -307,11 +307,11 @@ def acoustic_map(
     if band_hz is not None:
         checks.interval("band_hz", band_hz, 0.0, 1e9)
     if (photo is None) != (photo_fov_deg is None):
-        raise ArgumentError("photo and photo_fov_deg need each other; give both or neither")
+        raise ArgumentError("photo and photo_fov_deg belong together; use both or neither")
     if photo is None or photo_fov_deg is None:
         return _acoustic.draw(canvas, found, band_hz=band_hz)
     if isinstance(photo_fov_deg, str) or not isinstance(photo_fov_deg, Sequence) or len(photo_fov_deg) != 2:
-        raise ArgumentError(f"photo_fov_deg is {photo_fov_deg!r:.80}; give its width and its height in degrees")
+        raise ArgumentError(f"photo_fov_deg is {photo_fov_deg!r:.80}; use its width and height in degrees")
     for number, each_deg in enumerate(photo_fov_deg):
         checks.between(f"photo_fov_deg[{number}]", each_deg, 1.0, 170.0)
     return _acoustic.draw_on_photo(canvas, found, band_hz=band_hz, photo=_picture(photo), fov_deg=photo_fov_deg)
@@ -345,7 +345,7 @@ def spectrum(
     direction_deg : (azimuth, elevation), optional
         Direction in degrees. By default the loudest direction of a map, or the mean of the microphones.
     dynamic_range_db, **look
-        As for `plot`.
+        Range of the colours in dB and the style, as for `plot`.
 
     Raises
     ------
@@ -355,7 +355,7 @@ def spectrum(
     canvas = _canvas(dynamic_range_db, look)
     if isinstance(source, AcousticMap):
         return _acoustic.draw_bands(canvas, source, direction_deg=direction_deg)
-    checks.instance("source", source, Measurement, "a recording holds, or an AcousticMap")
+    checks.instance("source", source, Measurement, "a recording contains, or an AcousticMap")
     return _acoustic_signals.draw_spectrum(canvas, source, direction_deg=direction_deg)
 
 
@@ -376,14 +376,14 @@ def spectrogram(
     direction_deg : (azimuth, elevation), optional
         Direction of the beam in degrees.
     dynamic_range_db, **look
-        As for `plot`.
+        Range of the colours in dB and the style, as for `plot`.
 
     Raises
     ------
     ArgumentError
         An argument is invalid.
     """
-    checks.instance("measurement", measurement, Measurement, "a recording holds")
+    checks.instance("measurement", measurement, Measurement, "a recording contains")
     return _acoustic_signals.draw_spectrogram(_canvas(dynamic_range_db, look), measurement, direction_deg=direction_deg)
 
 
@@ -407,7 +407,7 @@ def array(
     azimuth_deg, elevation_deg : float
         Steering direction in degrees, -90 to 90.
     dynamic_range_db, **look
-        As for `plot`.
+        Range of the colours in dB and the style, as for `plot`.
 
     Raises
     ------
@@ -448,7 +448,7 @@ def calibration(
     azimuth_deg, elevation_deg : float
         Steering direction in degrees, -90 to 90.
     dynamic_range_db, **look
-        As for `plot`.
+        Range of the colours in dB and the style, as for `plot`.
 
     Raises
     ------
@@ -457,7 +457,7 @@ def calibration(
     """
     checks.positive("dynamic_range_db", dynamic_range_db)
     checks.instance("made", made, Calibration, "calibrate returns")
-    checks.instance("settings", settings, Settings, "a measurement holds")
+    checks.instance("settings", settings, Settings, "a measurement contains")
     return _calibration.draw(
         Canvas(style_of(**look), dynamic_range_db),
         made,
@@ -476,7 +476,7 @@ def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack
     title, note : str
         Heading, and the line below it.
     **look
-        As for `plot`.
+        Style of the figure, as for `plot`.
 
     Returns
     -------
@@ -490,7 +490,13 @@ def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack
     return _pareto_front.draw(style_of(**look), points, title=title, note=note)
 
 
-def occupancy(found: OccupancyMap, **look: Unpack[StyleOptions]) -> Figure:
+def occupancy(
+    found: OccupancyMap,
+    *,
+    trajectory: Trajectory | None = None,
+    mountings: Mapping[str, _map.Mounting] | None = None,
+    **look: Unpack[StyleOptions],
+) -> Figure:
     """Draw an occupancy map from above: white for free, grey for unknown, and black for occupied cells.
 
     A map of three dimensions is also drawn from the side. Each view shows the most certain occupied cell along each
@@ -499,8 +505,12 @@ def occupancy(found: OccupancyMap, **look: Unpack[StyleOptions]) -> Figure:
     Parameters
     ----------
     found : OccupancyMap
+    trajectory : Trajectory, optional
+        Path of the platform in the frame of the map, drawn as a line with an arrow at the last pose.
+    mountings : mapping of str to (translation_m, rotation_xyzw), optional
+        Sensors on the platform, drawn as dots at the last pose.
     **look
-        As for `plot`.
+        Style of the figure, as for `plot`.
 
     Returns
     -------
@@ -512,7 +522,9 @@ def occupancy(found: OccupancyMap, **look: Unpack[StyleOptions]) -> Figure:
         An argument is invalid.
     """
     checks.instance("found", found, OccupancyMap, "Mapper.map returns")
-    return _map.draw(style_of(**look), found)
+    if trajectory is not None:
+        checks.instance("trajectory", trajectory, Trajectory, "read_trajectory returns")
+    return _map.draw(style_of(**look), found, trajectory, mountings or {})
 
 
 def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None = None) -> None:  # noqa: A002 - as savefig
@@ -535,9 +547,9 @@ def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None =
         checks.choice("format", format, _FORMATS)
     elif kind not in _FORMATS:
         raise ArgumentError(
-            "an open file names no format; give format"
+            "an open file has no name that states a format; set format"
             if hasattr(target, "write")
-            else f"{target} ends in none of .pdf, .png and .svg; give such a name, or format"
+            else f"{target} ends in none of .pdf, .png and .svg; use such a name, or set format"
         )
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
     with parameters({"pdf.fonttype": 42, "svg.hashsalt": "ertis"}):
@@ -562,8 +574,8 @@ def _canvas_with_directions(
     if not _has_direction(image):
         note = observable_angles(image.settings.array).note
         raise ArgumentError(
-            f"the array of sensor {image.stamp.sensor} {note}; draw a curve over range with 'ertis plot --kind image' "
-            "or ertis.plot"
+            f"the array of sensor {image.stamp.sensor} {note}; draw a curve over range with ertis.plot ('ertis plot "
+            "--kind image')"
         )
     return canvas
 

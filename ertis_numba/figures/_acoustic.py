@@ -223,4 +223,4 @@ def _place(found: AcousticMap, direction_deg: tuple[float, float] | None, power:
 
 def _require_directions(found: AcousticMap) -> None:
     if len(found.azimuth_rad) < 2:
-        raise ArgumentError("the acoustic map has one direction; draw its spectrum instead, or give more directions")
+        raise ArgumentError("the acoustic map has one direction; draw its spectrum instead, or use more directions")

@@ -149,9 +149,9 @@ def _lines(settings: Settings, frequencies_hz: Sequence[float] | None) -> list[C
         ends = [Cut(f"{_captions.khz(frequency_hz)} kHz", (frequency_hz,)) for frequency_hz in (low_hz, high_hz)]
         return [*ends, Cut(f"{band}, mean power", waves_hz)]
     if isinstance(frequencies_hz, int | float | str):
-        raise ArgumentError(f"frequencies_hz is {frequencies_hz!r}; give a list, of one as [40e3]")
+        raise ArgumentError(f"frequencies_hz is {frequencies_hz!r}; pass a list, such as [40e3]")
     if not 1 <= len(frequencies_hz) <= _MAX_LINES:
-        raise ArgumentError(f"frequencies_hz holds {len(frequencies_hz)} frequencies; give 1 to {_MAX_LINES}")
+        raise ArgumentError(f"frequencies_hz holds {len(frequencies_hz)} frequencies; use 1 to {_MAX_LINES}")
     return [
         Cut(f"{_captions.khz(checks.positive('frequencies_hz', frequency_hz))} kHz", (float(frequency_hz),))
         for frequency_hz in frequencies_hz

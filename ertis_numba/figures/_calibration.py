@@ -16,6 +16,7 @@ from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures.style import LINES, angle
 from ertis_numba.geometry import Layout, unit_vectors
 from ertis_numba.settings import Settings
+from ertis_numba.units import counted
 
 __all__ = ["draw"]
 
@@ -65,7 +66,7 @@ def draw(canvas: Canvas, made: Calibration, settings: Settings, *, azimuth_deg: 
     heading = Heading(
         ("Calibration", made.former.name),
         (
-            f"{len(made.source_m)} recordings, {len(made.channels)} microphones",
+            f"{counted(len(made.source_m), 'recording')}, {counted(len(made.channels), 'microphone')}",
             fit,
             found,
         ),

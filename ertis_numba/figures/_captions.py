@@ -11,6 +11,7 @@ from ertis_numba.frames import AcousticMap, Energyscape, Stamp
 from ertis_numba.geometry import microphones, observable_angles
 from ertis_numba.method_titles import METHOD_TITLES
 from ertis_numba.settings import Settings
+from ertis_numba.units import counted
 
 __all__ = [
     "Heading",
@@ -55,14 +56,15 @@ def of_image(image: Energyscape) -> Heading:
     parts = (processing.beamformer, "delay_and_sum"), (processing.weighting, "none")
     adaptive = "".join(f", {METHOD_TITLES[name]}" for name, usual in parts if name != usual)
     budget_db = settings.accuracy.max_error_db
+    taken = "measurement" if image.points is None else "pulse"  # A fused image has measurements of several sensors.
     return Heading(
-        ("Energyscape", image.stamp.sensor, f"measurement {image.stamp.sequence}", *_if_faint(image.amplitude)),
+        ("Energyscape", image.stamp.sensor, f"{taken} {image.stamp.sequence}", *_if_faint(image.amplitude)),
         (
             *_of_sensor(settings, image.stamp),
             directions,
             *((f"array {seen.note}",) if seen.note and image.points is None else ()),
             *level,
-            f"{span(image.range_m)} m in {len(image.range_m)} range{'s' if len(image.range_m) > 1 else ''}",
+            f"{span(image.range_m)} m in {counted(len(image.range_m), 'range')}",
             f"method {processing.method}{adaptive}",
             *((f"error up to {minus(f'{budget_db:g}')} dB",) if processing.method == "fast" else ()),
             f"{minus(f'{settings.air.temperature_c:g}')} °C",
@@ -155,14 +157,13 @@ def _of_sensor(settings: Settings, stamp: Stamp) -> tuple[str, str]:
 
 def highest_over(axes: str, *, hidden: bool) -> str:
     """Return the caption of a panel that shows maxima, and whether side lobes are ``hidden``."""
-    return f"strongest over {axes}" + (", side lobes hidden" if hidden else "")
+    return f"strongest over {axes}" + (", side lobes dimmed" if hidden else "")
 
 
 def number(value: float, digits: int = 3) -> str:
     """Return a number to so many digits, of large ones all before the point; never with an exponent."""
     before = math.floor(math.log10(abs(value))) + 1 if value else 1
-    text = f"{value:.{max(0, digits - before)}f}"
-    return text.rstrip("0").rstrip(".") if "." in text else text
+    return _shortened(f"{value:.{max(0, digits - before)}f}")
 
 
 def khz(frequency_hz: float) -> str:
@@ -171,10 +172,16 @@ def khz(frequency_hz: float) -> str:
 
 
 def span(values: NDArray[np.float64]) -> str:
-    """Return the first and the last of rising values, to so many digits that they differ, or the only one."""
+    """Return the first and the last of rising values, to so many decimals that they differ, or the only one."""
     first, last = float(values[0]), float(values[-1])
-    for digits in range(3, 10):
-        low, high = number(first, digits), number(last, digits)
+    fewest = 2 - math.floor(math.log10(abs(last))) if last else 2
+    for decimals in range(max(0, fewest), max(0, fewest) + 7):
+        low, high = (f"{value:.{decimals}f}" for value in (first, last))
         if low != high:
-            return f"{low}–{high}"
-    return low
+            return f"{_shortened(low)}–{_shortened(high)}"
+    return _shortened(low)
+
+
+def _shortened(text: str) -> str:
+    """Return a number without zeros at the end of its decimals."""
+    return text.rstrip("0").rstrip(".") if "." in text else text

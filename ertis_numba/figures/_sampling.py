@@ -24,7 +24,7 @@ _THIN = 0.005  # of the range, to either side: ranges within it would be too thi
 
 
 def centres(first: float, last: float, step: float) -> NDArray[np.float64]:
-    """Return the centres of steps of about a given size between two ends in any order: (step,) float64."""
+    """Divide an interval into steps of about a given size, and return their centres: (step,) float64."""
     count = max(1, round(abs(last - first) / step))
     return np.asarray(first + (np.arange(count) + 0.5) * (last - first) / count)
 
@@ -68,7 +68,7 @@ def polar_raster(
     Parameters
     ----------
     level_db : (azimuth, range) float32
-        For the azimuths of ``fan``.
+        Levels in dB for the azimuths of ``fan``.
     fan : Fan
     range_m : (range,) float64
         Rising.

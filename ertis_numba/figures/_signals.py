@@ -101,8 +101,8 @@ def _chosen(heard: MicrophoneTraces, microphone: int | None) -> MicrophoneTraces
     place = np.flatnonzero(heard.channels == checks.integer("microphone", microphone, 0))
     if not len(place):
         raise ArgumentError(
-            f"microphone {microphone} is none of the {len(heard.channels)} enabled ones; "
-            f"give one from {heard.channels[0]} to {heard.channels[-1]}"
+            f"microphone {microphone} is none of the {len(heard.channels)} enabled ones; use a number from "
+            f"{heard.channels[0]} to {heard.channels[-1]}"
         )
     return MicrophoneTraces(heard.values[place], heard.axis, heard.channels[place])
 

@@ -35,7 +35,7 @@ def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float |
     if image.is_planar and left_m is not None:
         raise ArgumentError(
             f"left_m is {left_m:g}, but a planar image has no upright plane; "
-            "leave it out, or give an image with elevations"
+            "leave it out, or choose an image with elevations"
         )
     level_db = canvas.level_db(image.amplitude)
     cuts = [_level(image, height_m)]
@@ -91,7 +91,7 @@ class _Cut:
         raster = volume_raster(joined_db, directions, range_m, points_m=points_m)
         if np.isnan(raster).all():
             raise ArgumentError(
-                f"{self.name} is {self.at_m:g}, where the image shows nothing; give a plane that crosses it"
+                f"{self.name} is {self.at_m:g}, where the image shows nothing; use a plane that crosses it"
             )
         return raster
 

@@ -185,7 +185,7 @@ def style_of(
         return style
     checks.choice("columns", columns, COLUMNS_MM)
     if style.width_pt is None:
-        raise ArgumentError(f"columns is {columns}, which theme {theme!r} has none of; give theme 'paper'")
+        raise ArgumentError(f"columns is {columns}, which theme {theme!r} does not have; use theme 'paper'")
     return replace(style, width_pt=COLUMNS_MM[columns] * _PT_PER_MM)
 
 

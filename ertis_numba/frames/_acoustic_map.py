@@ -147,7 +147,7 @@ class AcousticMap(DegreesFromRadians):
     def __post_init__(self) -> None:
         for name in ("power", "azimuth_rad", "elevation_rad", "band_hz"):
             checks.instance(name, getattr(self, name), np.ndarray, "numpy.asarray makes")
-        checks.instance("settings", self.settings, Settings, "a recording holds, or Settings.from_preset returns")
+        checks.instance("settings", self.settings, Settings, "a recording contains, or Settings.from_preset returns")
         checks.shape("elevation_rad", self.elevation_rad.shape, self.azimuth_rad.shape)
         checks.shape("band_hz", self.band_hz.shape, (len(self.band_hz), 2))
         checks.shape("power", self.power.shape, (*self.azimuth_rad.shape, len(self.band_hz)))
@@ -229,7 +229,7 @@ class AcousticMap(DegreesFromRadians):
         if not chosen.any():
             raise ArgumentError(
                 f"no band lies within {low_hz:g} to {high_hz:g} Hz; the map has bands from {self.band_hz.min():g} to "
-                f"{self.band_hz.max():g} Hz; give wider limits"
+                f"{self.band_hz.max():g} Hz; use wider limits"
             )
         return np.asarray(self.power[:, chosen].sum(axis=1), np.float32)
 

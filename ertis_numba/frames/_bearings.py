@@ -32,10 +32,14 @@ class Bearing(RadiansFromDegrees):
     snr_db : float
         Power of the source relative to the noise of a microphone in the band, in decibels.
     level_db : float, optional
-        Its sound pressure level at the array in dB re 20 µPa; None, the default, if the sensitivity of the microphones
-        is unknown.
+        Sound pressure level of the source at the array in dB re 20 µPa; None, the default, if the sensitivity of the
+        microphones is unknown.
     source_level_db : float, optional
-        Its source level in dB re 20 µPa at 1 m, as in `AcousticMap`; None, the default, if it is unknown.
+        Level of the source in dB re 20 µPa at 1 m, as in `AcousticMap`; None, the default, if it is unknown.
+    may_be_crosstalk : bool
+        A signal that is equal in all channels fits as well as this direction: electrical crosstalk cannot be told from
+        a source straight ahead of a flat array. No sound is equal in all channels of an array that is not flat. False
+        by default.
 
     Examples
     --------
@@ -56,6 +60,7 @@ class Bearing(RadiansFromDegrees):
     snr_db: float
     level_db: float | None = None
     source_level_db: float | None = None
+    may_be_crosstalk: bool = False
 
     @property
     def level(self) -> tuple[float, LevelUnit]:

@@ -77,7 +77,7 @@ class Energyscape(DegreesFromRadians):
     def __post_init__(self) -> None:
         for name in ("amplitude", "azimuth_rad", "elevation_rad", "range_m"):
             checks.instance(name, getattr(self, name), np.ndarray, "numpy.asarray makes")
-        checks.instance("settings", self.settings, Settings, "a recording holds, or Settings.from_preset returns")
+        checks.instance("settings", self.settings, Settings, "a recording contains, or Settings.from_preset returns")
         checks.shape("elevation_rad", self.elevation_rad.shape, self.azimuth_rad.shape)
         checks.shape("amplitude", self.amplitude.shape, (*self.azimuth_rad.shape, *self.range_m.shape))
 
@@ -275,7 +275,7 @@ def _limits(name: str, value: tuple[float, float]) -> tuple[float, float]:
     try:
         low, high = map(float, value)
     except (TypeError, ValueError) as error:
-        raise ArgumentError(f"{name} is {value!r}; give a pair of numbers (low, high)") from error
+        raise ArgumentError(f"{name} is {value!r}; use a pair of numbers (low, high)") from error
     if math.isnan(low) or math.isnan(high) or low > high:
-        raise ArgumentError(f"{name} runs from {low:g} to {high:g}; give two numbers, the smaller one first")
+        raise ArgumentError(f"{name} runs from {low:g} to {high:g}; use two numbers, the smaller one first")
     return low, high

@@ -46,7 +46,7 @@ class SequenceGap:
         first = checks.integer("first missing sequence number", self.first, 0)
         last = checks.integer("last missing sequence number", self.last, first, _MAX_NUMBER)
         if not self.reason or not self.reason.isprintable() or len(self.reason.encode()) > _MAX_REASON_BYTES:
-            raise ArgumentError(f"reason of a gap is {self.reason!r}; give a line of 1 to {_MAX_REASON_BYTES} bytes")
+            raise ArgumentError(f"reason of a gap is {self.reason!r}; use a line of 1 to {_MAX_REASON_BYTES} bytes")
         session_id = checks.integer("session_id", self.session_id, 0, _MAX_NUMBER)
         for name, value in (("first", first), ("last", last), ("session_id", session_id)):
             object.__setattr__(self, name, value)  # NumPy integers become int, which files and messages accept.

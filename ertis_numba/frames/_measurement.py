@@ -52,8 +52,8 @@ class Measurement:
     stamp: Stamp = Stamp()
 
     def __post_init__(self) -> None:
-        checks.instance("data", self.data, np.ndarray, "a recording holds, or numpy.asarray makes")
-        checks.instance("settings", self.settings, Settings, "a recording holds, or Settings.from_preset returns")
+        checks.instance("data", self.data, np.ndarray, "a recording contains, or numpy.asarray makes")
+        checks.instance("settings", self.settings, Settings, "a recording contains, or Settings.from_preset returns")
 
     def to_xarray(self) -> "xarray.DataArray":
         """Return the samples as an `xarray.DataArray`, with the names that recordings have.

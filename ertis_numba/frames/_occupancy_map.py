@@ -67,8 +67,8 @@ class OccupancyMap:
         log_odds = np.asarray(self.log_odds)
         if log_odds.ndim not in {2, 3} or not log_odds.size or log_odds.dtype.kind not in "fiu":
             raise ArgumentError(
-                f"log_odds has shape {log_odds.shape} and type {log_odds.dtype}; give numbers with rows and columns, "
-                "or with layers, rows and columns"
+                f"log_odds has shape {log_odds.shape} and type {log_odds.dtype}; pass numbers of shape (row, column) "
+                "or (layer, row, column)"
             )
         if log_odds.size > MAX_CELLS:
             raise ArgumentError(f"log_odds has {log_odds.size} cells; the limit is {MAX_CELLS}")
@@ -133,7 +133,7 @@ class OccupancyMap:
         place_m = np.asarray(position_m, np.float64)
         if not place_m.ndim or place_m.shape[-1] != self.n_dimensions:
             names = "x and y" if self.n_dimensions == 2 else "x, y and z"
-            raise ArgumentError(f"position_m has shape {place_m.shape}; give {names} along the last axis")
+            raise ArgumentError(f"position_m has shape {place_m.shape}; use {names} along the last axis")
         checks.finite_array("position_m", place_m)
         place = np.floor((place_m - np.array(self.origin_m)) / self.cell_m)[..., ::-1]
         is_inside = ((place >= 0) & (place < self.log_odds.shape)).all(axis=-1)

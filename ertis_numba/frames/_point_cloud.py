@@ -237,7 +237,8 @@ class PointCloud(DegreesFromRadians):
         if self.translation_m is None or self.rotation_xyzw is None:
             raise ArgumentError(
                 f"the mounting of sensor {self.stamp.sensor!r} is unknown, so its points have no place on a platform; "
-                "use position_m, which is in the sensor's frame, or give 'ertis capture' a --mounting"
+                "use position_m, which is in the sensor's frame, or add the mounting with 'ertis capture --mounting "
+                "FILE'"
             )
         axis, w = np.array(self.rotation_xyzw[:3]), self.rotation_xyzw[3]
         position_m = self.position_m.astype(np.float64)

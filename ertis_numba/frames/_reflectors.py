@@ -63,9 +63,16 @@ class Peak(RadiansFromDegrees):
     level_dbfs : float, default NaN
         Level in dB relative to a full-scale echo in every microphone; NaN if it is unknown.
     grid_error_deg : float, default NaN
-        Standard deviation of the direction that the grid causes, in degrees: 0 if the direction is interpolated. At the
-        edge of a grid, one or both angles are those of the grid, and it is the spacing divided by √12. It is infinite
-        for a single direction, and where the reflector may lie beyond the grid, and NaN if it is unknown.
+        Standard deviation of the direction that the grid causes, in degrees: 0 if the direction is interpolated.
+        Otherwise, it is the spacing divided by √12 at most. It is infinite for a single direction, and where the
+        reflector may lie beyond the grid, and NaN if it is unknown.
+    angle_sd_deg : float, default NaN
+        Standard deviation of the direction along its least certain axis in degrees, from noise, plan and grid.
+        Infinite where ``grid_error_deg`` is, and NaN if the noise is unknown, like the following ones.
+    range_sd_m : float, default NaN
+        Standard deviation of the range in metres.
+    level_sd_db : float, default NaN
+        Standard deviation of ``level_dbfs`` in dB.
 
     Examples
     --------
@@ -80,3 +87,6 @@ class Peak(RadiansFromDegrees):
     level_db: float
     level_dbfs: float = field(default=math.nan, compare=False)
     grid_error_deg: float = field(default=math.nan, compare=False)
+    angle_sd_deg: float = field(default=math.nan, compare=False)
+    range_sd_m: float = field(default=math.nan, compare=False)
+    level_sd_db: float = field(default=math.nan, compare=False)

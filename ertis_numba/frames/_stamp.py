@@ -78,7 +78,7 @@ def is_passive(settings: Settings, stamp: Stamp) -> bool:
     Parameters
     ----------
     settings : Settings
-        Their ``processing.mode`` decides.
+        Settings whose ``processing.mode`` decides if a measurement is passive.
     stamp : Stamp
         Stamp of the measurement; its ``behaviour`` decides in the mode ``auto``.
 

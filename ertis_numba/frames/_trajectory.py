@@ -10,6 +10,7 @@ from ertis_numba import checks
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames.platform_tilt import turned_axes
+from ertis_numba.units import counted
 
 __all__ = ["PoseAxes", "Trajectory"]
 
@@ -77,10 +78,10 @@ class Trajectory:
     def __post_init__(self) -> None:
         time_ns = _times("time_ns", self.time_ns)
         if not len(time_ns):
-            raise ArgumentError("time_ns has no time; give at least one pose")
+            raise ArgumentError("time_ns is empty; pass at least one pose")
         if time_ns.min() < -_MAX_TIME_NS or time_ns.max() > _MAX_TIME_NS:
             raise ArgumentError(
-                f"time_ns runs from {time_ns.min()} to {time_ns.max()}; give nanoseconds since 1970 within "
+                f"time_ns runs from {time_ns.min()} to {time_ns.max()}; use nanoseconds since 1970 within "
                 f"±{_MAX_TIME_NS}"
             )
         n_poses = len(time_ns)
@@ -89,7 +90,7 @@ class Trajectory:
             first = late[0]
             raise ArgumentError(
                 f"time_ns does not increase: {time_ns[first + 1]} at [{first + 1}] follows {time_ns[first]}; "
-                "sort the poses by time, and give one for each time"
+                "sort the poses by time, and keep one pose for each time"
             )
         rotation = _numbers("rotation_xyzw", self.rotation_xyzw, (n_poses, 4))
         with np.errstate(over="ignore"):
@@ -97,7 +98,7 @@ class Trajectory:
         wrong = np.flatnonzero(np.abs(norms - 1) > _MAX_NORM_ERROR)
         if wrong.size:
             raise ArgumentError(
-                f"rotation_xyzw has length {norms[wrong[0]]:g} at [{wrong[0]}]; give unit quaternions x, y, z, w"
+                f"rotation_xyzw has length {norms[wrong[0]]:g} at [{wrong[0]}]; pass unit quaternions x, y, z, w"
             )
         norms[np.abs(norms - 1) < _MAX_ROUNDING] = 1.0  # A copy has the same bits.
         covariance = self.covariance
@@ -110,7 +111,7 @@ class Trajectory:
         farthest_m = float(np.max(np.abs(position_m)))
         if farthest_m > _MAX_POSITION_M:
             raise ArgumentError(
-                f"position_m reaches {farthest_m:g} m; give metres within ±{_MAX_POSITION_M:g} m of the world's origin"
+                f"position_m reaches {farthest_m:g} m; use metres within ±{_MAX_POSITION_M:g} m of the world's origin"
             )
         rotation = rotation / norms[:, None]
         fields = {
@@ -294,13 +295,13 @@ class Trajectory:
             raise ArgumentError(
                 f"{outside} of {len(wanted)} times from {_seconds(wanted.min())} to {_seconds(wanted.max())} lie "
                 f"outside the trajectory, which covers {_seconds(first)} to {_seconds(last)}"
-                f"{self._exception}; give times within it, or correct the clock offset"
+                f"{self._exception}; use times within it, or correct the clock offset"
             )
 
     @property
     def _exception(self) -> str:
         n_gaps = int(np.count_nonzero(self._gaps()))
-        return f", except {n_gaps} interval{'s' * (n_gaps != 1)} longer than {self.max_gap_s:g} s" if n_gaps else ""
+        return f", except {counted(n_gaps, 'interval')} longer than {self.max_gap_s:g} s" if n_gaps else ""
 
     def _brackets(self, wanted: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
         """Return the index of the pose before each time, and the fraction of the way to the next one."""
@@ -328,10 +329,10 @@ def _times(name: str, values: ArrayLike) -> NDArray[np.int64]:
     try:
         times = np.array(values)
     except ValueError as error:
-        raise ArgumentError(f"{name} is not an array ({error}); give one dimension of whole nanoseconds") from error
+        raise ArgumentError(f"{name} is not an array ({error}); pass one dimension of whole nanoseconds") from error
     if times.ndim != 1 or (times.size and times.dtype.kind not in "iu"):
         raise ArgumentError(
-            f"{name} has shape {times.shape} and type {times.dtype}; give one dimension of whole nanoseconds"
+            f"{name} has shape {times.shape} and type {times.dtype}; pass one dimension of whole nanoseconds"
         )
     return times.astype(np.int64)
 
@@ -340,7 +341,7 @@ def _numbers(name: str, values: ArrayLike, wanted: tuple[int, ...]) -> NDArray[n
     try:
         numbers = np.array(values, np.float64)
     except (TypeError, ValueError) as error:
-        raise ArgumentError(f"{name} is not an array of numbers ({error}); give shape {wanted}") from error
+        raise ArgumentError(f"{name} is not an array of numbers ({error}); pass shape {wanted}") from error
     checks.shape(name, numbers.shape, wanted)
     checks.finite_array(name, numbers)
     return numbers
@@ -351,15 +352,15 @@ def _covariances(values: ArrayLike, n_poses: int) -> NDArray[np.float64]:
     covariance = _numbers("covariance", values, (n_poses, 6, 6))
     largest = float(np.max(np.abs(covariance)))
     if largest > _MAX_POSITION_M**2:
-        raise ArgumentError(f"covariance reaches {largest:g}; give square metres up to {_MAX_POSITION_M**2:g}")
+        raise ArgumentError(f"covariance reaches {largest:g}; pass square metres up to {_MAX_POSITION_M**2:g}")
     tolerance = _MAX_ASYMMETRY * np.max(np.abs(covariance), axis=(1, 2))
     uneven = np.max(np.abs(covariance - covariance.transpose(0, 2, 1)), axis=(1, 2)) > tolerance
     if uneven.any():
-        raise ArgumentError(f"covariance is not symmetric at [{np.argmax(uneven)}]; give covariances of pose errors")
+        raise ArgumentError(f"covariance is not symmetric at [{np.argmax(uneven)}]; use covariances of pose errors")
     negative = np.linalg.eigvalsh(covariance)[:, 0] < -tolerance
     if negative.any():
         raise ArgumentError(
-            f"covariance has a negative eigenvalue at [{np.argmax(negative)}]; give positive semidefinite matrices"
+            f"covariance has a negative eigenvalue at [{np.argmax(negative)}]; use positive semidefinite matrices"
         )
     return covariance
 

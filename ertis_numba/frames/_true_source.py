@@ -24,7 +24,7 @@ class TrueSource(RadiansFromDegrees):
     azimuth_deg, elevation_deg : float
         Direction of this position in the sensor frame, in degrees.
     range_m : float
-        Its distance from the sensor's origin, in metres.
+        Distance of the source from the sensor's origin, in metres.
     band_hz : (low, high)
         Lowest and highest frequency of the sound, in hertz.
     level_dbfs : float

@@ -85,7 +85,7 @@ class DirectSoundCheck:
     Parameters
     ----------
     mountings : mapping of str to (translation_m, rotation_xyzw)
-        As for `Fuser`.
+        Position and orientation of each sensor on the platform, by name.
 
     Raises
     ------
@@ -124,11 +124,11 @@ class DirectSoundCheck:
             The samples do not match the settings.
         """
         group = {}
-        for each in checks.items("measurements", measurements, Measurement, "a recording holds"):
+        for each in checks.items("measurements", measurements, Measurement, "a recording contains"):
             if each.stamp.sensor not in self._mountings:
                 raise ArgumentError(
-                    f"measurements has sensor {each.stamp.sensor!r}, but its mounting is unknown; give mountings for "
-                    f"it, or one of {', '.join(self._mountings)}"
+                    f"measurements has sensor {each.stamp.sensor!r}, whose mounting is unknown; add it to mountings, "
+                    f"or use sensors of {', '.join(self._mountings)}"
                 )
             group[each.stamp.sensor] = each
         for name, each in group.items():

@@ -283,8 +283,8 @@ class Fuser:
         names = ("pistons", "omnidirectional emitters")
         right, wrong = names if other_m else names[::-1]
         return (
-            f"the echoes are those of {right}, but {wrong} are assumed; set array.emitter_diameter_m, or "
-            f"--emitter-diameter, to {'their diameter' if other_m else '0'}"
+            f"the echoes are those of {right}, but {wrong} are assumed; set "
+            f"emitter_diameter_m to {'their diameter' if other_m else '0'}"
         )
 
     def has_tables(self, images: Iterable[Energyscape]) -> bool:
@@ -337,7 +337,7 @@ class Fuser:
             number = self._number(image.stamp.sensor, "images")
             image.settings.processing.require_sensor_frame("fusion needs directions of each sensor")
             if number in found:
-                raise ArgumentError(f"images has two of sensor {image.stamp.sensor!r}; give one image of each sensor")
+                raise ArgumentError(f"images has two of sensor {image.stamp.sensor!r}; use one image of each sensor")
             if not np.isfinite(image.amplitude).all():
                 raise DataError(
                     f"the image of sensor {image.stamp.sensor!r} contains NaN or infinity; leave it out, or check its "
@@ -345,7 +345,7 @@ class Fuser:
                 )
             found[number] = image
         if not found:
-            raise ArgumentError("images is empty; give the images of one SYNC pulse")
+            raise ArgumentError("images is empty; pass the images of one SYNC pulse")
         group = dict(sorted(found.items()))
         first, *others = group.values()
         for other in others:
@@ -354,7 +354,7 @@ class Fuser:
                 raise DataError(
                     f"images of sensors {first.stamp.sensor!r} and {other.stamp.sensor!r} are not from the same pulse: "
                     f"SYNC counts {first.stamp.sync_count} and {other.stamp.sync_count}, {apart_ns / 1e9:.3g} s apart; "
-                    "give images of equal count"
+                    "use images of equal count"
                 )
             if other.is_planar != first.is_planar:
                 raise ArgumentError(
@@ -369,7 +369,7 @@ class Fuser:
     def _number(self, sensor: str, name: str) -> int:
         if sensor not in self._numbers:
             raise ArgumentError(
-                f"{name} has sensor {sensor!r}, but its mounting is unknown; give mountings for it, or one of "
+                f"{name} has sensor {sensor!r}, whose mounting is unknown; add it to mountings, or use sensors of "
                 f"{', '.join(self._numbers)}"
             )
         return self._numbers[sensor]
@@ -380,7 +380,7 @@ class Fuser:
         step_m = max(_STEP_M[kind], spacing_m) if self._step_m is None else self._step_m
         if step_m < spacing_m:
             raise ArgumentError(
-                f"range_step_m is {step_m:g}, but ranges are {spacing_m:.3g} m apart; give at least that"
+                f"range_step_m is {step_m:g}, but ranges are {spacing_m:.3g} m apart; use at least this spacing"
             )
         # Of all sensors: one without an image now may reach farthest in a later group.
         farthest_m = max(float(np.linalg.norm(sensor.translation_m[:2])) for sensor in self._mountings)

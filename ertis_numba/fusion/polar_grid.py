@@ -63,7 +63,7 @@ class PolarGrid:
         if grid.n_cells > MAX_CELLS:
             raise ArgumentError(
                 f"the fused image would reach {last_m:.4g} m and have {grid.n_cells} cells, but the limit is "
-                f"{MAX_CELLS}; correct the mountings, shorten the ranges, or give a larger spacing_deg or range_step_m"
+                f"{MAX_CELLS}; correct the mountings, shorten the ranges, or use a larger spacing_deg or range_step_m"
             )
         return grid
 

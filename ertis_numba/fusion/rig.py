@@ -62,15 +62,15 @@ def mounted_sensors(mountings: Mountings) -> tuple[MountedSensor, ...]:
     """
     if not isinstance(mountings, Mapping):
         raise ArgumentError(
-            f"mountings is of type {type(mountings).__name__}; give a dictionary of (translation_m, rotation_xyzw) by "
-            "sensor"
+            f"mountings is of type {type(mountings).__name__}; pass a dictionary with (translation_m, rotation_xyzw) "
+            "for each sensor"
         )
     if not mountings:
-        raise ArgumentError("mountings is empty; give the mounting of each sensor on the platform")
+        raise ArgumentError("mountings is empty; pass the mounting of each sensor on the platform")
     sensors = []
     for name, given in mountings.items():
         if not isinstance(given, Sequence) or len(given) != 2:
-            raise ArgumentError(f"mounting of sensor {name!r} is {given!r:.80}; give (translation_m, rotation_xyzw)")
+            raise ArgumentError(f"mounting of sensor {name!r} is {given!r:.80}; pass (translation_m, rotation_xyzw)")
         place = mounting(name, *given)
         sensors.append(
             MountedSensor(name, place["translation_m"], Rotation.from_quat(place["rotation_xyzw"]).as_matrix())

@@ -52,7 +52,7 @@ class PulseReflectors(NamedTuple):
     floor : dict of int to EchoFloor
         Detection thresholds of each sensor, `HeardImage.floor`.
     without_echo : list of int
-        Sensors whose images have no echo above it.
+        Numbers of the sensors whose images have no echo above the floor.
     unheard : frozenset of int
         Emitters whose calls are not heard.
     apart : frozenset of int

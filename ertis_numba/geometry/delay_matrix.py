@@ -63,7 +63,7 @@ def delay_matrix(settings: Settings, *, n_directions: int) -> NDArray[np.float64
         hint = "; transpose it" if samples.shape == wanted[::-1] else ""
         raise ArgumentError(
             f"{name} has shape {samples.shape}, but the image has {wanted[0]} directions and the array {wanted[1]} "
-            f"channels; give shape {wanted}, a row for each direction{hint}"
+            f"channels; pass shape {wanted}, a row for each direction{hint}"
         )
     checks.finite_array(name, samples)
     in_layout = microphones(settings.array.replace(disabled=None)).enabled
@@ -111,14 +111,14 @@ def _read(name: str, path: Path) -> NDArray[np.float64]:
     """Return the numbers in a CSV or NPY file."""
     suffix = path.suffix.lower()
     if suffix not in {".csv", ".npy"}:
-        raise ArgumentError(f"{name} is not a .csv or .npy file; give one, or a list of rows")
+        raise ArgumentError(f"{name} is not a .csv or .npy file; use such a file, or a list of rows")
     try:
         if suffix == ".npy":
             loaded = np.asarray(npy_content(path))
         else:
             rows = csv_rows(name, path.read_text("utf-8-sig"))
             if len({len(row) for row in rows}) != 1:
-                raise ArgumentError(f"{name} has rows of different lengths; give a delay for each channel in each row")
+                raise ArgumentError(f"{name} has rows of different lengths; write a delay for each channel in each row")
             loaded = np.array(rows)
     except (OSError, ValueError) as error:
         if isinstance(error, ArgumentError):
@@ -126,5 +126,5 @@ def _read(name: str, path: Path) -> NDArray[np.float64]:
         reason = checks.reason_unreadable(error) if isinstance(error, OSError | UnicodeDecodeError) else error
         raise ArgumentError(f"{name} cannot be read ({reason}); save it again") from error
     if loaded.ndim != 2 or loaded.dtype.kind not in "iuf":
-        raise ArgumentError(f"{name} contains {loaded.dtype} of shape {loaded.shape}; give rows of real numbers")
+        raise ArgumentError(f"{name} contains {loaded.dtype} of shape {loaded.shape}; pass rows of real numbers")
     return np.asarray(loaded, dtype=np.float64)

@@ -67,10 +67,10 @@ def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
     if head not in {"2d", "3d"} or not colon:
         return None
     if not (count.isascii() and count.isdecimal()):
-        raise ArgumentError(f"directions {name[:80]!r} has no count; give a number after the colon, such as {head}:181")
+        raise ArgumentError(f"directions {name[:80]!r} has no count; use a number after the colon, such as {head}:181")
     if len(count.lstrip("0")) > len(str(MAX_DIRECTIONS)):  # Python does not convert several thousand digits
         raise ArgumentError(
-            f"directions {name[:80]!r} has a count of {len(count)} digits; give at most {MAX_DIRECTIONS}"
+            f"directions {name[:80]!r} has a count of {len(count)} digits; use at most {MAX_DIRECTIONS} directions"
         )
     return checks.integer(f"count of directions {name!r}", int(count), 1, MAX_DIRECTIONS)
 
@@ -175,19 +175,19 @@ def _equal_area_grid(
 def _csv_grid(path: str) -> Grid:
     if Path(path).suffix.lower() != ".csv":
         raise ArgumentError(
-            f"directions {path!r} is not a grid; give {', '.join(PAPER_GRIDS)}, 2d:N, 3d:N or a .csv file"
+            f"directions {path!r} is not a grid; use {', '.join(PAPER_GRIDS)}, 2d:N, 3d:N or a .csv file"
         )
     try:
         text = Path(path).read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = checks.reason_unreadable(error)
         raise ArgumentError(
-            f"directions {path}: {reason}; give a readable CSV of azimuth, elevation in degrees"
+            f"directions {path}: {reason}; choose a readable CSV of azimuth, elevation in degrees"
         ) from error
     rows = csv_rows(f"directions {path}", text)
     if not rows or any(len(row) != 2 for row in rows):
         raise ArgumentError(
-            f"directions {path} does not have two numbers in every row; give azimuth, elevation in degrees"
+            f"directions {path} does not have two numbers in every row; write azimuth, elevation in degrees"
         )
     angles_rad = np.radians(np.asarray(rows))
     checks.finite_array(f"directions {path}", angles_rad)

@@ -189,8 +189,8 @@ def parse_layout(path: str, text: str) -> ReadLayout:
     except SettingsError as error:
         if _HAS_SETTINGS.search(text):
             raise ArgumentError(
-                f"{source} is a file of settings; use it as such (--settings), or move the keys of its array to a file "
-                "of their own"
+                f"{source} is a file of settings; load it as settings (settings), or move the keys of its array to a "
+                "file of their own"
             ) from error
         raise
     rows, unit = file.rows(source)

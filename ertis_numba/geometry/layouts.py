@@ -334,11 +334,11 @@ def storable(settings: Settings) -> Settings:
     if grid_count(settings.processing.directions) is None:
         raise ArgumentError(
             f"processing.directions is the file {settings.processing.directions}, but a recording cannot contain "
-            "directions; name a grid, and give the file when processing"
+            "directions; use the name of a grid here, and the file when processing"
         )
     if isinstance(delays := settings.processing.delay_matrix, str):
         raise ArgumentError(
-            f"processing.delay_matrix is the file {delays}, but a recording cannot contain files; give the file when "
+            f"processing.delay_matrix is the file {delays}, but a recording cannot contain files; use the file when "
             "processing"
         )
     return self_contained(settings)

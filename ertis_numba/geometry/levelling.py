@@ -59,7 +59,7 @@ def levelled_grid(grid: Grid, attitude_xyzw: ArrayLike) -> tuple[Grid, NDArray[n
         given_xyzw = np.asarray(attitude_xyzw, np.float64)
     except (TypeError, ValueError) as error:
         raise ArgumentError(
-            f"attitude_xyzw is not made of numbers ({error}); give a unit quaternion x, y, z, w"
+            f"attitude_xyzw is not made of numbers ({error}); use a unit quaternion x, y, z, w"
         ) from error
     require_unit_quaternion("attitude_xyzw", given_xyzw)
     rotation = Rotation.from_quat(given_xyzw).as_matrix()

@@ -56,7 +56,7 @@ def mounting(
         }
     except (TypeError, ValueError) as error:
         raise ArgumentError(
-            f"mounting of sensor {sensor} is not made of numbers ({error}); give x, y, z in metres, and a unit "
+            f"mounting of sensor {sensor} is not made of numbers ({error}); use x, y, z in metres, and a unit "
             "quaternion x, y, z, w"
         ) from error
     name = f"translation_m of sensor {sensor}"
@@ -78,4 +78,4 @@ def require_unit_quaternion(name: str, rotation_xyzw: NDArray[np.float64]) -> No
     checks.finite_array(name, rotation_xyzw)
     length = float(np.linalg.norm(rotation_xyzw))
     if abs(length - 1) > _UNIT:
-        raise ArgumentError(f"{name} has length {length:g}; give a unit quaternion")
+        raise ArgumentError(f"{name} has length {length:g}; use a unit quaternion")

@@ -79,7 +79,7 @@ def read_position_file(path: str | Path, content: bytes) -> PositionTable:
     path : str or Path
         File with one of the endings in `ertis_numba.settings.LAYOUT_SUFFIXES`.
     content : bytes
-        Its content.
+        Content of the file.
 
     Raises
     ------

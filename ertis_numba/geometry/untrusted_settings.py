@@ -36,11 +36,11 @@ def received_settings(text: bytes | str, source: str, *, are_applied: bool = Fal
         try:
             text = text.decode()
         except UnicodeDecodeError as error:
-            raise SettingsError(f"{source}: not text ({error}); give TOML in UTF-8") from error
+            raise SettingsError(f"{source}: not text ({error}); write TOML in UTF-8") from error
     settings = Settings.from_toml(text, source, find_line=False)
     layout, directions = settings.array.layout, settings.processing.directions
     if not layout.isprintable() or not str(directions).isprintable():
-        raise SettingsError(f"{source}: a name has characters that cannot be printed; give printable characters")
+        raise SettingsError(f"{source}: a name has characters that cannot be printed; use printable characters")
     if settings.array.positions_m is None and layout not in layout_names():
         raise SettingsError(
             f"{source}: array.layout is {layout[:80]!r}, the name of a file; send its positions instead, or name one "

@@ -54,8 +54,8 @@ def array_weights(settings: Settings) -> NDArray[np.float64]:
     mean = float(weights.mean())
     if not mean > 0:
         raise ArgumentError(
-            f"processing.array_weights is 0 for all {len(weights)} enabled microphones; give one of them a weight "
-            "above 0"
+            f"processing.array_weights is 0 for all {len(weights)} enabled microphones; use a weight above 0 for at "
+            "least one of them"
         )
     return np.asarray(weights / mean)
 

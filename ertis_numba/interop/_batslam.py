@@ -140,14 +140,14 @@ def _require_equal(ears: VirtualEars, sensor: str, measurement: Measurement) -> 
     if measurement.stamp.sensor != sensor:
         raise ArgumentError(
             f"sensors {sensor} and {measurement.stamp.sensor} are given, but format 'batslam' holds one; choose one "
-            "(sensor, --sensor)"
+            "(sensor)"
         )
     first, other = ears.settings, measurement.settings
     for name in ("array", "recording", "call"):
         if getattr(first, name) != getattr(other, name):
             raise ArgumentError(
                 f"measurement {measurement.stamp.sequence} has another {name} than the first; choose measurements with "
-                "equal settings (--measurement)"
+                "equal settings (measurement)"
             )
 
 
@@ -155,7 +155,7 @@ def _require_size(count: int, n_samples: int) -> None:
     if count * n_samples * np.dtype(np.int16).itemsize > _MAX_BYTES:
         raise ArgumentError(
             f"{count} measurements of {n_samples} samples exceed the 2 GiB of a variable in MATLAB v7; choose fewer "
-            "(--measurement), or shorten processing.range_m"
+            "(measurement), or shorten processing.range_m"
         )
 
 
@@ -163,7 +163,7 @@ def _require_order(time_ns: NDArray[np.int64]) -> None:
     late = np.flatnonzero(np.diff(time_ns) <= 0)
     if late.size:
         raise ArgumentError(
-            f"measurement [{late[0] + 1}] is not later than the one before, so times are unknown or out of order; give "
+            f"measurement [{late[0] + 1}] is not later than the one before, so times are unknown or out of order; use "
             "a recording whose timestamps increase"
         )
 

@@ -50,5 +50,5 @@ class Drive:
         for name in ("poses", "odometry"):
             given = getattr(self, name)
             if not isinstance(given, Trajectory):
-                raise ArgumentError(f"{name} is of type {type(given).__name__}; give a Trajectory of the platform")
+                raise ArgumentError(f"{name} is of type {type(given).__name__}; pass a Trajectory of the platform")
         checks.between("beam_azimuth_deg", self.beam_azimuth_deg, -90.0, 90.0)

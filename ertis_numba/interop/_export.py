@@ -107,7 +107,7 @@ def output_files(path: str | Path, name: str) -> tuple[Path, ...]:
         return (Path(path),)
     files = Path(path), Path(path).with_suffix(".xml")
     if files[0] == files[1]:
-        raise ArgumentError(f"{path} is also the name of the array's file; give a name that ends in .h5")
+        raise ArgumentError(f"{path} is also the name of the array's file; choose a name that ends in .h5")
     return files
 
 
@@ -180,7 +180,7 @@ def export(
     points.csv
     """
     if not isinstance(items, Iterable):
-        raise ArgumentError(f"items is of type {type(items).__name__}; give a list of Energyscape")
+        raise ArgumentError(f"items is of type {type(items).__name__}; pass a list of Energyscape")
     name = choose_format(path, file_format)
     finding = {"top": top, "min_level_db": min_level_db}
     _require_options(name, {"mounting": mounting, "topics": topics, "text": text or None, **finding, "drive": drive})
@@ -229,7 +229,8 @@ def _write_signals(path: Path, geometry: Path, items: Iterable[Exported]) -> Non
     if len(several) != 1 or not isinstance(several[0], Measurement):
         came = f"{'no' if not several else 'more than one'} measurement" if len(several) != 1 else "an energyscape"
         raise ArgumentError(
-            f"format 'acoular' contains signals of one measurement, but {came} was given; give one (--measurement)"
+            f"format 'acoular' contains signals of one measurement, but {came} was passed; choose one measurement "
+            "(measurement)"
         )
     write_acoular(path, geometry, several[0])
 
@@ -238,7 +239,7 @@ def _write_drive(path: Path, items: Iterable[Any], mountings: Mountings, drive: 
     from ertis_numba.interop._batslam import write_batslam  # noqa: PLC0415
 
     if drive is None:
-        raise ArgumentError("format 'batslam' needs poses and odometry; give drive=Drive(poses=…, odometry=…)")
+        raise ArgumentError("format 'batslam' needs poses and odometry; pass drive=Drive(poses=…, odometry=…)")
     write_batslam(path, items, drive, mountings)
 
 
@@ -307,4 +308,4 @@ def _results(items: Iterable[Exported]) -> Iterator[Energyscape | Beams | Microp
             )
         yield item
     if not count:
-        raise ArgumentError("no energyscape is given; give at least one")
+        raise ArgumentError("no energyscape is passed; pass at least one")

@@ -81,7 +81,7 @@ def _write_samples(file: IO[bytes], results: Iterable[Result], first: Result, co
         file.write(np.ascontiguousarray(getattr(result, name), dtype=kind).data.cast("B"))
         stamps.append(result.stamp)
     if len(stamps) != count:
-        raise ArgumentError(f"{len(stamps)} results were given, but count is {count}; give as many")
+        raise ArgumentError(f"{len(stamps)} results were passed, but count is {count}; pass as many results")
     return stamps
 
 
@@ -89,21 +89,21 @@ def _require_same(result: Result, first: Result) -> None:
     """Refuse a result whose type, axes or settings differ from the first."""
     if type(result) is not type(first):
         raise ArgumentError(
-            f"{type(first).__name__} and {type(result).__name__} cannot share one npz; give results of one stage"
+            f"{type(first).__name__} and {type(result).__name__} cannot share one npz; pass results of one stage"
         )
     if result.stamp.sensor != first.stamp.sensor:
         raise ArgumentError(
             f"sensors {first.stamp.sensor} and {result.stamp.sensor} cannot share the axes of one npz; choose one "
-            "(sensor, --sensor)"
+            "(sensor)"
         )
     for name in _content(first)[1]:
         if not np.array_equal(getattr(result, name), getattr(first, name)):
             raise ArgumentError(
                 f"measurement {result.stamp.sequence} has another {name} than the first, for example because of other "
-                "air; export it to its own npz (--measurement)"
+                "air; export it to its own npz (measurement)"
             )
     if result.settings is not first.settings and result.settings != first.settings:
         raise ArgumentError(
             f"measurement {result.stamp.sequence} has other settings than the first; export it to its own npz "
-            "(--measurement)"
+            "(measurement)"
         )

@@ -73,8 +73,8 @@ class PointTable:
             if len(frames) > 1:
                 raise ArgumentError(
                     f"the mountings of sensors {', '.join(numbers)} on their platform are unknown, but all "
-                    "points need one frame; choose one (sensor, --sensor), or pass their mountings (mountings, "
-                    "--mounting)"
+                    "points need one frame; choose one sensor (sensor), or add their mountings "
+                    "(mountings)"
                 )
         frame = PLATFORM if numbers.keys() & mountings.keys() else next(iter(numbers), PLATFORM)
         return cls(np.concatenate(parts), tuple(numbers), frame)

@@ -130,15 +130,13 @@ def _topic(kinds: dict[str, str], wanted: str | None, edge: str, edges: Callable
     if wanted is None and len(poses) == 1:
         return poses[0]
     if wanted is None and poses:
-        raise ArgumentError(f"topics with poses: {listed}; choose one of them (topic, --topic)")
+        raise ArgumentError(f"topics with poses: {listed}; choose one of them (topic)")
     transforms = [topic for topic, kind in kinds.items() if kind == _TRANSFORMS]
     if wanted is None or (wanted in transforms and not edge):
         moving = [topic for topic in transforms if not topic.endswith("_static")]
         choices = [f"{topic}:{each}" for topic in moving for each in edges(topic)]
         if choices:
-            raise ArgumentError(
-                f"topics with poses: {listed}; choose a transform (topic, --topic): {', '.join(choices)}"
-            )
+            raise ArgumentError(f"topics with poses: {listed}; choose a transform (topic): {', '.join(choices)}")
         raise ArgumentError(f"topics with poses: {listed}; record a topic of type {', '.join(_POSES)}")
     if wanted not in kinds:
         raise ArgumentError(
@@ -196,7 +194,7 @@ def _pose(log_ns: int, message: Any) -> _StampedPose:
 
 def _rows(poses: list[_StampedPose]) -> PoseRows:
     if not poses:
-        raise DataError("the topic contains no poses; choose another topic (topic, --topic)")
+        raise DataError("the topic contains no poses; choose another topic (topic)")
     frames = sorted({(pose.header.frame_id, pose.child) for pose in poses})
     if len(frames) > 1:
         named = ", ".join(f"{child or 'a platform'} in {frame!r}" for frame, child in frames)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import PoseAxes, Trajectory
 from ertis_numba.frames.pose_doubts import pose_doubts
+from ertis_numba.units import counted
 
 __all__ = ["PoseRows", "trajectory_of"]
 
@@ -60,7 +61,7 @@ class PoseRows:
 
     def count(self, n_rows: int) -> str:
         """Return a number of rows in messages, such as "3 lines"."""
-        return f"{n_rows} {self.kind}{'s' * (n_rows != 1)}"
+        return f"{counted(n_rows, self.kind)}"
 
     def kept(self, is_kept: NDArray[np.bool_], note: str) -> "PoseRows":
         """Return some rows, and a note on the others."""
@@ -113,7 +114,7 @@ def _gap_note(rows: PoseRows) -> str | None:
         return None
     worst = gaps[np.argmax(steps_s[gaps])]
     return (
-        f"{len(gaps)} gap{'s' * (len(gaps) != 1)} of more than {_LONG_S:g} s between poses, bridged by interpolation; "
+        f"{counted(len(gaps), 'gap')} of more than {_LONG_S:g} s between poses, bridged by interpolation; "
         f"the longest lasts {steps_s[worst]:.3g} s after {rows.name(worst)}"
     )
 

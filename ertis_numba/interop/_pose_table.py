@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ertis_numba.errors import DataError
 from ertis_numba.interop._pose_rows import PoseRows
 from ertis_numba.interop._pose_times import times_of
+from ertis_numba.units import counted
 
 __all__ = ["TUM", "read_table"]
 
@@ -106,8 +107,8 @@ def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: s
         return _kitti(rows, time_unit, times)
     if times is not None:
         raise DataError(
-            f"times (--times) is for poses of KITTI, with {_N_KITTI} fields in a row, but the rows have {n_fields}; "
-            "remove the option"
+            f"a file of times is for poses of KITTI, with {_N_KITTI} fields in a row, but the rows have {n_fields}; "
+            "remove it (times)"
         )
     if columns is None:
         columns = _without_header(rows[0], text)
@@ -118,8 +119,7 @@ def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: s
             raise DataError(f"line {number} has {len(row)} fields; write {wanted}")
     if time_unit is not None and columns.unit is not None and time_unit != columns.unit:
         raise DataError(
-            f"the file states that its times are in {columns.unit}, but time_unit is {time_unit}; remove time_unit "
-            "(--time-unit)"
+            f"the file states that its times are in {columns.unit}, but time_unit is {time_unit}; remove time_unit"
         )
     rows, unknown = _with_times(rows, columns.time)
     time_ns, notes = times_of([(number, row[columns.time]) for number, row in rows], columns.unit or time_unit)
@@ -138,9 +138,9 @@ def _with_times(rows: list[Row], place: int) -> tuple[list[Row], tuple[str, ...]
     numbers = {number for number, _ in kept}
     first = next(number for number, _ in rows if number not in numbers)
     n_left = len(rows) - len(kept)
-    note = f"{n_left} line{'s' * (n_left != 1)} of {len(rows)} without a time (NaN) left out, the first is line {first}"
+    note = f"{counted(n_left, 'line')} of {len(rows)} without a time (NaN) left out, the first is line {first}"
     if not kept:
-        raise DataError(f"there are no poses; {note}; give at least one")
+        raise DataError(f"there are no poses; {note}; write at least one pose")
     return kept, (note,)
 
 
@@ -218,8 +218,8 @@ def _columns(names: Sequence[str], *, is_stated: bool) -> _Columns:
     unread = [each for each in unread if not is_known[_PLACES.match(each) is not None]]
     if unread and is_stated and axes:
         raise DataError(
-            f"the first line names the columns {', '.join(names)}, of which {', '.join(unread)} would not be read; "
-            f"give {_COLUMNS}, and remove or rename other columns"
+            f"the first line names the columns {', '.join(names)}, but {', '.join(unread)} are unknown; use "
+            f"{_COLUMNS}, and remove or rename other columns"
         )
     if repeated and is_stated:
         raise DataError(
@@ -263,7 +263,7 @@ def _without_header(first: Row, text: str) -> _Columns:
     if len(cells) == 1:
         raise DataError(
             f"line {number} has one number, as in the times of KITTI; choose the file of the poses, and add this file "
-            "with --times (times in Python)"
+            "as that of the times (times)"
         )
     if len(cells) > len(TUM):
         raise DataError(
@@ -284,8 +284,7 @@ def _kitti(rows: list[Row], time_unit: str | None, times: str | None) -> PoseRow
 
     if times is None:
         raise DataError(
-            "the rows have 12 fields, as poses of KITTI do, but no times; add the file of their times with --times "
-            "times.txt (times in Python)"
+            "the rows have 12 fields, as poses of KITTI do, but no times; add the file of their times (times)"
         )
     cells = [(number, cells[0]) for number, cells in _lines(times)]
     if len(cells) != len(rows):

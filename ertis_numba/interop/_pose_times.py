@@ -20,7 +20,7 @@ _NAMES: Final = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns
 _FIRST_S: Final = 10**8  # Year 1973: times before it count from a start. The ranges of units do not overlap.
 _MAX_NS: Final = 2**62  # As for Trajectory.
 _LONG_S: Final = 10.0  # Interval between poses that is doubtful.
-_OTHER_UNIT: Final = "if they have another unit, choose it (time_unit, --time-unit)"
+_OTHER_UNIT: Final = "if they have another unit, choose it (time_unit)"
 _DATE: Final = re.compile(
     r"(?P<day>\d{4}-\d\d-\d\d)[T ](?P<time>\d\d:\d\d:\d\d)(?:[.,](?P<rest>\d+))?\s*(?P<zone>[Zz]|[+-]\d\d:?\d\d)?"
 )
@@ -53,7 +53,7 @@ def times_of(cells: Sequence[tuple[int, str]], unit: str | None) -> tuple[NDArra
         if abs(time_ns) > _MAX_NS:
             raise DataError(
                 f"line {line}: time {text} in {_NAMES[unit]} is beyond the year 2116; correct the time, or choose its "
-                "unit (time_unit, --time-unit)"
+                "unit (time_unit)"
             )
         times_ns.append(time_ns)
     return np.array(times_ns, np.int64), notes
@@ -71,7 +71,7 @@ def _times_of_dates(
             zone = date["zone"] if date["zone"] and date["zone"] not in "Zz" else "+00:00"
             whole = datetime.fromisoformat(f"{date['day']}T{date['time']}{zone}")
         except ValueError:
-            raise DataError(f"line {line}: {text!r} is no date; give dates as in 2023-11-14T22:13:20.5Z") from None
+            raise DataError(f"line {line}: {text!r} is no date; use dates as in 2023-11-14T22:13:20.5Z") from None
         times_ns.append(round(whole.timestamp()) * 10**9 + int((date["rest"] or "0").ljust(9, "0")[:9]))
     n_local = sum(not date["zone"] for date in dates if date is not None)
     note = f"dates without a time zone read as UTC; the first is {cells[0][1].strip()}; add a zone, as in +02:00, or Z"
@@ -105,7 +105,7 @@ def _unit_of(times: Sequence[Decimal]) -> tuple[str, tuple[str, ...]]:
             return unit, (note if step_s <= _LONG_S else f"{note}; rows are {step_s:f} s apart; {_OTHER_UNIT}",)
     raise DataError(
         f"times such as {usual:g} are no dates from 1973 to 2116 in any unit; correct them, or choose their unit "
-        f"(time_unit, --time-unit): {', '.join(TIME_UNITS)}"
+        f"(time_unit): {', '.join(TIME_UNITS)}"
     )
 
 

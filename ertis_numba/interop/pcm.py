@@ -158,15 +158,15 @@ def _require_different(paths: Sequence[Path]) -> None:
 
 def _require_emissions(skip_s: float, *, passive: bool) -> None:
     """Refuse options that contradict a loopback channel."""
-    for name, is_used in (("--skip", skip_s), ("--passive", passive)):
+    for name, is_used in (("skip_s", skip_s), ("passive=True", passive)):
         if is_used:
-            raise ArgumentError(f"{name} and --sync-channel cannot be combined; remove one of them")
+            raise ArgumentError(f"{name} and sync_channel cannot be combined; remove one of them")
 
 
 def _require_settings(settings: Settings | None, first: PcmFile) -> Settings:
     known = settings or first.settings
     if known is None:
-        raise ArgumentError(f"{first.path} contains no array and no call; pass settings (--settings)")
+        raise ArgumentError(f"{first.path} contains no array and no call; add them (settings)")
     return known
 
 
@@ -177,8 +177,8 @@ def _require_channels(files: Sequence[PcmFile], settings: Settings, sync_channel
         checks.integer("sync_channel", sync_channel, 0, first.n_channels - 1)
         if first.n_channels != wanted + 1:
             raise DataError(
-                f"{first.path} has {first.n_channels} channels, but array {layout.name!r} and --sync-channel need "
-                f"{wanted} + 1; use a layout (--layout) with one row for each channel except that of --sync-channel"
+                f"{first.path} has {first.n_channels} channels, but array {layout.name!r} and sync_channel need "
+                f"{wanted} + 1; use a layout (layout) with one row for each channel except that of sync_channel"
             )
         return
     if first.n_channels == wanted:
@@ -188,12 +188,12 @@ def _require_channels(files: Sequence[PcmFile], settings: Settings, sync_channel
     text = f"{first.path} has {first.n_channels} channels, but array {layout.name!r} has {wanted}"
     if len(files) > 1 and sum(file.n_channels for file in files) == wanted:
         raise DataError(
-            f"{text}, the total of all {len(files)} files; use --join (join=True) if the files are the microphones of "
+            f"{text}, the total of all {len(files)} files; use join=True if the files are the microphones of "
             "one measurement"
         )
     if settings.array.positions_m is not None:
         raise DataError(f"{text}; write one row for each of {first.n_channels} channels in array.positions_m")
-    raise DataError(f"{text}; use a layout with one row for each channel (--layout, or array.layout in the settings)")
+    raise DataError(f"{text}; use a layout with one row for each channel (layout)")
 
 
 def _fitted(
@@ -207,13 +207,13 @@ def _fitted(
         raise DataError(
             f"{first.path} has a sample rate of {recording.sample_rate_hz:g} Hz, too low for a call up to "
             f"{call.high_frequency_hz:g} Hz; set the emitted call as [call], record at a higher rate, use "
-            "--time-expansion (time_expansion) if the file plays slower than the sound, or --passive (passive=True) "
+            "time_expansion if the file plays slower than the sound, or passive=True "
             "if no call was emitted"
         )
     if recording.duration_s <= call.end_s:
         raise DataError(
             f"a measurement of {first.path} has {1e3 * recording.duration_s:.4g} ms, but the call alone lasts "
-            f"{1e3 * call.end_s:.4g} ms; use a longer --length, or skip less (--skip)"
+            f"{1e3 * call.end_s:.4g} ms; use a longer length_s, or a shorter skip_s"
         )
     held_m = record_range_m(recording, call, sound_speed_m_s(settings.air))
     stated_m = settings.processing.range_m

@@ -14,6 +14,7 @@ from ertis_numba.errors import DataError
 from ertis_numba.interop.pcm_files import PcmFile, per_file
 from ertis_numba.interop.sync_channel import find_emissions, louder_and_earlier
 from ertis_numba.settings import Call
+from ertis_numba.units import counted
 
 __all__ = ["Cuts", "cut_at_emissions", "cut_regularly"]
 
@@ -69,16 +70,14 @@ def cut_regularly(files: Sequence[PcmFile], *, skip_s: float, length_s: float | 
         period = _checked_length_s(length_s) * rate_hz
     n_samples = math.floor(period * (1 + 1e-12))
     if length_s is not None and n_samples < 1:
-        raise DataError(
-            f"--length is {length_s:g} s, less than a sample at {rate_hz:g} Hz; use a longer --length (length_s)"
-        )
+        raise DataError(f"length_s is {length_s:g}, less than a sample at {rate_hz:g} Hz; use a longer length_s")
     counts = [1 if length_s is None else _count(file.n_samples - skipped, period, n_samples) for file in files]
     for file, count in zip(files, counts, strict=True):
         if count < 1 or n_samples < 1:
             raise DataError(
                 f"{file.path} lasts {file.duration_s:.4g} s, but {skipped / rate_hz:.4g} s to skip and a measurement "
-                f"of {max(n_samples, 1) / rate_hz:.4g} s are needed; skip less (--skip)"
-                + (" or use a shorter --length" if length_s is not None else "")
+                f"of {max(n_samples, 1) / rate_hz:.4g} s are needed; use a shorter skip_s"
+                + (" or length_s" if length_s is not None else "")
             )
     several = [period * np.arange(count, dtype=np.float64) for count in counts]
     return Cuts(
@@ -120,7 +119,7 @@ def cut_at_emissions(
         if wanted > n_samples:
             raise DataError(
                 f"{files[0].path}: an emission is followed by the next one or by the end after "
-                f"{n_samples / rate_hz:.6g} s, but --length is {length_s:g} s; use a shorter --length (length_s)"
+                f"{n_samples / rate_hz:.6g} s, but length_s is {length_s:g}; use a shorter length_s"
             )
         n_samples = wanted
     kept = [starts[starts + n_samples <= file.n_samples] for file, starts in zip(files, several, strict=True)]
@@ -128,7 +127,7 @@ def cut_at_emissions(
     rounding = max(float(np.abs(exact - starts).max()) for exact, starts in zip(times, kept, strict=True))
     cuts = Cuts(n_samples, kept, [exact / rate_hz for exact in times], ())
     summary = (
-        f"{len(cuts)} emission{'s' * (len(cuts) > 1)} found in channel {channel}, which is not imported"
+        f"{counted(len(cuts), 'emission')} found in channel {channel}, which is not imported"
         f"{_intervals(cuts.times_s)}; rounding to samples changes ranges by up to "
         f"{1e3 * rounding / rate_hz * sound_speed_m_s / 2:.2g} mm"
     )
@@ -162,10 +161,7 @@ def _assumption(skip_s: float, length_s: float | None) -> str:
     text = f"{skip_s:g} s after the start of each file" if skip_s else "at the first sample of each file"
     if length_s is not None:
         text += f", and then every {length_s:g} s"
-    return (
-        f"the emission (range 0) is assumed {text}; use --skip or --sync-channel (skip_s, sync_channel) if this is "
-        "wrong"
-    )
+    return f"the emission (range 0) is assumed {text}; use skip_s or sync_channel if this is wrong"
 
 
 def _shortest(files: Sequence[PcmFile], several: Sequence[NDArray[np.int64]]) -> int:

@@ -236,7 +236,7 @@ def require_alike(files: Sequence[PcmFile], *, joined: bool = False) -> None:
         ):
             if came != wanted:
                 if name == "Hz" and _is_multiple(file.rate_hz, first.rate_hz) and not joined:
-                    remedy += ", or use --time-expansion (time_expansion) if all play slower by one factor"
+                    remedy += ", or use time_expansion if all play slower by one factor"
                 raise DataError(
                     f"{file.path} has {_format_value(came)} {name}, but {first.path.name} has "
                     f"{_format_value(wanted)}; {remedy}"

@@ -104,7 +104,7 @@ class PcmReader:
         text = f"{self.rest_s:.4g} s at the ends of files were left out"
         if len(self) == len(self._files) and self.rest_s > shortest.duration_s / 2:
             text += (
-                f", because {shortest.path.name} lasts only {shortest.duration_s:.4g} s; use --length (length_s) for "
+                f", because {shortest.path.name} lasts only {shortest.duration_s:.4g} s; use length_s for "
                 "several measurements per file"
             )
         return [text]

@@ -58,17 +58,19 @@ class RawReader:
         self._format = sample_format(settings)
         counts = [self._count(path) for path in paths]
         if not counts:
-            raise ArgumentError("no raw file is given; give at least one")
+            raise ArgumentError("no raw file is passed; pass at least one")
         ends = np.cumsum(counts).tolist()
         starts = [0, *ends[:-1]] if first is None else list(first)
         for path, count, start, following in zip(paths, counts, starts, starts[1:], strict=False):
             if start + count > following:
                 raise DataError(
-                    f"{path} contains {count} measurements, but the next file is number {following}; give the "
-                    "files themselves in their order"
+                    f"{path} contains {count} measurements, but the next file is number {following}; list the files "
+                    "themselves in their order"
                 )
         if starts[-1] + counts[-1] > _END:
-            raise DataError(f"{paths[-1]} is number {starts[-1]}, above the limit of recordings; give it a smaller one")
+            raise DataError(
+                f"{paths[-1]} is number {starts[-1]}, above the limit of recordings; rename it with a smaller number"
+            )
         self._files = list(zip(paths, counts, starts, strict=True))
         self._silent: list[int] = []
 
@@ -109,9 +111,7 @@ class RawReader:
             raise DataError(f"{path}: {error.strerror}; choose a file of raw words") from error
         found = problem_of(path) if self._check_kind else ""
         if found:
-            raise DataError(
-                f"{path} {found}; if the file contains raw words nevertheless, use --raw (check_kind=False)"
-            )
+            raise DataError(f"{path} {found}; if the file contains raw words nevertheless, use check_kind=False")
         count, rest = divmod(n_bytes, self._format.n_bytes)
         if count and not rest:
             return count
@@ -126,7 +126,9 @@ class RawReader:
         return f"{self._format.n_bytes // self._format.dtype.itemsize} words of {self._format.dtype.itemsize} bytes"
 
 
-_LENGTH_REMEDY = "copy it again if it is cut short, or give the number of words of a measurement (recording.n_samples)"
+_LENGTH_REMEDY = (
+    "copy it again if it is cut short, or correct the number of words of a measurement (recording.n_samples)"
+)
 
 
 def _remedy(n_bytes: int, words: SampleFormat) -> str:

@@ -21,7 +21,7 @@ from ertis_numba.interop.recorder_names import (
 __all__ = ["file_times"]
 
 _NEGLIGIBLE_S: Final = 1e-3
-_UNKNOWN: Final = "use --start for the first file, or once for each file (start_ns)"
+_UNKNOWN: Final = "set start_ns for the first file, or for each file"
 
 
 def file_times(
@@ -47,8 +47,8 @@ def file_times(
     """
     if len(starts_ns) not in {0, 1, len(files)}:
         raise ArgumentError(
-            f"--start (start_ns) is used {len(starts_ns)} times for {len(files)} files; use it once for the first "
-            "file, or once for each file"
+            f"start_ns has {len(starts_ns)} times for {len(files)} files; set the time of the first file, or that of "
+            "each file"
         )
     if len(starts_ns) == len(files) and files:
         _require_order(files, starts_ns)
@@ -64,8 +64,8 @@ def file_times(
         without = files[best.index(None)].path
         with_time = next(file.path for file, time in zip(files, best, strict=True) if time)
         raise DataError(
-            f"{without} contains no time in its metadata or name, but {with_time.name} does; use --start once for each "
-            "file (start_ns), or import the files without times separately"
+            f"{without} contains no time in its metadata or name, but {with_time.name} does; set start_ns for each "
+            "file, or import the files without times separately"
         )
     times_ns = [time.since_1970_ns for time in known]
     if min(times_ns) < 0:
@@ -94,8 +94,8 @@ def _unknown(files: Sequence[PcmFile], starts_ns: Sequence[int]) -> list[str]:
     if len(files) == 1:
         first = f"{files[0].path.name} contains no time{unread and ' in a known order'}, so its time is unknown"
         return [f"{first}; {_UNKNOWN.partition(',')[0]}"]
-    relative = ", beginning at --start" if starts_ns else ""
-    remedy = "use --start once for each file" if starts_ns else _UNKNOWN
+    relative = ", beginning at start_ns" if starts_ns else ""
+    remedy = "set start_ns for each file" if starts_ns else _UNKNOWN
     missing = f"neither metadata nor names contain times{unread}"
     assumption = f"{missing}, so the files are assumed to follow each other without pauses"
     return [f"{assumption}{relative}; {remedy}"]
@@ -106,8 +106,8 @@ def _require_order(files: Sequence[PcmFile], times_ns: Sequence[int]) -> None:
         if after_ns < before_ns:
             raise DataError(
                 f"{files[number + 1].path} begins at {_text(after_ns)}, before {files[number].path.name} at "
-                f"{_text(before_ns)}; list the files in the order of their times, import their folder, or use "
-                "--start once for each file (start_ns) if a clock was set back"
+                f"{_text(before_ns)}; list the files in the order of their times, import their folder, or set "
+                "start_ns for each file if a clock was set back"
             )
 
 
@@ -134,7 +134,7 @@ def _moved(moved_s: Sequence[float], resolution_s: float, times_ns: Sequence[int
     """Return the note on files that were stamped at the end of the previous one."""
     if max(moved_s) < _NEGLIGIBLE_S:
         return []
-    same = "; use --join (join=True) if files with the same time are the microphones of one measurement"
+    same = "; use join=True if files with the same time are the microphones of one measurement"
     note = (
         f"times in whole steps of {resolution_s:g} s overlap the previous file by up to {max(moved_s):.3g} s; such "
         f"files begin at the end of the previous one{same if len(set(times_ns)) < len(times_ns) else ''}"
@@ -182,7 +182,7 @@ def _ambiguous(files: Sequence[PcmFile], known: Sequence[StatedTime]) -> list[st
         written = datetime.fromtimestamp(file.path.stat().st_mtime, UTC).replace(tzinfo=None) + timedelta(days=1)
         if other is not None and other.date() != time.clock.date() and other < written:
             dates = f"{time.clock:%Y-%m-%d} (year first, as assumed) or {other:%Y-%m-%d} (day first)"
-            return [f"{file.path.name}: the date may be {dates}; use --start (start_ns) if the day comes first"]
+            return [f"{file.path.name}: the date may be {dates}; use start_ns if the day comes first"]
     return []
 
 
@@ -193,7 +193,7 @@ def _unset(files: Sequence[PcmFile], known: Sequence[StatedTime]) -> list[str]:
         return []
     file, time = unset[0]
     problem = f"{file.path.name} begins at {_stated(time)} by {time.source}"
-    return [f"{problem}, so the clock of the recorder was probably not set; use --start (start_ns)"]
+    return [f"{problem}, so the clock of the recorder was probably not set; use start_ns"]
 
 
 def _agree(one: StatedTime, other: StatedTime) -> bool:
@@ -208,12 +208,12 @@ def _source(known: Sequence[StatedTime], *, is_relative: bool) -> str:
     """Return the note on the source and the zone of the times."""
     sources = " and ".join(dict.fromkeys(time.source for time in known))
     if is_relative:
-        return f"the first file begins at --start; the times between files are from {sources}"
+        return f"the first file begins at start_ns; the times between files are from {sources}"
     span = _text(known[0].since_1970_ns)
     if len(known) > 1:
         span += f" to {_text(known[-1].since_1970_ns)}"
     if all(time.offset is None for time in known):
-        return f"times are from {sources} ({span}); they state no offset, so UTC is assumed; otherwise use --start"
+        return f"times are from {sources} ({span}); they state no offset, so UTC is assumed; otherwise use start_ns"
     offsets = dict.fromkeys("UTC" if time.offset is None else _zone(time.offset) for time in known)
     return f"times are from {sources} ({span}), with the offset {' and '.join(offsets)}"
 

@@ -15,9 +15,9 @@ from ertis_numba.settings import Settings
 __all__ = ["CUSTOM_KEYS", "with_custom_files"]
 
 CUSTOM_KEYS: Final = {
-    "directionsCustom": "give --directions when processing",
+    "directionsCustom": "set processing.directions instead",
     "delayMatrixCustom": "process with the delays of plane waves",
-    "rangesCustom": "give --range when processing",
+    "rangesCustom": "set processing.range_m instead",
 }
 """Keys that name files, with the remedy if a file cannot be used."""
 

@@ -100,15 +100,17 @@ def open_rtis_folder(
     reported = _settings_in(folder)
     layout = layout or reported.get("microphoneLayout")
     if layout is None:
-        raise DataError(f"{folder} does not name its array (microphoneLayout); give --layout")
+        raise DataError(f"{folder} does not name its array (microphoneLayout); set it (layout)")
     if not isinstance(layout, str):
-        raise ArgumentError(f"{folder}: microphoneLayout is {layout!r}; give the name of an array, or --layout")
+        raise ArgumentError(
+            f"{folder}: microphoneLayout is {layout!r}; correct it to the name of an array, or set another (layout)"
+        )
     if preset is not None:
         settings = Settings.from_preset(preset)
     elif reported.keys() & {*_RECORDING, "callCustom"}:
         settings = _recording_settings(folder, reported)
     else:
-        raise DataError(f"{folder} contains no recording settings of RTIS Dev (.json); give --preset")
+        raise DataError(f"{folder} contains no recording settings of RTIS Dev (.json); choose a preset (preset)")
     processing = _processing_settings(folder, reported, settings.processing)
     settings = settings.replace(array=Array(layout=layout), air=air or Air(), processing=processing)
     settings = with_custom_files(folder, reported, settings)
@@ -120,7 +122,7 @@ def _measurements(folder: Path) -> tuple[list[Path], list[int]]:
     try:
         paths = [path for path in folder.iterdir() if path.suffix == ".bin"]
     except OSError as error:
-        raise DataError(f"{folder}: {error.strerror}; give a folder of raw files") from error
+        raise DataError(f"{folder}: {error.strerror}; choose a folder of raw files") from error
     if not paths:
         raise DataError(
             f"{folder} is a folder; choose a file of raw words, or a folder with .wav files or .bin files of RTIS Dev"
@@ -133,7 +135,7 @@ def _measurements(folder: Path) -> tuple[list[Path], list[int]]:
     if len(names) != 1 or not all(digits) or len({int(number) for number in digits}) != len(paths):
         raise DataError(
             f"{folder}: the order of its {len(paths)} .bin files is unknown, because their names are not like "
-            "NAME<number>.bin; give the files themselves in their order"
+            "NAME<number>.bin; list the files themselves in their order"
         )
     ordered = sorted(zip(map(int, digits), paths, strict=True))
     return [path for _, path in ordered], [number for number, _ in ordered]
@@ -147,12 +149,13 @@ def _settings_in(folder: Path) -> dict[str, Any]:
         try:
             content = json.loads(path.read_text("utf-8-sig"))
         except (OSError, ValueError) as error:
-            raise DataError(f"{path}: {error}; give readable JSON, or remove the file") from error
+            raise DataError(f"{path}: {error}; correct the JSON, or remove the file") from error
         for key in _KNOWN & content.keys() if isinstance(content, dict) else ():
             name = _KEYS_OF_DICT.get(key, key)
             if name in reported and reported[name] != content[key]:
                 raise DataError(
-                    f"{path}: {key} is {content[key]!r}, but {reported[name]!r} in {sources[name].name}; keep one"
+                    f"{path}: {key} is {content[key]!r}, but {reported[name]!r} in {sources[name].name}; keep one of "
+                    "them"
                 )
             reported[name], sources[name] = content[key], path
     return reported
@@ -162,16 +165,16 @@ def _recording_settings(folder: Path, reported: dict[str, Any]) -> Settings:
     """Return call and length of a measurement."""
     if "callCustom" in reported:
         raise DataError(
-            f"{folder}: callCustom is the file {reported['callCustom']!r}, which a recording cannot contain; give "
-            "--preset to process it as a sweep"
+            f"{folder}: callCustom is the file {reported['callCustom']!r}, which a recording cannot contain; "
+            "choose a preset (preset) to process the call as a sweep"
         )
     number = {
         name: checks.finite(f"{folder}: {name}", reported.get(name, standard)) for name, standard in _RECORDING.items()
     }
     if number["callEmissions"] != 1:
         raise DataError(
-            f"{folder}: callEmissions is {number['callEmissions']:g}, but an image shows only 1 emission; give "
-            "--preset to use the first one"
+            f"{folder}: callEmissions is {number['callEmissions']:g}, but an image shows only 1 emission; "
+            "choose a preset (preset) to use the first emission"
         )
     call = Call(
         start_frequency_hz=number["callMaximumFrequency"],
@@ -220,5 +223,5 @@ def _angles_rad(folder: Path, reported: dict[str, Any], name: str) -> list[float
     """Return the angles of all directions."""
     angles = reported[name]
     if not isinstance(angles, list) or not angles:
-        raise ArgumentError(f"{folder}: {name} is {angles!r}; give an angle for each direction, or remove it")
+        raise ArgumentError(f"{folder}: {name} is {angles!r}; write an angle for each direction, or remove the key")
     return [checks.finite(f"{folder}: {name}", angle_rad) for angle_rad in angles]

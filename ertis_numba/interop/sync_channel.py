@@ -84,7 +84,7 @@ def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, 
             raise DataError(
                 f"{path}: channel {channel} contains no emission: neither the call (correlation "
                 f"{max(match, 0.0):.2f}) nor a pulse above the noise; choose the channel of the loopback "
-                "(--sync-channel), and set the emitted call as [call]"
+                "(sync_channel), and set the emitted call as [call]"
             )
         notes.append(
             f"channel {channel} does not contain the call (correlation {match:.2f}); emissions are assumed at the "
@@ -138,7 +138,7 @@ def louder_and_earlier(
             early_s = (at - first - times[0]) / rate_hz
             return (
                 f"channel {other} contains the call {1e3 * early_s:.3g} ms before channel {channel}, and louder; "
-                f"use --sync-channel {other} (sync_channel) if it is the loopback"
+                f"use sync_channel={other} if channel {other} is the loopback"
             )
     return ""
 

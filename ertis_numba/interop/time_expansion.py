@@ -34,7 +34,7 @@ def true_rate_hz(
     ratio = None if metadata.rate_hz is None else metadata.rate_hz / header_hz
     if expansion is not None:
         differs = any(each is not None and not _equal(each, expansion) for each in (stated, ratio))
-        text = _expanded(expansion, header_hz, "--time-expansion")
+        text = _expanded(expansion, header_hz, "time_expansion")
         if differs:
             text += f", although the metadata state {_statement(metadata)}"
         return header_hz * expansion, [text] if differs or expansion != 1 else []
@@ -47,13 +47,13 @@ def true_rate_hz(
         factor = round(ratio)
         return header_hz * factor, [_expanded(factor, header_hz, "metadata")] if factor > 1 else []
     other = (
-        f"--time-expansion {ratio:.6g} if the metadata are right"
+        f"time_expansion={ratio:.6g} if the metadata are right"
         if stated in {None, 1.0}
-        else f"--time-expansion {stated:g} if the file plays slower by this factor"
+        else f"time_expansion={stated:g} if the file plays slower by this factor"
     )
     raise DataError(
         f"{path}: the header states {header_hz:g} Hz, but the metadata state {_statement(metadata)}; use "
-        f"--time-expansion 1 (time_expansion=1) if the header is right, or {other}"
+        f"time_expansion=1 if the header is right, or {other}"
     )
 
 

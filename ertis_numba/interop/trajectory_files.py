@@ -97,7 +97,7 @@ def read_trajectory(
         checks.choice("time_unit", time_unit, TIME_UNITS)
     is_mcap = path.suffix.lower() == ".mcap"
     if topic is not None and not is_mcap:
-        raise ArgumentError(f"topic (--topic) is for .mcap files, but {path} is none; remove the topic")
+        raise ArgumentError(f"the topic is for .mcap files, but {path} is none; remove it (topic)")
     for name, value in (("time_unit", time_unit), ("times", times)):
         if value is not None and is_mcap:
             option = f"--{name.replace('_', '-')}"
@@ -209,9 +209,11 @@ def check_tum_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = (
     Raises
     ------
     ArgumentError
-        As for `write_tum`.
+        The file exists and ``overwrite`` is false, or its name has another ending.
     """
     suffix = path.suffix.lower()
     if suffix in _OTHER_SUFFIXES:
-        raise ArgumentError(f"output {path} ends in {suffix}, but the file is text of TUM; give a name in .tum or .txt")
+        raise ArgumentError(
+            f"output {path} ends in {suffix}, but the file is text of TUM; choose a name in .tum or .txt"
+        )
     check_target(path, overwrite=overwrite, sources=sources)

@@ -47,7 +47,7 @@ _MESSAGES: Final = {
     sqlite3.SQLITE_CANTOPEN: "cannot be opened ({}); allow reading and writing of the file and of its folder",
     sqlite3.SQLITE_PERM: "cannot be opened ({}); allow reading and writing of the file and of its folder",
     sqlite3.SQLITE_CORRUPT: "is damaged ({}); copy it again if you can",
-    sqlite3.SQLITE_NOTADB: "is not a journal ({}); give a file that 'ertis capture' left",
+    sqlite3.SQLITE_NOTADB: "is not a journal ({}); choose a file that 'ertis capture' left",
 }
 
 
@@ -78,7 +78,7 @@ class Database:
         with self._translate_errors():
             self._file = before = path.stat()
             if not before.st_size and not empty:  # Locking would turn it into a database.
-                raise DataError(f"{path} is empty; give a journal left by 'ertis capture'")
+                raise DataError(f"{path} is empty; choose a journal left by 'ertis capture'")
             for log, least_bytes in _min_sizes(path):  # SQLite would discard the log, or pad with zeros.
                 if before.st_size < least_bytes:
                     raise DamagedError(
@@ -109,7 +109,9 @@ class Database:
         )
         is_new = bool(empty and application == version == n_tables == 0)
         if not is_new and application != APPLICATION_ID:
-            raise DataError(f"{self._path} is an SQLite file, but not a journal; give one left by 'ertis capture'")
+            raise DataError(
+                f"{self._path} is an SQLite file, but not a journal; choose a journal left by 'ertis capture'"
+            )
         if version > VERSION:
             raise FormatVersionError(
                 f"{self._path} has format version {version}, but this package reads up to {VERSION}; update ertis-numba"
@@ -339,7 +341,7 @@ class Database:
         except UnicodeError as error:  # Damaged text raises this error.
             raise DamagedError(f"{self._path} {_MESSAGES[sqlite3.SQLITE_CORRUPT].format(_one_line(error))}") from error
         except OSError as error:
-            raise DataError(f"{self._path}: {error.strerror}; give a journal left by 'ertis capture'") from error
+            raise DataError(f"{self._path}: {error.strerror}; choose a journal left by 'ertis capture'") from error
 
 
 def _min_sizes(path: Path) -> Iterator[tuple[Path, int]]:

@@ -109,7 +109,7 @@ class JournalSensor:
         if made.n_bytes > _MAX_BYTES:
             raise ArgumentError(
                 f"a measurement of sensor {name} has {made.n_bytes / 1e6:.0f} MB, but the limit of a journal is "
-                f"{_MAX_BYTES / 1e6:.0f} MB; give fewer samples"
+                f"{_MAX_BYTES / 1e6:.0f} MB; use fewer samples"
             )
         return made
 
@@ -172,7 +172,7 @@ class JournalSensor:
     def _sample_data(self, words: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.unsignedinteger[Any]]:
         checks.shape(f"a measurement of sensor {self.name}", words.shape, self.shape)
         if words.dtype.newbyteorder("<") != self.dtype:
-            raise ArgumentError(f"a measurement of sensor {self.name} contains {words.dtype}; give {self.dtype.name}")
+            raise ArgumentError(f"a measurement of sensor {self.name} contains {words.dtype}; pass {self.dtype.name}")
         return np.ascontiguousarray(words, dtype=self.dtype)
 
     def entry(self, path: Path, row: Sequence[Any]) -> JournalEntry:

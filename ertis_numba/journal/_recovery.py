@@ -16,6 +16,7 @@ from ertis_numba.journal._files import keep_damaged_log
 from ertis_numba.journal._log import WriteAheadLog
 from ertis_numba.journal._poses import JournalPose, read_poses
 from ertis_numba.journal._tables import POSES, select_statement
+from ertis_numba.units import counted
 
 if TYPE_CHECKING:
     from ertis_numba.journal._journal import Journal
@@ -82,7 +83,7 @@ def recover_rows(journal: "Journal", database: Database, log: WriteAheadLog | No
             found = _read_copy(journal, database, log)
     unrecorded = [] if found is None else _store_recovered(journal, found)
     if n_commits and found is None and not missing:
-        unrecorded.append(f"{n_commits} commits of unknown content")
+        unrecorded.append(f"{counted(n_commits, 'commit')} of unknown content")
     if found is not None:
         unrecorded += _record_lost(journal, found.lost)
     is_complete = found is not None and found.is_complete
@@ -100,7 +101,7 @@ def _record_lost(journal: "Journal", gaps: Iterable[SequenceGap]) -> list[str]:
         if gap.sensor in journal.sensors:
             journal.note_gaps(list(_missing_parts(journal, gap)))
         else:
-            unrecorded.append(f"up to {gap.n_missing} numbers of sensor {gap.sensor}")
+            unrecorded.append(f"up to {counted(gap.n_missing, 'number')} of sensor {gap.sensor}")
     return unrecorded
 
 
@@ -224,5 +225,7 @@ def _store_recovered(journal: "Journal", found: _RecoveredRows) -> list[str]:
     journal.note_gaps([gap for gap in found.gaps if gap.sensor in journal.sensors])
     if found.poses:
         journal.append_poses(found.poses)
-    unreadable = [f"{found.n_unreadable} measurements whose numbers cannot be read"] if found.n_unreadable else []
+    unreadable = (
+        [f"{counted(found.n_unreadable, 'measurement')} whose numbers cannot be read"] if found.n_unreadable else []
+    )
     return [*unreadable, found.pose_damage] if found.pose_damage else unreadable

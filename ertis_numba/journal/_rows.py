@@ -73,7 +73,7 @@ class WritableJournal(ReadableJournal):
         )
         with self._lock:
             if name in self._sensors:
-                raise ArgumentError(f"sensor {name!r} is in {self.path} already; give each sensor its own name")
+                raise ArgumentError(f"sensor {name!r} is in {self.path} already; use a different name for each sensor")
             with self._database.transaction():
                 self._insert("sensors", made.row())
             self._register(len(self._ids) + len(self._unusable) + 1, made)
@@ -131,7 +131,7 @@ class WritableJournal(ReadableJournal):
         key = (sensor.name, stamp.session_id)
         if stamp.sequence <= last.get(key, -1):
             raise ArgumentError(
-                f"measurement {stamp.sequence} of sensor {sensor.name} follows {last[key]}; give rising numbers, "
+                f"measurement {stamp.sequence} of sensor {sensor.name} follows {last[key]}; pass rising numbers, "
                 "or another session_id"
             )
         last[key] = stamp.sequence

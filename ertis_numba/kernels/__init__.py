@@ -17,7 +17,15 @@ from ertis_numba.kernels._contract.fusion import (
     ViewingSensors,
 )
 from ertis_numba.kernels._contract.mapping import MappingKernels
-from ertis_numba.kernels._contract.points import ABSENT, BeamErrors, PointKernels, Pulse, Quadrics
+from ertis_numba.kernels._contract.points import (
+    ABSENT,
+    N_VALUES,
+    BeamErrors,
+    EchoSamples,
+    PointKernels,
+    Pulse,
+    Quadrics,
+)
 from ertis_numba.kernels._contract.steering import SteeringKernels
 from ertis_numba.kernels._device_protocols import Lane, Memory
 from ertis_numba.kernels._dispatch import (
@@ -37,8 +45,10 @@ __all__ = [
     "DEVICES",
     "LAST_PATH_M",
     "NEAREST_M",
+    "N_VALUES",
     "SPREADING_M",
     "BeamErrors",
+    "EchoSamples",
     "FusionKernels",
     "HeardEchoes",
     "KernelSet",

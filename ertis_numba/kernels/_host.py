@@ -52,7 +52,9 @@ class HostMemory:
 
     def __init__(self, *, graphs: bool | None = None) -> None:
         if graphs:
-            raise ArgumentError("graphs is True, but only device 'cuda' has CUDA graphs; leave it out or give 'cuda'")
+            raise ArgumentError(
+                "graphs is True, but only device 'cuda' has CUDA graphs; remove graphs, or use device 'cuda'"
+            )
         self._images = ImagePool(lambda shape: np.empty(shape, np.float32))
 
     def table(self, array: Array) -> Array:

@@ -143,7 +143,7 @@ class CellGrid:
         if n_cells > MAX_CELLS:
             sides = " by ".join(f"{count * self._cell_m:.0f}" for count in sizes[: self._n_dimensions])
             raise ArgumentError(
-                f"the map would have {n_cells} cells ({sides} m), but the limit is {MAX_CELLS}; give larger cells "
+                f"the map would have {n_cells} cells ({sides} m), but the limit is {MAX_CELLS}; use larger cells "
                 "(cell_m), or poses closer together"
             )
         grown = np.zeros((3, *sizes[::-1]), np.float32)

@@ -175,7 +175,7 @@ class Mapper:
         if self._dimensions == 3 and any(image.is_planar for image in group):
             raise ArgumentError(
                 "images include a planar image, but a map of three dimensions needs directions over elevation; process "
-                "with directions such as 3d:1000, or give dimensions 2"
+                "with directions such as 3d:1000, or use dimensions 2"
             )
         fused = self._fuser(group) if fused is None else fused
         time_ns = fused.stamp.timestamp_ns
@@ -296,6 +296,6 @@ def _pose(pose: Pose, time_ns: int) -> tuple[Floats, Floats, Floats]:
     try:
         translation_m, rotation_xyzw = pose
     except (TypeError, ValueError) as error:
-        raise ArgumentError(f"pose is {pose!r}; give a position and a unit quaternion, or a Trajectory") from error
+        raise ArgumentError(f"pose is {pose!r}; pass a position and a unit quaternion, or a Trajectory") from error
     found = mounting("platform", translation_m, rotation_xyzw)
     return found["translation_m"], Rotation.from_quat(found["rotation_xyzw"]).as_matrix(), np.zeros((6, 6))

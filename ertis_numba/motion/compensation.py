@@ -63,9 +63,9 @@ def compensate_motion(points: PointCloud, velocity_m_s: Sequence[float], yaw_rat
     try:
         velocity = np.asarray(velocity_m_s, np.float64)
     except (TypeError, ValueError) as error:
-        raise ArgumentError(f"velocity_m_s is {velocity_m_s!r:.80}; give x, y, z in metres per second") from error
+        raise ArgumentError(f"velocity_m_s is {velocity_m_s!r:.80}; use x, y, z in metres per second") from error
     if velocity.shape != (3,):
-        raise ArgumentError(f"velocity_m_s has shape {velocity.shape}; give x, y, z in metres per second")
+        raise ArgumentError(f"velocity_m_s has shape {velocity.shape}; use x, y, z in metres per second")
     for part in velocity.tolist():
         checks.between("velocity_m_s", part, -_MAX_SPEED_M_S, _MAX_SPEED_M_S)
     checks.between("yaw_rate_rad_s", yaw_rate_rad_s, -_MAX_YAW_RATE_RAD_S, _MAX_YAW_RATE_RAD_S)

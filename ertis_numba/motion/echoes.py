@@ -117,7 +117,8 @@ class EchoExtractor:
         cloud = self._cloud(item) if isinstance(item, Energyscape) else item
         if item.stamp.sensor not in self._sensors:
             raise ArgumentError(
-                f"sensor {item.stamp.sensor!r} has no mounting; give its mounting, or one of {', '.join(self._sensors)}"
+                f"sensor {item.stamp.sensor!r} has no mounting; add its mounting, or use one of "
+                f"{', '.join(self._sensors)}"
             )
         number, mounted = self._sensors[item.stamp.sensor]
         local_m = cloud.position_m.astype(np.float64)

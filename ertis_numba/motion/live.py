@@ -22,7 +22,7 @@ class LiveOdometry:
     on_note : callable
         Called with a line for each group that cannot be used.
     alone : bool, optional
-        As for `Odometry`.
+        True if no other sensor emits than those given, as for `Odometry`; False by default.
     """
 
     def __init__(self, on_note: Callable[[str], None], *, alone: bool | None = None) -> None:

@@ -123,24 +123,24 @@ def ego_velocity(
     time_s = (time_after_ns(groups[1], times_ns_of(groups[0]), first.timestamp_ns) - first.timestamp_ns) / 1e9
     if not 0 < time_s <= MAX_TIME_S:
         raise DataError(
-            f"after is {time_s:.3g} s later than before; give groups in order of time, at most {MAX_TIME_S:g} s apart"
+            f"after is {time_s:.3g} s later than before; use groups in order of time, at most {MAX_TIME_S:g} s apart"
         )
     if not groups[0].keys() & groups[1].keys():
         raise DataError(
-            f"before has sensors {', '.join(groups[0])}, and after has {', '.join(groups[1])}; give images of the same "
+            f"before has sensors {', '.join(groups[0])}, and after has {', '.join(groups[1])}; use images of the same "
             "sensors"
         )
     extract = EchoExtractor(sensors, alone=alone)
     found = fit_flow(extract(groups[0]), extract(groups[1]), sensors, time_s)
     if found is None:
         raise DataError(
-            "too few echoes of before and after match; give images that show more reflectors, or images closer in time"
+            "too few echoes of before and after match; use images that show more reflectors, or images closer in time"
         )
     if not found.is_significant:
         places = f"{found.n_places} place{'' if found.n_places == 1 else 's'}"
         raise DataError(
             f"only {found.n_matches} echoes of before and after match, in {places}, as many as echoes "
-            "of noise or of one moving object; give images that show more reflectors, or images closer in time"
+            "of noise or of one moving object; use images that show more reflectors, or images closer in time"
         )
     return velocity_of(found, second.timestamp_ns, time_s)
 
@@ -162,25 +162,25 @@ def grouped(items: Iterable[Item], name: str) -> Mapping[str, Item]:
         The items are not of the same pulse.
     """
     if not isinstance(items, Iterable):
-        raise ArgumentError(f"{name} is a {type(items).__name__}; give a list of images or point clouds")
+        raise ArgumentError(f"{name} is a {type(items).__name__}; pass a list of images or point clouds")
     group: dict[str, Item] = {}
     for item in items:
         if not isinstance(item, Energyscape | PointCloud):
-            raise ArgumentError(f"{name} has a {type(item).__name__}; give images of Pipeline.process, or point clouds")
+            raise ArgumentError(f"{name} has a {type(item).__name__}; pass images of Pipeline.process, or point clouds")
         sensor = item.stamp.sensor
         item.settings.processing.require_sensor_frame("odometry needs directions of each sensor")
         if sensor in group:
-            raise ArgumentError(f"{name} has two items of sensor {sensor!r}; give one of each sensor")
+            raise ArgumentError(f"{name} has two items of sensor {sensor!r}; pass one item of each sensor")
         group[sensor] = item
     if not group:
-        raise ArgumentError(f"{name} is empty; give the images or point clouds of one SYNC pulse")
+        raise ArgumentError(f"{name} is empty; pass the images or point clouds of one SYNC pulse")
     first, *others = group.values()
     for other in others:
         if not is_same_pulse(other.stamp, first.stamp):
             raise DataError(
                 f"sensors {first.stamp.sensor!r} and {other.stamp.sensor!r} in {name} are not from the same pulse: "
                 f"SYNC counts {first.stamp.sync_count} and {other.stamp.sync_count}, "
-                f"{abs(other.stamp.timestamp_ns - first.stamp.timestamp_ns) / 1e9:.3g} s apart; give items of equal "
+                f"{abs(other.stamp.timestamp_ns - first.stamp.timestamp_ns) / 1e9:.3g} s apart; use items of equal "
                 "count"
             )
     return group

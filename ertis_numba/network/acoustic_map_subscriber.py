@@ -37,7 +37,7 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
         has no directions, those of a sensor are replaced by a grid over the half-space where they are planar or coarse.
     device : {"auto", "cpu", "cuda", "numpy"}
     threads : int, optional
-        As for `AcousticCamera`.
+        Number of threads; all cores by default.
     keys : ClientKeys, optional
         None on loopback only.
     on_note : callable, optional

@@ -44,13 +44,13 @@ def endpoint(text: str, *, name: str = "address") -> str:
     """
     found = _ADDRESS.fullmatch(text) if isinstance(text, str) else None
     if found is None or (found[2] != "*" and int(found[2]) > 65535):
-        raise ArgumentError(f"{name} {text!r} cannot be used; give tcp://HOST:PORT, such as {DEFAULT_LISTEN}")
+        raise ArgumentError(f"{name} {text!r} cannot be used; use tcp://HOST:PORT, such as {DEFAULT_LISTEN}")
     if found[1].startswith("["):
         try:
             ipaddress.IPv6Address(found[1].strip("[]"))
         except ValueError as error:
             raise ArgumentError(
-                f"{name} {text!r} cannot be used ({error}); give one such as tcp://[::1]:5601"
+                f"{name} {text!r} cannot be used ({error}); use an address such as tcp://[::1]:5601"
             ) from error
     return f"tcp://{found[1]}:{'*' if found[2] == '*' else int(found[2])}"
 
@@ -105,5 +105,5 @@ def require_keys(endpoint: str, *, keys: object | None) -> None:
     if keys is None and not is_loopback(endpoint):
         raise ArgumentError(
             f"address {endpoint} can be reached from other machines, but there are no keys; create keys with "
-            "'ertis keys new' and give --key, or use tcp://127.0.0.1:PORT"
+            "'ertis keys new' and use them (keys), or use tcp://127.0.0.1:PORT"
         )

@@ -49,10 +49,12 @@ class Permission(TomlTable, frozen=True, kw_only=True):
         checks.choice("role", self.role, ROLES)
         if self.role == "sensor" and not self.serials:
             raise ArgumentError(
-                f"{self.name} is a sensor without serials; name the sensors that it may send for (--serial)"
+                f"{self.name} is a sensor without serials; name the sensors that it may send for (serials)"
             )
         if self.role != "sensor" and self.serials:
-            raise ArgumentError(f"{self.name} has serials but is not a sensor; give serials to sensors only")
+            raise ArgumentError(
+                f"{self.name} has serials but is not a sensor; remove the serials, which only sensors have"
+            )
         for serial in self.serials:
             checks.sensor_name(serial)
 
@@ -142,7 +144,9 @@ class AllowList(Checked, frozen=True, kw_only=True):
         """
         others = tuple(each for each in self.keys if each.public != permission.public)
         if any(each.name == permission.name for each in others):
-            raise ArgumentError(f"another key is listed as {permission.name!r}; remove it first, or give --name")
+            raise ArgumentError(
+                f"another key is listed as {permission.name!r}; remove it first, or choose another name (name)"
+            )
         return AllowList(keys=(*others, permission))
 
     def remove(self, who: str) -> "AllowList":

@@ -32,7 +32,7 @@ Answer = TypeVar("Answer")
 class CentralClient:
     """Client of a central node; use it in a ``with`` statement.
 
-    Several threads may use one client. Their requests take turns; give each thread its own client to avoid waiting.
+    Several threads may use one client. Their requests take turns; use a client for each thread to avoid waiting.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class CentralClient:
             nodes refuses the settings. A central node that computes images refuses settings without an image.
         """
         if not isinstance(sensor, str):
-            raise ArgumentError(f"sensor is of type {type(sensor).__name__}; give the name of a sensor")
+            raise ArgumentError(f"sensor is of type {type(sensor).__name__}; pass the name of a sensor")
         checks.instance("settings", settings, Settings, "Settings.load returns")
         checks.positive("patience_s", patience_s)
         request_id = secrets.randbits(62)

@@ -84,7 +84,9 @@ class KeyPair:
         """
         path = Path(path)
         if path.name.endswith(".public.toml"):
-            raise SettingsError(f"{path} contains a public key; give the file .secret.toml of the same name")
+            raise SettingsError(
+                f"{path} contains a public key; use the secret key, the file .secret.toml of the same name"
+            )
         try:
             mode, folder_mode = mode_of(path), mode_of(path.parent)
         except OSError as error:
@@ -128,7 +130,7 @@ class KeyPair:
         secret, public = folder / f"{self.name}.secret.toml", folder / f"{self.name}.public.toml"
         for path in (secret, public):
             if path.exists():
-                raise ArgumentError(f"{path} exists; give another name, or remove the file if nothing uses it")
+                raise ArgumentError(f"{path} exists; choose another name, or remove the file if nothing uses it")
         write(secret, _Secret(name=self.name, public=self.public, secret=self.secret).to_toml(), mode=0o600)
         write(public, _Public(name=self.name, public=self.public).to_toml(), mode=0o644)
         return secret, public
@@ -186,11 +188,11 @@ def public_key(given: str | Path) -> tuple[str, str]:
     path = Path(given)
     if path.name.endswith(".secret.toml"):
         raise SettingsError(
-            f"{path} contains a secret key, which must stay on its machine; give the file .public.toml beside it"
+            f"{path} contains a secret key, which must stay on its machine; use the file .public.toml beside it"
         )
     if not path.is_file():
         raise SettingsError(
-            f"{str(given)!r} is neither a public key nor a file with one; give NAME.public.toml from 'ertis keys "
+            f"{str(given)!r} is neither a public key nor a file with one; use NAME.public.toml from 'ertis keys "
             "new', or the 40 characters from 'ertis keys list'"
         )
     read = _Public.load(path)
@@ -211,7 +213,7 @@ def require_name(name: str) -> None:
         The name cannot be used.
     """
     if not _NAME.fullmatch(name):
-        raise ArgumentError(f"key name {name!r} cannot be used; give up to 64 letters, digits and _ . @ + -")
+        raise ArgumentError(f"key name {name!r} cannot be used; use up to 64 letters, digits and _ . @ + -")
 
 
 def _is_key(key: str) -> bool:
@@ -231,4 +233,4 @@ def require_key(key: str) -> None:
         The text is not a key.
     """
     if not _is_key(key):
-        raise ArgumentError(f"{key[:48]!r} is not a key; give the 40 characters from 'ertis keys list'")
+        raise ArgumentError(f"{key[:48]!r} is not a key; use the 40 characters from 'ertis keys list'")

@@ -70,7 +70,7 @@ class Metrics:
             import prometheus_client  # noqa: F401, PLC0415  an extra
         endpoint = addresses.endpoint(f"tcp://{address}")
         if not addresses.is_loopback(endpoint):
-            raise ArgumentError(f"metrics address {address!r} can be reached from other machines; give 127.0.0.1:PORT")
+            raise ArgumentError(f"metrics address {address!r} can be reached from other machines; use 127.0.0.1:PORT")
         self.address = address
         self._host, self._port = addresses.host_of(endpoint), endpoint.rpartition(":")[2].replace("*", "0")
         self._latest = latest
@@ -94,7 +94,7 @@ class Metrics:
         try:
             self._server = Server((self._host, int(self._port)), Handler)
         except OSError as error:
-            raise NetworkError(f"cannot listen at {self.address} ({error.strerror}); give another address") from error
+            raise NetworkError(f"cannot listen at {self.address} ({error.strerror}); choose another address") from error
         self._server.set_app(_of_own_hosts(make_wsgi_app(registry), self._host))
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()

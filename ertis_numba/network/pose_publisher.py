@@ -20,6 +20,7 @@ from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import SILENCE_LIMIT_S, Bye, Ping, PlatformPose, Pong, Refused
 from ertis_numba.network.owner import Owner
+from ertis_numba.units import counted
 
 __all__ = ["PosePublisher"]
 
@@ -69,11 +70,11 @@ class PosePublisher:
         self._address, self._keys = addresses.endpoint(address), keys
         addresses.require_keys(self._address, keys=keys)
         if isinstance(sensors, str) or not 1 <= len(sensors) <= _MAX_SENSORS:
-            raise ArgumentError(f"sensors is {sensors!r:.80}; give a list of 1 to {_MAX_SENSORS} names of sensors")
+            raise ArgumentError(f"sensors is {sensors!r:.80}; pass a list of 1 to {_MAX_SENSORS} names of sensors")
         self._sensors = tuple(checks.sensor_name(name) for name in sensors)
         checks.instance("source", source, str, "names the origin of the poses")
         if not 1 <= len(source) <= _MAX_SOURCE:
-            raise ArgumentError(f"source has {len(source)} characters; give 1 to {_MAX_SOURCE}")
+            raise ArgumentError(f"source has {len(source)} characters; use 1 to {_MAX_SOURCE}")
         self._source, self._session_id = source, secrets.randbits(62)
         self._watch = PoseWatch()
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
@@ -222,7 +223,7 @@ class PosePublisher:
         """Raise an error if poses of an interrupted connection may be lost."""
         n_uncertain, self._n_uncertain = self._n_uncertain, 0
         if n_uncertain:
-            poses = "1 sent pose" if n_uncertain == 1 else f"{n_uncertain} sent poses"
+            poses = counted(n_uncertain, "sent pose")
             raise NetworkError(
                 f"the connection to {self._address} was interrupted, so that up to {poses} may be lost; "
                 "send again what the recording needs"

@@ -33,10 +33,11 @@ def private_folder(folder: Path) -> Path:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         mode = mode_of(folder)
     except OSError as error:
-        raise NetworkError(f"{folder}: {error.strerror}; give a writable folder (--dir)") from error
+        raise NetworkError(f"{folder}: {error.strerror}; choose a writable folder (folder)") from error
     if mode & OTHERS:
         raise ArgumentError(
-            f"other users can access {folder} (mode {mode:04o}); run 'chmod 700 {folder}', or give another (--dir)"
+            f"other users can access {folder} (mode {mode:04o}); run 'chmod 700 {folder}', or choose another folder "
+            "(folder)"
         )
     return folder
 
@@ -113,11 +114,11 @@ def mode_of(path: Path) -> int:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Run the block while no other process is in such a block; a process that ends leaves it."""
+    """Hold a lock of a file during a block, so that only one process at a time is in such a block."""
     try:
         descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o600)
     except OSError as error:
-        raise NetworkError(f"{path.parent}: {error.strerror}; give a writable folder") from error
+        raise NetworkError(f"{path.parent}: {error.strerror}; choose a writable folder") from error
     try:
         if sys.platform == "win32":
             msvcrt.locking(descriptor, msvcrt.LK_LOCK, 1)

@@ -42,12 +42,12 @@ _BACKLOG = 512
 _DESCRIPTORS = 8192
 _NO_ACCESS = 400  # Status code of ZAP.
 _HUNG_UP = (
-    "the central node closed the connection before the handshake; if it requires a key, give --key and --server-key",
-    "the central node closed the connection: its key differs from --server-key, or it has none; give its actual key",
+    "the central node closed the connection before the handshake; if it requires a key, set one (keys)",
+    "the central node closed the connection: its key is not the expected one, or it has none; correct it (server_key)",
 )
 _DISAGREE = (
-    "the central node requires a key; give --key and --server-key",
-    "the central node has no keys; start it with keys, or leave out --key",
+    "the central node requires a key; set one (keys)",
+    "the central node has no keys; start it with keys, or connect without one (keys)",
 )
 _CLIENT_EVENTS = (
     zmq.EVENT_DISCONNECTED
@@ -114,9 +114,9 @@ def server(
         made.close(linger=0)
         if isinstance(error, zmq.ZMQError) and error.errno == zmq.EADDRINUSE:
             raise NetworkError(
-                f"{endpoint} is in use by another program; end that program or give another {option}"
+                f"{endpoint} is in use by another program; end that program or choose another {option}"
             ) from error
-        raise NetworkError(f"cannot listen at {endpoint} ({error}); give another {option}") from error
+        raise NetworkError(f"cannot listen at {endpoint} ({error}); choose another {option}") from error
     except BaseException:
         made.close(linger=0)
         raise
@@ -170,7 +170,7 @@ def client(
     except zmq.ZMQError as error:
         Monitor(made).close()
         made.close(linger=0)
-        raise NetworkError(f"cannot connect to {endpoint} ({error}); give another address") from error
+        raise NetworkError(f"cannot connect to {endpoint} ({error}); choose another address") from error
     except BaseException:
         Monitor(made).close()
         made.close(linger=0)
@@ -256,7 +256,7 @@ class Monitor(_Events):
         self.final = True
         if value == zmq.PROTOCOL_ERROR_ZMTP_MECHANISM_MISMATCH:
             return _DISAGREE[with_keys]
-        return "the peer does not use this protocol; give the address of a central node"
+        return "the peer does not use this protocol; choose the address of a central node"
 
 
 class HandshakeMonitor(_Events):

@@ -145,10 +145,10 @@ class Subscriber(ReceivingLoop[Kind_co]):
         for product in given:
             checks.choice("product", product, PRODUCTS)
         if not given:
-            raise ArgumentError(f"products is empty; give some of {', '.join(PRODUCTS)}")
+            raise ArgumentError(f"products is empty; choose some of {', '.join(PRODUCTS)}")
         named = None if sensors is None else tuple([sensors] if isinstance(sensors, str) else dict.fromkeys(sensors))
         if named is not None and not 0 < len(named) <= _MAX_SENSORS:
-            raise ArgumentError(f"sensors lists {len(named)} names; give 1 to {_MAX_SENSORS}, or None for all")
+            raise ArgumentError(f"sensors lists {len(named)} names; use 1 to {_MAX_SENSORS}, or None for all")
         for sensor in named or ():
             checks.sensor_name(sensor)
         checks.integer("credit", credit, 1, 64)

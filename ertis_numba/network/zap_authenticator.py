@@ -266,5 +266,5 @@ def _read(path: Path) -> bytes:
     with path.open("rb") as file:
         text = file.read(_LIST_BYTES + 1)
     if len(text) > _LIST_BYTES:
-        raise SettingsError(f"{path} exceeds {_LIST_BYTES // 1_000_000} MB; give an allow list")
+        raise SettingsError(f"{path} exceeds {_LIST_BYTES // 1_000_000} MB; use an allow list")
     return text

@@ -72,7 +72,7 @@ def band_edges(passive: Passive, recording: Recording) -> NDArray[np.float64]:
         if not len(bands):
             raise ArgumentError(
                 f"passive.limits_hz {low_hz:g} to {high_hz:g} contains none of the {given.replace('_', ' ')} up to "
-                f"{highest_hz:g} Hz, the highest frequency of the record; give wider limits, or your own bands_hz"
+                f"{highest_hz:g} Hz, the highest frequency of the record; use wider limits, or your own bands_hz"
             )
         return bands
     for number, (_, high_hz) in enumerate(given):

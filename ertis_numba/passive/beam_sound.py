@@ -78,7 +78,7 @@ def listen_to(
     Parameters
     ----------
     measurement : Measurement
-        Its settings give the air, and ``passive`` the distance of the sound's source and the highest frequency.
+        Measurement whose settings state the air, the distance of the source and the highest frequency (``passive``).
     azimuth_deg, elevation_deg : float
         Direction in the sensor frame in degrees; the elevation is 0 by default.
     signals : HeardSignals, optional
@@ -103,7 +103,7 @@ def listen_to(
     >>> sound.rate_hz
     225000.0
     """
-    checks.instance("measurement", measurement, Measurement, "a recording holds")
+    checks.instance("measurement", measurement, Measurement, "a recording contains")
     checks.between("azimuth_deg", azimuth_deg, -180.0, 180.0)
     checks.between("elevation_deg", elevation_deg, -90.0, 90.0)
     if signals is None:
@@ -166,7 +166,7 @@ def heterodyned(sound: BeamSound, shift_hz: float, rate_hz: float = 48e3) -> Bea
         return BeamSound(sound.samples, rate_hz)
     ratio = Fraction(rate_hz / sound.rate_hz).limit_denominator(_FINEST_RATIO)
     if not ratio:
-        raise ArgumentError(f"rate_hz is {rate_hz:g}, too low for a sound of {sound.rate_hz:g} Hz; give a higher rate")
+        raise ArgumentError(f"rate_hz is {rate_hz:g}, too low for a sound of {sound.rate_hz:g} Hz; use a higher rate")
     n_samples = math.ceil(len(sound.samples) * ratio)
     size = ratio.denominator * math.ceil((len(sound.samples) + _SILENCE) / ratio.denominator)
     time_s = np.arange(size) / sound.rate_hz

@@ -94,7 +94,9 @@ class BearingTracker:
             The time is not after that of the map before.
         """
         if checks.finite("time_s", time_s) <= self._time_s:
-            raise ArgumentError(f"time_s is {time_s:g}, but the map before has {self._time_s:g}; give maps in order")
+            raise ArgumentError(
+                f"time_s is {time_s:g}, but the map before has {self._time_s:g}; add maps in the order of their times"
+            )
         for track in self._tracks:
             track.filter.predict(time_s - self._time_s)
         self._time_s = time_s

@@ -34,7 +34,8 @@ class BearingFinder:
     directions. Its wave is then projected out, and the next direction is searched in the rest, until noise alone
     explains the loudest one: see `exceedance`. Side lobes of a source therefore yield no bearings. After each new
     source, the directions of all sources of its band are corrected. The noise is a mixture of white noise of the
-    microphones and of diffuse sound, whose shares are estimated in each band.
+    microphones and of diffuse sound, whose shares are estimated in each band. Electrical crosstalk that is equal in all
+    channels looks like sound straight ahead of a flat array: see `Bearing.may_be_crosstalk`.
 
     Parameters
     ----------
@@ -172,6 +173,7 @@ def _bearing(source: FoundSource, band_hz: NDArray[np.float64], settings: Settin
         band_hz=(float(band_hz[0]), float(band_hz[1])),
         level_dbfs=level_dbfs,
         snr_db=10 * math.log10(max(source.ratio, _LEAST)),
+        may_be_crosstalk=source.may_be_crosstalk,
         **{name: _level(level_dbfs, settings, band_hz, name) for name in ("level_db", "source_level_db")},
     )
 

@@ -113,7 +113,7 @@ class BlockSpectra:
         n_blocks = (heard.shape[1] - first - self._n_block) // hop + 1
         if n_blocks < 1:
             raise DataError(
-                f"a measurement has no block of {self._n_block} samples after its call; give wider bands, a larger "
+                f"a measurement has no block of {self._n_block} samples after its call; use wider bands, a larger "
                 "passive.resolution_hz, or passive measurements"
             )
         blocks, transforms = self._planned(n_blocks)
@@ -179,5 +179,5 @@ def _too_narrow(settings: Settings, n_block: int, n_samples: int, rate_hz: float
     least_hz = math.ceil(n_bins * rate_hz / n_longest)
     return (
         f"{key} needs blocks of {n_block / rate_hz:.3g} s, longer than the record with {n_samples / rate_hz:.3g} s; "
-        f"give {what} of at least {least_hz} Hz, or longer measurements"
+        f"use {what} of at least {least_hz} Hz, or longer measurements"
     )

@@ -34,7 +34,7 @@ _TINY: Final = 1e-30
 class AcousticCamera:
     """Camera that computes acoustic maps from the measurements of one sensor.
 
-    Signals are cut into blocks that overlap by half. Their spectra, under a Hann window, give the cross-spectral matrix
+    Signals are cut into blocks that overlap by half. Their spectra, under a Hann window, use the cross-spectral matrix
     of the microphones, which is averaged over blocks and measurements. A map is the power of this matrix for the wave
     from each direction. Maps of CLEAN-SC and HR-CLEAN-SC sum the components of a direction and its neighbours at the
     strongest of them, whose value is the power of the source. Measurements with a call are accepted; the time of the
@@ -96,7 +96,7 @@ class AcousticCamera:
     ) -> None:
         if isinstance(settings, str | Path):
             settings = Settings.load(settings)
-        checks.instance("settings", settings, Settings, "a recording holds, or Settings.from_preset returns")
+        checks.instance("settings", settings, Settings, "a recording contains, or Settings.from_preset returns")
         settings.processing.require_sensor_frame("acoustic maps are means over measurements at several poses")
         kernel_set = kernels.load(device)
         self._threads = kernel_set.max_threads if threads is None else threads
@@ -158,7 +158,7 @@ class AcousticCamera:
         DataError
             Its array, call, record or air are not those of the settings, or no sound is left without its call.
         """
-        checks.instance("measurement", measurement, Measurement, "a recording holds")
+        checks.instance("measurement", measurement, Measurement, "a recording contains")
         masked = measurement.stamp.behaviour == "active"
         products = self._blocks.products(measurement, masked=masked)
         self._outside.add(measurement)
@@ -286,7 +286,7 @@ class AcousticCamera:
             As for `add` and `map`.
         """
         self.reset()
-        for measurement in checks.items("measurements", measurements, Measurement, "a recording holds"):
+        for measurement in checks.items("measurements", measurements, Measurement, "a recording contains"):
             self.add(measurement)
             if self.n_measurements == self.settings.passive.averages:
                 yield self.map()
@@ -310,11 +310,11 @@ class AcousticCamera:
         passive, n_mics = self.settings.passive, int(microphones(self.settings.array).enabled.sum())
         if n_mics < 2:
             raise ArgumentError(
-                "array has 1 enabled microphone, which hears no directions; give a layout with two or more, or disable "
-                "fewer"
+                "array has 1 enabled microphone, which hears no directions; choose a layout with two or more, or "
+                "disable fewer"
             )
         if passive.method == "music" and passive.n_sources >= n_mics:
             raise ArgumentError(
-                f"passive.n_sources is {passive.n_sources}, but the array has {n_mics} microphones; give fewer than "
+                f"passive.n_sources is {passive.n_sources}, but the array has {n_mics} microphones; use fewer than "
                 f"{n_mics}"
             )

@@ -121,7 +121,7 @@ class EdgeTones:
         low_hz, high_hz = (1 - _WIDTH) * frequency_hz, min((1 + _WIDTH) * frequency_hz, self._highest_hz)
         if frequency_hz + 3 * self._spacing_hz > self._highest_hz:
             return f"for its level, record at a higher rate: bands end at {self._highest_hz / 1e3:.4g} kHz"
-        return f"for its level, use --bands {typed_hz(low_hz)}:{typed_hz(high_hz)} (passive.bands_hz)"
+        return f"for its level, use the band {typed_hz(low_hz)}:{typed_hz(high_hz)} Hz (passive.bands_hz)"
 
     def _found(self, number: int, band: int) -> _Tone | None:
         """Return the tone at an edge that dominates a band at the microphones, or else in its loudest direction."""

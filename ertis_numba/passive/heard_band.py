@@ -32,7 +32,7 @@ class HeardBand(NamedTuple):
     matrix : (bin, mic, mic) complex128
         Matrices with a mean power of 1.
     level : (bin,) float64
-        Their mean powers.
+        Mean power of each bin.
     shares, weights : (bin,) float64
         Share of each bin in the band, and the same with a sum of 1.
     omega : (bin,) float64
@@ -141,7 +141,7 @@ class _Frequencies(NamedTuple):
         return total_hz / power if power > 0 else 0.0
 
     def certain_hz(self, n_blocks: int) -> Floats:
-        """Return the mean frequencies of sources, which are those of the bins if noise hides them."""
+        """Return the mean frequency of the source in each bin, or that of the bin if noise hides the source."""
         noise, powers = _CERTAIN / math.sqrt(n_blocks) * self.noise, np.maximum(self.powers, 0)
         return np.asarray(self.moments_hz * powers / np.maximum(powers**2 + noise**2, _LEAST))
 

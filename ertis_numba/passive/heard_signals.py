@@ -72,7 +72,7 @@ class HeardSignals:
     def __init__(
         self, settings: Settings, *, highest_hz: float | None = None, device: str = "auto", threads: int | None = None
     ) -> None:
-        checks.instance("settings", settings, Settings, "a recording holds, or Settings.from_preset returns")
+        checks.instance("settings", settings, Settings, "a recording contains, or Settings.from_preset returns")
         self.settings, recording = settings, settings.recording
         lowest_hz = 0.0
         if highest_hz is None:
@@ -116,7 +116,7 @@ class HeardSignals:
         DataError
             Its array, call, record or air are not those of the settings, or samples exceed 1e12 times full scale.
         """
-        checks.instance("measurement", measurement, Measurement, "a recording holds")
+        checks.instance("measurement", measurement, Measurement, "a recording contains")
         words, exponent = self._words.read(measurement)
         out = np.empty(self.shape, np.float32) if out is None else out
         with self._kernels.threads(self._threads), self._lane.entered():

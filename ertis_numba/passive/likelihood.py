@@ -76,10 +76,11 @@ class BandLikelihood:
     others : (source, axis) float64
         Directions of the other sources; none by default.
     others_omega : (bin, source) float64, optional
-        Their angular frequencies; ``omega`` by default.
+        Angular frequencies of the other sources; ``omega`` by default.
 
     Attributes
     ----------
+    matrix : (bin, mode, mode) complex128
     power : (bin,) float64
         Trace of the matrix outside of the other sources.
     dimensions : int
@@ -102,7 +103,7 @@ class BandLikelihood:
         self._whitening, self.omega, self._delays = whitening, omega, delays
         self.is_whitened = whitening is not None
         self.weights = weights
-        self._matrix, self.dimensions = matrix, matrix.shape[1] - len(others)
+        self.matrix, self.dimensions = matrix, matrix.shape[1] - len(others)
         power = np.trace(matrix, axis1=1, axis2=2).real
         self._basis = None
         if len(others):
@@ -113,15 +114,15 @@ class BandLikelihood:
     @functools.cached_property
     def projection(self) -> NDArray[np.complex128]:
         """Projection outside of the other sources: (bin, mode, mode) complex128."""
-        identity = np.broadcast_to(np.eye(self._matrix.shape[1], dtype=np.complex128), self._matrix.shape)
+        identity = np.broadcast_to(np.eye(self.matrix.shape[1], dtype=np.complex128), self.matrix.shape)
         return self.outside(identity)
 
     @functools.cached_property
     def rest(self) -> NDArray[np.complex128]:
         """Matrix outside of the other sources: (bin, mode, mode) complex128."""
         if self._basis is None:
-            return self._matrix
-        return np.asarray(self.projection @ self._matrix @ self.projection)
+            return self.matrix
+        return np.asarray(self.projection @ self.matrix @ self.projection)
 
     def outside(self, waves: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the parts of waves outside of the other sources: (bin, mode, direction) complex128."""
@@ -135,7 +136,7 @@ class BandLikelihood:
         Frequencies of the other sources, (bin, source), and those of the likelihood, (bin,), are its own by default.
         """
         omega = self.omega if omega is None else omega
-        return type(self)(self._matrix, self._whitening, omega, self.weights, self._delays, others, others_omega)
+        return type(self)(self.matrix, self._whitening, omega, self.weights, self._delays, others, others_omega)
 
     def unwhitened(self, matrices: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the matrices whose powers for a wave are those of given matrices for the whitened wave."""
@@ -148,6 +149,24 @@ class BandLikelihood:
 
         Angular frequencies, (bin, direction), are those of the likelihood by default.
         """
+        waves = self.unwhitened_waves(directions, omega, order=order)
+        if self._whitening is None:
+            return waves
+        return (self._whitening @ waves.view(np.float64)).view(np.complex128)  # Weights are real.
+
+    def beams(self, directions: Floats) -> tuple[Floats, Floats]:
+        """Return the power b^H C b, and the size of the wave outside of other sources, both (bin, direction)."""
+        return self._powers(self.waves(directions))
+
+    def _powers(self, waves: NDArray[np.complex128]) -> tuple[Floats, Floats]:
+        waves = self.outside(waves)
+        size = np.maximum((waves.real**2 + waves.imag**2).sum(axis=1), _LEAST)
+        return (waves.conj() * (self.matrix @ waves)).sum(axis=1).real / size, size
+
+    def unwhitened_waves(
+        self, directions: Floats, omega: Floats | None = None, *, order: int = 0
+    ) -> NDArray[np.complex128]:
+        """Return waves as `waves` does, at the microphones: (bin, mic, direction)."""
         delay_s = np.ascontiguousarray(self._delays(directions).T)
         lags = -(self.omega[:, None] if omega is None else omega)[:, None] * delay_s
         waves = np.empty(lags.shape, np.complex128)
@@ -155,15 +174,7 @@ class BandLikelihood:
         np.sin(lags, out=waves.imag)
         if order:
             waves *= (-1j * delay_s) ** order
-        if self._whitening is None:
-            return waves
-        return (self._whitening @ waves.view(np.float64)).view(np.complex128)  # Weights are real.
-
-    def beams(self, directions: Floats) -> tuple[Floats, Floats]:
-        """Return the power b^H C b, and the size of the wave outside of other sources, both (bin, direction)."""
-        waves = self.outside(self.waves(directions))
-        size = np.maximum((waves.real**2 + waves.imag**2).sum(axis=1), _LEAST)
-        return (waves.conj() * (self._matrix @ waves)).sum(axis=1).real / size, size
+        return waves
 
     def separated(self, directions: Floats, omega: Floats | None = None) -> tuple[Floats, Floats]:
         """Return the powers of sources without noise, each outside of the others, and the noise in each dimension.
@@ -175,7 +186,7 @@ class BandLikelihood:
         directions : (source, axis) float64
             All sources, one or more. This likelihood must have no other sources.
         omega : (bin, source) float64, optional
-            Their angular frequencies; those of the likelihood by default.
+            Angular frequencies of the sources; by default, those of the likelihood.
 
         Returns
         -------
@@ -186,7 +197,7 @@ class BandLikelihood:
         products = waves.conj().transpose(0, 2, 1) @ waves
         inverse = np.linalg.inv(products + _SINGULAR * waves.shape[1] * np.eye(len(directions)))
         beams = waves @ inverse
-        heard = self._matrix @ beams
+        heard = self.matrix @ beams
         within = (waves.conj() * heard).sum(axis=(1, 2)).real
         noise = np.maximum(self.power - within, _LEAST) / max(self.dimensions - len(directions), 1)
         sizes = np.einsum("kss->ks", inverse).real
@@ -199,7 +210,16 @@ class BandLikelihood:
 
     def __call__(self, directions: Floats) -> Floats:
         """Return the logarithm of the likelihood of directions, per sample: (direction,) float64."""
-        powers, _ = self.beams(directions)
+        return self._of_powers(self.beams(directions)[0])
+
+    def of_equal_channels(self) -> float:
+        """Return the logarithm of the likelihood of a signal that is equal at all microphones, per sample."""
+        waves = np.ones((*self.matrix.shape[:2], 1), np.complex128)
+        if self._whitening is not None:
+            waves = self._whitening @ waves
+        return float(self._of_powers(self._powers(waves)[0])[0])
+
+    def _of_powers(self, powers: Floats) -> Floats:
         left = np.maximum(self.power[:, None] - powers, 0) + _ROUNDING
         return np.asarray(-self.weights @ np.log(left))
 
@@ -222,7 +242,7 @@ class BandLikelihood:
 
     def powers_of(self, vectors: NDArray[np.complex128], others: NDArray[np.complex128]) -> Floats:
         """Return the real parts of ``x^H C y`` for vectors x and y: (bin, x, y) float64."""
-        return np.asarray((vectors.conj().transpose(0, 2, 1) @ (self._matrix @ others)).real)
+        return np.asarray((vectors.conj().transpose(0, 2, 1) @ (self.matrix @ others)).real)
 
     def maximum(self, start: Floats, *, reach_rad: float, level: bool) -> Floats:
         """Return the direction of the maximum next to a direction, by a Gauss-Newton method.

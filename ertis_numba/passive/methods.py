@@ -74,7 +74,7 @@ def music(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:
     if spectrum.n_blocks <= n_sources:
         raise DataError(
             f"passive.method is 'music' with {n_sources} sources, which needs more than {n_sources} blocks of samples, "
-            f"but there are {spectrum.n_blocks}; give a larger passive.averages, or wider bands"
+            f"but there are {spectrum.n_blocks}; use a larger passive.averages, or wider bands"
         )
 
     is_noise = 2 * n_sources > n_mics  # The smaller one of both subspaces takes fewer operations.

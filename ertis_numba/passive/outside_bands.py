@@ -94,4 +94,4 @@ class OutsideBands:
         low_hz, high_hz = 0.8 * frequency_hz, min(1.2 * frequency_hz, highest_hz)
         if frequency_hz >= 0.98 * highest_hz:
             return f"to locate this sound, record at a higher rate: bands end at {highest_hz / 1e3:.4g} kHz"
-        return f"to locate this sound, use --bands {typed_hz(low_hz)}:{typed_hz(high_hz)} (passive.bands_hz)"
+        return f"to locate this sound, use the band {typed_hz(low_hz)}:{typed_hz(high_hz)} Hz (passive.bands_hz)"

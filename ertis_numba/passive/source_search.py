@@ -11,8 +11,8 @@ from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.detection_law import LAGS, exceedance, independent_samples
 from ertis_numba.passive.direction_errors import covariance_of, powers_in_noise
 from ertis_numba.passive.heard_band import HeardBand
-from ertis_numba.passive.likelihood import BandLikelihood, Delays
-from ertis_numba.passive.noise_model import NoiseModel
+from ertis_numba.passive.likelihood import BandLikelihood, Delays, moved
+from ertis_numba.passive.noise_model import NoiseFluctuations, NoiseModel
 from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
 
 __all__ = ["BandSearch", "FoundSource", "Scan"]
@@ -25,6 +25,9 @@ _BLIND: Final = 0.3  # Size of a wave outside of other sources, relative to its 
 _SHARE_STEPS: Final = 10  # Per decade of white noise. Between steps, extents change by a few hundredths.
 _SWEEPS: Final = 2  # Corrections of all sources after each new one.
 _OWN: Final = 0.75  # Largest distance of sound from the centre of its bin, in spacings of bins.
+_WITHIN_NOISE: Final = 4.5  # Log-likelihood below its maximum: three standard deviations of a direction.
+_ARRAY_ERROR_RAD: Final = math.radians(0.4)  # Two standard deviations, as in `BearingTracker`.
+_AROUND: Final = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
 _MAX_EXCESS: Final = 10**0.1  # Power of all sources relative to that of the band: 1 dB for errors of estimates.
 
 
@@ -61,12 +64,15 @@ class FoundSource(NamedTuple):
         This power relative to the noise of a microphone.
     covariance_rad2 : (2, 2) float64
         Covariance of the direction's errors sideways and upwards; infinite along directions that are not resolved.
+    may_be_crosstalk : bool
+        A signal that is equal at all microphones fits as well as the direction.
     """
 
     direction: Floats
     power: float
     ratio: float
     covariance_rad2: Floats
+    may_be_crosstalk: bool
 
 
 class BandSearch:
@@ -175,15 +181,37 @@ class BandSearch:
         least: float,
     ) -> bool:
         """Return False if noise or errors of the known sources may cause a further source."""
-        extent, similarity = self._of_noise(diffuse)
-        n_samples = independent_samples(band.weights, band.n_blocks, similarity)
         share = float(rest.relative_power(place[None])[0]) / rest.dimensions
-        chance = exceedance(share, n_samples=n_samples, n_dimensions=rest.dimensions, extent=extent)
+        chance = self._chance(share, place, rest, whole, band, diffuse, places)
         known = band.weights @ whole.separated(places, band.omegas[:, : len(places)])[0] if len(places) else np.zeros(0)
         strongest = max(0.0, known.max(initial=0.0))
         power = float(band.weights @ powers_in_noise(rest, place)[0])
         size, whole_size = (float(band.weights @ each.beams(place[None])[1][:, 0]) for each in (rest, whole))
         return chance <= false_alarm and power >= least * strongest and size >= _BLIND * whole_size
+
+    def _chance(
+        self,
+        share: float,
+        place: Floats,
+        rest: BandLikelihood,
+        whole: BandLikelihood,
+        band: HeardBand,
+        diffuse: float,
+        places: Floats,
+    ) -> float:
+        """Return the probability that noise as it is heard outside of a direction and of known sources has a share."""
+        extent, similarity = self._of_noise(diffuse)
+        of_white = independent_samples(band.weights, band.n_blocks, similarity)
+        omegas = np.append(band.omegas[:, : len(places)], rest.omega[:, None], axis=1)
+        beside = whole.beside(np.concatenate([places, place[None]]), omegas)
+        outside = beside.projection
+        if self._scan.level:  # The source may be above or below.
+            loudest = np.linalg.eigh(beside.rest)[1][:, :, -1:]
+            outside = outside - loudest @ loudest.conj().transpose(0, 2, 1)
+        wave = rest.unwhitened_waves(place[None])
+        noise = NoiseFluctuations.of(whole.matrix, outside, wave, band.weights, of_white)
+        n_samples = noise.samples_at(share, rest.dimensions)
+        return exceedance(share, n_samples=n_samples, n_dimensions=rest.dimensions, extent=extent)
 
     def _of_noise(self, share: float) -> tuple[ScanExtent, Floats]:
         """Return the extent of the scan, and the similarity of the beams of neighbouring bins.
@@ -241,7 +269,15 @@ class BandSearch:
         powers, noise = powers_in_noise(band.beside(likelihood, places, k), places[k], band.width)
         ratio, power = float(band.weights @ (powers / noise)), float(band.shares @ (powers * band.level))
         covariance = covariance_of(likelihood, places, k, band, level=self._scan.level)
-        return FoundSource(places[k], max(0.0, power), max(0.0, ratio), covariance)
+        may_be_crosstalk = self._may_be_crosstalk(band.beside(likelihood, places, k), places[k], band)
+        return FoundSource(places[k], max(0.0, power), max(0.0, ratio), covariance, may_be_crosstalk)
+
+    def _may_be_crosstalk(self, beside: BandLikelihood, place: Floats, band: HeardBand) -> bool:
+        """Return True if equal channels are as likely as a direction within its noise, or as errors of the array."""
+        n_samples = independent_samples(band.weights, band.n_blocks)
+        nearby = beside(moved(place, _ARRAY_ERROR_RAD * _AROUND, level=False))
+        least = min(float(beside(place[None])[0]) - _WITHIN_NOISE / n_samples, float(nearby.min()))
+        return beside.of_equal_channels() >= least
 
 
 def _has_power(heard: CrossSpectrum) -> bool:

@@ -124,12 +124,12 @@ def time_differences(
         signals = _of_measurement(heard)
     else:
         if rate_hz is None:
-            raise ArgumentError("rate_hz is missing; give the sample rate of the signals")
+            raise ArgumentError("rate_hz is missing; pass the sample rate of the signals")
         signals = _Signals(_of_array(heard), checks.positive("rate_hz", rate_hz), (0.0, rate_hz / 2))
     n_mics, n_samples = signals.rows.shape if signals.rows.ndim == 2 else (0, 0)
     if n_mics < 2 or n_samples < _MIN_BLOCK:
         raise ArgumentError(
-            f"heard has shape {signals.rows.shape}; give {_MIN_BLOCK} samples or more of two microphones or more"
+            f"heard has shape {signals.rows.shape}; pass {_MIN_BLOCK} samples or more of two microphones or more"
         )
     checks.positive("resolution_hz", resolution_hz)
     n_block = round(min(signals.rate_hz / resolution_hz, _MAX_BLOCK))
@@ -166,7 +166,7 @@ def _of_array(heard: NDArray[np.float32]) -> NDArray[np.float32]:
         rows = np.asarray(None)
     if rows.dtype.kind not in "iuf":
         raise ArgumentError(
-            f"heard is of type {type(heard).__name__}; give a Measurement, or real numbers with axes microphone, sample"
+            f"heard is of type {type(heard).__name__}; pass a Measurement, or real numbers with axes microphone, sample"
         )
     with np.errstate(over="ignore"):  # finite_array reports what exceeds single precision
         rows = rows.astype(np.float32)
@@ -196,7 +196,7 @@ class _Correlator:
         if not self._chosen.any():
             raise ArgumentError(
                 f"band_hz {band_hz[0]:g} to {band_hz[1]:g} contains none of the frequencies {frequency_hz[1]:g} "
-                "Hz apart; give a wider band, or a smaller resolution_hz"
+                "Hz apart; use a wider band, or a smaller resolution_hz"
             )
         self._omega = 2 * np.pi * np.asarray(frequency_hz, np.float64)
         largest = np.abs(signals.rows).max()  # Powers of very large or small sound exceed single precision.

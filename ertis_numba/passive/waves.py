@@ -111,7 +111,7 @@ class Waves:
         matrices : (bin, mic, mic) complex64
             Hermitian matrices of all bins.
         powers : (bin, direction) float32
-            Their map of delay-and-sum.
+            Map of the powers by delay-and-sum.
         hollow : bool
             Leave out the diagonal of the matrices.
         """

@@ -75,7 +75,7 @@ class Child(Generic[Kind]):
 
     @property
     def ended(self) -> bool:
-        """True if the process is gone, and can write to no memory any more."""
+        """True if the process has ended, so that it cannot write to shared memory."""
         return self._process.poll() is not None
 
     def interrupt(self) -> None:

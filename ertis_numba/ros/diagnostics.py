@@ -3,6 +3,7 @@
 from typing import Any, Final
 
 from ertis_numba.network.status import SensorStatus, Status
+from ertis_numba.units import counted
 
 __all__ = ["diagnostics_message"]
 
@@ -36,7 +37,7 @@ def _sensor_row(title: str, name: str, sensor: SensorStatus) -> dict[str, Any]:
     if not sensor.connected:
         level, message = _STALE, "not connected"
     elif n_missing:
-        level, message = _WARN, f"{n_missing} measurements are missing"
+        level, message = _WARN, f"{counted(n_missing, 'measurement')} missing"
     values = {
         "rate_hz": f"{sensor.rate_hz:.2f}",
         "received": sensor.received,

@@ -29,7 +29,7 @@ class OdometryPublisher:
     is_paused : callable
         Returns True while nothing is to be published; the pose is still computed.
     alone : bool, optional
-        As for `Odometry`.
+        True if no other sensor emits than those given, as for `Odometry`; False by default.
     """
 
     def __init__(
@@ -63,9 +63,7 @@ class OdometryPublisher:
         if mounting is None:
             if sensor not in self._left_out:
                 self._left_out.add(sensor)
-                self._note(
-                    f"sensor {sensor} is left out of the odometry: its mounting is unknown; give --mounting FILE"
-                )
+                self._note(f"sensor {sensor} is left out of the odometry: its mounting is unknown; add it (mounting)")
             return
         self._mountings[sensor] = mounting
         for group in self._groups.add(item):

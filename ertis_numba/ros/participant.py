@@ -86,8 +86,8 @@ class Participant:
             self._participant: Any = DomainParticipant(self.domain)
         except DDSException as error:
             raise DeviceError(
-                f"cannot join domain {self.domain} on interface {interface}: {error}; give another --domain or "
-                "--interface, or end programs that use too many participants"
+                f"cannot join domain {self.domain} on interface {interface}: {error}; choose another domain or "
+                "interface (domain, interface), or end programs that use too many participants"
             ) from error
 
     def __enter__(self) -> Self:
@@ -186,7 +186,7 @@ def _domain_id(given: int | None) -> int:
     if value is None:
         name, text = "ROS_DOMAIN_ID", os.environ.get("ROS_DOMAIN_ID", "") or "0"
         if not text.isdecimal():
-            raise ArgumentError(f"ROS_DOMAIN_ID is {text!r}; give a number from 0 to {_MAX_DOMAIN}, or unset it")
+            raise ArgumentError(f"ROS_DOMAIN_ID is {text!r}; use a number from 0 to {_MAX_DOMAIN}, or unset it")
         value = int(text)
     return checks.integer(name, value, 0, _MAX_DOMAIN)
 

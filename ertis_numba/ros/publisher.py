@@ -361,7 +361,7 @@ def _namespace(given: str) -> str:
     for part in parts:
         if not part.isidentifier() or not part.isascii() or "__" in part:
             raise ArgumentError(
-                f"namespace {given!r} is not allowed in ROS; give names of letters, digits and single underscores that "
-                "do not begin with a digit, separated by /"
+                f"namespace {given!r} is not allowed in ROS; choose names of letters, digits and single underscores "
+                "that do not begin with a digit, separated by /"
             )
     return "".join(f"/{part}" for part in parts)

@@ -92,41 +92,41 @@ class Configuration:
     def __post_init__(self) -> None:
         if self.n_signal < 1:
             raise ArgumentError(
-                f"{self.n_samples} words give no signal after decimation by {self.pdm_factor}; give more words"
+                f"{self.n_samples} words give no signal after decimation by {self.pdm_factor}; use more words"
             )
         n_bins = self.n_signal // 2 + 1
         if self.matched_filter is not None and self.matched_filter.shape != (self.n_mics, n_bins):
             raise ArgumentError(
-                f"the matched filter has shape {self.matched_filter.shape}; give ({self.n_mics}, {n_bins}) for "
+                f"the matched filter has shape {self.matched_filter.shape}; use ({self.n_mics}, {n_bins}) for "
                 f"{self.n_mics} microphones and {self.n_samples} words"
             )
         if self.delays is not None:
             self._require_delays(self.delays)
         if not 1 <= self.dmas_order <= _MAX_ORDER:
-            raise ArgumentError(f"dmasOrder is {self.dmas_order}; give 0 to {_MAX_ORDER}")
+            raise ArgumentError(f"dmasOrder is {self.dmas_order}; use 0 to {_MAX_ORDER}")
         if len(self.disabled) >= self.n_mics:
             raise ArgumentError(f"all {self.n_mics} microphones are disabled; leave one enabled")
         if self.has_envelope and not 0 <= self.first_range < self.last_range:
             raise ArgumentError(
-                f"the image has ranges {self.first_range} to {self.last_range}; give a first one of at least 0, and a "
-                "later last one"
+                f"the image has ranges {self.first_range} to {self.last_range}; use a first range of at least 0, and a "
+                "last range after it"
             )
         if self.has_envelope and self.last_range > (n_ranges := -(-self.n_signal // self.envelope_factor)):
             raise ArgumentError(
-                f"the image ends at range {self.last_range}, but the record has {n_ranges}; give a smaller last_range"
+                f"the image ends at range {self.last_range}, but the record has {n_ranges}; use a smaller last_range"
             )
 
     def _require_delays(self, delays: NDArray[np.int32]) -> None:
         checks.integer("beamforming_drop", self.beamforming_drop, 0, self.n_signal - 1)
         if delays.shape != (self.n_directions, self.n_mics):
             raise ArgumentError(
-                f"the delay matrix has shape {delays.shape[::-1]}; give ({self.n_mics}, {self.n_directions})"
+                f"the delay matrix has shape {delays.shape[::-1]}; use ({self.n_mics}, {self.n_directions})"
             )
         if delays.min() < 0:
-            raise ArgumentError(f"the delay matrix holds {delays.min()}; give numbers of at least 0")
+            raise ArgumentError(f"the delay matrix holds {delays.min()}; pass numbers of at least 0")
         if delays.max() > self.n_signal:
             raise ArgumentError(
-                f"the delay matrix holds {delays.max()}, but signals have {self.n_signal} samples; give smaller delays"
+                f"the delay matrix holds {delays.max()}, but signals have {self.n_signal} samples; use smaller delays"
             )
 
     @property
@@ -311,7 +311,7 @@ class Processor:
 
     def _require_length(self, signals: Real) -> None:
         if signals.shape[1] != self._given.n_signal:
-            raise ArgumentError(f"signals have {signals.shape[1]} samples; give {self._given.n_signal}")
+            raise ArgumentError(f"signals have {signals.shape[1]} samples; use {self._given.n_signal}")
 
 
 def cleaned(image: Real, multipliers: tuple[float, float] | None) -> Real:

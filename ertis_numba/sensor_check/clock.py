@@ -25,7 +25,7 @@ _OUTLIER: Final = 5.0  # Limit of a deviation relative to the median deviation.
 _FALL_REMEDY: Final = "synchronise the clock of the host before recording again"
 _COUNT_REMEDY: Final = "check the SYNC cable and the supply of the sensor, and record again"
 _RATE_REMEDY: Final = "correct recording.sample_rate_hz or recording.n_samples in the settings"
-_NOMINAL_REMEDY: Final = "give the rate of this recording as --rate, or check the trigger"
+_NOMINAL_REMEDY: Final = "set --rate to the rate of this recording, or check the trigger"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -197,7 +197,7 @@ def _with_drift(found: ClockCheck, nominal_rate_hz: float | None) -> ClockCheck:
     if found.rate_hz is None or found.rate_sd_ppm is None:
         return found
     if nominal_rate_hz is None:
-        return replace(found, drift_unknown="the nominal rate is not known; give it as --rate")
+        return replace(found, drift_unknown="the nominal rate is not known; add it with --rate")
     drift_ppm = 1e6 * (found.rate_hz / nominal_rate_hz - 1)
     if abs(drift_ppm) > 1e6 * _MAX_DEVIATION:
         text = f"measurements have a rate of {found.rate_hz:.4g} Hz, but the nominal rate is {nominal_rate_hz:g} Hz"

@@ -21,6 +21,7 @@ from ertis_numba.sensor_check.residuals import CalibrationResiduals
 from ertis_numba.sensor_check.result import CheckFault
 from ertis_numba.settings import Settings
 from ertis_numba.storage.verify import SensorReport
+from ertis_numba.units import counted
 
 __all__ = [
     "CALIBRATION",
@@ -66,7 +67,7 @@ OTHER_CALL: Final = "another call was emitted"
 
 _DEVIATIONS: Final = 4.0
 _WORTH_S: Final = 1e-6  # 18 degrees of a period at 50 kHz.
-_CALIBRATE: Final = "calibrate the array (ertis calibrate), or give its own layout (--settings)"
+_CALIBRATE: Final = "calibrate the array (ertis calibrate), or check it with its own layout (--settings)"
 
 
 class CheckResult(NamedTuple):
@@ -147,7 +148,7 @@ def of_samples(report: Health | None, words: LostWords, shift: tuple[str, str] |
 
 
 def _none_lost(words: LostWords) -> str:
-    return f"no lost word found in {words.n_examined} measurement{'s' * (words.n_examined != 1)}"
+    return f"no lost word found in {counted(words.n_examined, 'measurement')}"
 
 
 def of_storage(stored: SensorReport) -> CheckResult:
@@ -167,7 +168,7 @@ def of_storage(stored: SensorReport) -> CheckResult:
         count = len(stored.damaged)
         add(f"{count} of {stored.measurements} measurements {'is' if count == 1 else 'are'} damaged", COPY)
     if stored.out_of_order:
-        add(f"{len(stored.out_of_order)} measurements are out of order", "record again")
+        add(f"{counted(len(stored.out_of_order), 'measurement')} out of order", "record again")
     if stored.remark:
         add(stored.remark, COPY)
     return _result_of(faults, f"{stored.measurements} stored, none missing or damaged")

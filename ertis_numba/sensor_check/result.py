@@ -11,6 +11,7 @@ from ertis_numba.sensor_check.lost_words import LostWords
 from ertis_numba.sensor_check.residuals import CalibrationResiduals
 from ertis_numba.settings import Settings
 from ertis_numba.storage.verify import SensorReport
+from ertis_numba.units import counted
 
 __all__ = ["CheckFault", "CheckItem", "RecordingCheck", "SensorCheck"]
 
@@ -163,6 +164,6 @@ class RecordingCheck:
             found = "fit for use as far as this recording shows" if hidden else "fit for use"
             return f"{self.path}: {'; '.join(filter(None, (found, unknown, hidden)))}"
         faults = self.faults
-        count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
+        count = counted(len(faults), "fault")
         remedies = "; ".join(dict.fromkeys(fault.remedy for fault in faults))
         return f"{self.path}: {count}: {'; '.join(fault.text for fault in faults)}. Remedy: {remedies}"

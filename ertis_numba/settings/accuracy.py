@@ -89,7 +89,7 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
             if value not in accepted:
                 raise ArgumentError(
                     f"accuracy.{name} is {value!r}, but processing.delay_matrix needs exact delays; leave {name} out "
-                    f"or give {accepted[1]!r}"
+                    f"or use {accepted[1]!r}"
                 )
 
     def _check_phase_shifts(self) -> None:
@@ -99,5 +99,5 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
             if value not in accepted:
                 raise ArgumentError(
                     f"accuracy.{name} is {value!r}, but accuracy.delay_taps 0 (phase shifts of spectra) supports only "
-                    f"{accepted[1]!r}; leave {name} out, or give delay_taps 1 to 8"
+                    f"{accepted[1]!r}; leave {name} out, or use delay_taps 1 to 8"
                 )

@@ -99,7 +99,7 @@ class Array(TomlTable, frozen=True, kw_only=True):
     def _refuse_per_channel(self) -> None:
         for name in ("enabled", "gain", "delay_s"):
             if getattr(self, name) is not None:
-                raise ArgumentError(f"array.{name} is given without array.positions_m; give both or neither")
+                raise ArgumentError(f"array.{name} is given without array.positions_m; use both or neither")
 
     @property
     def is_file(self) -> bool:

@@ -47,7 +47,7 @@ def parse_window(name: str) -> ArrayWindow:
     if parameter is None:
         if colon:
             raise ArgumentError(
-                f"processing.array_weights is {name[:80]!r} although the window {window} has no parameter; give "
+                f"processing.array_weights is {name[:80]!r} although the window {window} has no parameter; use "
                 f"{window!r}"
             )
         return ArrayWindow(window, 0.0)
@@ -57,7 +57,7 @@ def parse_window(name: str) -> ArrayWindow:
         value = float(given)
     except ValueError:
         raise ArgumentError(
-            f"processing.array_weights is {name[:80]!r}; give a number after the colon, such as "
+            f"processing.array_weights is {name[:80]!r}; use a number after the colon, such as "
             f"'{window}:{parameter.default:g}'"
         ) from None
     return ArrayWindow(window, checks.between(f"parameter of processing.array_weights {window}", value, *parameter[1:]))

@@ -70,12 +70,12 @@ class Call(TomlTable, frozen=True, kw_only=True):
             frequency_hz = checks.positive(f"call.{name}", getattr(self, name))
             if frequency_hz >= self.sample_rate_hz / 2:
                 raise ArgumentError(
-                    f"call.{name} is {frequency_hz:g}; give less than half of call.sample_rate_hz "
+                    f"call.{name} is {frequency_hz:g}; use less than half of call.sample_rate_hz "
                     f"({self.sample_rate_hz:g})"
                 )
         if self.start_frequency_hz == self.stop_frequency_hz:
             raise ArgumentError(
-                f"call.start_frequency_hz and call.stop_frequency_hz are both {self.start_frequency_hz:g}; give two "
+                f"call.start_frequency_hz and call.stop_frequency_hz are both {self.start_frequency_hz:g}; choose two "
                 "different frequencies"
             )
         checks.between("call.duration_s", self.duration_s, 16 / self.sample_rate_hz, 1.0)
@@ -89,7 +89,7 @@ class Call(TomlTable, frozen=True, kw_only=True):
         if self.duration_s * self.low_frequency_hz < 1:
             raise ArgumentError(
                 f"call.duration_s is {self.duration_s:g}, less than a period of {self.low_frequency_hz:g} Hz; "
-                f"give {1 / self.low_frequency_hz:g} or more"
+                f"use {1 / self.low_frequency_hz:g} or more"
             )
         checks.between("call.ramp_fraction", self.ramp_fraction, 0.0, 0.5)
         checks.choice("call.modulation", self.modulation, ("hyperbolic", "linear"))
@@ -169,7 +169,7 @@ class Call(TomlTable, frozen=True, kw_only=True):
         """
         if isinstance(self.waveform, str):
             raise ArgumentError(
-                f"call.waveform is the file {self.waveform!r}, which has not been read; give Call.from_file("
+                f"call.waveform is the file {self.waveform!r}, which has not been read; use Call.from_file("
                 f"{self.waveform!r}), or read the settings by Settings.load"
             )
 

@@ -21,8 +21,8 @@ def check_delays(given: tuple[tuple[float, ...], ...]) -> None:
     lengths = {len(row) for row in given}
     if len(lengths) > 1:
         raise ArgumentError(
-            f"processing.delay_matrix has rows of {min(lengths)} to {max(lengths)} numbers; give one for each channel "
-            "in each row"
+            f"processing.delay_matrix has rows of {min(lengths)} to {max(lengths)} numbers; write one number for each "
+            "channel in each row"
         )
     if sum(map(len, given)) > MAX_LISTED_DELAYS:
         raise ArgumentError(

@@ -47,7 +47,7 @@ class FirFilters(NamedTuple):
         for name, value in given.items():
             if isinstance(value, str):
                 raise ArgumentError(
-                    f"processing.{name} is the file {value!r}, which has not been read; give its taps, or read the "
+                    f"processing.{name} is the file {value!r}, which has not been read; set its taps, or read the "
                     "settings by Settings.load"
                 )
             taps += [value] if value else []
@@ -83,4 +83,4 @@ def check_taps(name: str, taps: tuple[float, ...]) -> None:
     for place, tap in enumerate(taps):
         checks.between(f"{name}[{place}]", tap, -_LARGEST_TAP, _LARGEST_TAP)
     if taps and not any(taps):
-        raise ArgumentError(f"{name} contains only 0; give other taps, or leave it out")
+        raise ArgumentError(f"{name} contains only 0; choose other taps, or leave it out")

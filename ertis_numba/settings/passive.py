@@ -89,7 +89,7 @@ class Passive(TomlTable, frozen=True, kw_only=True):
         if self.diagonal_removal and self.method not in _WITHOUT_DIAGONAL:
             raise ArgumentError(
                 f"passive.diagonal_removal is true, which passive.method {self.method!r} does not support; leave it "
-                f"out, or give one of {', '.join(_WITHOUT_DIAGONAL)}"
+                f"out, or choose one of {', '.join(_WITHOUT_DIAGONAL)}"
             )
 
     @property
@@ -119,12 +119,12 @@ class Passive(TomlTable, frozen=True, kw_only=True):
             checks.choice("passive.bands_hz", given, ("third_octaves", "octaves"))
             return
         if not 1 <= len(given) <= MAX_BANDS:
-            raise ArgumentError(f"passive.bands_hz lists {len(given)} bands; give 1 to {MAX_BANDS}")
+            raise ArgumentError(f"passive.bands_hz lists {len(given)} bands; use 1 to {MAX_BANDS}")
         for number, band in enumerate(given):
             checks.interval(f"passive.bands_hz[{number}]", band, 1.0, 1e9)
         for (low_hz, high_hz), (next_low_hz, next_high_hz) in itertools.pairwise(sorted(given)):
             if next_low_hz < high_hz:  # The sum of all bands would count their frequencies twice.
                 raise ArgumentError(
                     f"passive.bands_hz has overlapping bands {low_hz:g} to {high_hz:g} Hz and {next_low_hz:g} to "
-                    f"{next_high_hz:g} Hz; give bands that share at most an edge"
+                    f"{next_high_hz:g} Hz; use bands that share at most an edge"
                 )

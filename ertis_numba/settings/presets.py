@@ -16,8 +16,8 @@ __all__ = ["PRESETS", "PresetKind", "preset_tables", "preset_text", "presets"]
 PresetKind = Literal["recording", "processing"]
 
 _INSTEAD = {
-    "recording": "give it to Settings.from_preset, or as --preset of 'ertis capture'",
-    "processing": "give it to Processing.from_preset, or as --preset of 'ertis process'",
+    "recording": "use it with Settings.from_preset or 'ertis capture --preset {0}'",
+    "processing": "use it with Processing.from_preset or 'ertis process --preset {0}'",
 }
 
 
@@ -81,11 +81,11 @@ def preset_tables(name: str, kind: PresetKind | None = None) -> dict[str, dict[s
     own = of_rtisdev.get(name, name)
     if own not in _shipped():
         if str(own).lower().endswith(".toml"):
-            raise ArgumentError(f"preset {own!r} is the name of a file; use it as settings (--settings {own})")
+            raise ArgumentError(f"preset {own!r} is the name of a file; load it as settings (settings)")
         checks.choice("preset", own, presets(kind))
     tables = _shipped()[own]
     if kind not in {None, _kind(tables)}:
-        raise ArgumentError(f"preset is {name!r}, a {_kind(tables)} preset; {_INSTEAD[_kind(tables)]}")
+        raise ArgumentError(f"preset is {name!r}, a {_kind(tables)} preset; {_INSTEAD[_kind(tables)].format(own)}")
     return {section: dict(keys) for section, keys in tables.items() if section != "rtisdev"}
 
 

@@ -187,7 +187,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         shape = getattr(self.directions, "shape", None)  # of an array, before its rows become tuples
         if shape is not None and shape[1:] != (2,):
             raise ArgumentError(
-                f"processing.directions has shape {shape}; give azimuth and elevation in degrees, of shape (n, 2)"
+                f"processing.directions has shape {shape}; use azimuth and elevation in degrees, of shape (n, 2)"
             )
         super().__post_init__()
         checks.choice("processing.mode", self.mode, ("auto", "active", "passive"))
@@ -202,21 +202,21 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             checks.interval("processing.band_edges_hz", self.band_edges_hz, 0.0, 1e9)
             if self.method == "paper":
                 raise ArgumentError(
-                    "processing.band_edges_hz is not supported by processing.method 'paper'; leave it out, or give "
+                    "processing.band_edges_hz is not supported by processing.method 'paper'; leave it out, or use "
                     "method 'fast'"
                 )
         if self.decimation is not None:
             checks.integer("processing.decimation", self.decimation, 1, 1000)
             if self.range_decimation % self.decimation:
                 raise ArgumentError(
-                    f"processing.decimation is {self.decimation}; give a divisor of processing.range_decimation "
+                    f"processing.decimation is {self.decimation}; use a divisor of processing.range_decimation "
                     f"({self.range_decimation})"
                 )
         checks.choice("processing.wavefront", self.wavefront, ("plane", "spherical", "auto"))
         if self.wavefront != "plane" and self.method == "paper":
             raise ArgumentError(
                 f"processing.wavefront is {self.wavefront!r}, but processing.method 'paper' supports only plane "
-                "wavefronts; give 'plane', or method 'fast'"
+                "wavefronts; use 'plane', or method 'fast'"
             )
         self._check_beamformer()
         self._check_array_weights()
@@ -236,7 +236,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             return
         if not 1 <= len(given) <= MAX_LISTED_DIRECTIONS:
             raise ArgumentError(
-                f"processing.directions lists {len(given)} directions; give 1 to {MAX_LISTED_DIRECTIONS}, or more of "
+                f"processing.directions lists {len(given)} directions; use 1 to {MAX_LISTED_DIRECTIONS}, or more of "
                 "them in a CSV file"
             )
         for row, (azimuth_deg, elevation_deg) in enumerate(given):
@@ -249,14 +249,14 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         if isinstance(given, str):
             parse_window(given)
         elif not 1 <= len(given) <= MAX_MICROPHONES:
-            raise ArgumentError(f"processing.array_weights has {len(given)} numbers; give one for each channel")
+            raise ArgumentError(f"processing.array_weights has {len(given)} numbers; use one number for each channel")
         else:
             for channel, weight in enumerate(given):
                 checks.between(f"processing.array_weights[{channel}]", weight, 0.0, 1e6)
         if given != "uniform" and self.is_adaptive:
             raise ArgumentError(
                 f"processing.array_weights is {_shortened(given)}, but {self._adaptive_part} supports only 'uniform'; "
-                "leave array_weights out, or give processing.beamformer 'delay_and_sum' and weighting 'none'"
+                "leave array_weights out, or use processing.beamformer 'delay_and_sum' and weighting 'none'"
             )
 
     def _check_beamformer(self) -> None:
@@ -264,7 +264,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         weightings: tuple[str, ...] = tuple(WEIGHTINGS)
         if self.beamformer in weightings:
             raise ArgumentError(
-                f"processing.beamformer {self.beamformer!r} is a weighting; give it as processing.weighting, with"
+                f"processing.beamformer {self.beamformer!r} is a weighting; set it as processing.weighting, with"
                 f" one of the beamformers {', '.join(BEAMFORMERS)}"
             )
         checks.choice("processing.beamformer", self.beamformer, tuple(BEAMFORMERS))
@@ -278,13 +278,13 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         if self.is_adaptive and self.method == "paper":
             raise ArgumentError(
                 "processing.method is 'paper', which supports only processing.beamformer 'delay_and_sum' and weighting "
-                f"'none'; give 'fast' with {self._adaptive_part}"
+                f"'none'; use 'fast' with {self._adaptive_part}"
             )
         beamformer = BEAMFORMERS[self.beamformer]
         if self.wavefront == "spherical" and not beamformer.streams(*beamformer.values(self)):
             raise ArgumentError(
                 f"processing.wavefront is 'spherical', which processing.beamformer {self.beamformer!r} does not "
-                "support; give 'plane', or another processing.beamformer"
+                "support; use 'plane', or another processing.beamformer"
             )
 
     def _check_filters(self) -> None:
@@ -297,13 +297,13 @@ class Processing(TomlTable, frozen=True, kw_only=True):
                 check_taps(f"processing.{name}", taps)
             if taps and self.method == "paper":
                 raise ArgumentError(
-                    f"processing.{name} is not supported by processing.method 'paper'; leave it out, or give method "
+                    f"processing.{name} is not supported by processing.method 'paper'; leave it out, or use method "
                     "'fast'"
                 )
         if self.post_filter and self.is_adaptive:
             raise ArgumentError(
                 f"processing.post_filter filters beams, but {self._adaptive_part} combines signals to amplitudes; "
-                "leave it out, or give processing.beamformer 'delay_and_sum' and weighting 'none'"
+                "leave it out, or use processing.beamformer 'delay_and_sum' and weighting 'none'"
             )
 
     def _check_delays(self) -> None:
@@ -323,7 +323,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         if self.is_adaptive or self.wavefront != "plane":
             part = self._adaptive_part if self.is_adaptive else f"processing.wavefront {self.wavefront!r}"
             raise ArgumentError(
-                f"processing.delay_matrix is given, which {part} does not support; leave it out, or give beamformer "
+                f"processing.delay_matrix is given, which {part} does not support; leave it out, or use beamformer "
                 "'delay_and_sum', weighting 'none' and wavefront 'plane'"
             )
 
@@ -374,7 +374,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         """
         if self.last_stage != "envelope":
             raise ArgumentError(
-                f"processing.last_stage is {self.last_stage!r}, which yields no image; give 'envelope', or call "
+                f"processing.last_stage is {self.last_stage!r}, which yields no image; use 'envelope', or call "
                 "Pipeline.result for the result of that stage"
             )
 
@@ -393,7 +393,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         """
         if self.level_directions:
             raise ArgumentError(
-                f"processing.level_directions is true, but {reason}; process again without it (--no-level)"
+                f"processing.level_directions is true, but {reason}; process again without it (level_directions)"
             )
 
     def require_beams(self, wanted: str) -> None:
@@ -410,10 +410,10 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             The method is ``paper``, or amplitudes are adaptive.
         """
         if self.method == "paper":
-            raise ArgumentError(f"{wanted}, but processing.method 'paper' returns none; give method 'fast'")
+            raise ArgumentError(f"{wanted}, but processing.method 'paper' returns none; use method 'fast'")
         if self.is_adaptive:
             raise ArgumentError(
-                f"{wanted}, but {self._adaptive_part} combines signals to amplitudes without a phase; give "
+                f"{wanted}, but {self._adaptive_part} combines signals to amplitudes without a phase; use "
                 "processing.beamformer 'delay_and_sum' and weighting 'none'"
             )
 

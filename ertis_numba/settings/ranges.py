@@ -52,7 +52,7 @@ def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Proc
     if recording.duration_s <= call.end_s:
         raise ArgumentError(
             f"recording.n_samples gives a record of {1e3 * recording.duration_s:.4g} ms, but the call ends after "
-            f"{1e3 * call.end_s:.4g} ms; give more samples"
+            f"{1e3 * call.end_s:.4g} ms; use more samples"
         )
     changes: dict[str, Any] = {}
     first_m, last_m = Processing().range_m

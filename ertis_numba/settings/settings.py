@@ -92,14 +92,14 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         if self.signal_rate_hz <= 2 * self.call.high_frequency_hz:
             raise ArgumentError(
                 f"processing.decimation {self.decimation} leaves signals at "
-                f"{self.signal_rate_hz:g} Hz; give one that leaves more than twice the call's "
+                f"{self.signal_rate_hz:g} Hz; use a decimation that leaves more than twice the call's "
                 f"{self.call.high_frequency_hz:g} Hz, or without a call, processing.mode 'passive'"
             )
         swept_hz = self.call.high_frequency_hz - self.call.low_frequency_hz
         if self.processing.method == "paper" and swept_hz < _MIN_BANDWIDTH_HZ:
             raise ArgumentError(
                 f"call sweeps over {swept_hz:g} Hz, too little for the band-pass filter of processing.method 'paper'; "
-                f"give {_MIN_BANDWIDTH_HZ:g} Hz or more, or method 'fast'"
+                f"use {_MIN_BANDWIDTH_HZ:g} Hz or more, or method 'fast'"
             )
         self._check_band()
         self._check_plan()
@@ -108,8 +108,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         if self.processing.decimation is None and self.decimation * _MAX_OVERSAMPLING < min(step, self._max_decimation):
             raise ArgumentError(
                 f"processing.range_decimation {step} has no divisor near "
-                f"{self._max_decimation}, the decimation that suits the call; give a multiple of "
-                f"{self._max_decimation}, or give processing.decimation"
+                f"{self._max_decimation}, the decimation that suits the call; use a multiple of "
+                f"{self._max_decimation}, or set processing.decimation"
             )
 
     def _check_band(self) -> None:
@@ -128,13 +128,13 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
         if given[0] > highest_hz or given[1] < lowest_hz:
             raise ArgumentError(
                 f"processing.band_edges_hz is {given[0]:g} to {given[1]:g} Hz, but the call sweeps over "
-                f"{self.call.low_frequency_hz:g} to {self.call.high_frequency_hz:g} Hz; give a lower edge of at most "
+                f"{self.call.low_frequency_hz:g} to {self.call.high_frequency_hz:g} Hz; use a lower edge of at most "
                 f"{highest_hz:g} and an upper edge of at least {lowest_hz:g}"
             )
         if given[1] > nyquist_hz:
             raise ArgumentError(
                 f"processing.band_edges_hz ends at {given[1]:g} Hz, but signals at {self.signal_rate_hz:g} Hz reach "
-                f"only {nyquist_hz:g} Hz; give a lower edge or a smaller processing.decimation"
+                f"only {nyquist_hz:g} Hz; use a lower edge or a smaller processing.decimation"
             )
 
     def _check_filters(self) -> None:
@@ -147,14 +147,14 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             return
         if filters.rate_hz <= 2 * high_hz:
             raise ArgumentError(
-                f"processing.filter_rate_hz is {filters.rate_hz:g}; give more than twice the call's {high_hz:g} Hz"
+                f"processing.filter_rate_hz is {filters.rate_hz:g}; use more than twice the call's {high_hz:g} Hz"
             )
         gain = np.abs(filters.response(np.linspace(self.call.low_frequency_hz, high_hz, _BAND_STEPS)))
         largest = math.prod(sum(map(abs, taps)) for taps in filters.taps)
         if gain.max() < _MIN_FILTER_GAIN * largest:
             raise ArgumentError(
                 "processing.pre_filter and post_filter remove the band of the call, "
-                f"{self.call.low_frequency_hz:g} to {high_hz:g} Hz; give filters that pass it, or another "
+                f"{self.call.low_frequency_hz:g} to {high_hz:g} Hz; use filters that pass it, or another "
                 "processing.filter_rate_hz"
             )
 
@@ -167,7 +167,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             raise ArgumentError(
                 f"accuracy.delay_taps is 0 (phase shifts of spectra), which processing.beamformer "
                 f"{processing.beamformer!r} with weighting {processing.weighting!r} does not support; leave it out or "
-                "give 1"
+                "use 1"
             )
         beamformer = BEAMFORMERS[processing.beamformer]
         if beamformer.streams(*beamformer.values(processing)):
@@ -180,7 +180,7 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
             if value != wanted:
                 raise ArgumentError(
                     f"accuracy.{name} is {value!r}, which processing.beamformer {processing.beamformer!r} does not "
-                    f"support; leave it out or give {wanted!r}"
+                    f"support; leave it out or use {wanted!r}"
                 )
 
     @classmethod

@@ -42,10 +42,10 @@ def read_waveform(path: Path, *, key: str = "call.waveform") -> tuple[tuple[floa
     """
     suffix = path.suffix.lower()
     if suffix not in WAVEFORM_FILES:
-        raise SettingsError(f"{key} is {str(path)!r}; give a .wav, .csv or .npy file, or a list of samples")
+        raise SettingsError(f"{key} is {str(path)!r}; choose a .wav, .csv or .npy file, or a list of samples")
     try:
         if not path.is_file():
-            raise SettingsError(f"{key} {path}: no such file; give the name of a .wav, .csv or .npy file")
+            raise SettingsError(f"{key} {path}: no such file; choose the name of a .wav, .csv or .npy file")
         n_bytes = path.stat().st_size
         if n_bytes > _MAX_FILE_BYTES:
             raise SettingsError(f"{key} {path} has {n_bytes} bytes; the limit is {_MAX_FILE_BYTES}")
@@ -60,7 +60,7 @@ def read_waveform(path: Path, *, key: str = "call.waveform") -> tuple[tuple[floa
         values = values[:, 0]
     if values.ndim != 1 or values.dtype.kind not in "iuf":
         raise SettingsError(
-            f"{key} {path} contains {values.dtype} of shape {values.shape}; give one channel of real numbers"
+            f"{key} {path} contains {values.dtype} of shape {values.shape}; use one channel of real numbers"
         )
     # Unsigned bytes are the only WAV samples whose silence is not 0.
     middle = 128.0 if suffix == ".wav" and values.dtype == np.uint8 else 0.0
@@ -91,14 +91,14 @@ def normalise(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
         samples = samples[: max((number + 1 for number, sample in enumerate(samples) if sample), default=len(samples))]
     if not smallest <= len(samples) <= MAX_WAVEFORM_SAMPLES:
         raise ArgumentError(
-            f"call.waveform has {len(samples)} samples; give {smallest} to {MAX_WAVEFORM_SAMPLES}, at "
+            f"call.waveform has {len(samples)} samples; use {smallest} to {MAX_WAVEFORM_SAMPLES}, at "
             f"{rate_hz:g} Hz {1e3 * (MAX_WAVEFORM_SAMPLES - 1) / rate_hz:.3g} ms at most"
         )
     values = np.array(samples, dtype=np.float64)
     checks.finite_array("call.waveform", values)
     peak = float(np.abs(values).max())
     if not peak:
-        raise ArgumentError("call.waveform contains only 0; give other samples")
+        raise ArgumentError("call.waveform contains only 0; choose other samples")
     return tuple(np.round(values / peak, _DECIMALS).tolist())
 
 

@@ -63,4 +63,4 @@ def _n_bytes(found: object) -> int:
         return _OBJECT_BYTES + sum(map(_n_bytes, found))
     if dataclasses.is_dataclass(found):
         return _OBJECT_BYTES + sum(_n_bytes(getattr(found, each.name)) for each in dataclasses.fields(found))
-    raise TypeError(f"size of {type(found).__name__} is unknown; give it a property nbytes")
+    raise TypeError(f"size of {type(found).__name__} is unknown; add a property nbytes to it")

@@ -85,7 +85,7 @@ class Platform(TomlTable, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.waypoints:
-            raise ArgumentError("platform has no waypoints; give at least one (time_s, x, y, z, yaw_deg)")
+            raise ArgumentError("platform has no waypoints; write at least one (time_s, x, y, z, yaw_deg)")
         for number, (time_s, x, y, z, yaw_deg) in enumerate(self.waypoints):
             checks.finite(f"platform.waypoints[{number}] time", time_s)
             check_vector(f"platform.waypoints[{number}]", (x, y, z), MAX_DISTANCE_M)
@@ -93,7 +93,7 @@ class Platform(TomlTable, frozen=True, kw_only=True):
         for (before_s, *a, start_deg), (after_s, *b, stop_deg) in itertools.pairwise(self.waypoints):
             if after_s <= before_s:
                 raise ArgumentError(
-                    f"platform.waypoints go from {before_s:g} s to {after_s:g} s; give strictly increasing times"
+                    f"platform.waypoints go from {before_s:g} s to {after_s:g} s; pass strictly increasing times"
                 )
             took_s = after_s - before_s
             checks.between("platform.waypoints speed", math.dist(a, b) / took_s, 0.0, MAX_SPEED_M_S)

@@ -107,7 +107,7 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
                     f"effect {name!r} cannot be left out ({INDISPENSABLE[name]}); remove it from effects"
                 )
         if not self.sensors:
-            raise ArgumentError("the scene has no sensors; give at least one")
+            raise ArgumentError("the scene has no sensors; add at least one")
         names = [sensor.name for sensor in self.sensors]
         for name in names:
             if names.count(name) > 1:

@@ -31,7 +31,7 @@ def require_few_mirrors(n_walls: int, order: int, n_places: int) -> None:
     if n_chains * n_places > MAX_MIRROR_POINTS:
         raise ArgumentError(
             f"the scene has {n_chains * n_places} mirror points, from {n_walls} walls (6 per box), {n_places} targets "
-            f"and max_reflections {order}; the limit is {MAX_MIRROR_POINTS}. Lower max_reflections, or give fewer "
+            f"and max_reflections {order}; the limit is {MAX_MIRROR_POINTS}. Lower max_reflections, or use fewer "
             "walls or targets"
         )
 
@@ -47,7 +47,7 @@ def require_few_paths(n_paths: int) -> None:
     if n_paths > MAX_PATHS:
         raise ArgumentError(
             f"the scene has at least {n_paths} sound paths to one sensor; the limit is {MAX_PATHS}. "
-            "Lower max_reflections, or give fewer targets or walls"
+            "Lower max_reflections, or use fewer targets or walls"
         )
 
 
@@ -63,5 +63,5 @@ def require_few_amplitudes(n_paths: int, n_mics: int, n_frequencies: int) -> Non
         raise ArgumentError(
             f"the scene has {n_paths} sound paths to {n_mics} microphones at {n_frequencies} frequencies, in total "
             f"{n_paths * n_mics * n_frequencies} amplitudes; the limit is {MAX_AMPLITUDES}. Lower max_reflections, or "
-            "give fewer targets, walls or microphones"
+            "use fewer targets, walls or microphones"
         )

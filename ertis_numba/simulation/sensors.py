@@ -75,7 +75,7 @@ class Emitter(TomlTable, frozen=True, kw_only=True):
             elif self.resonance_hz is None:
                 raise ArgumentError(
                     f"emitter.quality_factor is {self.quality_factor:g}, but the emitter has no resonance; "
-                    "give emitter.resonance_hz, or leave out quality_factor"
+                    "add emitter.resonance_hz, or remove quality_factor"
                 )
         checks.between("emitter.level_db", self.level_db, -300.0, _LOUDEST_DB)
         checks.between("emitter.diameter_m", self.diameter_m, 0.0, MAX_EMITTER_M)
@@ -143,7 +143,7 @@ class Electronics(TomlTable, frozen=True, kw_only=True):
         both = set(self.stuck_low) & set(self.stuck_high)
         if both:
             raise ArgumentError(
-                f"electronics has channel {min(both)} in both stuck_low and stuck_high; give it in only one of them"
+                f"electronics has channel {min(both)} in both stuck_low and stuck_high; use only one of them"
             )
 
     @property
@@ -201,7 +201,7 @@ class Sensor(Settings, frozen=True, kw_only=True):
         super().__post_init__()
         if not _NAME.fullmatch(self.name):
             raise ArgumentError(
-                f"sensor.name is {self.name!r}; give letters, digits and _, and from the second character also . @ + -"
+                f"sensor.name is {self.name!r}; use letters, digits and _, and from the second character also . @ + -"
             )
         checks.between("sensor.yaw_deg", self.yaw_deg, -180.0, 180.0)
         checks.between("sensor.pitch_deg", self.pitch_deg, -90.0, 90.0)
@@ -226,7 +226,7 @@ class Sensor(Settings, frozen=True, kw_only=True):
             if channel >= len(enabled) or not enabled[channel]:
                 raise ArgumentError(
                     f"sensor {self.name!r} has no microphone on channel {channel}, which electronics lists as faulty; "
-                    f"give one of its {len(enabled)} channels that has a microphone, counted from 0"
+                    f"choose one of its {len(enabled)} channels that has a microphone, counted from 0"
                 )
 
     def path(self) -> Placed:

@@ -51,7 +51,7 @@ class SoundSource(Placed, frozen=True, kw_only=True):
             if not self.diameter_m:
                 raise ArgumentError(
                     f"{name}.facing_deg is given, but a source without a diameter emits equally in all directions; "
-                    f"give {name}.diameter_m, or leave out facing_deg"
+                    f"add {name}.diameter_m, or remove facing_deg"
                 )
 
     def axis_at(self, time_s: float) -> Floats:
@@ -101,8 +101,8 @@ class Tone(SoundSource, frozen=True, kw_only=True):
             checks.between("tone.modulation_hz", self.modulation_hz, 1e-3, self.frequency_hz)
         elif self.modulation_depth != 1.0:
             raise ArgumentError(
-                f"tone.modulation_depth is {self.modulation_depth:g}, but the tone is steady; give tone.modulation_hz, "
-                "or leave out modulation_depth"
+                f"tone.modulation_depth is {self.modulation_depth:g}, but the tone is steady; add tone.modulation_hz, "
+                "or remove modulation_depth"
             )
 
     def partials(self) -> tuple[Floats, NDArray[np.complex128]]:
@@ -160,7 +160,7 @@ class Noise(SoundSource, frozen=True, kw_only=True):
             checks.between("noise.orifice_m", self.orifice_m, *_ORIFICES_M)
         if (self.orifice_m is not None) != (self.spectrum == "leak"):
             raise ArgumentError(
-                f"noise.spectrum is {self.spectrum!r} and noise.orifice_m is {self.orifice_m}; give noise.orifice_m "
+                f"noise.spectrum is {self.spectrum!r} and noise.orifice_m is {self.orifice_m}; use noise.orifice_m "
                 'with spectrum = "leak", and only with it'
             )
         if not isinstance(self.spectrum, str):
@@ -173,7 +173,7 @@ class Noise(SoundSource, frozen=True, kw_only=True):
             checks.between("frequency of noise.spectrum", each_hz, 1.0, _HIGHEST_HZ)
             checks.between("level of noise.spectrum", level_db, -300.0, 60.0)
         if any(after <= before for before, after in itertools.pairwise(frequency_hz)):
-            raise ArgumentError("noise.spectrum has frequencies that do not increase; give them in increasing order")
+            raise ArgumentError("noise.spectrum has frequencies that do not increase; sort them in increasing order")
 
     @property
     def peak_hz(self) -> float:
@@ -259,4 +259,4 @@ class Ambient(TomlTable, frozen=True, kw_only=True):
 def _check_band(name: str, band_hz: tuple[float, float]) -> None:
     checks.interval(name, band_hz, 1.0, _HIGHEST_HZ)
     if band_hz[0] == band_hz[1]:
-        raise ArgumentError(f"{name} starts and ends at {band_hz[0]:g} Hz; give two different frequencies")
+        raise ArgumentError(f"{name} starts and ends at {band_hz[0]:g} Hz; choose two different frequencies")

@@ -48,7 +48,7 @@ class Point(Placed, frozen=True, kw_only=True):
             if not self.diameter_m:
                 raise ArgumentError(
                     "point.facing_deg is given, but a point without a diameter reflects equally in all directions; "
-                    "give point.diameter_m for a disc, or leave out facing_deg"
+                    "add point.diameter_m for a disc, or remove facing_deg"
                 )
 
     def normal_at(self, time_s: float) -> NDArray[np.float64]:
@@ -152,7 +152,9 @@ class Box(Placed, frozen=True, kw_only=True):
         checks.between("box.yaw_deg", self.yaw_deg, -180.0, 180.0)
         checks.between("box.reflection_db", self.reflection_db, -300.0, 0.0)
         if self.waypoints:
-            raise ArgumentError("box has waypoints, but boxes support only position_m and velocity_m_s; give these")
+            raise ArgumentError(
+                "box has waypoints, but boxes support only position_m and velocity_m_s; use one of these"
+            )
 
     def walls(self) -> tuple[Wall, ...]:
         """Return the sides of the box, facing outwards: front, back, left, right, top, bottom."""

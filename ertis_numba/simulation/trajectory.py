@@ -28,7 +28,7 @@ class Placed(TomlTable, frozen=True, kw_only=True):
     position_m : (x, y, z), optional
         Position at the start of the first measurement, in metres.
     azimuth_deg, elevation_deg, range_m : float, optional
-        The same position in spherical coordinates about the origin; give either these or ``position_m``.
+        The same position in spherical coordinates about the origin; use either these or ``position_m``.
     velocity_m_s : (x, y, z)
         Constant velocity in the world frame, in metres per second; 0 by default.
     waypoints : tuple of (time_s, x, y, z)
@@ -49,12 +49,12 @@ class Placed(TomlTable, frozen=True, kw_only=True):
         polar = [value for value in (self.azimuth_deg, self.elevation_deg, self.range_m) if value is not None]
         if (self.position_m is not None) + bool(polar) + bool(self.waypoints) != 1:
             raise ArgumentError(
-                f"{name} does not have exactly one position; give one of position_m, range_m with azimuth_deg and "
+                f"{name} does not have exactly one position; choose one of position_m, range_m with azimuth_deg and "
                 "elevation_deg, or waypoints"
             )
         if polar:
             if self.range_m is None:
-                raise ArgumentError(f"{name} has a direction but no range_m; give range_m as well")
+                raise ArgumentError(f"{name} has a direction but no range_m; add range_m")
             checks.between(f"{name}.range_m", self.range_m, 1e-3, MAX_DISTANCE_M)
             checks.between(f"{name}.azimuth_deg", self.azimuth_deg or 0.0, -180.0, 180.0)
             checks.between(f"{name}.elevation_deg", self.elevation_deg or 0.0, -90.0, 90.0)
@@ -62,14 +62,14 @@ class Placed(TomlTable, frozen=True, kw_only=True):
             check_vector(f"{name}.position_m", self.position_m, MAX_DISTANCE_M)
         check_vector(f"{name}.velocity_m_s", self.velocity_m_s, MAX_SPEED_M_S)
         if self.waypoints and self.velocity_m_s != _STILL:
-            raise ArgumentError(f"{name} has both waypoints and velocity_m_s; give only one of them")
+            raise ArgumentError(f"{name} has both waypoints and velocity_m_s; use only one of them")
         for number, (time_s, *place) in enumerate(self.waypoints):
             checks.finite(f"{name}.waypoints[{number}] time", time_s)
             check_vector(f"{name}.waypoints[{number}]", (place[0], place[1], place[2]), MAX_DISTANCE_M)
         for (before_s, *a), (after_s, *b) in itertools.pairwise(self.waypoints):
             if after_s <= before_s:
                 raise ArgumentError(
-                    f"{name}.waypoints go from {before_s:g} s to {after_s:g} s; give strictly increasing times"
+                    f"{name}.waypoints go from {before_s:g} s to {after_s:g} s; pass strictly increasing times"
                 )
             checks.between(f"{name}.waypoints speed", math.dist(a, b) / (after_s - before_s), 0.0, MAX_SPEED_M_S)
 

@@ -160,12 +160,12 @@ def require_beam_grid(aperture: Aperture, n_ranges: int) -> None:
         extent = "is neither a line nor a plane" if aperture.n_axes == 3 else "has no extent along an axis"
         raise ArgumentError(
             f"accuracy.beam_taps is above 0, but the array {extent}. Beam interpolation needs a line or a plane array; "
-            "give 0 or omit accuracy.beam_taps"
+            "use 0 or omit accuracy.beam_taps"
         )
     if n_ranges < FEWEST_RANGES:
         raise ArgumentError(
             f"accuracy.beam_taps is above 0, but the image has {n_ranges} ranges. Beam interpolation needs at least "
-            f"{FEWEST_RANGES}; give 0 or omit accuracy.beam_taps"
+            f"{FEWEST_RANGES}; use 0 or omit accuracy.beam_taps"
         )
 
 

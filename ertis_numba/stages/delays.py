@@ -83,7 +83,7 @@ class DelayTable:
         if last > np.iinfo(np.int32).max:
             raise ArgumentError(
                 f"the signals have {int(self.rows.max()) + 1} rows (microphones times phases) of {width} samples, too "
-                "many for 32-bit indices; give a shorter processing.range_m or a lower accuracy.oversampling"
+                "many for 32-bit indices; use a shorter processing.range_m or a lower accuracy.oversampling"
             )
         return (self.rows * width + self.samples).astype(np.int32)
 

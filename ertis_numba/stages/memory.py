@@ -107,7 +107,7 @@ def require_image_size(settings: Settings) -> None:
     if n_bytes > _MAX_IMAGE_BYTES:
         raise ArgumentError(
             f"images of {grid} over {processing.range_m[0]:g} to {processing.range_m[1]:g} m have "
-            f"{n_bytes / 1e6:.0f} MB, but the limit is {_MAX_IMAGE_BYTES // 1_000_000} MB; give fewer directions or "
+            f"{n_bytes / 1e6:.0f} MB, but the limit is {_MAX_IMAGE_BYTES // 1_000_000} MB; use fewer directions or "
             "ranges"
         )
 

@@ -192,8 +192,8 @@ class Planner:
             has = "this machine has available" if measured else "the limit is"
             raise ArgumentError(
                 f"no plan fits into memory: the smallest needs {min(sizes) / 1e6:.0f} MB, {has} {limit / 1e6:.0f} MB; "
-                "shorten processing.range_m or start it at a larger range, give fewer directions or microphones, or "
-                "give a lower accuracy.oversampling or accuracy.focal_zones"
+                "shorten processing.range_m or start it at a larger range, use fewer directions or microphones, or "
+                "use a lower accuracy.oversampling or accuracy.focal_zones"
             )
         if within:
             # Costs are those of all threads, so that the plan does not depend on the number of threads in use.
@@ -205,10 +205,10 @@ class Planner:
             return self.chosen(self._accuracy(plan))
         best = self.chosen(self._accuracy(plan))
         memory = f"; more accurate plans exceed {limit / 1e6:.0f} MB of memory" if len(rated) < len(plans) else ""
-        wider = f"give {math.ceil(best.error_db)} or more, or " if best.error_db <= 0 else ""
+        wider = f"use {math.ceil(best.error_db)} or more, or " if best.error_db <= 0 else ""
         raise ArgumentError(
             f"accuracy.max_error_db is {wanted_db:g}, but the smallest error of these settings is {best.error_db:.1f} "
-            f"({_worst(best)}{memory}); {wider}leave more of [accuracy] open"
+            f"({_worst(best)}{memory}); {wider}remove keys of [accuracy]"
         )
 
     def chosen(self, accuracy: Accuracy) -> Chosen:
@@ -280,6 +280,6 @@ def _no_plan(settings: Settings) -> str:
     """Return the reason why no plan exists: the settings exclude streams, and spherical wavefronts need them."""
     return (
         f"processing.beamformer {settings.processing.beamformer!r} with weighting {settings.processing.weighting!r} "
-        "needs 16-bit streams for spherical wavefronts, but the accuracy settings exclude them; give "
+        "needs 16-bit streams for spherical wavefronts, but the accuracy settings exclude them; use "
         "processing.wavefront 'plane', or leave accuracy.precision, delay_taps and beam_taps out"
     )

@@ -66,7 +66,7 @@ class StreamPlanner:
         Spectrum of the output of the matched filter.
     aperture : Aperture
     sound_speed_m_s, nearest_m : float
-        As for `BeamGrid`.
+        Speed of sound, and the smallest distance of a reflector.
     """
 
     def __init__(

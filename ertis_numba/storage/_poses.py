@@ -52,7 +52,8 @@ def checked_poses(poses: object) -> Poses | None:
     for each in several:
         if not isinstance(each, Trajectory):
             raise ArgumentError(
-                f"poses are of type {type(each).__name__}; give a Trajectory, or a Trajectory for each sensor"
+                f"poses are of type {type(each).__name__}; pass a Trajectory, or a dictionary with a Trajectory for "
+                "each sensor"
             )
         if len(each.source.encode()) > _MAX_SOURCE_BYTES:
             raise ArgumentError(
@@ -87,7 +88,7 @@ def require_times(trajectory: Trajectory, time_ns: NDArray[np.int64], sensor: st
         )
     raise ArgumentError(
         f"the poses cover {_span(first_ns, last_ns)}, but the measurements of sensor {sensor} cover "
-        f"{_span(begin_ns, end_ns)}; give poses for this time, or correct the clock offset (--offset-s)"
+        f"{_span(begin_ns, end_ns)}; use poses of this time, or correct the offset of their clock (offset_s)"
     )
 
 

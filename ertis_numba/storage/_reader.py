@@ -198,9 +198,7 @@ class FileReader(Sequence[Item]):
     def _select_sensor(self, sensor: str | None) -> str:
         names = ", ".join(self.sensors[:_MAX_NAMES]) + ", …" * (len(self.sensors) > _MAX_NAMES)
         if sensor is None and len(self.sensors) != 1:
-            raise ArgumentError(
-                f"{self.path} contains {len(self.sensors)} sensors; choose one of {names} (sensor, --sensor)"
-            )
+            raise ArgumentError(f"{self.path} contains {len(self.sensors)} sensors; choose one of {names} (sensor)")
         if sensor is not None and sensor not in self.sensors:
             raise ArgumentError(f"{self.path} has no sensor {sensor!r}; choose one of {names}")
         return self.sensors[0] if sensor is None else sensor

@@ -126,7 +126,9 @@ class ResultWriter(ResultFile, FileWriter[Result]):
     def _row(self, item: Result) -> tuple[NDArray[Any], dict[str, float]]:
         first = self._first[item.stamp.sensor]
         if item.settings is not first.settings and item.settings != first.settings:
-            raise ArgumentError(f"settings of {self._name} differ from those of the first; write it to another file")
+            raise ArgumentError(
+                f"the settings of {self._name} differ from those of the first item; write this item to another file"
+            )
         for field in self._axes.values():
             ours, theirs = getattr(item, field), getattr(first, field)
             if ours is not theirs and not np.array_equal(ours, theirs):

@@ -88,7 +88,7 @@ class RowWriter:
         if self._numbered and self.runs.contains(sequence, session_id):
             raise ArgumentError(
                 f"measurement {self._n_rows} has sequence {sequence} of session {session_id}, like an earlier "
-                "one; give each measurement of a sensor its own number (Stamp.sequence)"
+                "one; use for each measurement of a sensor its own number (Stamp.sequence)"
             )
 
     def flush(self) -> None:

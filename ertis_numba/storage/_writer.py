@@ -70,7 +70,7 @@ class FileWriter(ABC, Generic[Item]):
         self._rows: dict[str, RowWriter] = {}
         if self.path.suffix.lower() in _OTHER_SUFFIXES:
             raise ArgumentError(
-                f"output {self.path} ends in {self.path.suffix}, but the file is HDF5; give a name in .h5"
+                f"output {self.path} ends in {self.path.suffix}, but the file is HDF5; choose a name in .h5"
             )
         check_target(self.path, overwrite=overwrite)
         try:  # before warnings on what is to be written
@@ -154,7 +154,7 @@ class FileWriter(ABC, Generic[Item]):
 
     def _finish(self, file: h5py.File) -> None:
         if not self._rows:
-            raise ArgumentError(f"{self.path} would contain no measurement; give at least one")
+            raise ArgumentError(f"{self.path} would contain no measurement; write at least one")
         self._require_sensors("truth", self._truth)
         contents = {sensor: self._finish_sensor(file, sensor) for sensor in self._rows}
         set_attributes(

@@ -107,7 +107,7 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         """
         for name, value in (("predicted_error_db", predicted_error_db), ("max_error_db", max_error_db)):
             if not math.isfinite(value):
-                raise ArgumentError(f"{name} is {value}; give a finite number of decibels")
+                raise ArgumentError(f"{name} is {value}; use a finite number of decibels")
         self._state(
             sensor,
             predicted_error_db=predicted_error_db,
@@ -186,7 +186,7 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
             if counts[stamp] != 1:
                 raise ArgumentError(
                     f"energyscape {index} of sensor {sensor} has the stamp of {counts[stamp]} measurements of the "
-                    "recording, but its ground truth needs exactly 1; give the right recording, or truth"
+                    "recording, but its ground truth needs exactly 1; pass the recording of the images, or truth"
                 )
         places = {stamp: index for index, stamp in enumerate(recorded)}
         rows = [places[stamp] for stamp in written]

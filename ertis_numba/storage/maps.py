@@ -201,7 +201,7 @@ def _content(file: h5py.File, axes: Sequence[str]) -> str:
 def _require_kind(file: h5py.File, path: Path) -> None:
     kind, version = (to_python(file.attrs.get(name, "")) for name in ("ertis_format", "ertis_format_version"))
     if kind != _KIND:
-        raise DataError(f"{path} is HDF5, but not an occupancy map; give one, as from 'ertis map'")
+        raise DataError(f"{path} is HDF5, but not an occupancy map; choose a file of 'ertis map'")
     if not isinstance(version, int) or version > FORMAT_VERSION:
         raise FormatVersionError(
             f"{path} has format version {version}, but this package reads up to {FORMAT_VERSION}; update ertis-numba"

@@ -106,7 +106,7 @@ def add_poses(
     """
     source = Path(path)
     if not isinstance(trajectory, Trajectory):
-        raise ArgumentError(f"trajectory is of type {type(trajectory).__name__}; give a Trajectory")
+        raise ArgumentError(f"trajectory is of type {type(trajectory).__name__}; pass a Trajectory")
     checked_poses(trajectory)
     warn_of_poses(trajectory, stacklevel=2)
     target = source if output is None else Path(output)
@@ -151,7 +151,7 @@ def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: 
         with open_recording(path, sensor=sensor) as recording:
             if recording.trajectory is not None and not replace:
                 origin = f" (source {recording.trajectory.source!r})" if recording.trajectory.source else ""
-                raise ArgumentError(f"{path} has poses already{origin}; keep them, or ask to replace them (--force)")
+                raise ArgumentError(f"{path} has poses already{origin}; keep them, or replace them (replace=True)")
             time_ns = np.array([stamp.timestamp_ns for stamp in recording.stamps()], np.int64)
         n_measurements += len(time_ns)
         try:
@@ -160,7 +160,7 @@ def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: 
             raise ArgumentError(f"{path}: {error}") from error
         if len(time_ns) and not trajectory.covers(time_ns).any():
             raise ArgumentError(
-                f"{path}: no measurement of sensor {sensor} is within the poses; give poses for this time, or correct "
+                f"{path}: no measurement of sensor {sensor} is within the poses; use poses for this time, or correct "
                 "the clock offset"
             )
     return n_measurements
@@ -242,10 +242,8 @@ def platform_trajectory(paths: Iterable[str | Path]) -> Trajectory | None:
     sources = {trajectory.source: path for path, trajectory in found.items()}
     if len(sources) > 1:
         named = " and ".join(f"{path} from {source or 'an unknown source'!r}" for source, path in sources.items())
-        raise ArgumentError(
-            f"poses have different sources: those of {named}; give one trajectory, such as --poses FILE"
-        )
-    return _merged(found, "recordings", "give one trajectory, such as --poses FILE")
+        raise ArgumentError(f"poses have different sources: those of {named}; use one trajectory for all (poses)")
+    return _merged(found, "recordings", "use one trajectory for all (poses)")
 
 
 def _merged(found: dict[str, Trajectory], kind: str, advice: str) -> Trajectory | None:

@@ -146,7 +146,7 @@ class RecordingWriter(FileWriter[Measurement]):
         if self._given is not None and self._settings:
             raise ArgumentError(
                 f"settings are given for one sensor, but there are measurements of {', '.join(self._settings)} "
-                f"and {sensor}; give none, so that each sensor keeps its own"
+                f"and {sensor}; remove settings, so that each sensor keeps its own"
             )
         given = self._given or first.settings
         settings = self._settings[sensor] = storable(given)
@@ -184,8 +184,8 @@ class RecordingWriter(FileWriter[Measurement]):
         name, wanted = f"measurement {len(self._rows[item.stamp.sensor])}", self._formats[item.stamp.sensor].dtype
         if not np.can_cast(item.data.dtype, wanted, "equiv"):  # This allows another byte order.
             raise ArgumentError(
-                f"{name} contains {item.data.dtype} samples, but its settings give {wanted.name}; convert them, "
-                "or give the settings of the recording"
+                f"{name} contains {item.data.dtype} samples, but its settings state {wanted.name}; convert them, "
+                "or use the settings of the recording"
             )
         if wanted.kind == "f":
             checks.finite_array(name, item.data)
@@ -450,6 +450,6 @@ def write_recording(
     with RecordingWriter(
         path, settings=settings, overwrite=overwrite, source=source, truth=truth, mounting=mounting, poses=poses
     ) as writer:
-        for measurement in checks.items("measurements", measurements, Measurement, "a recording holds"):
+        for measurement in checks.items("measurements", measurements, Measurement, "a recording contains"):
             writer.write(measurement)
     return writer.path

@@ -385,7 +385,7 @@ def _dataset(
     chunks = (_chunk_rows(name, dims), *shape[1:])
     if math.prod(chunks) * np.dtype(kind).itemsize > _MAX_CHUNK_BYTES:
         wanted = " × ".join(f"{size} {dim}s" for dim, size in zip(dims[1:], shape[1:], strict=True))
-        raise ArgumentError(f"{name} of {wanted} exceeds the 4 GiB limit of HDF5 for one chunk; give fewer")
+        raise ArgumentError(f"{name} of {wanted} exceeds the 4 GiB limit of HDF5 for one chunk; use fewer of them")
     return group.create_dataset(name, (0, *shape[1:]), kind, maxshape=(None, *shape[1:]), chunks=chunks)
 
 

@@ -109,7 +109,7 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
             for place in (target, target.parent):  # The writer may have been killed before it did this.
                 fsync(place)
         elif target.is_file() and not overwrite:
-            raise DataError(f"{target} exists with other content than {path}; move it, or give --force")
+            raise DataError(f"{target} exists with other content than {path}; move it, or replace it (overwrite=True)")
         else:
             history = [f"sensor {name} was set aside: {reason}" for name, reason in refused.items()]
             history += [pose_damage] if pose_damage else []

@@ -82,7 +82,7 @@ class GroundTruth:
         if self.sources and len(self.sources) != len(self.reflectors):
             raise ArgumentError(
                 f"the truth has sources of {len(self.sources)} measurements, but reflectors of "
-                f"{len(self.reflectors)}; give both of each"
+                f"{len(self.reflectors)}; pass both for each measurement"
             )
         if self.frames and len(self.frames) != len(self.reflectors):
             raise ArgumentError(
@@ -171,7 +171,7 @@ class GroundTruthLog:
             self.sources = tuple(sources)
         names, wanted = [each.name for each in sources], [each.name for each in self.sources]
         if names != wanted:
-            raise ArgumentError(f"measurement {self._rows} has the sources {names}; give {wanted}, as in the first")
+            raise ArgumentError(f"measurement {self._rows} has the sources {names}; pass {wanted}, as in the first")
         if sources is not self._last_sources[0]:
             self._last_sources = sources, _places(sources)
         self._waiting_sources.append(self._last_sources[1])
@@ -248,7 +248,7 @@ def write_truth(group: h5py.Group, truth: GroundTruth | GroundTruthLog, n_measur
     if len(truth) != n_measurements:
         raise ArgumentError(
             f"the truth of sensor {group.name.rpartition('/')[2]} has {len(truth)} measurements, but the file "
-            f"has {n_measurements}; give the reflectors of each"
+            f"has {n_measurements}; pass the reflectors of each"
         )
     texts = {field: truth.texts(field) for field in _TEXTS}
     if not any(texts["emitter"]):  # Files of a single sensor stay as in earlier versions.

@@ -55,8 +55,8 @@ class ExactImage:
         settings = self._settings = image.settings
         if settings.processing.is_cleaned:
             raise ArgumentError(
-                "image is cleaned by processing.clean_within_db or clean_above_mean_db, which the exact image is not; "
-                "give that of Pipeline.process(measurement, clean=False)"
+                "image is cleaned by processing.clean_within_db or clean_above_mean_db, but the exact image is not; "
+                "pass the image of Pipeline.process(measurement, clean=False)"
             )
         layout = microphones(settings.array)
         self._positions_m = layout.enabled_positions_m

@@ -162,7 +162,7 @@ def error_db(amplitude: NDArray[np.floating], exact: NDArray[np.floating]) -> fl
     wanted = float(np.linalg.norm(exact.astype(np.float64)))
     if not wanted:
         raise DataError(
-            "the exact image is silent, so the error relative to it is undefined; give a measurement with echoes"
+            "the exact image is silent, so the error relative to it is undefined; use a measurement with echoes"
         )
     difference = float(np.linalg.norm(amplitude.astype(np.float64) - exact))
     return 20 * math.log10(max(1e-15, difference / wanted)) if math.isfinite(difference) else math.inf

@@ -296,4 +296,4 @@ def _require_free(host: str, port: int) -> None:
 
 
 def _taken(host: str, port: int, why: str) -> NetworkError:
-    return NetworkError(f"cannot serve the page at {host}:{port} ({why}); give another host or port")
+    return NetworkError(f"cannot serve the page at {host}:{port} ({why}); choose another host or port")

@@ -119,7 +119,7 @@ class Playback:
             stamps = {name: reader.stamps() for name, reader in self._readers.items()}
             self.time_steps, self._notes = time_steps_of(stamps)
             if not self.time_steps:
-                raise DataError(f"{path} holds no measurement; give a file with one")
+                raise DataError(f"{path} contains no measurement; choose a file with measurements")
             if kind == "recording":
                 self.shows_maps = self._are_maps(stamps) if acoustic_maps is None else acoustic_maps
             else:

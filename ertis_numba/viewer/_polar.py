@@ -88,10 +88,10 @@ class Polar:
 
     def __init__(self, image: Energyscape, *, dynamic_range_db: float = 40.0, width_px: int = 520) -> None:
         if width_px < 4 * SIDE_PX:
-            raise ArgumentError(f"width_px is {width_px}; give at least {4 * SIDE_PX}")
+            raise ArgumentError(f"width_px is {width_px}; use at least {4 * SIDE_PX}")
         self._dynamic_range_db = dynamic_range_db
         if image.range_m[-1] <= 0:
-            raise ArgumentError("the image ends at range 0; give one with ranges")
+            raise ArgumentError("the image ends at range 0; use an image with ranges")
         self._fan = Fan.of(image.azimuth_rad, image.elevation_rad, image.range_m)
         self._place = Place.of(self._fan, width_px)
         self._bins = self._joined_ranges(image.range_m)

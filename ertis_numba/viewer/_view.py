@@ -240,7 +240,7 @@ class Viewer:
         edges_khz = [edge_hz / 1e3 for each in bands if each.band_hz is not None for edge_hz in each.band_hz]
         self._note(
             f"no map has a band at {(chosen_hz or 0.0) / 1e3:g} kHz, so the page shows none; choose a frequency from "
-            f"{min(edges_khz):.3g} to {max(edges_khz):.3g} kHz (--band)"
+            f"{min(edges_khz):.3g} to {max(edges_khz):.3g} kHz (band)"
         )
 
     def _completion(self) -> Callable[[str], str]:

@@ -114,7 +114,7 @@ def sample_bytes(content: Content, place: int, wide: int | None, frame_bytes: in
     place : int
         Where the data chunk begins.
     wide : int, optional
-        Its length in a ds64 chunk.
+        Length of the chunk as a ds64 chunk states it.
     frame_bytes : int
         Bytes of a sample of all channels; 1 if unknown.
 

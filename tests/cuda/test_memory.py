@@ -85,7 +85,7 @@ def test_too_little_gpu_memory_is_reported_with_size_and_remedy(monkeypatch, n_b
     text = str(caught.value)
     assert "\n" not in text
     assert "MB free, but this pipeline needs" in text
-    assert "give fewer directions, a shorter processing.range_m or a lower accuracy.oversampling" in text
+    assert "use fewer directions, a shorter processing.range_m or a lower accuracy.oversampling" in text
 
 
 @pytest.mark.parametrize("use", [lambda lane, _: lane.send(np.zeros(5)), lambda _, memory: memory.image((3, 4))])

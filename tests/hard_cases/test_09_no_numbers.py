@@ -97,7 +97,7 @@ def test_layout_files_refuse_nan_and_infinity(tmp_path, bad, suffix):
 def test_grids_refuse_nan_and_infinity(tmp_path, bad):
     path = tmp_path / "g.csv"
     path.write_text(f"0, 0\n{bad}, 1\n")
-    with pytest.raises(ArgumentError, match=r"g\.csv holds -?(nan|inf) at \[1, 0\]; give finite numbers"):
+    with pytest.raises(ArgumentError, match=r"g\.csv holds -?(nan|inf) at \[1, 0\]; pass finite numbers"):
         direction_grid(Processing(directions=str(path)))
 
 

@@ -211,7 +211,7 @@ def test_any_settings_and_data_give_an_image_or_one_line(made, kind, seed, devic
 def test_call_shorter_than_a_period_is_refused():
     """Sampled at the signal rate such a call is all zeros, and the matched filter would divide by its power."""
     with pytest.raises(
-        ArgumentError, match=r"call\.duration_s is 8e-05, less than a period of 2000 Hz; give 0\.0005 or"
+        ArgumentError, match=r"call\.duration_s is 8e-05, less than a period of 2000 Hz; use 0\.0005 or"
     ):
         Call(start_frequency_hz=2001.0, stop_frequency_hz=2000.0, duration_s=8e-5)
 
@@ -221,7 +221,7 @@ def test_sweep_too_narrow_for_the_paper_is_refused():
     call = Call(start_frequency_hz=40_000.5, stop_frequency_hz=40_000.0)
     Settings(call=call)
     with pytest.raises(
-        ArgumentError, match=r"call sweeps over 0\.5 Hz, too little for the band-pass filter .*; give 100 Hz"
+        ArgumentError, match=r"call sweeps over 0\.5 Hz, too little for the band-pass filter .*; use 100 Hz"
     ):
         Settings(call=call, processing=Processing(method="paper"))
 

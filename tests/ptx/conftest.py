@@ -5,8 +5,7 @@ import os
 import pytest
 
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels._cuda import offline_compilation
-from tests.ptx import launches
+from tests.ptx import launches, offline_compilation
 
 
 @pytest.fixture(scope="session", autouse=True)

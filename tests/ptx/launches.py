@@ -5,10 +5,10 @@ import functools
 import numpy as np
 
 from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
-from ertis_numba.kernels._cuda import offline_compilation
 from ertis_numba.settings import Accuracy, Processing, Settings
 from ertis_numba.stages import planner
 from ertis_numba.stages.fast_chain import FastChain
+from tests.ptx import offline_compilation
 
 ERTIS = Settings.from_preset("default_25_50")
 STREAMS = {"precision": "int16", "oversampling": 8, "delay_taps": 2, "beam_taps": 4, "max_error_db": -10.0}

@@ -9,8 +9,8 @@ from cuda import pathfinder
 from numba import cuda
 
 from ertis_numba.errors import DeviceError
-from ertis_numba.kernels._cuda import offline_compilation
 from ertis_numba.kernels._cuda.lane import launch
+from tests.ptx import offline_compilation
 from tests.ptx.faults import contracts, faults
 
 CC = (9, 0)

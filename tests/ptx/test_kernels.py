@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from ertis_numba.kernels._cuda import offline_compilation
 from ertis_numba.kernels._kernel_set import KERNEL_NAMES
-from tests.ptx import faults
+from tests.ptx import faults, offline_compilation
 
 CCS = [(6, 0), (7, 5), (9, 0)]  # oldest target of CUDA 12, oldest target of CUDA 13, and H200
 CONTRACTS = sorted(KERNEL_NAMES)

@@ -53,7 +53,7 @@ class AcousticMapper:
 
         layout, grid = microphones(settings.array), direction_grid(settings.processing)
         if settings.passive.focus_m is None:
-            raise ArgumentError("passive.focus_m is None, but Acoular's points need a distance; give focus_m")
+            raise ArgumentError("passive.focus_m is None, but Acoular's points need a distance; set focus_m")
         places_m = settings.passive.focus_m * unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         self._acoular, self._spectra, self._n_block = acoular, PeriodicSpectra, n_block
         self._settings = settings

@@ -80,7 +80,7 @@ def health(measurement: Measurement) -> Health:
             report = ertis.health(recording[0])
         print(report.verdict())
     """
-    checks.instance("measurement", measurement, Measurement, "a recording holds")
+    checks.instance("measurement", measurement, Measurement, "a recording contains")
     settings, has_call = measurement.settings, measurement.stamp.behaviour != "passive"
     enabled = np.flatnonzero(microphones(measurement.settings.array).enabled)
     record = sample_format(settings).validated(measurement.data, any_length=True)

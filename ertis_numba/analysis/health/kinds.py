@@ -7,7 +7,7 @@ __all__ = ["DISABLE", "KINDS", "FaultKind", "kind_of"]
 DISABLE = "exclude them with 'ertis process --without', or with array.disabled in a settings file"
 """Remedy for faults of single channels."""
 
-_LAYOUT = "give the layout of this array as array.layout, with its channels in the order of the bits"
+_LAYOUT = "set array.layout to the layout of this array, with its channels in the order of the bits"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ KINDS = {
     "low-frequency hum": FaultKind(remedy="check their supply and ground, or disable them in a layout file"),
     "idle tone": FaultKind(unit="dB"),
     "dead": FaultKind(unit="dB"),
-    "gain": FaultKind(unit="dB", remedy="give their sensitivity as array.gain, or disable them in a layout file"),
+    "gain": FaultKind(unit="dB", remedy="set their sensitivity (array.gain), or disable them in a layout file"),
     "noisy": FaultKind(unit="dB"),
     "white bits": FaultKind(unit="dB", remedy="check that a microphone is connected, or disable them in a layout file"),
     "flipped bits": FaultKind(unit="dB", remedy="check the clock and the cable, or disable them in a layout file"),
@@ -49,7 +49,7 @@ KINDS = {
     ),
     "inverted polarity": FaultKind(remedy="swap their wires, or disable them in a layout file"),
     "swapped": FaultKind(unit="µs", remedy=_LAYOUT),
-    "late": FaultKind(unit="µs", remedy="give their delay as array.delay_s, or disable them in a layout file"),
+    "late": FaultKind(unit="µs", remedy="set their delay (array.delay_s), or disable them in a layout file"),
     "order of channels": FaultKind(unit="µs", remedy=_LAYOUT, of_record=True),
     "size of the array": FaultKind(
         remedy="correct the unit of the positions, in the layout file or as array.positions_m", of_record=True

@@ -21,7 +21,7 @@ def scaled(words: NDArray[Any], full: float, channel: int) -> NDArray[np.float32
 
 
 def sounding_part(words: NDArray[Any], enabled: NDArray[np.intp]) -> slice:
-    """Return the samples without those at either end that are 0 in all enabled channels; all, if no sample differs."""
+    """Return the samples without silence at both ends, where all enabled channels are 0; or all samples."""
     sounding = np.flatnonzero((words[:, enabled] != 0).any(axis=1))
     return slice(int(sounding[0]), int(sounding[-1]) + 1) if len(sounding) else slice(None)
 

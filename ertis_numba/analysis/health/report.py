@@ -175,10 +175,10 @@ def merge(reports: Sequence[Health]) -> Health:
         There are no reports, or their channels differ.
     """
     if not reports:
-        raise ArgumentError("reports is empty; give at least one report")
+        raise ArgumentError("reports is empty; pass at least one report")
     first, *others = ([item.channel for item in report.channels] for report in reports)
     if any(other != first for other in others):
-        raise ArgumentError("reports have different channels; give reports of one array")
+        raise ArgumentError("reports have different channels; use reports of one array")
     return Health(
         channels=tuple(_merged(items) for items in zip(*(report.channels for report in reports), strict=True)),
         measurements=sum(report.measurements for report in reports),

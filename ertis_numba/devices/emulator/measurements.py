@@ -53,7 +53,7 @@ class Measurements:
             checks.integer("number of measurements to emulate", len(given), 1)
             if given[0].dtype != np.uint32 or given[0].ndim != 1:
                 raise ArgumentError(
-                    f"measurements to emulate are {given[0].ndim}-dimensional {given[0].dtype}; give one uint32 word "
+                    f"measurements to emulate are {given[0].ndim}-dimensional {given[0].dtype}; use one uint32 word "
                     "per sample"
                 )
         self._name, self._faults, self._log = name, faults, log

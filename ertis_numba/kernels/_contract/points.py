@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 __all__ = [
     "ABSENT",
-    "ALIKE",
-    "CONVERGED",
-    "DARK",
-    "MAX_SHIFT",
+    "N_VALUES",
     "BeamErrors",
     "Complexes",
     "Doubles",
+    "EchoSamples",
     "Places",
     "PointKernels",
     "Pulse",
@@ -25,14 +23,26 @@ __all__ = [
 
 ABSENT: Final = math.log(np.finfo(np.float32).tiny)
 """Logarithm of an amplitude of 0, as of a bin that cleaning removes."""
-ALIKE: Final = 1.0
-"""Deviation in nepers from the samples of a single reflector, beyond which there are several."""
-CONVERGED: Final = 1e-5
-"""Change by a correction, in range steps, in unit vectors and in nepers, below which there are no more."""
-DARK: Final = 1e-6
-"""Amplitude below the side lobes of any array."""
-MAX_SHIFT: Final = 0.5
-"""Change by all corrections, in range steps and in nepers, beyond which they have not converged."""
+N_ROUNDS: Final = 8
+N_TRIED: Final = 3
+"""Further starts that are followed: those with the least misfits."""
+N_VALUES: Final = 22
+N_WIDENED: Final = 3
+DAMPING: Final = 1e-3
+MAX_DAMPING: Final = 1e4
+CONVERGED: Final = 1e-2
+"""Last step, in standard deviations."""
+RICE: Final = 0.5
+"""The mean amplitude of an echo a in noise of the power n² is about the root of a² + n² / 2."""
+MUCH: Final = 2.5
+"""Misfit per degree of freedom, beyond which another minimum may fit better."""
+TOO_MUCH: Final = 2.0
+"""Misfit per degree of freedom, beyond which something other than a single echo and noise is in the samples."""
+WIDE_RAD: Final = 0.5
+"""Standard deviation of a direction that the samples do not determine."""
+DARK: Final = 1e-9
+LEAST_M: Final = 1e-3
+TINY: Final = 1e-30
 
 Complexes = NDArray[np.complex128]
 Doubles = NDArray[np.float64]
@@ -48,7 +58,7 @@ class Pulse(NamedTuple):
     table : (path,) complex128
         Pulse relative to its carrier; at negative differences, it is the complex conjugate.
     tilted_hz : (path,) complex128
-        The same with the spectrum weighted by the frequency relative to the carrier; empty without errors of beams.
+        The same with the spectrum weighted by the frequency relative to the carrier.
     step_m : float
         Spacing of the differences.
     carrier_1_m : float
@@ -56,6 +66,8 @@ class Pulse(NamedTuple):
     positions_m : (mic, axis) float64
     weights : (mic,) float64
         Array weights, with a mean of 1.
+    speed_m_s : float
+        Sound speed of the table.
     """
 
     table: Complexes
@@ -64,6 +76,7 @@ class Pulse(NamedTuple):
     carrier_1_m: float
     positions_m: Doubles
     weights: Doubles
+    speed_m_s: float
 
 
 class Quadrics(NamedTuple):
@@ -141,47 +154,91 @@ class FindTops(Protocol):
 
 
 class InterpolateTops(Protocol):
-    """Interpolate the maxima of the logarithm of an image, and subtract the error of this interpolation.
+    """Interpolate the maxima of the logarithm of an image by parabolas.
 
-    The error is that for a reflector at the interpolated maximum. Maxima whose samples do not match a single reflector
-    are not corrected.
+    Parameters
+    ----------
+    quadrics : Quadrics
+    fit : (place,) int64
+        Quadric of each place.
+    logs : (place, sample) float64
+        Logarithms of the amplitudes: those at the range before the maximum, of the maximum, and at the range after it;
+        then those of its neighbours.
+    out : (place, 5) float64
+        Shift along the range in steps, offset of the direction, and logarithm of the amplitude.
+    """
+
+    def __call__(self, quadrics: Quadrics, fit: Places, logs: Doubles, out: Doubles) -> None: ...
+
+
+class EchoSamples(NamedTuple):
+    """Samples of an image around its maxima.
+
+    Attributes
+    ----------
+    row : (place, sample) int64
+        Directions; the first one is that of the maximum.
+    is_used : (place, sample) bool
+        False for samples that are equal to others or have no amplitude.
+    amplitude : (place, sample) float64
+    offset_m : (place, sample) float64
+        Ranges relative to that of the maximum.
+    range_m : (place,) float64
+        Ranges of the maxima.
+    is_coarse : (place,) bool
+        True if the grid is so coarse that several echoes may explain the samples.
+    """
+
+    row: Places
+    is_used: NDArray[np.bool_]
+    amplitude: Doubles
+    offset_m: Doubles
+    range_m: Doubles
+    is_coarse: NDArray[np.bool_]
+
+
+class FitEchoes(Protocol):
+    """Fit range, direction and amplitude of single echoes to samples of an image, weighted by their noise.
+
+    White noise in the signals correlates the noise of neighbouring samples as the image of an echo does. Half of its
+    power changes amplitudes. The errors of the model are independent. If the misfit is too large for both, the errors
+    of the model are larger, and the fit is repeated with these.
 
     Parameters
     ----------
     pulse : Pulse
-    quadrics : Quadrics
+        With the tilted table.
     beams : BeamErrors
-    row : (place, sample) int64
-        Directions of the samples: the first three are those of the maximum, at the range before, its own, and the
-        range after; then its neighbours at its range.
-    fit : (place,) int64
-        Quadric of each place.
-    logs : (place, sample) float64
-        Logarithms of the amplitudes.
-    offset_m : (place, sample) float64
-        Ranges of the samples, relative to that of the maximum.
-    step_m : float
-        Spacing of ranges.
+    samples : EchoSamples
+    starts : (place, start, 4) float64
+        Range offset in metres, offsets of the direction along both axes, and logarithm of the amplitude. The first one
+        serves alone, unless the grid is coarse or the misfit is large.
+    axes : (place, 2, axis) float64
+        Axes across the direction of the maximum; the second one is 0 if the grid has one.
+    noise : float
+        Root mean square of the noise of the image.
+    model : float
+        Errors of the model relative to the amplitude.
+    is_focused : bool
+        True if beams assume spherical wavefronts.
     scale : float
         As for `SpreadAmplitudes`.
-    n_rounds : int
-        Largest number of corrections; 0 for none.
-    out : (place, 5) float64
-        Shift along the range in steps, offset of the direction, and logarithm of the amplitude.
+    out : (place, 22) float64
+        The four values of the best fit, its misfit, their covariance, (4, 4), and the errors of the model. Other minima
+        that fit nearly as well are part of the covariance.
     """
 
     def __call__(
         self,
         pulse: Pulse,
-        quadrics: Quadrics,
         beams: BeamErrors,
-        row: Places,
-        fit: Places,
-        logs: Doubles,
-        offset_m: Doubles,
-        step_m: float,
+        samples: EchoSamples,
+        starts: Doubles,
+        axes: Doubles,
+        noise: float,
+        model: float,
+        is_focused: bool,  # noqa: FBT001  Numba has no keywords
         scale: float,
-        n_rounds: int,
         out: Doubles,
     ) -> None: ...
 
@@ -193,3 +250,4 @@ class PointKernels:
     spread_amplitudes: SpreadAmplitudes
     find_tops: FindTops
     interpolate_tops: InterpolateTops
+    fit_echoes: FitEchoes

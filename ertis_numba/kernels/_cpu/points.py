@@ -6,7 +6,9 @@ import math
 import numpy as np
 from numba import njit
 
-from ertis_numba.kernels._contract.points import ABSENT, ALIKE, CONVERGED, DARK, MAX_SHIFT, PointKernels
+from ertis_numba.kernels._contract.points import ABSENT, PointKernels
+from ertis_numba.kernels._cpu.echo_fits import fit_echoes
+from ertis_numba.kernels._cpu.pulse_table import at_path, carrier_of, place_of
 
 __all__ = ["KERNELS"]
 
@@ -18,8 +20,8 @@ def spread_amplitudes(pulse, direction_offset, offset_m, scale, out):
         total = 0j
         for mic in range(len(pulse.weights)):
             path_m = _path_m(pulse, direction_offset[place], offset_m[place], scale, mic)
-            before, between = _place(pulse, path_m)
-            total += _at(pulse.table, before, between, path_m) * _carrier(pulse, path_m, mic)
+            before, between = place_of(pulse, path_m)
+            total += at_path(pulse.table, before, between, path_m) * carrier_of(pulse, path_m, mic)
         out[place] = abs(total) / len(pulse.weights)
 
 
@@ -31,49 +33,21 @@ def find_tops(quadrics, fit, rises, out):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def interpolate_tops(pulse, quadrics, beams, row, fit, logs, offset_m, step_m, scale, n_rounds, out):
-    """Interpolate the maxima of the logarithm of an image, and subtract the error of this interpolation."""
-    n_samples = logs.shape[1]
-    rises, predicted = np.empty(n_samples - 3), np.empty(n_samples)
-    here, found = np.empty(5), np.empty(5)
+def interpolate_tops(quadrics, fit, logs, out):
+    """Interpolate the maxima of the logarithm of an image by parabolas."""
+    rises = np.empty(logs.shape[1] - 3)
     for place in range(len(out)):
-        first = out[place]
-        _interpolate(quadrics, fit[place], logs[place], rises, first)
-        here[:] = first
-        last = np.inf
-        for _ in range(n_rounds):
-            _predict(pulse, beams, row[place], offset_m[place], step_m, scale, here, predicted)
-            if not _is_alike(logs[place], predicted):
-                here[:] = first
-                break
-            _interpolate(quadrics, fit[place], predicted, rises, found)
-            size = 0.0
-            for i in range(5):
-                size = max(size, abs(first[i] - found[i]))
-            if not size < last:  # The corrections of noise need not converge.
-                break
-            for i in range(5):
-                here[i] += first[i] - found[i]
-            last = size
-            if size <= CONVERGED:
-                break
-        if abs(here[0] - first[0]) <= MAX_SHIFT and abs(here[4] - first[4]) <= MAX_SHIFT:
-            first[:] = here
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _interpolate(quadrics, fit, logs, rises, out):
-    """Interpolate one maximum by parabolas through logarithms."""
-    level = logs[1]
-    absent = level - math.log(2.0)
-    before, after = logs[0] if logs[0] > ABSENT else absent, logs[2] if logs[2] > ABSENT else absent
-    for neighbour in range(len(rises)):
-        log = logs[3 + neighbour]
-        rises[neighbour] = (log if log > ABSENT else absent) - level
-    curvature = before - 2.0 * level + after
-    out[0] = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
-    _top(quadrics, fit, rises, out[1:])
-    out[4] += level + 0.25 * (after - before) * out[0]
+        level = logs[place, 1]
+        absent = level - math.log(2.0)
+        before = logs[place, 0] if logs[place, 0] > ABSENT else absent
+        after = logs[place, 2] if logs[place, 2] > ABSENT else absent
+        for neighbour in range(len(rises)):
+            log = logs[place, 3 + neighbour]
+            rises[neighbour] = (log if log > ABSENT else absent) - level
+        curvature = before - 2.0 * level + after
+        out[place, 0] = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
+        _top(quadrics, fit[place], rises, out[place, 1:])
+        out[place, 4] += level + 0.25 * (after - before) * out[place, 0]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -98,40 +72,6 @@ def _top(quadrics, fit, rises, out):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def _predict(pulse, beams, row, offset_m, step_m, scale, found, out):
-    """Predict the logarithms of the samples of a reflector."""
-    top, away = np.empty(3), np.empty(3)
-    for axis in range(3):
-        top[axis] = beams.directions[row[0], axis] + found[1 + axis]
-    top /= math.sqrt(top[0] * top[0] + top[1] * top[1] + top[2] * top[2])
-    for sample in range(len(out)):
-        direction = row[sample]
-        for axis in range(3):
-            away[axis] = beams.directions[direction, axis] - top[axis]
-        away_m = offset_m[sample] - step_m * found[0]
-        total = 0j
-        for mic in range(len(pulse.weights)):
-            path_m = _path_m(pulse, away, away_m, scale, mic)
-            before, between = _place(pulse, path_m)
-            value = _at(pulse.table, before, between, path_m)
-            if len(beams.gain):
-                tilted = _at(pulse.tilted_hz, before, between, path_m)
-                value = value * beams.gain[direction, mic] + beams.slope_s[direction, mic] * tilted
-            total += value * _carrier(pulse, path_m, mic)
-        out[sample] = math.log(max(abs(total) / len(pulse.weights), DARK)) + found[4]
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _is_alike(logs, predicted):
-    """Return True if samples match those of a single reflector."""
-    middle = logs[1] - predicted[1]
-    for sample in range(len(logs)):  # noqa: SIM110  Numba has no generators in `all`
-        if not abs(logs[sample] - predicted[sample] - middle) < ALIKE:
-            return False
-    return True
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
 def _path_m(pulse, direction_offset, offset_m, scale, mic):
     along_m = 0.0
     for axis in range(3):
@@ -139,24 +79,9 @@ def _path_m(pulse, direction_offset, offset_m, scale, mic):
     return scale * (2.0 * offset_m - along_m)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
-def _place(pulse, path_m):
-    """Return the entry of the table before a difference of paths, and the distance from it."""
-    place = min(abs(path_m) / pulse.step_m, len(pulse.table) - 1.0)
-    before = min(int(place), len(pulse.table) - 2)
-    return before, place - before
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _at(table, before, between, path_m):
-    value = table[before] + between * (table[before + 1] - table[before])
-    return value.conjugate() if path_m < 0.0 else value
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _carrier(pulse, path_m, mic):
-    phase = pulse.carrier_1_m * path_m
-    return complex(math.cos(phase), math.sin(phase)) * pulse.weights[mic]
-
-
-KERNELS = PointKernels(spread_amplitudes=spread_amplitudes, find_tops=find_tops, interpolate_tops=interpolate_tops)
+KERNELS = PointKernels(
+    spread_amplitudes=spread_amplitudes,
+    find_tops=find_tops,
+    interpolate_tops=interpolate_tops,
+    fit_echoes=fit_echoes,
+)

@@ -52,7 +52,7 @@ def indexed(array):
     if array.size > _MAX_INDEXED:
         raise DeviceError(
             f"device 'cuda' would have to index {array.size:,} numbers; the limit is {_MAX_INDEXED:,}. "
-            "Give a shorter record or range, or use device 'cpu'"
+            "Use a shorter record or range, or device 'cpu'"
         )
     return array
 

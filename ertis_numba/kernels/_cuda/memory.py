@@ -95,7 +95,7 @@ class CudaMemory:
             raise DeviceError(
                 f"device 'cuda' has {free / 1e6:,.0f} of {total / 1e6:,.0f} MB free, but this pipeline needs at least "
                 f"{n_bytes / 1e6:,.0f} MB in addition to the {self._bytes / 1e6:,.0f} MB that it already uses; "
-                "give fewer directions, a shorter processing.range_m or a lower accuracy.oversampling, close other "
+                "use fewer directions, a shorter processing.range_m or a lower accuracy.oversampling, close other "
                 "pipelines, or use device 'cpu'"
             ) from error
         self._bytes += n_bytes

@@ -189,7 +189,9 @@ def require_room(
     if peer is None and len(peers) >= _PEERS:
         raise Unwanted("size", f"this central node already has {_PEERS} sensor nodes; use another", "too many")
     if peer is None and key and sum(each.key == key for each in peers.values()) >= _PEERS_OF_KEY:
-        raise Unwanted("size", f"{_PEERS_OF_KEY} sensor nodes already use this key; give each its own", "too many")
+        raise Unwanted(
+            "size", f"{_PEERS_OF_KEY} sensor nodes already use this key; use a different one for each", "too many"
+        )
     if peer is not None and run not in peer.streams and len(peer.streams) >= _STREAMS:
         raise Unwanted("size", f"a sensor node already has {_STREAMS} sessions; send bye for finished ones", "too many")
     if run.sensor not in tracks and len(tracks) >= _SENSORS:
@@ -206,7 +208,7 @@ def require_same(
             if stream.run.sensor == source.name and not same(stream.source, source):
                 raise Unwanted(
                     "settings",
-                    f"another sensor node sends sensor {source.name}, with other settings; give each sensor its "
+                    f"another sensor node sends sensor {source.name}, with other settings; use for each sensor its "
                     "own name, or end the other node",
                     "settings",
                 )

@@ -108,7 +108,7 @@ class Archive:
         try:
             make_folder(self.folder)
         except OSError as error:
-            raise DataError(f"{self.folder}: {error.strerror}; give a writable folder") from error
+            raise DataError(f"{self.folder}: {error.strerror}; choose a writable folder") from error
         self._lock = Lock(self.folder)
         try:
             self._journal_store = JournalStore(self.folder, self._name, Ledger(self.folder), self._emit_event)

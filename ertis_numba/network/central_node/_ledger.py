@@ -280,7 +280,7 @@ class Lock:
         try:
             self._descriptor = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
         except OSError as error:
-            raise DataError(f"{path}: {error.strerror}; give a writable folder") from error
+            raise DataError(f"{path}: {error.strerror}; choose a writable folder") from error
         try:
             if sys.platform == "win32":
                 msvcrt.locking(self._descriptor, msvcrt.LK_NBLCK, 1)
@@ -289,7 +289,7 @@ class Lock:
         except OSError as error:
             os.close(self._descriptor)
             raise JournalInUseError(
-                f"{folder} is in use by another central node; give each its own folder, or end the other"
+                f"{folder} is in use by another central node; use a different folder for each, or end the other"
             ) from error
 
     def release(self) -> None:

@@ -110,7 +110,7 @@ class CentralNode:
         on_stored: Callable[[str, int, int, int], None] | None = None,
     ) -> None:
         if archive is None and processing is None:
-            raise ArgumentError("a central node has neither archive nor processing; give at least one")
+            raise ArgumentError("a central node has neither archive nor processing; pass at least one of them")
         self._listen, self._keys, self._archive = listen, keys, archive
         self._images = None if processing is None else Guarded(processing, self._internal)
         self._window = checks.integer("window", window, 1, 1024)

@@ -51,7 +51,7 @@ class ReceivedItem:
     again : bool
         The number was acknowledged before: stored only if the measurement differs.
     done : bool
-        Its result was reported.
+        True if the result of the item was reported.
     """
 
     run: SensorSession

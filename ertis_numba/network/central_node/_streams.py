@@ -58,7 +58,7 @@ def _source(
     max_bytes: int,
 ) -> JournalSensor:
     if not firmware.isprintable():
-        raise ArgumentError(f"firmware of sensor {name} is {firmware!r}; give printable characters")
+        raise ArgumentError(f"firmware of sensor {name} is {firmware!r}; use printable characters")
     settings = received_settings(text, f"settings of sensor {name}")
     source = JournalSensor.from_settings(
         name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
@@ -224,7 +224,7 @@ class PeerConnection:
     waiting_bytes : int
         Bytes from it that wait for the disk.
     key : str
-        Its key; empty without keys.
+        Key of the sensor node; empty without keys.
     """
 
     streams: dict[SensorSession, Stream] = field(default_factory=dict)
@@ -325,7 +325,7 @@ class Sharing:
                 if len(track.peers) > 1:
                     self._sensors.add(sensor)
                     self._emit_event(
-                        "shared", sensor=sensor, text="several sensor nodes send it; give each its own name"
+                        "shared", sensor=sensor, text="several sensor nodes send it; use a different name for each"
                     )
 
     def remark(self, peer: PeerConnection | None) -> str:
@@ -333,4 +333,4 @@ class Sharing:
         shared = () if peer is None else sorted(self._sensors & {run.sensor for run in peer.streams})
         if not shared:
             return ""
-        return f"another sensor node sends sensor {shared[0]}, too; give each its own name (--name), or end one"
+        return f"another sensor node sends sensor {shared[0]}, too; use a different name for each (--name), or end one"

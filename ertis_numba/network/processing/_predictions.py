@@ -102,7 +102,7 @@ class Predictions:
             if needed > MAX_MEMORY_BYTES:
                 text = f"the error of images was not predicted: that would need {needed / 1e6:.0f} MB"
             else:
-                text = predict(planner_of(image, measurement, kernels.load(self._device), threads=1)).warning
+                text = predict(planner_of(image, measurement, kernels.load(self._device), threads=1), image).warning
         except Exception as error:  # noqa: BLE001  a failed prediction must not end a worker that makes images
             text = f"the error of images was not predicted: {type(error).__name__}: {error}"
         if text:

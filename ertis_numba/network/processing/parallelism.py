@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from ertis_numba.units import counted
+
 __all__ = ["Choice", "Load", "Mode"]
 
 _BUSY: Final = 0.8  # Share of busy time above which more measurements share the cores, …
@@ -55,7 +57,7 @@ class Mode:
     threads: int
 
     def __str__(self) -> str:
-        threads = "1 thread" if self.threads == 1 else f"{self.threads} threads"
+        threads = counted(self.threads, "thread")
         return f"{self.at_once} at once on {threads} each" if self.at_once > 1 else f"one at a time on {threads}"
 
 

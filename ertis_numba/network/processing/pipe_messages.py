@@ -199,7 +199,7 @@ ToPublisher = Begin | SlotMemory | Describe | Publish | Grouped | StatusNote
 
 
 class Started(_Note, frozen=True, kw_only=True):
-    """Applications can subscribe, or an error."""
+    """The publisher has started, so that applications can subscribe; or it has failed with an error."""
 
     address: str
     error: str = ""

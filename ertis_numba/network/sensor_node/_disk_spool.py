@@ -67,7 +67,7 @@ class DiskSpool(Spool):
             with tempfile.TemporaryFile(dir=self._folder):  # root may write regardless of the mode.
                 pass
         except OSError as error:
-            raise NetworkError(f"{self._folder}: {error.strerror}; give a writable spool folder (--spool)") from error
+            raise NetworkError(f"{self._folder}: {error.strerror}; choose a writable spool folder (spool)") from error
         for path in sorted(self._folder.glob(f"*{SUFFIX}")):
             try:
                 journal = Journal.open(path)

@@ -104,7 +104,7 @@ class Spool:
         if sensor.n_bytes > self._max_bytes:
             raise ArgumentError(
                 f"a measurement of sensor {sensor.name} has {sensor.n_bytes} bytes, but the memory has room for "
-                f"{self._max_bytes}; give a larger ring_bytes (--ring)"
+                f"{self._max_bytes}; use a larger ring_bytes"
             )
         with self.turn:
             self._sensors[sensor.name] = sensor
@@ -150,7 +150,7 @@ class Spool:
             key = stamp.sensor, stamp.session_id
             if stamp.sequence <= last.get(key, -1):
                 raise ArgumentError(
-                    f"measurement {stamp.sequence} of sensor {sensor.name} follows {last[key]}; give rising "
+                    f"measurement {stamp.sequence} of sensor {sensor.name} follows {last[key]}; pass rising "
                     "numbers, or another session_id"
                 )
             if key in self.runs:

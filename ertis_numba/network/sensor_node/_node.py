@@ -103,7 +103,7 @@ class SensorNode:
         self._on_acked, self._on_note = _UserCallback("on_acked", on_acked), _UserCallback("on_note", on_note)
         self._on_settings = None if on_settings is None else _UserCallback("on_settings", on_settings)
         if spool_bytes is not None and spool is None:
-            raise ArgumentError("spool_bytes is given without a spool; give its folder with spool")
+            raise ArgumentError("spool_bytes is given without a spool; set its folder with spool")
         checks.integer("ring_bytes", ring_bytes, 1)
         self._spool = (
             Spool(ring_bytes)

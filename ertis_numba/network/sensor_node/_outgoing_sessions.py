@@ -101,7 +101,7 @@ class OutgoingSession:
         """Refuse a number that does not rise."""
         if self.following is not None and number < self.following:
             raise ArgumentError(
-                f"measurement {number} of sensor {self.sensor.name} follows {self.following - 1}; give rising "
+                f"measurement {number} of sensor {self.sensor.name} follows {self.following - 1}; pass rising "
                 "numbers, or another session_id"
             )
 

@@ -256,7 +256,7 @@ def _tool(name: str) -> str:
 
 
 def _run(name: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    done = subprocess.run([_tool(name), *arguments], capture_output=True, text=True, check=False)  # noqa: S603
+    done = subprocess.run([_tool(name), *arguments], capture_output=True, text=True, check=False)
     if done.returncode:
         raise DeviceError(f"{name} fails ({done.stderr.strip().splitlines()[-1]}); {_REMEDY}")
     return done

@@ -1,1 +1,0 @@
-"""Parts of plans that were rejected, and their counts and errors."""

@@ -1,0 +1,178 @@
+"""Fits of single echoes to the samples of an image around its maxima."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba import kernels
+from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.frames import Energyscape
+from ertis_numba.settings import Settings
+from ertis_numba.stages.plan_response import deviation_of
+
+__all__ = ["EchoFits", "Fitted"]
+
+_COARSE = 0.8  # Amplitude of an echo at the border of a cell, below which other places may explain the samples.
+_SPARSE = 0.5  # The same, below which the errors of range and level are those of a wide cell, too.
+_SPARSE_NP = 0.35
+_STARTS = (0.25, 0.5)  # Shares of the way to each neighbour.
+_UNIFORM = 0.34  # A uniform distribution has 68 % of its values within this share of its width around the middle.
+_UNKNOWN = 1.0  # Variance of what a fit does not determine, in square metres, radians or nepers.
+_OTHER = 0.05  # Error of the model beyond the noise, above which samples are not those of a single echo at rest.
+_SAME = 1e-9  # Distance in radians below which two directions are one.
+
+Floats = NDArray[np.float64]
+
+
+class Fitted(NamedTuple):
+    """Echoes that were fitted.
+
+    Attributes
+    ----------
+    range_m : (place,) float64
+        Ranges relative to those of the maxima.
+    offset : (place, axis) float64
+        Offsets of the directions, before they are scaled to unit vectors.
+    level : (place,) float64
+        Natural logarithm of the amplitude.
+    range_sd_m, across_sd_rad, level_sd : (place,) float64
+        Standard deviations: of the range, of the direction along its least certain axis, and of the level in nepers.
+    is_sparse : (place,) bool
+        True where the main lobe of an echo is narrower than the cell, so that side lobes may decide its direction.
+    """
+
+    range_m: Floats
+    offset: Floats
+    level: Floats
+    range_sd_m: Floats
+    across_sd_rad: Floats
+    level_sd: Floats
+    is_sparse: NDArray[np.bool_]
+
+
+class EchoFits:
+    """Fits of single echoes to maxima of images of delay-and-sum.
+
+    Parameters
+    ----------
+    settings : Settings
+    directions : (direction, axis) float64
+        Unit vectors.
+    spread : PointSpread
+    """
+
+    def __init__(self, settings: Settings, directions: Floats, spread: PointSpread) -> None:
+        self._directions, self._spread = np.ascontiguousarray(directions), spread
+        self._beams = spread.beams(self._directions, deviation_of(settings, directions))
+        self._is_planar = bool(np.ptp(directions[:, 2]) == 0)
+
+    def __call__(
+        self,
+        image: Energyscape,
+        rows: NDArray[np.int64],
+        columns: NDArray[np.int64],
+        tops: Floats,
+        *,
+        noise: float,
+        model: float,
+    ) -> Fitted:
+        """Return the echoes that fit samples best.
+
+        Parameters
+        ----------
+        image : Energyscape
+        rows, columns : (place, sample) int64
+            Directions and ranges of the samples. The second one is the maximum, the first and third ones are those
+            beside it in range, and its neighbours follow.
+        tops : (place, 5) float64
+            Interpolated maxima: shift in range steps, offset of the direction, and logarithm of the amplitude.
+        noise : float
+            Root mean square of the noise of the image; 0 if it is unknown.
+        model : float
+            Errors of the plan relative to the amplitude.
+        """
+        middle = rows[:, 0]
+        offsets = self._directions[rows[:, 3:]] - self._directions[middle][:, None]
+        amplitude = image.amplitude[rows, columns].astype(np.float64)
+        is_used = amplitude > 0
+        is_used[:, 3:] &= np.linalg.norm(offsets, axis=2) > _SAME
+        is_used[:, [0, 2]] &= columns[:, [0, 2]] != columns[:, 1:2]
+        axes, width_rad = self._axes(middle), _widths_rad(offsets)
+        at_border = self._at_border(width_rad, axes)
+        is_sparse = at_border < _SPARSE
+        samples = kernels.EchoSamples(
+            rows,
+            is_used,
+            amplitude,
+            image.range_m[columns] - image.range_m[columns[:, 1:2]],
+            image.range_m[columns[:, 1]].astype(np.float64),
+            at_border < _COARSE,
+        )
+        step_m = float(image.range_m[1] - image.range_m[0]) if len(image.range_m) > 1 else 0.0
+        starts = self._starts(tops, step_m, offsets, axes, amplitude[:, 1])
+        out = np.empty((len(rows), kernels.N_VALUES))
+        kernels.load_points().fit_echoes(
+            self._spread.pulse,
+            self._beams,
+            samples,
+            starts,
+            axes,
+            noise,
+            model,
+            image.settings.processing.wavefront == "spherical",
+            self._spread.scale(image.settings.air),
+            out,
+        )
+        covariance = out[:, 5:21].reshape(-1, 4, 4)
+        covariance[~np.isfinite(covariance).all(axis=(1, 2))] = _UNKNOWN * np.eye(4)
+        across = covariance[:, 1:3, 1:3]
+        widest = across[:, 0, 0] if self._is_planar else np.linalg.norm(across, 2, axis=(1, 2))
+        # Samples that are not those of a single echo keep the maximum of the parabolas; the difference is uncertain.
+        is_other = out[:, 21] > _OTHER + noise / np.maximum(amplitude[:, 1], np.finfo(np.float32).tiny)
+        kept = np.where(is_other[:, None], starts[:, 0], out[:, :4])
+        variance = np.stack([covariance[:, 0, 0], widest, covariance[:, 3, 3]])
+        away = kept - out[:, :4]
+        variance += np.stack([away[:, 0], np.hypot(away[:, 1], away[:, 2]), away[:, 3]]) ** 2
+        sd = np.sqrt(np.minimum(variance, _UNKNOWN))
+        extent_m = np.linalg.norm(self._spread.pulse.positions_m, axis=1).max()
+        return Fitted(
+            kept[:, 0],
+            np.einsum("pi,pij->pj", kept[:, 1:3], axes),
+            kept[:, 3],
+            np.hypot(sd[0], np.where(is_sparse, _UNIFORM * width_rad * extent_m / 2, 0.0)),
+            sd[1],
+            np.hypot(sd[2], np.where(is_sparse, _SPARSE_NP, 0.0)),
+            is_sparse,
+        )
+
+    def _axes(self, middle: NDArray[np.int64]) -> Floats:
+        """Return unit vectors to the left and upwards, across directions: (place, 2, axis) float64."""
+        ahead = self._directions[middle]
+        level = np.hypot(ahead[:, 0], ahead[:, 1])
+        is_up = level < _SAME
+        left = np.stack([-ahead[:, 1], np.where(is_up, 1.0, ahead[:, 0]), np.zeros(len(ahead))], axis=1)
+        left /= np.where(is_up, 1.0, level)[:, None]
+        return np.stack([left, np.zeros_like(left) if self._is_planar else np.cross(ahead, left)], axis=1)
+
+    def _at_border(self, width_rad: Floats, axes: Floats) -> Floats:
+        """Return the least amplitude, in the direction of a cell, of echoes at its border: (place,) float64."""
+        half_rad = np.where(np.isfinite(width_rad), width_rad, 0.0)[:, None] / 2
+        none_m = np.zeros(len(axes))
+        return np.minimum(*(self._spread(half_rad * axes[:, axis], none_m) for axis in (0, 1)))
+
+    def _starts(self, tops: Floats, step_m: float, offsets: Floats, axes: Floats, amplitude: Floats) -> Floats:
+        """Return the starts of the fits: the interpolated maximum, and places towards the neighbours."""
+        first = np.concatenate([step_m * tops[:, :1], np.einsum("pi,pji->pj", tops[:, 1:4], axes), tops[:, 4:]], axis=1)
+        aside = np.concatenate([share * np.einsum("pni,pji->pnj", offsets, axes) for share in _STARTS], axis=1)
+        level = np.broadcast_to(
+            np.log(np.maximum(amplitude, np.finfo(np.float32).tiny))[:, None, None], (*aside.shape[:2], 1)
+        )
+        others = np.concatenate([np.zeros_like(level), aside, level], axis=2)
+        return np.concatenate([first[:, None], others], axis=1)
+
+
+def _widths_rad(offsets: Floats) -> Floats:
+    """Return the distance of the nearest other direction; infinite if there is none: (place,) float64."""
+    distance = np.linalg.norm(offsets, axis=2)
+    return np.asarray(np.where(distance > _SAME, distance, np.inf).min(axis=1, initial=np.inf))
