@@ -166,8 +166,6 @@ def write_maps(
     ----------
     path, target : Path
         Recording, and the file to write.
-    wanted : CampaignOptions
-    sensors : sequence of str
     quiet, as_json : bool
         As for the command.
     """

@@ -91,12 +91,9 @@ class CentralWatch:
     ----------
     life : Life
         This process.
-    quiet, as_json : bool
 
     Attributes
     ----------
-    life : Life
-    quiet, as_json : bool
     recordings : list of str
         Sealed recordings.
     """
@@ -204,12 +201,8 @@ def run(
 
     Parameters
     ----------
-    node : CentralNode
-    watch : CentralWatch
     made : list of Path
         New folders, as yielded by `ertis_cli._saving.withdrawn`; cleared once the node runs.
-    metrics : Metrics or None
-    duration_s : float or None
 
     Raises
     ------
@@ -237,8 +230,6 @@ def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
 
     Parameters
     ----------
-    status : Status
-    watch : CentralWatch
     event : str
         Name of the JSON event.
     """

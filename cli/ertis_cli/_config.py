@@ -44,7 +44,6 @@ def add_variables(command: click.Command, path: tuple[str, ...]) -> None:
 
     Parameters
     ----------
-    command : click.Command
     path : tuple of str
         Names of the groups that contain the command, then its own name.
     """

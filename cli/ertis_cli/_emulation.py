@@ -29,10 +29,6 @@ class SceneRenderer:
 
     All effects are simulated, except those that the scene switches off. This takes longer than rendering only the
     relevant effects, but much less time than determining them.
-
-    Parameters
-    ----------
-    scene : Scene
     """
 
     def __init__(self, scene: "Scene") -> None:

@@ -114,8 +114,6 @@ def drive_of(
         Mountings of sensors, as far as they are known.
     poses, odometry, scene : Path or None
         Files given as options.
-    beam_azimuth_deg : float
-    quiet : bool
 
     Raises
     ------

@@ -39,8 +39,6 @@ class SoundOptions(NamedTuple):
     ----------
     direction : (azimuth, elevation), optional
         Direction in degrees.
-    heterodyne_hz, expansion : float, optional
-    with_silence : bool
     """
 
     direction: tuple[float, float] | None

@@ -19,7 +19,6 @@ class JsonLines:
 
     Parameters
     ----------
-    stream : file
     largest : int
         Largest number of waiting texts; 65,536 by default.
 

@@ -58,10 +58,8 @@ def listen_pulses(
 
     Parameters
     ----------
-    address : str
     sensors : sequence of str
         Requested sensors; empty for all.
-    connect : callable
     show : callable
         Prints what arrived of a pulse.
     head : str
@@ -72,9 +70,6 @@ def listen_pulses(
         Product that the subscriber receives.
     at_end : callable
         Called with the subscriber at the end, also after an error.
-    n : int or None
-    duration : float or None
-    quiet, as_json : bool
     """
     notes: deque[str] = deque()
     heard = MicrophoneTable(as_json=as_json, quiet=quiet)

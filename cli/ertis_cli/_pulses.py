@@ -234,7 +234,6 @@ def active_groups(
         Recordings of all sensors of the platform.
     changed : callable
         Function that returns the settings to use; with their ``processing.mode``, `is_passive` decides.
-    quiet : bool
 
     Raises
     ------

@@ -60,19 +60,13 @@ class Sending:
 
     Parameters
     ----------
-    address : str
-    settings : Settings
-    spool : Path or None
     limits_mb : tuple of (float or None)
         Limits of the spool and of the memory, in MB; None for the defaults of `SensorNode`.
     is_fixed : bool
         True to refuse new settings from admins.
-    quiet, as_json : bool
 
     Attributes
     ----------
-    address : str
-    watch : Watch
     report : dict
         Summary for JSON output, complete once `run` has returned.
     n_lost : int

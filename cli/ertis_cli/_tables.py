@@ -29,7 +29,6 @@ class TextTable:
     ----------
     columns : mapping of str
         Headings and the alignment of their cells; numbers are aligned right.
-    rows : sequence of sequences of str
     styles : mapping of str, optional
         Styles of cells by their text, as in ``{"failed": "red"}``; empty by default.
     """

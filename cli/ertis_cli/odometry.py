@@ -125,12 +125,10 @@ def odometry_of(
         Recordings of all sensors of the platform.
     groups : sequence of mapping of str to StampedIndex
         Measurements of each pulse, by sensor.
-    pipelines : PipelinesBySensor
     mountings : mapping of str to Mounting
         Mountings of all sensors.
     alone : bool, optional
         As for `Odometry`.
-    quiet : bool
 
     Raises
     ------

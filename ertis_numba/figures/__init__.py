@@ -442,7 +442,6 @@ def calibration(
 
     Parameters
     ----------
-    made : Calibration
     settings : Settings
         Settings of the recordings, for the call and the air.
     azimuth_deg, elevation_deg : float

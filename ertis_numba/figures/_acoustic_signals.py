@@ -82,7 +82,6 @@ def power_spectra(
     Parameters
     ----------
     values : (channel, sample) float32
-    rate_hz : float
 
     Raises
     ------

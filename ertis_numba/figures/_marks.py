@@ -35,15 +35,10 @@ def name_points(
 
     Parameters
     ----------
-    axes : Axes
-    style : Style
     points : sequence of (x, y)
         Positions in the coordinates of the axes.
-    names : sequence of str
     ring_pt : float
         Radius around each point that names avoid.
-    colour : str
-    bold : bool
     """
     px_per_pt, size_pt, page = axes.figure.dpi / 72, style.tick_pt, axes.figure.bbox
     taken = [text.get_window_extent() for text in axes.texts if text.get_text()]

@@ -39,7 +39,6 @@ class Panel:
         Returns the height of the axes from their width, both in points.
     finish : callable
         Draws what depends on the final position of the axes.
-    title : str
     title_ems : float
         Distance of the title from the axes.
     box_aspect : float, optional
@@ -71,9 +70,6 @@ def compose(
 
     Parameters
     ----------
-    canvas : Canvas
-    heading : Heading
-    panels : sequence of Panel
     width_pt : float
         Width of the page if the style has none.
     stacked : bool

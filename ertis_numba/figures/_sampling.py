@@ -69,7 +69,6 @@ def polar_raster(
     ----------
     level_db : (azimuth, range) float32
         Levels in dB for the azimuths of ``fan``.
-    fan : Fan
     range_m : (range,) float64
         Rising.
     right_m : (column,) float64

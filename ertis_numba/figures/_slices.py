@@ -56,7 +56,6 @@ class _Cut:
     ----------
     name : str
         Name of the argument that sets its position.
-    at_m : float
     across, up, normal : int
         Axes of the sensor frame.
     extent_m : (left, right, bottom, top)

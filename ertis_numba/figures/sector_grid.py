@@ -24,8 +24,6 @@ def draw_grid(
     ----------
     axes : Axes
         Metres to the right of the sensor and ahead of it; limits must be final.
-    style : Style
-    fan : Fan
     first_m : float
         First range that a ring may have.
     largest : int

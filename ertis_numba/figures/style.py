@@ -65,16 +65,12 @@ class Style:
 
     Attributes
     ----------
-    page, ink, faint, mark, colours : str
-    font : str
     title_pt, label_pt, tick_pt, list_pt : float
         Font sizes.
-    line_pt : float
     margin_pt : float
         Margin around the page.
     side_pt : float
         Minimum width beside the pictures for the scale and the list.
-    dpi : int
     width_pt : float or None
         Width of the page; None for the width of the kind of picture.
     """

@@ -27,7 +27,6 @@ def delay_matrix(settings: Settings, *, n_directions: int) -> NDArray[np.float64
 
     Parameters
     ----------
-    settings : Settings
     n_directions : int
         Number of directions of the image.
 
@@ -83,7 +82,6 @@ def plane_delays(settings: Settings, grid: Grid, *, sound_speed_m_s: float) -> N
 
     Parameters
     ----------
-    settings : Settings
     grid : Grid
         Directions of the image.
     sound_speed_m_s : float

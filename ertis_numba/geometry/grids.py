@@ -78,10 +78,6 @@ def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
 def named_grid(processing: Processing) -> tuple[str, tuple[float, float], tuple[float, float]] | None:
     """Return the kind of a grid, 2d or 3d, with its azimuth and elevation limits in degrees; None for other directions.
 
-    Parameters
-    ----------
-    processing : Processing
-
     Examples
     --------
     >>> from ertis_numba.settings import Processing
@@ -103,10 +99,6 @@ def direction_grid(processing: Processing) -> Grid:
     ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths at one elevation, including both limits.
     ``3d:N`` is N cells of equal area between the limits, in rows of equal elevation. Any other name is the path of a
     CSV file of azimuth, elevation in degrees.
-
-    Parameters
-    ----------
-    processing : Processing
 
     Returns
     -------

@@ -119,7 +119,6 @@ class ReadLayout:
 
     Attributes
     ----------
-    array : Array
     notes : tuple of str
         Remarks for the user; none by default.
     unit_is_stated : bool

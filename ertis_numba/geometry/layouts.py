@@ -109,7 +109,6 @@ def layout_file(layout: Layout, *, name: str, source: str = "") -> LayoutFile:
 
     Parameters
     ----------
-    layout : Layout
     name : str
         Name of the layout.
     source : str
@@ -196,10 +195,6 @@ def _shipped_array(name: str) -> Array:
 
 def microphones(array: Array) -> Layout:
     """Return the microphones that array settings describe, by position or by name.
-
-    Parameters
-    ----------
-    array : Array
 
     Returns
     -------
@@ -317,10 +312,6 @@ def require_plausible_size(settings: Settings) -> None:
 
 def storable(settings: Settings) -> Settings:
     """Return settings in the form that recordings contain, which depends on no file.
-
-    Parameters
-    ----------
-    settings : Settings
 
     Returns
     -------

@@ -50,7 +50,6 @@ class ObservableAngles(NamedTuple):
 
         Parameters
         ----------
-        azimuth_rad, elevation_rad : float
         is_planar : bool
             True if all compared directions lie at one elevation; the azimuth then remains.
         """

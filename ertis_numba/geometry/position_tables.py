@@ -56,7 +56,6 @@ def read_position_table(source: str, text: str) -> PositionTable:
     ----------
     source : str
         Name of the table in errors.
-    text : str
 
     Raises
     ------

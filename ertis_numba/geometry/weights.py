@@ -26,10 +26,6 @@ def array_weights(settings: Settings) -> NDArray[np.float64]:
     ``wᴴv = 1`` does the same for the response in the steered direction (H. L. Van Trees, Optimum Array Processing,
     2002, sections 2.6 and 3.1).
 
-    Parameters
-    ----------
-    settings : Settings
-
     Returns
     -------
     (mic,) float64

@@ -36,8 +36,6 @@ def write_batslam(path: Path, measurements: Iterable[Measurement], drive: Drive,
 
     Parameters
     ----------
-    path : Path
-    measurements : iterable of Measurement
     drive : Drive
         Poses of the platform, and the scene.
     mountings : mapping of str to (translation_m, rotation_xyzw)

@@ -22,10 +22,6 @@ class GreyImage:
 
     A planar image becomes a picture of azimuth, from the left, and of range, from below. An image with elevations
     becomes a map of azimuth and elevation as the sensor sees it: the maximum over range of the nearest direction.
-
-    Parameters
-    ----------
-    image : Energyscape
     """
 
     def __init__(self, image: Energyscape) -> None:

@@ -81,7 +81,6 @@ def trajectory_of(rows: PoseRows, pose_axes: PoseAxes = "platform") -> Trajector
 
     Parameters
     ----------
-    rows : PoseRows
     pose_axes : {"platform", "camera", "camera-world", "ned"}
         Axes of the rows.
 

@@ -84,7 +84,6 @@ def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: s
 
     Parameters
     ----------
-    text : str
     needs_header : bool
         Refuse rows without a line that names the columns, instead of reading them as TUM or KITTI.
     time_unit : {"s", "ms", "us", "ns"} or None

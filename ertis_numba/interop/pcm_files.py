@@ -45,15 +45,12 @@ class PcmFile:
         Files in the order of their channels.
     rate_hz : float
         Rate at which the sound was recorded.
-    n_samples : int
     counts : tuple of int
         Number of channels of each file.
     kind : dtype
         Type of the samples in the file.
-    metadata : RecorderMetadata
     is_wide : bool
         True for integers of 32 or 64 bits, all of which are used according to the file.
-    notes : tuple of str
     settings : Settings or None
         Settings in the file.
     """

@@ -42,7 +42,6 @@ class Emissions:
     ----------
     times : (emission,) float64
         Times of the emissions since the first sample, in samples; range 0 of the call.
-    notes : tuple of str
     """
 
     times: NDArray[np.float64]
@@ -61,8 +60,6 @@ def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, 
         Function that returns consecutive samples of the channel.
     n_samples : int
         Number of samples of the channel.
-    call : Call
-    rate_hz : float
     path, channel : Path, int
         Names in messages.
 

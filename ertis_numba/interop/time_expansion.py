@@ -18,10 +18,8 @@ def true_rate_hz(
 
     Parameters
     ----------
-    path : Path
     header_hz : float
         Rate in the header, in hertz.
-    metadata : RecorderMetadata
     expansion : float or None
         Factor given by the user, which overrides the metadata.
 

@@ -201,8 +201,6 @@ def check_tum_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = (
 
     Parameters
     ----------
-    path : Path
-    overwrite : bool
     sources : iterable of Path
         Input files, which are never overwritten.
 

@@ -62,7 +62,6 @@ class FusedImages:
 
         Parameters
         ----------
-        image : Energyscape
         mountings : mapping of str to (translation_m, rotation_xyzw)
             Poses of all sensors with a known mounting.
         """

@@ -23,7 +23,6 @@ class OdometryPublisher:
 
     Parameters
     ----------
-    odometry, transforms : Topic
     on_note : callable
         Called by any thread with a line for each sensor without mounting, and for each pulse that cannot be used.
     is_paused : callable

@@ -47,7 +47,6 @@ class Configuration:
         Factors for the spectra of the signals, as `numpy.fft.rfft` returns them.
     delays : (direction, mic) int32 or None
         Delays in samples of the signals, at least 0.
-    n_mics, n_directions : int
     n_samples : int
         Number of PDM words.
     pdm_factor, envelope_factor : int
@@ -140,7 +139,6 @@ class Processor:
 
     Parameters
     ----------
-    configuration : Configuration
     device : {"auto", "cpu", "cuda", "numpy"}
         Device of the PDM filter and of the beams; Fourier transforms and the other filters use the CPU.
 

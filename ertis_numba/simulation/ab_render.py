@@ -33,10 +33,6 @@ class ABRender:
 
     Modulators and converters are included only if a signal comes within 6 dB of full scale. Otherwise they are left
     out, because any change of their input changes their noise. A different noise does not count as a changed image.
-
-    Parameters
-    ----------
-    scene : Scene
     """
 
     def __init__(self, scene: Scene) -> None:

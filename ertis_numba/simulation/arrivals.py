@@ -60,7 +60,6 @@ class Arrivals:
 
     Attributes
     ----------
-    call : Call or NoiseFrame
     delay_s : (path, mic) float64
         Delay from the start of the record, including the microphone's own delay.
     amplitude : (path, mic, frequency) float64 or complex128
@@ -97,7 +96,6 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
 
     Parameters
     ----------
-    shot : Snapshot
     active : set of str
         The effects that are simulated.
     frequency_hz : (frequency,) float64
@@ -169,12 +167,10 @@ def echoes(
 
     Parameters
     ----------
-    shot : Snapshot
     active : set of str
         The effects that are simulated.
     number : int
         Index of the emitting sensor.
-    clock : CostStopwatch
     n_frequencies : int
         Number of frequencies at which amplitudes will be computed.
 
@@ -208,14 +204,12 @@ def views_of(
 
     Parameters
     ----------
-    shot : Snapshot
     active : set of str
         The effects that are simulated.
     number : int
         Number of the emitter, different for each of the snapshot.
     transmitter : Transmitters
         The emitter without mirror images.
-    clock : CostStopwatch
     """
     views: Views = (
         images(transmitter, shot.targets.positions_m, shot.mirrors, 0),
@@ -306,7 +300,6 @@ def arrived(
 
     Parameters
     ----------
-    shot : Snapshot
     active : set of str
         The effects that are simulated.
     number : int

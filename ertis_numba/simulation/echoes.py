@@ -21,7 +21,6 @@ class Echoes:
 
     Attributes
     ----------
-    names : tuple of str
     gain : (path, frequency) float64 or complex128
     delay_s : (path,) float64
         Delay at the centre of the array.
@@ -69,8 +68,6 @@ class Ways:
 
     Attributes
     ----------
-    paths : list of Paths
-    names : tuple of str
     delay_s : (path,) float64
     direction : (path, axis) float64
     coverage : (path,) float64

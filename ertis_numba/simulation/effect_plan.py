@@ -103,10 +103,6 @@ def make_plan(scene: Scene) -> EffectPlan:
     the greatest estimates, with and without the effect. They also use the loudest measurement, because estimates do not
     model converters.
 
-    Parameters
-    ----------
-    scene : Scene
-
     Returns
     -------
     EffectPlan

@@ -35,7 +35,6 @@ class Engine:
 
     Parameters
     ----------
-    scene : Scene
     sensor : Sensor
         One of the scene's sensors.
     active : frozenset of str
@@ -45,9 +44,6 @@ class Engine:
 
     Attributes
     ----------
-    scene : Scene
-    sensor : Sensor
-    active : frozenset of str
     clock : CostStopwatch
         Time spent on each effect so far.
     loudest : float

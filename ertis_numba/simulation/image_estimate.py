@@ -46,7 +46,6 @@ class Sight:
 
     Parameters
     ----------
-    shot : Snapshot
     active : frozenset of str
         The effects that are simulated.
 

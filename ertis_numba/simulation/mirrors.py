@@ -91,7 +91,6 @@ def images(end: End, places_m: Floats, mirrors: Mirrors, largest: int) -> Seen[E
     end : Transmitters or Receivers
         The end without images.
     places_m : (place, axis) float64
-    mirrors : Mirrors
     largest : int
         Maximum number of reflections.
 
@@ -157,7 +156,6 @@ def _longer(chains: Indices, tips_m: Floats, mirrors: Mirrors) -> tuple[Indices,
     chains : (wall, chain) int
     tips_m : (image, chain, axis) float64
         Positions of the end and its images in the walls of the chain.
-    mirrors : Mirrors
     """
     number = np.tile(np.arange(len(mirrors)), chains.shape[1])
     chain = np.repeat(np.arange(chains.shape[1]), len(mirrors))

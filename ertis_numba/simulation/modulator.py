@@ -23,7 +23,6 @@ class Modulator:
 
     Parameters
     ----------
-    layout : Layout
     keys : (mic,) uint64
         Seed of each microphone's noise and dither.
     noise_rms : (mic,) float64

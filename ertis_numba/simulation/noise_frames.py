@@ -31,7 +31,6 @@ class NoiseFrame:
 
     Attributes
     ----------
-    noise : Noise
     seed : tuple of int
         Seed of the random numbers.
     """

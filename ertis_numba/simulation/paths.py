@@ -21,7 +21,6 @@ class Paths:
 
     Attributes
     ----------
-    transmitter : Transmitters
     receiver : Receivers
         One image of the emitter and of the microphones per path.
     targets : Targets

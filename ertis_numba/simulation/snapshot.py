@@ -95,7 +95,6 @@ class Targets:
 
     Attributes
     ----------
-    names : tuple of str
     positions_m, velocities_m_s : (target, axis) float64
     strength : (target,) float64
         Amplitude of the echo at 1 m from a point, or amplitude reflection factor of a sphere.
@@ -130,7 +129,6 @@ class Mirrors:
 
     Attributes
     ----------
-    names : tuple of str
     points_m, velocities_m_s : (wall, axis) float64
         Centres of the walls, and their velocities.
     axes : (wall, 3, axis) float64
@@ -158,7 +156,6 @@ class Snapshot:
 
     Attributes
     ----------
-    scene : Scene
     sensor : Sensor
         The receiving sensor.
     time_s : float
@@ -171,8 +168,6 @@ class Snapshot:
         The microphones, without mirror images.
     transmitters : tuple of Transmitters
         Emitters without mirror images, one per sensor of the scene.
-    targets : Targets
-    mirrors : Mirrors
     speed_m_s : float
         Speed of sound.
     token : object

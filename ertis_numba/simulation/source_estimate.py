@@ -30,7 +30,6 @@ def change_of_sources(name: str, shot: Snapshot, active: frozenset[str]) -> Esti
     ----------
     name : str
         Name of the effect.
-    shot : Snapshot
     active : frozenset of str
         The other effects that are simulated.
 

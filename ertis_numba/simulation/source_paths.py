@@ -37,8 +37,6 @@ class SourceInScene(Generic[Kind]):
         Name in the scene, such as ``tones[0]``.
     number : int
         Number among the sources of its kind.
-    source : Tone, Noise or Sonar
-    shot : Snapshot
     active : set of str
         The effects that are simulated.
     clock : CostStopwatch

@@ -31,7 +31,6 @@ def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
 
     Parameters
     ----------
-    shot : Snapshot
     active : frozenset of str
         The effects that are simulated.
 
@@ -100,7 +99,6 @@ def true_sources(shot: Snapshot, active: frozenset[str]) -> list[TrueSource]:
 
     Parameters
     ----------
-    shot : Snapshot
     active : frozenset of str
         The effects that are simulated.
 

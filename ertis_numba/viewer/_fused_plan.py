@@ -49,7 +49,6 @@ class FusedPlan:
         ----------
         several : mapping of str to ReceivedImage
             Latest image of each sensor; all poses are known.
-        choices : Choices
         """
         whole = self._image(several)
         made_for: list[object] = [whole, choices]

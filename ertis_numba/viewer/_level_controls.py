@@ -22,7 +22,6 @@ class LevelControls:
 
     Parameters
     ----------
-    gui : viser.GuiApi
     choices : Choices
         Initial choices.
     choose : callable

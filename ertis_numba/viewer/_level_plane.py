@@ -106,7 +106,6 @@ class LevelPlane:
             Result of `LevelScale.shade`.
         table : (256, 3) uint8
             Colours of levels.
-        scale : LevelScale
 
         Returns
         -------

@@ -17,7 +17,6 @@ class MapSequence:
 
     Parameters
     ----------
-    reader : RecordingReader
     device : {"auto", "cpu", "cuda", "numpy"}
     """
 

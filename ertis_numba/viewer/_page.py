@@ -50,10 +50,8 @@ class ViewerPage:
 
     Parameters
     ----------
-    host : str
     port : int
         0 selects a free one.
-    orders : queue.SimpleQueue
     title : str
         Name of the source.
     choices : Choices

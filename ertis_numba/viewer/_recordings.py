@@ -36,9 +36,6 @@ class ToFile:
 
     Parameters
     ----------
-    path : Path
-    overwrite : bool
-    on_note : callable
     sources : sequence of Path
         Files on display, which are never overwritten.
 
@@ -86,7 +83,6 @@ class ToBrowser:
 
     Parameters
     ----------
-    client : viser.ClientHandle
     name : str
         Name of the file.
     """

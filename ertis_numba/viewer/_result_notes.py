@@ -44,7 +44,6 @@ class ResultNotes:
 
         Parameters
         ----------
-        item : Energyscape or AcousticMap
         band_note : str, optional
             Note on sound that the bands of the map do not show.
         """

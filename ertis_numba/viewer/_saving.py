@@ -86,7 +86,6 @@ def with_legend(page: str, title: str, frame: DrawnFrame | None) -> str:
     ----------
     page : str
         HTML, with a head and a body.
-    title : str
     frame : DrawnFrame or None
         The pictures of its first four sensors are shown; they have colour bars.
     """

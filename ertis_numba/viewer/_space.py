@@ -25,12 +25,7 @@ _NONE: Final = np.zeros((1, 3), np.float32)
 
 
 class Space:
-    """Three-dimensional scene in viser.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    """
+    """Three-dimensional scene in viser."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene

@@ -29,7 +29,6 @@ class WavFile:
 
     Attributes
     ----------
-    rate_hz : float
     samples : Samples
         (sample, channel); slices along the first axis are arrays. The file is mapped into memory. Integers have the
         full scale of their type, and bytes are unsigned.

@@ -67,7 +67,6 @@ def read_form(content: bytes, order: str, place: int, path: Path) -> Form:
 
     Parameters
     ----------
-    content : bytes
     order : str
         ``<`` or ``>``.
     place : int

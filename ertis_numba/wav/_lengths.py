@@ -110,7 +110,6 @@ def sample_bytes(content: Content, place: int, wide: int | None, frame_bytes: in
 
     Parameters
     ----------
-    content : Content
     place : int
         Where the data chunk begins.
     wide : int, optional

@@ -33,7 +33,6 @@ def samples_of(content: NDArray[np.uint8], n_channels: int, sample_bytes: int, k
     ----------
     content : (byte,) uint8
         Complete frames.
-    n_channels, sample_bytes : int
     kind : str
         ``i`` or ``f``; bytes are unsigned.
     order : str

@@ -40,7 +40,6 @@ class Dot16:
 
     Parameters
     ----------
-    builder : llvmlite.ir.IRBuilder
     n_beams : int
         BeamErrors that are summed at a time.
     """

@@ -39,7 +39,6 @@ class InstructionSet:
 
     Attributes
     ----------
-    name : str
     lanes : int
         Numbers of 32 bits in a vector register.
     sums : int

@@ -66,7 +66,6 @@ def drawn(random: np.random.Generator, bins: NDArray[np.int64], mix: NDArray[np.
 
     Parameters
     ----------
-    random : numpy.random.Generator
     bins : (bin,) int64
     mix : (bin, row, source) float64
         Mixing matrix from independent sources to rows at each frequency.

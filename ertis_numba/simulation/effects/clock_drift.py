@@ -25,7 +25,6 @@ def clock_times(shot: Snapshot, number: int, delay_s: Floats, stretch: Floats | 
 
     Parameters
     ----------
-    shot : Snapshot
     number : int
         Index of the emitting sensor.
     delay_s : (path, mic) float64

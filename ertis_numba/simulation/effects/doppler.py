@@ -37,7 +37,6 @@ def emission(shot: Snapshot, paths: Paths, received_s: Floats) -> Floats:
 
     Parameters
     ----------
-    shot : Snapshot
     paths : Paths
         Paths without targets.
     received_s : (mic, time) float64

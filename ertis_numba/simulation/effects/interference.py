@@ -88,8 +88,6 @@ def _received(
 
     Parameters
     ----------
-    source : SourceInScene
-    sound : Call or NoiseFrame
     start_s : float
         Time at which its beginning leaves the source, relative to the snapshot.
     centre_s : float
