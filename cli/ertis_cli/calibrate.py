@@ -267,8 +267,10 @@ def _print(made: "Calibration", places: list[str], *, quiet: bool) -> None:
     for line in made.findings:
         click.echo(line)
     residuals, (before_db, after_db) = made.residuals, made.contrast_db
+    n_used, n_left = len(made.source_m), len(made.rejected)
+    used = f"{n_used} of {n_used + n_left} measurements" if n_left else options.counted(n_used, "measurement")
     click.echo(
-        f"residuals of {options.counted(len(made.source_m), 'measurement')}: {1e6 * residuals.before_s:.3f} µs and "
+        f"residuals of {used}: {1e6 * residuals.before_s:.3f} µs and "
         f"{residuals.before_db:.3f} dB before, {1e6 * residuals.after_s:.3f} µs and {residuals.after_db:.3f} dB after"
     )
     click.echo(f"contrast of images: {before_db:.2f} dB before, {after_db:.2f} dB after")

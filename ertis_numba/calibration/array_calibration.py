@@ -56,6 +56,7 @@ _MAX_CHANGE: Final = 3.0  # Root-mean-square change relative to the tolerance, a
 _MAX_SPEED: Final = 0.1  # Relative difference of a measured speed of sound.
 _BAD_RECORD: Final = 6.0  # Residual of a bad recording relative to that of the median one.
 _MIN_BAD_S: Final = 1e-7
+_MAX_OTHER_S: Final = 3e-7  # Error of times because of other sound, beyond which a recording is left out.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,7 +193,7 @@ def _fitted(job: _Prepared) -> Calibration:
     source_m = job.source_m
     n_valid = np.isfinite(seen.time_sd_s).sum(axis=1)
     few = {i: f"{n} microphones receive the same sound" for i, n in enumerate(n_valid) if n < _MIN_MICROPHONES}
-    seen, source_m = _left_out(job, few, seen, source_m)
+    seen, source_m = _left_out(job, few | _overlapped(job, few), seen, source_m)
     fit = _fit(job, seen, source_m)
     bad = {
         int(i): f"it does not agree with the others: residuals of {1e6 * _rms(fit.residual_s[i]):.1f} µs"
@@ -205,6 +206,21 @@ def _fitted(job: _Prepared) -> Calibration:
         fit = _fit(job, seen, source_m)
     _require_plausible(job, fit)
     return _assembled(job, seen, fit, inverted)
+
+
+def _overlapped(job: _Prepared, few: dict[int, str]) -> dict[int, str]:
+    """Return the recordings whose echo another sound overlaps, with the reason, if enough others remain.
+
+    Such a sound, as from a floor, moves the times of neighbouring microphones together. Residuals do not show that.
+    """
+    other_s = [sound.arrival.other_sound[0] for sound in job.heard.sounds.values()]
+    found = {
+        index: f"another sound overlaps its echo: parts of the band differ by {1e6 * each_s:.1f} µs"
+        for index, each_s in enumerate(other_s)
+        if each_s > _MAX_OTHER_S and index not in few
+    }
+    n_left = len(other_s) - len(few) - len(found)
+    return found if n_left >= _FEW else {}
 
 
 def _fit(job: _Prepared, seen: Observations, source_m: NDArray[np.float64]) -> ArrayFit:
