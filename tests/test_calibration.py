@@ -244,10 +244,10 @@ def test_fixed_positions_need_no_other_direction():
 
 
 def test_wrong_layout_is_refused_and_the_right_one_is_named():
-    with pytest.raises(DataError, match="eRTIS_v3D1 does; use it with --layout eRTIS_v3D1"):
+    with pytest.raises(DataError, match="eRTIS_v3D1 does; use layout='eRTIS_v3D1'"):
         calibrate(plain(), "eRTIS_v2")
     strange = reordered(plain(), np.random.default_rng(1).permutation(32))
-    with pytest.raises(DataError, match=r"does not fit the recordings.*give the layout of this sensor"):
+    with pytest.raises(DataError, match=r"does not fit the recordings.*choose the layout of this sensor"):
         calibrate(strange)
     with pytest.raises(ArgumentError, match="32 channels, but layout"):
         calibrate(plain(), dataclasses.replace(LAYOUT, enabled=np.ones(8, bool)))
@@ -270,7 +270,7 @@ def test_foolish_arguments_are_refused(options, text):
 
 
 def test_wrong_target_is_refused_and_the_right_one_is_named():
-    with pytest.raises(DataError, match=r"fit a reflector better than a wall.*give --target reflector"):
+    with pytest.raises(DataError, match=r"fit a reflector better than a wall.*use target=.reflector."):
         calibrate(plain(), target="wall")
 
 
