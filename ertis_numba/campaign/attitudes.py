@@ -19,24 +19,8 @@ _UNTURNED = (0.0, 0.0, 0.0, 1.0)
 class Attitudes:
     """Rotations from the frame of a sensor to the world frame.
 
-    Parameters
-    ----------
-    recording : RecordingReader
-        Recording with poses of the platform.
-    stamps : sequence of Stamp
-        Stamps of the measurements.
-    rotation_xyzw : sequence of 4 float, optional
-        Rotation of the sensor on its platform; that of the recording by default.
-
-    Attributes
-    ----------
-    note : str or None
-        Notes on poses that are hardly those of a platform, such as those that tilt it.
-
-    Raises
-    ------
-    DataError
-        A measurement has no pose, or the mounting of the sensor is unknown.
+    The recording has poses of the platform. ``rotation_xyzw`` is the rotation of the sensor on its platform; that of
+    the recording by default. ``note`` describes poses that are hardly those of a platform, such as those that tilt it.
     """
 
     def __init__(
@@ -72,12 +56,6 @@ class Attitudes:
 
 
 def unlevelled_image(pipeline: Pipeline, measurement: Measurement) -> Energyscape:
-    """Return the image of a measurement in directions of the sensor frame, without cleaning, for checks of its error.
-
-    Parameters
-    ----------
-    pipeline : Pipeline
-    measurement : Measurement
-    """
+    """Return the uncleaned image of a measurement in directions of the sensor frame, for checks of its error."""
     attitude_xyzw = _UNTURNED if pipeline.settings.processing.level_directions else None
     return pipeline.process(measurement, attitude_xyzw=attitude_xyzw, clean=False)

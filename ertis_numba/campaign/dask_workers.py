@@ -24,20 +24,10 @@ class DaskWorkerPool:
     """`WorkerPool` of the workers of a dask scheduler, with at most one recording in progress per worker.
 
     The workers need the same versions of this package and its dependencies, and access to the files under the same
-    paths. Dask repeats the task of a lost worker on another worker, a few times. Every program that reaches a
-    scheduler can run code on its workers: keep it in a trusted network, or use TLS with dask.
-
-    Parameters
-    ----------
-    address : str
-        Address of the scheduler.
-
-    Raises
-    ------
-    DeviceError
-        dask.distributed is not installed.
-    NetworkError
-        No scheduler answers, or it has no workers. `wait` also raises this error if the connection is lost.
+    paths. Dask repeats the task of a lost worker on another worker, a few times. Every program that reaches a scheduler
+    can run code on its workers: keep it in a trusted network, or use TLS with dask. Raises DeviceError if
+    dask.distributed is not installed; or NetworkError if no scheduler answers, or it has no workers. `wait` also raises
+    NetworkError if the connection is lost.
     """
 
     def __init__(self, address: str) -> None:

@@ -17,19 +17,8 @@ __all__ = ["EchoMeasurements", "count_images", "passive_note", "require_images"]
 class EchoMeasurements(Sequence[Measurement]):
     """Measurements of one sensor that become images of echoes, each read when it is indexed.
 
-    Parameters
-    ----------
-    recording : RecordingReader
-    settings : Settings
-        Settings whose ``processing.mode`` decides if a measurement is passive.
-
-    Attributes
-    ----------
-    recording : RecordingReader
-    path : Path
-    sensor : str
-    settings : Settings
-        Settings of the recording.
+    ``settings.processing.mode`` decides if a measurement is passive; the attribute ``settings`` is that of the
+    recording.
     """
 
     def __init__(self, recording: RecordingReader, settings: Settings) -> None:
@@ -58,10 +47,7 @@ class EchoMeasurements(Sequence[Measurement]):
     def attitudes(self, mountings: Mapping[str, Mounting] | None = None) -> Attitudes:
         """Return the attitudes of the sensor at its measurements; raises the errors of `Attitudes`.
 
-        Parameters
-        ----------
-        mountings : mapping of str to (translation_m, rotation_xyzw), optional
-            Mountings by sensor, in place of those of the recording.
+        ``mountings``, (translation_m, rotation_xyzw) by sensor, replace those of the recording.
         """
         stamps = self.recording.stamps()
         _, rotation_xyzw = (mountings or {}).get(self.sensor, (None, None))
@@ -100,13 +86,7 @@ def passive_note(path: Path, sensor: str, n_images: int, n_measurements: int) ->
 
 
 def require_images(path: Path, n_images: int) -> None:
-    """Refuse a recording of which no measurement becomes an image.
-
-    Raises
-    ------
-    DataError
-        All measurements of all sensors are passive.
-    """
+    """Refuse a recording of which no measurement becomes an image."""
     if not n_images:
         raise DataError(
             f"{path}: all measurements are passive and have no images; make acoustic maps, or use "

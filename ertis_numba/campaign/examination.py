@@ -30,32 +30,10 @@ def examine(
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the examination of a sensor's plan for JSON: ``plan``, then ``verified``.
 
-    Parameters
-    ----------
-    pipeline : Pipeline
-        Pipeline of the sensor.
-    first : Measurement
-        Measurement with which the plan is examined.
-    threads : int, optional
-        Number of threads; all by default.
-    explain : bool
-        Yield the plan, its predicted error and its predicted time.
-    verify : bool
-        Yield the true error of the image of ``first``, with the predicted errors.
-    heard : Planner, optional
-        Planner from `planner_of`, if it exists already.
-
-    Yields
-    ------
-    tuple of str and dict
-        Name and content of each part.
-
-    Raises
-    ------
-    ArgumentError
-        The method has no plan.
-    DataError
-        The true error exceeds the budget. It is yielded first.
+    ``first`` is the measurement with which the plan is examined; all ``threads`` are used by default. ``explain``
+    yields the plan, its predicted error and its predicted time; ``verify`` yields the true error of the image of
+    ``first``, with the predicted errors. ``heard`` is a planner from `planner_of`, if it exists already. Raises
+    ArgumentError if the method has no plan; or DataError if the true error exceeds the budget, after it is yielded.
     """
     settings = pipeline.settings
     if settings.processing.method == "paper":

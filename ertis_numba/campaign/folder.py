@@ -19,11 +19,6 @@ def exclusive_folder(folder: Path) -> Iterator[None]:
     """Create a folder unless it exists, and lock it for this campaign until the block ends.
 
     The system releases the lock when the process ends, even after a crash.
-
-    Raises
-    ------
-    ArgumentError
-        Another campaign writes into the folder.
     """
     folder.mkdir(exist_ok=True)
     if os.name != "posix":  # Windows cannot open folders, so they cannot be locked.

@@ -79,10 +79,7 @@ class _MapsOfSensor:
     def write(self, writer: AcousticMapWriter) -> Generator[None]:
         """Process the recording and write its maps; yield after each measurement.
 
-        Raises
-        ------
-        DataError
-            The air of a measurement differs from that of the recording, and no settings replace it.
+        Raises DataError if the air of a measurement differs from that of the recording, and no settings replace it.
         """
         recording, camera = self._recording, self._camera
         settings, n_left, elapsed_s = camera.settings, len(recording), 0.0
@@ -156,31 +153,11 @@ def prepare_maps(
 ) -> Generator[MapJob]:
     """Open a recording and check every sensor, so that errors are reported before any processing.
 
-    Parameters
-    ----------
-    path, target : Path
-        Recording, and its file of acoustic maps.
-    options : CampaignOptions
-        Options for processing; those of images have no effect.
-    sensors : sequence of str
-        Names of the sensors to process.
-    settings : mapping of str to Settings, optional
-        Settings for each sensor. By default, ``options.settings`` derives them from the recorded settings.
-    warn : callable
-        Called with a line for each sensor that has faulty microphones, bands of noise only or coarse directions, and
-        after the processing of a sensor that emitted its call.
-
-    Yields
-    ------
-    MapJob
-        Recording that is ready to be processed.
-
-    Raises
-    ------
-    DataError
-        Microphones are faulty and ``options.strict`` is set.
-    ErtisError
-        The recording, its settings or the target is invalid.
+    Options of images have no effect. By default, ``options.settings`` derives ``settings`` from the recorded ones.
+    ``warn`` is called with a line for each sensor that has faulty microphones, bands of noise only or coarse
+    directions, and after the processing of a sensor that emitted its call. Yields the recording, ready to be processed.
+    Raises DataError if microphones are faulty and ``options.strict`` is set; or ErtisError if the recording, its
+    settings or the target is invalid.
     """
     with ExitStack() as stack:
         if settings is None:
@@ -215,20 +192,8 @@ def check_maps(
 ) -> None:
     """Check every sensor of a recording as `prepare_maps` does; write nothing.
 
-    Parameters
-    ----------
-    path : Path
-        Recording.
-    options : CampaignOptions
-    settings : mapping of str to Settings
-        Settings with which its maps were made, by sensor.
-    warn : callable
-        Receiver of warnings, as for `prepare_maps`.
-
-    Raises
-    ------
-    DataError
-        As for `prepare_maps`.
+    ``settings`` are those with which its maps were made, by sensor; ``warn`` is as for `prepare_maps`. Raises its
+    DataError.
     """
     for name, each in settings.items():
         with open_recording(path, sensor=name) as recording:

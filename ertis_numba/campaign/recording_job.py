@@ -88,39 +88,15 @@ def prepare_recording(
 ) -> Iterator[RecordingJob]:
     """Open a recording and check every sensor, so that errors are reported before any processing.
 
-    Parameters
-    ----------
-    path, target : Path
-        Recording, and its energyscape file.
-    options : CampaignOptions
-        Options for processing.
-    sensors : sequence of str
-        Names of the sensors to process.
-    settings : mapping of str to Settings, optional
-        Settings for each sensor. By default, ``options.settings`` derives them from the recorded settings.
-    pipelines : callable
-        Function that takes a sequence of settings, and returns a context manager with one pipeline for each.
-    max_bytes : float, optional
-        Limit on images that wait to be written, in bytes. See `SensorProcessing`.
-    warn : callable
-        Called with a line for each sensor that has faulty microphones, whose echoes do not match the call or the
-        layout, or whose images may exceed the error budget, and for each sensor with passive measurements, which are
-        left out, or with level directions from poses that tilt the platform by more than 30°.
-    show : callable
-        Called with the name of a sensor and each result about its plan.
-
-    Yields
-    ------
-    RecordingJob
-        Recording that is ready to be processed.
-
-    Raises
-    ------
-    DataError
-        Microphones are faulty and ``options.strict`` is set, or the error of an image exceeds its budget and
-        ``options.verify`` is set, or all measurements are passive.
-    ErtisError
-        The recording, its settings or the target is invalid.
+    ``target`` is the energyscape file. By default, ``options.settings`` derives ``settings`` from the recorded ones.
+    ``pipelines`` takes a sequence of settings, and returns a context manager with one pipeline for each. ``max_bytes``
+    limits the images that wait to be written; see `SensorProcessing`. ``warn`` is called with a line for each sensor
+    that has faulty microphones, whose echoes do not match the call or the layout, or whose images may exceed the error
+    budget, and for each sensor with passive measurements, which are left out, or with level directions from poses that
+    tilt the platform by more than 30°. ``show`` is called with the name of a sensor and each result about its plan.
+    Yields the recording, ready to be processed. Raises DataError if microphones are faulty and ``options.strict`` is
+    set, the error of an image exceeds its budget and ``options.verify`` is set, or all measurements are passive; or
+    ErtisError if the recording, its settings or the target is invalid.
     """
     with ExitStack() as stack:
         if settings is None:

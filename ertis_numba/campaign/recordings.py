@@ -97,12 +97,6 @@ def output_paths(recordings: Sequence[RecordingFile], folder: Path) -> list[Path
     """Return the energyscape file in ``folder`` for each recording.
 
     Recordings without images have files of acoustic maps instead; see `map_path`.
-
-    Raises
-    ------
-    ArgumentError
-        Two recordings have the same output file, an output would replace another recording, or the folder cannot be
-        created.
     """
     if folder.exists() and not folder.is_dir():
         raise ArgumentError(f"output {folder} is a file, but several recordings need a folder; choose another name")

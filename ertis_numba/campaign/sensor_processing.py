@@ -53,30 +53,12 @@ def describe_faults(name: str, report: Health, sensor: str = "") -> str:
 class SensorProcessing:
     """Pipeline of one sensor, its predictions, and the time of each measurement.
 
-    Parameters
-    ----------
-    pipeline : Pipeline
-        Pipeline of the sensor.
-    batch : int
-        Number of measurements per batch; fewer if the images exceed ``max_bytes``.
-    max_bytes : float, optional
-        Limit on images that wait to be written, in bytes; `MAX_WAITING_BYTES` by default.
-    attitudes : Attitudes, optional
-        Attitudes of the sensor; required if ``processing.level_directions`` is true.
-
-    Attributes
-    ----------
-    pipeline : Pipeline
-        Pipeline of the sensor.
-    times_ms : list of float
-        Processing time of each measurement, in milliseconds.
-    reported : dict
-        Results about the plan.
-    prediction : Prediction or None
-        Predicted error of the first measurement's image; None before it is computed, and for the paper's method.
-    call_warning, start_warning, layout_warning : str
-        Warnings that the sound does not match the call, the start of the record or the layout, or that the call could
-        not be checked; otherwise empty.
+    ``batch`` is the number of measurements per batch; fewer if the images that wait to be written exceed ``max_bytes``,
+    `MAX_WAITING_BYTES` by default. ``attitudes`` of the sensor are required if ``processing.level_directions`` is true.
+    ``times_ms`` has the processing time of each measurement, and ``reported`` the results about the plan.
+    ``prediction`` is the predicted error of the first measurement's image; None before it is computed, and for the
+    paper's method. ``call_warning``, ``start_warning`` and ``layout_warning`` warn that the sound does not match the
+    call, the start of the record or the layout, or that the call could not be checked; otherwise they are empty.
     """
 
     def __init__(
@@ -103,10 +85,7 @@ class SensorProcessing:
     def write(self, recording: EchoMeasurements, writer: EnergyscapeWriter) -> Iterator[None]:
         """Process a recording and write its images; yield after each.
 
-        Raises
-        ------
-        DataError
-            The air of a measurement differs from that of the recording, and no settings replace it.
+        Raises DataError if the air of a measurement differs from that of the recording, and no settings replace it.
         """
         settings = self.pipeline.settings
         as_recorded = settings.air == recording.settings.air
@@ -159,13 +138,7 @@ class SensorProcessing:
 
 
 def require_same_air(measurement: Measurement, settings: Settings) -> None:
-    """Refuse a measurement in other air, because its ranges and delays would differ from those of the others.
-
-    Raises
-    ------
-    DataError
-        The air differs from that of the settings.
-    """
+    """Refuse a measurement in other air, because its ranges and delays would differ from those of the others."""
     came, wanted = measurement.settings.air, settings.air
     if came != wanted:
         raise DataError(

@@ -43,14 +43,7 @@ _idle_pipelines: dict[_Key, Pipeline] = {}  # Pipelines that are not in use.
 def run_task(action: str, arguments: Mapping[str, Any], notify: ReportProgress = lambda _: None) -> dict[str, Any]:
     """Run a task, and return its result; expected errors are returned as ``error``.
 
-    Parameters
-    ----------
-    action : {"look", "plan", "make", "check"}
-        Action.
-    arguments : mapping
-        Arguments of the action.
-    notify : callable
-        Called with the number of processed measurements. An exception that it raises ends the work.
+    ``notify`` is called with the number of processed measurements. An exception that it raises ends the work.
     """
     try:
         return _ACTIONS[action](arguments, notify)

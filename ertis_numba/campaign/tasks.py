@@ -127,14 +127,7 @@ TaskAction = Literal["look", "plan", "make", "check"]
 class Task:
     """Task of a worker.
 
-    Attributes
-    ----------
-    number : int
-        Identifier of the task.
-    action : {"look", "plan", "make", "check"}
-        Action.
-    arguments : dict
-        Arguments of the action, see `ertis_numba.campaign.task_actions`.
+    ``arguments`` are those of the action; see `ertis_numba.campaign.task_actions`.
     """
 
     number: int
@@ -146,15 +139,8 @@ class Task:
 class TaskUpdate:
     """Message of a worker about a task.
 
-    Attributes
-    ----------
-    number : int
-        Identifier of the task.
-    done : int
-        Number of processed measurements, in a progress report.
-    result : dict or None
-        Result at the end of a task. ``error`` is the reason of a failure, and ``by_chance`` marks a failure that may
-        be temporary.
+    ``done`` is the number of processed measurements, in a progress report. ``result`` comes at the end of a task:
+    ``error`` is the reason of a failure, and ``by_chance`` marks a failure that may be temporary.
     """
 
     number: int

@@ -13,16 +13,8 @@ _RECENT_S = 3.0  # Interval of the reported rate.
 class CaptureCounts:
     """Counts of one sensor's measurements.
 
-    Attributes
-    ----------
-    stored : int
-        Number of stored measurements.
-    missing : Counter of str
-        Number of missing measurements, by reason.
-    unplugged : int
-        Number of times that the sensor was unplugged.
-    skipped : int
-        Number of commands that were skipped because the sensor was still busy.
+    ``missing`` counts measurements by reason, ``unplugged`` the times that the sensor was unplugged, and ``skipped``
+    the commands that were skipped because the sensor was still busy.
     """
 
     stored: int = 0

@@ -27,23 +27,10 @@ __all__ = [
 class BlockArrived:
     """A received measurement.
 
-    Attributes
-    ----------
-    sensor : str
-        Name of the sensor.
-    block : Block
-        Received block.
-    count : int
-        Number of the measurement among those of this sensor: the number of the command, or else the sensor's own
-        counter, without wrap-around.
-    tick : int or None
-        Number of the command, which all sensors share; None with SYNC pulses.
-    skipped : int
-        Number of measurements that the sensor counted since the previous block, but that did not arrive; 0 by default.
-    damaged : bool
-        True if blocks were rejected since the previous one; False by default.
-    waited_s : float
-        Time in seconds that the reader waited for the disk since the previous block; 0 by default.
+    ``count`` is the number of the measurement among those of this sensor: the number of the command, or else the
+    sensor's own counter, without wrap-around. ``tick`` is the number of the command, which all sensors share; None with
+    SYNC pulses. Since the previous block, the sensor counted ``skipped`` measurements that did not arrive, blocks were
+    rejected if ``damaged``, and the reader waited ``waited_s`` for the disk.
     """
 
     sensor: str
@@ -107,14 +94,8 @@ Event = BlockArrived | MeasurementFailed | SensorMessage | CounterRestarted | Se
 class TriggerClock:
     """Times of commands: ticks that all sensors share.
 
-    Attributes
-    ----------
-    start_s : float
-        Time of the first tick by `time.monotonic`, in seconds.
-    rate_hz : float
-        Rate of ticks, in Hz.
-    n : int, optional
-        Number of measurements of each sensor.
+    The first tick is at ``start_s`` by `time.monotonic`. ``n`` is the number of measurements of each sensor, unlimited
+    if None.
     """
 
     start_s: float
@@ -125,20 +106,9 @@ class TriggerClock:
 class SensorReader(threading.Thread):
     """Thread that receives the blocks of one sensor, and reconnects after it was unplugged.
 
-    Nothing else may use the sensor meanwhile.
-
-    Parameters
-    ----------
-    sensor : str
-        Name of the sensor.
-    sonar : SonarDriver
-        Configured driver, armed if pulses trigger it.
-    pace : TriggerClock, optional
-        Times of commands; None with SYNC pulses.
-    patience_s : float
-        Timeout for a silent or unplugged sensor, in seconds.
-    events : queue.Queue
-        Queue of all events; while it is full, the sensor waits.
+    Nothing else may use the sensor meanwhile. The driver is configured, and armed if pulses trigger it. ``pace`` has
+    the times of commands; None with SYNC pulses. ``patience_s`` is the timeout for a silent or unplugged sensor. While
+    the queue of all ``events`` is full, the sensor waits.
     """
 
     def __init__(

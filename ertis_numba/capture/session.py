@@ -42,12 +42,8 @@ _MAX_OPEN_GROUPS = 16  # Limit on open groups: sensors deliver simultaneous meas
 class SettingsChange:
     """Change of the settings of all sensors, between two measurements.
 
-    Attributes
-    ----------
-    settings : Settings
-    on_done : callable
-        Called with None once the sensors are configured, or with the error because of which all of them keep their
-        former settings.
+    ``on_done`` is called with None once the sensors are configured, or with the error because of which all of them keep
+    their former settings.
     """
 
     settings: Settings
@@ -71,44 +67,16 @@ class CaptureSession:
     Sequence numbers are those of the commands to a sensor, or of the SYNC pulses since its first one. They start at 0,
     and a missing number is a missing measurement.
 
-    Parameters
-    ----------
-    sonars : dict of str to SonarDriver
-        Configured drivers by their names in the recording. They are armed one after the other in this order, except
-        passive ones.
-    settings : Settings
-        Settings of all sensors.
-    trigger : {"command", "sync"}
-        Source of triggers: commands of this computer, or pulses of the SYNC chain.
-    rate_hz : float
-        Rate of commands in Hz, by default 10.
-    n : int, optional
-        Number of measurements of each sensor, or of pulses; unlimited by default.
-    duration_s : float, optional
-        Duration of the session in seconds; unlimited by default.
-    patience_s : float
-        Timeout for a silent or unplugged sensor in seconds, by default 30.
-    mounting : dict of str to (translation_m, rotation_xyzw), optional
-        Mountings by name of the sensor, as in `ertis_numba.journal.Journal.add_sensor`; unknown by default.
-    session_id : int, optional
-        Identifier that distinguishes the sequence numbers of sessions; random by default.
-    on_stored : callable, optional
-        Called with the entries of each commit, once they are durable.
-    on_note : callable, optional
-        Called with the sensor's name and a message about it.
-    on_back : callable, optional
-        Called with the sensor's name and the seconds that it was unplugged.
-    on_tick : callable, optional
-        Called about ten times a second.
-    configure : callable, optional
-        Called with the name of a sensor and new settings; configures its driver. Required by `change`.
-
-    Attributes
-    ----------
-    counts : dict of str to CaptureCounts
-        Counts of each sensor.
-    complete, incomplete : int
-        Number of pulses with measurements of all sensors, and of some sensors only.
+    ``sonars`` are configured drivers by their names in the recording, armed one after the other in this order, except
+    passive ones. ``trigger`` is ``command`` for commands of this computer, or ``sync`` for pulses of the SYNC chain.
+    ``n`` is the number of measurements of each sensor, or of pulses; like ``duration_s``, it is unlimited by default.
+    ``patience_s`` is the timeout for a silent or unplugged sensor. ``mounting`` has (translation_m, rotation_xyzw) by
+    sensor, as in `ertis_numba.journal.Journal.add_sensor`; unknown by default. ``session_id`` distinguishes the
+    sequence numbers of sessions; it is random by default. ``on_stored`` is called with the entries of each commit, once
+    they are durable; ``on_note`` with a sensor's name and a message about it; ``on_back`` with its name and the seconds
+    that it was unplugged; ``on_tick`` about ten times a second. ``configure`` configures the driver of a named sensor
+    with new settings, and is required by `change`. ``complete`` and ``incomplete`` count the pulses with measurements
+    of all sensors, and of some sensors only.
     """
 
     def __init__(  # noqa: PLR0913  trigger, limits and callbacks
@@ -171,13 +139,6 @@ class CaptureSession:
 
         The sensors are configured after the current measurements. The following ones belong to a new session, whose
         numbers start at 0.
-
-        Raises
-        ------
-        ArgumentError
-            The session was created without ``configure``.
-        SonarError
-            The session has ended.
         """
         if self._configure is None:
             raise ArgumentError("this session cannot change settings; create it with configure")
@@ -192,12 +153,8 @@ class CaptureSession:
     def run(self, sink: MeasurementSink) -> None:
         """Capture until the session ends.
 
-        Raises
-        ------
-        SonarError
-            Sensors have failed permanently; the measurements of the others are stored.
-        DataError
-            Further measurements cannot be stored; reported measurements are durable.
+        Raises SonarError if sensors have failed permanently (the measurements of the others are stored), or DataError
+        if further measurements cannot be stored (reported ones are durable).
         """
         end_s = None if self._duration_s is None else time.monotonic() + self._duration_s
         for sensor in self._sonars:

@@ -38,19 +38,9 @@ class PulseAligner(Generic[Item]):
     microseconds, and pulses are at least 50 ms apart. A block may arrive late, so the majority of three blocks decides.
     The offset then stays, until the times of five successive blocks contradict it.
 
-    Parameters
-    ----------
-    sensors : list of str
-        Sensors in the order in which they are armed: the first receives every pulse that any other receives.
-    shortest_s : float
-        Minimum interval between pulses, in seconds.
-
-    Attributes
-    ----------
-    realigned : int
-        Number of offsets that were changed.
-    interval_ns : float
-        Interval between pulses; the minimum while it is unknown.
+    ``sensors`` are in the order in which they are armed: the first receives every pulse that any other receives.
+    ``shortest_s`` is the minimum interval between pulses. ``realigned`` counts the offsets that were changed.
+    ``interval_ns`` is the interval between pulses; the minimum while it is unknown.
     """
 
     def __init__(self, sensors: list[str], *, shortest_s: float) -> None:
@@ -74,21 +64,8 @@ class PulseAligner(Generic[Item]):
     def add(self, sensor: str, item: Item, counter: int, arrived_ns: int) -> list[tuple[Item, int]]:
         """Add a block, and return the blocks whose pulse is now known, with its number.
 
-        Parameters
-        ----------
-        sensor : str
-            Name of the sensor.
-        item : object
-            Block, or another object to return.
-        counter : int
-            Counter of the sensor, without wrap-around.
-        arrived_ns : int
-            Time of arrival by a monotonic clock, in nanoseconds.
-
-        Returns
-        -------
-        list of tuple of object and int
-            Released blocks with the number of their pulse.
+        ``counter`` is that of the sensor, without wrap-around; ``arrived_ns`` is the time of arrival by a monotonic
+        clock.
         """
         self._sensors[sensor].held.append(_HeldBlock(item, counter, arrived_ns))
         return self.release(arrived_ns)

@@ -20,12 +20,7 @@ _BEFORE = MEAN_OF // 2  # samples of the first mean before the record
 
 
 class BitMeans:
-    """Means of successive bits, full scale 1, centred on every 31st sample. Bits beyond the record count 0.
-
-    Parameters
-    ----------
-    n_samples : int
-    """
+    """Means of successive bits, full scale 1, centred on every 31st sample. Bits beyond the record count 0."""
 
     def __init__(self, n_samples: int) -> None:
         n_means = -(-(n_samples + _BEFORE) // MEAN_OF)

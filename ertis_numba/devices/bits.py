@@ -41,27 +41,12 @@ _AS_EVER = (0.3, 0.7)  # Share of differing bits there; near overload, which com
 class BitCheck:
     """Detector of blocks that microphones cannot have sent.
 
-    Parameters
-    ----------
-    n_samples : int
-        Words of a block.
-    pdm_rate_hz : float
-        At the slower clock of 1.125 MHz, neither splices nor stretches of noise can be distinguished from sound.
-    enabled : (channel,) bool, optional
-        Channels with a microphone; all by default.
-    splices : bool
-        Also detect missing and misplaced words. This finds nearly all of them. False alarms were tested with simulated
-        sensors and with the only public measurement of a real one.
-
-    Attributes
-    ----------
-    density : (channel,) float64 or None
-        Share of ones in the last checked block; 0 or 1 is a stuck microphone, which is no reason for rejection.
-
-    Raises
-    ------
-    ArgumentError
-        A number is out of range, or ``enabled`` does not have 32 channels.
+    ``n_samples`` is the number of words of a block. At the slower clock of 1.125 MHz, neither splices nor stretches of
+    noise can be distinguished from sound. ``enabled`` has shape (channel,) and is true for channels with a microphone,
+    all by default. ``splices`` also detects missing and misplaced words, nearly all of them; false alarms were tested
+    with simulated sensors and with the only public measurement of a real one. ``density`` has shape (channel,): the
+    share of ones in the last checked block; 0 or 1 is a stuck microphone, which is no reason for rejection. Raises
+    ArgumentError if a number is out of range, or ``enabled`` does not have 32 channels.
     """
 
     def __init__(
@@ -88,17 +73,8 @@ class BitCheck:
 
         ``constant bits``: no channel changes, in the whole block or in a stretch with abrupt ends. ``density``: most
         channels have too many ones or zeros, and change unlike a modulator. ``noise``: the bits are random, in the
-        whole block or in a stretch. ``splice``: words are missing or misplaced.
-
-        Parameters
-        ----------
-        words : (sample,) uint32
-            Bit m is channel m.
-
-        Raises
-        ------
-        ArgumentError
-            The words are not of this shape and type.
+        whole block or in a stretch. ``splice``: words are missing or misplaced. Bit m of ``words``, (sample,) uint32,
+        is channel m.
         """
         checks.shape("words", words.shape, (self._n_samples,))
         if words.dtype != np.uint32:
@@ -142,12 +118,8 @@ class BitCheck:
     def _chance(self, mean: Floats, power: Floats, product: Floats) -> str | None:
         """Return ``density`` or ``noise`` if bits are not those of modulators, in the whole block or in a stretch.
 
-        Parameters
-        ----------
-        mean : (channel, n) float32
-            Of each 31 samples.
-        power, product : (n,) float32
-            Mean square of these means and the mean product of neighbours less that.
+        ``mean`` has shape (channel, n): means of 31 samples each. ``power`` and ``product``, both (n,), are the mean
+        square of these means, and the mean product of neighbours minus that square.
         """
         low, high = _POWER_RANGE
         usual, middle = np.quantile(product[:: _EVERY // 4], [0.25, 0.5])

@@ -35,14 +35,7 @@ COUNTERS: Final = 2**32
 class Instant:
     """Time of an arrival.
 
-    Attributes
-    ----------
-    realtime_ns : int
-        Nanoseconds since 1970-01-01 UTC.
-    monotonic_ns : int
-        Time by a monotonic clock.
-    uncertainty_ns : int
-        Longest possible delay before it was read.
+    ``realtime_ns`` counts from 1970-01-01 UTC; ``uncertainty_ns`` is the longest possible delay before it was read.
     """
 
     realtime_ns: int
@@ -54,17 +47,9 @@ class Instant:
 class Block:
     """One measurement as a sensor sent it.
 
-    Attributes
-    ----------
-    counter : int
-        Number from the sensor.
-    data : (sample,) uint32
-        PDM words in separate, read-only memory.
-    arrived : Instant
-        Arrival of its first byte.
-    behaviour : {"active", "passive", "unknown"}, default "unknown"
-        ``active`` if the sensor was told to emit its call, ``passive`` if not. A block does not contain it, so
-        `SonarDriver` sets it.
+    ``data`` has shape (sample,): PDM words in separate, read-only memory. ``arrived`` is the arrival of its first byte.
+    ``behaviour`` is ``active`` if the sensor was told to emit its call, ``passive`` if not; a block does not contain
+    it, so `SonarDriver` sets it.
     """
 
     counter: int
@@ -74,18 +59,7 @@ class Block:
 
 
 def encode_block(counter: int, words: NDArray[np.uint32]) -> bytes:
-    """Return a measurement in the form that a sensor sends.
-
-    Parameters
-    ----------
-    counter : int
-    words : (sample,) uint32
-
-    Raises
-    ------
-    ArgumentError
-        The counter does not fit into 32 bits, or the words are no uint32.
-    """
+    """Return a measurement, words of (sample,) uint32, in the form that a sensor sends."""
     counter = checks.integer("counter", counter, 0, COUNTERS - 1)
     if words.dtype.kind != "u" or words.dtype.itemsize != 4 or words.ndim != 1:
         raise ArgumentError(f"words are {words.dtype} of shape {words.shape}; use (sample,) uint32")

@@ -60,19 +60,9 @@ _LINE: Final = re.compile(rb"!([A-Z]),(\d{1,10}),(\d{1,10}),(\d{1,10})\n?")
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One command to a sensor.
+    """One command to a sensor: one of `CODES`, and three numbers from 0 to 2³² − 1; unused ones are 0.
 
-    Attributes
-    ----------
-    code : str
-        One of `CODES`.
-    first, second, third : int
-        0 to 2³² − 1; unused numbers are 0.
-
-    Raises
-    ------
-    ArgumentError
-        The command does not exist, or a number does not fit into 32 bits.
+    Raises ArgumentError if the command does not exist, or a number does not fit into 32 bits.
     """
 
     code: str
@@ -91,13 +81,7 @@ class Command:
 
     @classmethod
     def decode(cls, line: bytes) -> Self:
-        """Decode a line, with or without its line end.
-
-        Raises
-        ------
-        DataError
-            It is no command.
-        """
+        """Decode a line, with or without its line end."""
         match = _LINE.fullmatch(line)
         numbers = [int(group) for group in match.groups()[1:]] if match else []
         if match is None or match[1].decode() not in CODES or max(numbers) > MAX_NUMBER:
@@ -141,15 +125,7 @@ class Command:
 class CustomCommand:
     """One command as text, which may have a code that only some firmware knows.
 
-    Attributes
-    ----------
-    text : str
-        Such as ``!Y,0,0,0``.
-
-    Raises
-    ------
-    ArgumentError
-        It is not of the form ``!X,i,j,k``, or it measures.
+    ``text`` is of the form ``!X,i,j,k``, such as ``!Y,0,0,0``, and must not measure.
     """
 
     text: str
@@ -182,22 +158,13 @@ class CustomCommand:
 def encode_answer(value: int) -> bytes:
     """Return a sensor's answer: four bytes, least significant first.
 
-    Raises
-    ------
-    ArgumentError
-        The number does not fit into 32 bits.
+    Raises ArgumentError if the number does not fit into 32 bits.
     """
     return checks.integer("answer", value, 0, MAX_NUMBER).to_bytes(4, "little")
 
 
 def decode_answer(data: bytes) -> int:
-    """Return the number in a sensor's answer.
-
-    Raises
-    ------
-    DataError
-        It is not four bytes.
-    """
+    """Return the number in a sensor's answer."""
     if len(data) != 4:
         raise DataError(f"answer has {len(data)} bytes; an answer has 4: ask again")
     return int.from_bytes(data, "little")

@@ -45,19 +45,9 @@ class CounterCheck:
     ones, regardless of earlier numbers. This recovers the count after any loss, and after a sensor has restarted. 4. A
     number between the last correct one and a later one is correct if the time between them has room for it.
 
-    A block is held for at most three others. A repeated number is a copy.
-
-    Parameters
-    ----------
-    shortest_s : float
-        Minimum time between triggers.
-    expected : int, optional
-        Number of the first block; it or the following one is correct. Any by default.
-
-    Attributes
-    ----------
-    lost : int
-        Numbers skipped between correct ones.
+    A block is held for at most three others. A repeated number is a copy. ``shortest_s`` is the minimum time between
+    triggers. The block ``expected`` or the following one comes first, any by default. ``lost`` counts the numbers
+    skipped between correct ones.
     """
 
     def __init__(self, *, shortest_s: float, expected: int | None = None) -> None:
@@ -91,11 +81,7 @@ class CounterCheck:
     def judge(self, block: Block, rejected: float) -> list[tuple[Block, bool]]:
         """Return all blocks that this one decides, in order of arrival, and True for each correct one.
 
-        Parameters
-        ----------
-        block : Block
-        rejected : float
-            Number of bytes rejected outside of blocks up to now, relative to the size of a block.
+        ``rejected`` is the number of bytes rejected outside of blocks up to now, relative to the size of a block.
         """
         place = bisect.bisect_right(self._burst_ns, block.arrived.monotonic_ns) - 1
         self._bursts += max(place, 0)

@@ -23,20 +23,8 @@ _log = logging.getLogger("ertis_numba")
 class Dialogue(SerialLine):
     """Serial line with commands and answers.
 
-    An answer differs from four bytes of a measurement only in that nothing follows it.
-
-    Parameters
-    ----------
-    path : str
-    timeout_s : float
-        Timeout of an answer.
-    stop : callable
-        See `SerialLine`.
-
-    Attributes
-    ----------
-    dropped : int
-        Bytes without a request.
+    An answer differs from four bytes of a measurement only in that nothing follows it. ``timeout_s`` is that of an
+    answer, and ``stop`` that of `SerialLine`. ``dropped`` counts bytes without a request.
     """
 
     def __init__(self, path: str, *, timeout_s: float, stop: Callable[[], bool]) -> None:
@@ -47,16 +35,8 @@ class Dialogue(SerialLine):
     def drain(self, *, within_s: float, repeat: Command | None = None) -> int:
         """Drop bytes until none arrive, and return their number without the answers to ``repeat``.
 
-        Parameters
-        ----------
-        within_s : float
-        repeat : Command, optional
-            Sent again and again while bytes keep coming: the first may have followed half of another command.
-
-        Raises
-        ------
-        SonarError
-            There is no end to it.
+        ``repeat`` is sent again and again while bytes keep coming: the first may have followed half of another command.
+        Raises SonarError if they do not end.
         """
         count = n_answers = 0
         began = last = reported = time.monotonic()
@@ -86,18 +66,8 @@ class Dialogue(SerialLine):
         """Send a command and return its answer.
 
         Earlier bytes are dropped. If more than an answer arrives, it belonged to something else, and the command is
-        sent again afterwards.
-
-        Parameters
-        ----------
-        command : Command or CustomCommand
-        alone : bool
-            False where measurements may follow the answer.
-
-        Raises
-        ------
-        SonarError
-            No answer came, or none by itself.
+        sent again afterwards. ``alone`` is false where measurements may follow the answer. Raises SonarError if no
+        answer came, or none by itself.
         """
         deadline = time.monotonic() + self._timeout_s
         while True:
@@ -120,10 +90,7 @@ class Dialogue(SerialLine):
     def ask_twice(self, command: Command) -> int:
         """Return an answer that arrived twice: four other bytes may look like an answer once, but not twice.
 
-        Raises
-        ------
-        SonarError
-            The second answer is another one, or as `ask`.
+        Raises SonarError if the second answer is another one, or as `ask` does.
         """
         first, second = self.ask(command), self.ask(command)
         if first != second:
@@ -136,10 +103,7 @@ class Dialogue(SerialLine):
     def ask_all(self, commands: Sequence[Command]) -> None:
         """Send many commands, a few at a time, and receive their answers.
 
-        Raises
-        ------
-        SonarError
-            Answers are missing.
+        Raises SonarError if answers are missing.
         """
         for start in range(0, len(commands), _GROUP):
             group = commands[start : start + _GROUP]
@@ -149,13 +113,7 @@ class Dialogue(SerialLine):
                 raise self._no_answer(group[n_answers], data[len(data) - rest :])
 
     def notify(self, setup: Setup, *, counter: int) -> None:
-        """Send the setup, including the call if the sensor has another one, and the number of the next measurement.
-
-        Raises
-        ------
-        SonarError
-            A command is not answered, or the sensor holds another call than it was sent.
-        """
+        """Send the setup, including the call if the sensor has another one, and the number of the next measurement."""
         for command in setup.before_call():
             self.ask(command)
         wanted = call_hash(setup.codes)

@@ -54,19 +54,9 @@ _log = logging.getLogger("ertis_numba")
 class SerialLine:
     """Serial port for exclusive use.
 
-    Other threads may call only `close`.
-
-    Parameters
-    ----------
-    path : str
-    stop : callable
-        Called before each read and write, some hundred times a second; once it returns True, these raise an error.
-
-    Raises
-    ------
-    SonarError
-        The port cannot be opened. Its ``errno`` is ENOENT, EBUSY, EACCES, or EINVAL for a path that is not a serial
-        port.
+    Other threads may call only `close`. ``stop`` is called before each read and write, some hundred times a second;
+    once it returns True, these raise an error. Raises SonarError if the port cannot be opened: its ``errno`` is ENOENT,
+    EBUSY, EACCES, or EINVAL for a path that is not a serial port.
     """
 
     def __init__(self, path: str, *, stop: Callable[[], bool]) -> None:
@@ -92,18 +82,9 @@ class SerialLine:
     def receive(self, missing: int) -> tuple[bytes, Instant]:
         """Return bytes that arrive within some milliseconds, perhaps none, and the time of the first.
 
-        Parameters
-        ----------
-        missing : int
-            Bytes still missing of a block or answer. With 0, a new one may begin: its first byte is returned alone as
-            soon as it arrives, unless it has arrived before.
-
-        Raises
-        ------
-        SonarDisconnectedError
-            The device was unplugged.
-        SonarError
-            ``stop`` returned True, or the line is closed.
+        ``missing`` is the number of bytes still missing of a block or answer. With 0, a new one may begin: its first
+        byte is returned alone as soon as it arrives, unless it has arrived before. Raises SonarDisconnectedError if the
+        device was unplugged; or SonarError if ``stop`` returned True, or the line is closed.
         """
         with self._lock:
             self._check()
@@ -124,12 +105,8 @@ class SerialLine:
     def send(self, data: bytes) -> None:
         """Write all of ``data``.
 
-        Raises
-        ------
-        SonarDisconnectedError
-            The device was unplugged.
-        SonarError
-            The device reads nothing, ``stop`` returned True, or the line is closed.
+        Raises SonarDisconnectedError if the device was unplugged; or SonarError if it reads nothing, ``stop`` returned
+        True, or the line is closed.
         """
         with self._lock:
             self._check()
@@ -160,10 +137,8 @@ class SerialLine:
     def hang_up(self, why: str | None = None) -> None:
         """Close the port of an absent or silent device; later uses raise `SonarDisconnectedError`.
 
-        Parameters
-        ----------
-        why : str, optional
-            Message of this error; an empty one if the device was unplugged. That of an earlier call by default.
+        ``why`` is the message of this error: by default that of an earlier call, or an empty one if the device was
+        unplugged.
         """
         self._is_hung_up = True
         self._why_hung_up = self._why_hung_up if why is None else why

@@ -24,13 +24,7 @@ _RETRY_S = 0.002
 
 
 def require_terminals() -> None:
-    """Refuse to emulate on a system without pseudo terminals.
-
-    Raises
-    ------
-    SonarError
-        This system has no pseudo terminals.
-    """
+    """Refuse to emulate on a system without pseudo terminals."""
     if not _HAS_TERMINALS:
         raise SonarError("this system has no pseudo terminals; emulate sensors on Linux or macOS")
 
@@ -39,11 +33,6 @@ def emulated_folder() -> Path:
     """Return the folder of links to emulated devices: ``$ERTIS_EMULATED_DIR``, or one in the user's cache folder.
 
     It need not exist, and does not depend on ``TMPDIR``, which may differ between terminals.
-
-    Raises
-    ------
-    ArgumentError
-        Others may change the folder, and so choose the ports that a name leads to.
     """
     folder = Path(os.environ.get("ERTIS_EMULATED_DIR") or Path(platformdirs.user_cache_dir("ertis"), "emulated"))
     with suppress(FileNotFoundError):
@@ -60,19 +49,9 @@ class HeldLink:
     """Symbolic link that belongs to one emulated device during its life.
 
     A link left by a killed device is replaced. A lock on a hidden file beside the link shows if the device is alive.
-    The existence of the port does not, because the system reuses its number.
-
-    Parameters
-    ----------
-    path : Path
-        Its folder is made, for this user only, if it is missing.
-
-    Raises
-    ------
-    ArgumentError
-        The link belongs to a device that runs, or there is something else of this name.
-    SonarError
-        This system has no pseudo terminals, and so nothing to lead to.
+    The existence of the port does not, because the system reuses its number. The folder of ``path`` is made, for this
+    user only, if it is missing. Raises ArgumentError if the link belongs to a device that runs, or there is something
+    else of this name; or SonarError if this system has no pseudo terminals.
     """
 
     def __init__(self, path: Path) -> None:

@@ -21,16 +21,9 @@ _CDC_ACM = ("ttyACM", "cu.usbmodem", "tty.usbmodem", "COM")
 class Port:
     """A serial port.
 
-    Attributes
-    ----------
-    path : str
-        Path to open, such as ``/dev/ttyACM0``; it may change when the device is plugged in again.
-    link : str
-        Stable name, such as one in ``/dev/serial/by-id``; empty if there is none.
-    serial_number : str
-        Serial number of the USB device, or name of an emulated one. Empty if unknown.
-    description : str
-    emulated : bool
+    ``path`` is the path to open, such as ``/dev/ttyACM0``; it may change when the device is plugged in again. ``link``
+    is a stable name, such as one in ``/dev/serial/by-id``; empty if there is none. ``serial_number`` is that of the USB
+    device, or the name of an emulated one; empty if unknown.
     """
 
     path: str
@@ -63,10 +56,7 @@ def find_ports() -> list[Port]:
 def resolve(port: str) -> Port:
     """Return the port of this path, link, serial number, or name of an emulated device.
 
-    Raises
-    ------
-    SonarError
-        There is no such port (its ``errno`` is ENOENT), or several have this serial number (EINVAL).
+    Raises SonarError if there is no such port (its ``errno`` is ENOENT), or several have this serial number (EINVAL).
     """
     found = find_ports()
     named = [item for item in found if port in item.names]
@@ -94,10 +84,7 @@ def resolve(port: str) -> Port:
 def find_again(port: Port) -> Port:
     """Return the port of a device that was plugged in again: by its serial number, by its link, or at the same path.
 
-    Raises
-    ------
-    SonarError
-        As `resolve`: it is not there.
+    Raises SonarError as `resolve` does.
     """
     if port.serial_number and not port.emulated:
         return replace(resolve(port.serial_number), link=port.link)

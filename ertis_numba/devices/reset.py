@@ -22,24 +22,10 @@ def reset_sensor(
 ) -> Iterator[tuple[SonarDriver, bool]]:
     """Reset a sensor, whether it answers or not; use it in a ``with`` statement.
 
-    Parameters
-    ----------
-    port : str
-        As for `SonarDriver.open`. The port may be missing until the sensor is reset.
-    pulse : callable
-        Resets the hardware.
-    within_s : float
-        Longest time until the sensor answers.
-
-    Yields
-    ------
-    tuple of (SonarDriver, bool)
-        Its open driver, which is not configured, and the result of `SonarDriver.reset`.
-
-    Raises
-    ------
-    SonarError
-        The port cannot be used, ``pulse`` cannot reset the hardware, or the sensor does not answer within this time.
+    ``port`` is as for `SonarDriver.open`, and may be missing until the sensor is reset. ``pulse`` resets the hardware,
+    and ``within_s`` is the longest time until the sensor answers. Yields the open driver, which is not configured, and
+    the result of `SonarDriver.reset`. Raises SonarError if the port cannot be used, ``pulse`` cannot reset the
+    hardware, or the sensor does not answer in time.
     """
     try:
         sonar = SonarDriver.open(port)

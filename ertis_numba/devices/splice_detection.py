@@ -56,13 +56,7 @@ _LOUDEST, _LOUDEST_SHARE = 0.35, 0.8  # Full scale 1, in most channels: overload
 class _Filter:
     """Decimation filter of the bits of all channels, on one thread.
 
-    Parameters
-    ----------
-    n_samples : int
-    taps : (tap,) int16
-        Symmetric, an odd number.
-    scale : float
-    step : int
+    ``taps`` has shape (tap,): symmetric, an odd number.
     """
 
     def __init__(self, n_samples: int, taps: NDArray[np.int16], scale: float, step: int) -> None:
@@ -83,11 +77,7 @@ class _Filter:
 class Splices:
     """Detector of impulses in all channels at once, in a band with little sound and noise.
 
-    Parameters
-    ----------
-    n_samples : int
-        Words of a block.
-    pdm_rate_hz : float
+    ``n_samples`` is the number of words of a block.
     """
 
     def __init__(self, n_samples: int, pdm_rate_hz: float) -> None:
@@ -119,13 +109,8 @@ class Splices:
     def found(self, words: NDArray[np.uint32], mean: Floats, moving: NDArray[np.bool_]) -> bool:
         """Return True if there is a splice.
 
-        Parameters
-        ----------
-        words : (sample, 1) uint32
-        mean : (channel, n) float32
-            Of `MEAN_OF` samples each.
-        moving : (channel,) bool
-            Those with a microphone that is not stuck.
+        ``words`` has shape (sample, 1). ``mean`` has shape (channel, n): means of `MEAN_OF` samples each. ``moving``
+        has shape (channel,): true for channels with a microphone that is not stuck.
         """
         if self._n_samples < 8 * self._edge * _STEP:
             return False

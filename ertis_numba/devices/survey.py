@@ -20,16 +20,8 @@ _STATES: dict[int | None, State] = {errno.EBUSY: "in use", errno.EACCES: "not al
 class Answer:
     """Result of probing a port.
 
-    Attributes
-    ----------
-    port : Port
-    state : {"ready", "in use", "not allowed", "no answer"}
-    firmware : str
-        Firmware version; empty unless the sensor is ready.
-    call_hash : int or None
-        Hash of the sensor's call; None unless the sensor is ready.
-    error : SonarError or None
-        Reason why it is not ready.
+    ``state`` is "ready", "in use", "not allowed" or "no answer". ``firmware`` is empty and ``call_hash`` None unless
+    the sensor is ready; ``error`` is the reason why it is not.
     """
 
     port: Port
@@ -42,13 +34,8 @@ class Answer:
 def survey(ports: Iterable[Port], *, timeout_s: float = 0.3) -> list[Answer]:
     """Probe ports for sensors, in less than a second.
 
-    This stops a measurement for a host that has ended; ports in use are skipped.
-
-    Parameters
-    ----------
-    ports : iterable of Port
-    timeout_s : float
-        Timeout of an answer.
+    This stops a measurement for a host that has ended; ports in use are skipped. ``timeout_s`` is the timeout of an
+    answer.
     """
 
     def ask(port: Port) -> Answer:

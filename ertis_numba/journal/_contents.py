@@ -132,10 +132,7 @@ class ReadableJournal:
     def read_poses(self) -> tuple[list[JournalPose], int]:
         """Return the undamaged poses of platforms in order of arrival, and the number of damaged ones.
 
-        Raises
-        ------
-        DamagedError
-            The table of poses is damaged.
+        Raises DamagedError if the table of poses is damaged.
         """
         with self._lock:
             return read_poses(self._database, self.path)
@@ -153,10 +150,7 @@ class ReadableJournal:
     def times_ns(self, sensor: str) -> list[int]:
         """Return the times of the measurements of a sensor in any order, without checking them.
 
-        Raises
-        ------
-        DamagedError
-            The table of measurements is damaged.
+        Raises DamagedError if the table of measurements is damaged.
         """
         number = self._ids[self._sensor(sensor).name]
         with self._lock:
@@ -186,13 +180,7 @@ class ReadableJournal:
         return [(names[number], *rest) for number, *rest in reversed(rows) if number in names]
 
     def find(self, sensor: str, session_id: int, sequence: int) -> JournalKey:
-        """Return the key of a measurement.
-
-        Raises
-        ------
-        DamagedError
-            There is no measurement with this number.
-        """
+        """Return the key of a measurement."""
         with self._lock:
             rows = self._database.execute(
                 "SELECT id FROM measurements INDEXED BY key WHERE sensor = ? AND epoch = ? AND sequence = ?",
@@ -207,12 +195,7 @@ class ReadableJournal:
     def entry(self, key: JournalKey) -> JournalEntry:
         """Return a measurement with read-only data.
 
-        Raises
-        ------
-        DamagedError
-            The measurement does not match its CRC-32.
-        DataError
-            The measurement cannot be read.
+        Raises DataError if the measurement cannot be read.
         """
         with self._lock:
             rows = self._database.execute(_SELECTION, (key.place,))
@@ -226,13 +209,8 @@ class ReadableJournal:
     def entries(self, sensor: str | None = None) -> Iterator[JournalEntry]:
         """Yield the measurements of one sensor or of all, in order of arrival, each read when it is requested.
 
-        Raises
-        ------
-        DamagedError
-            A measurement does not match its CRC-32, or the index does not list it; `index` and `entry` give access to
-            the others.
-        DataError
-            The disk fails.
+        Raises DamagedError if a measurement does not match its CRC-32, or the index does not list it (`index` and
+        `entry` give access to the others); or DataError if the disk fails.
         """
         numbers = set(self._ids.values()) if sensor is None else {self._ids[self._sensor(sensor).name]}
         return self._in_order(self.index(sensor), numbers - self._unusable.keys())

@@ -54,19 +54,8 @@ _MESSAGES: Final = {
 class Database:
     """SQLite file with the tables of a journal, locked against other processes.
 
-    The lock belongs to the operating system. It ends with the process, even after a crash.
-
-    Parameters
-    ----------
-    path : Path
-        Existing file.
-    empty : bool
-        Accept an empty file, which then becomes a new journal.
-
-    Attributes
-    ----------
-    is_new : bool
-        True if the file was empty.
+    The lock belongs to the operating system. It ends with the process, even after a crash. ``path`` exists; with
+    ``empty``, an empty file is accepted and becomes a new journal, and ``is_new`` is then true.
     """
 
     def __init__(self, path: Path, *, empty: bool) -> None:
@@ -158,12 +147,8 @@ class Database:
 
         Until then, a commit writes to the log with one sync, and a full log is moved to the main file. If each commit
         fills the log, all data is written twice. A rollback journal stores only the old content of changed pages. New
-        rows use new pages without old content. A commit then needs four syncs.
-
-        Raises
-        ------
-        DataError
-            The disk is full or fails. Nothing has changed.
+        rows use new pages without old content. A commit then needs four syncs. Raises DataError if the disk is full or
+        fails; nothing has changed.
         """
         if not self._uses_rollback_journal:
             self._set_rollback_mode("DELETE")
@@ -183,10 +168,7 @@ class Database:
     def require_file(self) -> None:
         """Refuse to continue if the path no longer leads to the open file, because new data would be lost.
 
-        Raises
-        ------
-        JournalInUseError
-            The file was removed or replaced.
+        Raises JournalInUseError if the file was removed or replaced.
         """
         self._require_same_file(self._file)
 
@@ -212,14 +194,8 @@ class Database:
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Run a statement and return its rows.
 
-        Raises
-        ------
-        JournalInUseError
-            Another process has the journal open.
-        DamagedError
-            The file is damaged.
-        DataError
-            The disk is full, fails or is not writable, or the file is closed.
+        Raises JournalInUseError if another process has the journal open; DamagedError if the file is damaged; or
+        DataError if the disk is full, fails or is not writable, or the file is closed.
         """
         with self._translate_errors():
             return self._connection.execute(statement, values).fetchall()
@@ -255,10 +231,7 @@ class Database:
     def max_ids(self) -> dict[str, int]:
         """Return the highest row number of each table, 0 if it has no rows.
 
-        Raises
-        ------
-        DataError
-            The file is damaged or cannot be read.
+        Raises DataError if the file is damaged or cannot be read.
         """
         tables = [table for table in TABLES if self.has_table(table)]
         ends = (self.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in tables)  # noqa: S608  our own
@@ -284,12 +257,8 @@ class Database:
     def copy_to(self, path: Path) -> None:
         """Copy the current pages of the file.
 
-        The open connection makes the copy. A second descriptor would release the lock when it is closed (POSIX).
-
-        Raises
-        ------
-        DataError
-            The disk is full or fails.
+        The open connection makes the copy. A second descriptor would release the lock when it is closed (POSIX). Raises
+        DataError if the disk is full or fails.
         """
         with self._translate_errors():
             copy = sqlite3.connect(path, isolation_level=None)
@@ -301,12 +270,8 @@ class Database:
     def checkpoint_and_remove_log(self) -> None:
         """Move everything to the main file and remove the log, so that closing touches no file by name.
 
-        Only `close` may follow, because an interrupted commit could no longer be rolled back.
-
-        Raises
-        ------
-        DataError
-            The disk is full or fails. The log stays.
+        Only `close` may follow, because an interrupted commit could no longer be rolled back. Raises DataError if the
+        disk is full or fails; the log stays.
         """
         for statement in ("BEGIN IMMEDIATE", "COMMIT"):  # They roll back a commit that a disk error has interrupted.
             self.execute(statement)

@@ -56,23 +56,11 @@ class JournalKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JournalSensor:
-    """Sensor of a journal.
+    """Sensor of a journal, with settings that depend on no other file.
 
-    Attributes
-    ----------
-    name : str
-    settings : Settings
-        Settings of the measurements, independent of other files.
-    firmware : str
-        Version of the firmware.
-    translation_m : (x, y, z), or None
-        Position on the platform, in metres; None if the mounting is unknown.
-    rotation_xyzw : (x, y, z, w), or None
-        Unit quaternion that rotates the sensor frame into the platform frame; None if the mounting is unknown.
-    shape : tuple of int
-        Shape of a measurement's data.
-    dtype : dtype
-        Type of the data, little-endian.
+    ``translation_m`` is its position on the platform, and the unit quaternion ``rotation_xyzw`` rotates the sensor
+    frame into the platform frame; both are None if the mounting is unknown. ``shape`` and the little-endian ``dtype``
+    are those of a measurement's data.
     """
 
     name: str
@@ -144,10 +132,7 @@ class JournalSensor:
     def entry_values(self, entry: JournalEntry) -> tuple[Any, ...]:
         """Return the values of a measurement and its data, and fill in its CRC-32.
 
-        Raises
-        ------
-        ArgumentError
-            A number is out of range, or the data does not match this sensor.
+        Raises ArgumentError if a number is out of range, or the data does not match this sensor.
         """
         stamp, air = entry.measurement.stamp, entry.measurement.settings.air
         words = self._sample_data(entry.measurement.data)
@@ -176,13 +161,7 @@ class JournalSensor:
         return np.ascontiguousarray(words, dtype=self.dtype)
 
     def entry(self, path: Path, row: Sequence[Any]) -> JournalEntry:
-        """Return the measurement of a row.
-
-        Raises
-        ------
-        DamagedError
-            The row is damaged.
-        """
+        """Return the measurement of a row."""
         *values, words = row
         record = f"measurement {row[3]} of sensor {self.name}"
         _, session_id, sequence, sync_count, time_ns, uncertainty_ns, monotonic_ns, *air, behaviour, crc32 = (

@@ -29,21 +29,8 @@ def require_free_space(path: Path, target: Path, *, sizes_bytes: Sequence[int], 
 
     The disk of ``target`` needs space for the recording of the whole journal, and a reserve. The disk of the journal
     needs space to move the log to the main file. It also needs space for the new content, once in the log and once in
-    the main file. Without a log, it needs space for it and the changed pages.
-
-    Parameters
-    ----------
-    path, target : Path
-        Journal, and recording to be made from it.
-    sizes_bytes : sequence of int
-        Size of each new measurement, or of all new poses, in bytes.
-    seals_bytes : int
-        Size of the recording with the new content, in bytes.
-
-    Raises
-    ------
-    DiskFullError
-        There is not enough free space.
+    the main file. Without a log, it needs space for it and the changed pages. ``sizes_bytes`` has the size of each new
+    measurement, or of all new poses; ``seals_bytes`` is the size of the recording with the new content.
     """
     log = path.with_name(f"{path.name}-wal")
     grows_bytes = sum((size // PAGE_BYTES + 2) * PAGE_BYTES for size in sizes_bytes)

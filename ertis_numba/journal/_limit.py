@@ -22,17 +22,8 @@ LIMIT: Final = "-limit"
 def write_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
     """Write the limit of a journal durably.
 
-    Parameters
-    ----------
-    path : Path
-        Path of the journal.
-    acked : mapping of (sensor, session_id) to int
-        Highest acknowledged number of each session. No number of other sessions was acknowledged.
-
-    Raises
-    ------
-    OSError, DataError
-        The file cannot be written.
+    ``acked`` has the highest acknowledged number of each (sensor, session_id); no number of other sessions was
+    acknowledged. Raises OSError or DataError if the file cannot be written.
     """
     runs: list[list[str | int]] = [[sensor, session_id, last] for (sensor, session_id), last in acked.items()]
     text = json.dumps({"runs": runs, "crc32": _check(runs)})
@@ -41,15 +32,7 @@ def write_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
 
 
 def read_limit(path: Path) -> dict[tuple[str, int], int] | None:
-    """Return the limit of a journal; None if it has none.
-
-    Raises
-    ------
-    DamagedError
-        The file does not match its checksum.
-    DataError
-        The file cannot be read.
-    """
+    """Return the limit of a journal; None if it has none."""
     place = _limit_path(path)
     try:
         content = json.loads(place.read_bytes())

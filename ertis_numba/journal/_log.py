@@ -30,16 +30,9 @@ _PAGE_BYTES: Final = range(512, 65_537)
 class WriteAheadLog:
     """A write-ahead log as stored on the disk.
 
-    Attributes
-    ----------
-    content : bytes
-        Content of the file.
-    n_read : int
-        Number of frames that SQLite reads, up to the last commit before the first wrong checksum.
-    n_frames : int
-        Number of frames up to the last commit of this generation of the log.
-    n_lost_commits : int
-        Number of commits that SQLite will not read although they were synced. The last commit of a log never counts.
+    SQLite reads ``n_read`` frames, up to the last commit before the first wrong checksum; ``n_frames`` counts those up
+    to the last commit of this generation of the log. ``n_lost_commits`` counts the commits that SQLite will not read
+    although they were synced; the last commit of a log never counts.
     """
 
     content: bytes

@@ -25,22 +25,11 @@ _ROW_BYTES: Final = 100  # Numbers, checksum and index of a row: 91 to 102 bytes
 
 @dataclass(frozen=True, slots=True)
 class JournalPose:
-    """Pose of a platform, for the measurements of the sensors on it.
+    """Pose of a platform in the world frame, for the measurements of the sensors on it.
 
-    Attributes
-    ----------
-    sensors : tuple of str
-        Names of the sensors on the platform.
-    timestamp_ns : int
-        Time in nanoseconds since 1970-01-01 UTC.
-    position_m : tuple of 3 float
-        Position of the platform in the world frame.
-    rotation_xyzw : tuple of 4 float
-        Unit quaternion that rotates the platform frame into the world frame.
-    covariance : bytes
-        6 by 6 doubles, little-endian: the covariance, as in `Trajectory`. Empty if it is unknown.
-    source : str
-        Origin of the pose.
+    ``timestamp_ns`` counts from 1970-01-01 UTC, and the unit quaternion ``rotation_xyzw`` rotates the platform frame
+    into the world frame. ``covariance`` has 6 by 6 little-endian doubles, as in `Trajectory`; it is empty if unknown.
+    ``source`` is the origin of the pose.
     """
 
     sensors: tuple[str, ...]
@@ -63,13 +52,7 @@ class JournalPose:
 
     @classmethod
     def from_row(cls, path: Path, row: Sequence[Any]) -> Self:
-        """Return the pose of a row.
-
-        Raises
-        ------
-        DamagedError
-            The row does not match its checksum, or is not that of a pose.
-        """
+        """Return the pose of a row."""
         names, time_ns, *numbers, covariance, source = verified_values(path, "a pose", row)
         kinds = (isinstance(names, str), isinstance(source, str), isinstance(covariance, bytes))
         if not (all(kinds) and isinstance(time_ns, int) and all(isinstance(each, float) for each in numbers)):
@@ -82,21 +65,7 @@ def pose_blocks(
 ) -> Iterator[tuple[list[JournalPose], int]]:
     """Yield blocks of poses in order of arrival: the undamaged ones, and the number of damaged ones.
 
-    Parameters
-    ----------
-    database : Database
-        Tables of the journal.
-    path : Path
-        Path of the journal.
-    after : int
-        Number of the last row to leave out.
-    n_max : int
-        Largest number of rows in a block.
-
-    Raises
-    ------
-    DamagedError
-        The table is damaged.
+    ``after`` is the number of the last row to leave out, and ``n_max`` the largest number of rows in a block.
     """
     if not database.has_table(POSES):
         return
@@ -121,19 +90,9 @@ def read_poses(database: Database, path: Path, *, after: int = 0) -> tuple[list[
 def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Trajectory:
     """Return the trajectory through poses; of several poses at one time, the first counts.
 
-    The covariance is None if that of any pose is unknown. The source lists the sources of the poses.
-
-    Parameters
-    ----------
-    poses : sequence of JournalPose
-        Poses of one platform in any order, at least one.
-    max_gap_s : float
-        Longest interval of the trajectory between poses.
-
-    Raises
-    ------
-    ArgumentError, ValueError
-        A number or a covariance cannot be that of a pose.
+    The covariance is None if that of any pose is unknown. The source lists the sources of the poses. ``poses`` are
+    those of one platform in any order, at least one; ``max_gap_s`` is the longest interval of the trajectory between
+    poses. Raises ArgumentError or ValueError if a number or a covariance cannot be that of a pose.
     """
     time_ns, first = np.unique([pose.timestamp_ns for pose in poses], return_index=True)
     kept = [poses[index] for index in first]
@@ -153,14 +112,7 @@ class PosesAround:
     """Poses next to given times, selected from any number of poses.
 
     Memory depends on the number of times only, since a trajectory needs only the first and the last pose between two
-    times.
-
-    Parameters
-    ----------
-    time_ns : array_like of int
-        Times in any order, in nanoseconds.
-    max_gap_s : float
-        Longest interval of the trajectory between poses.
+    times. ``time_ns`` is in any order; ``max_gap_s`` is the longest interval of the trajectory between poses.
     """
 
     def __init__(self, time_ns: ArrayLike, *, max_gap_s: float) -> None:
@@ -174,10 +126,7 @@ class PosesAround:
     def add(self, poses: Sequence[JournalPose]) -> None:
         """Add poses in any order; the first of several poses at one time counts.
 
-        Raises
-        ------
-        ArgumentError, ValueError
-            A number or a covariance cannot be that of a pose.
+        Raises ArgumentError or ValueError if a number or a covariance cannot be that of a pose.
         """
         if not poses:
             return

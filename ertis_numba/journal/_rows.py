@@ -25,10 +25,7 @@ _INSERTION: Final = insert_statement("measurements")
 class WritableJournal(ReadableJournal):
     """An open journal for changes.
 
-    Attributes
-    ----------
-    tally : Tally
-        Highest stored numbers.
+    ``tally`` has the highest stored numbers.
     """
 
     def __init__(self, path: Path, database: Database) -> None:
@@ -47,26 +44,10 @@ class WritableJournal(ReadableJournal):
     ) -> None:
         """Register a sensor at any time before its first measurement.
 
-        Parameters
-        ----------
-        name : str
-            Name of the sensor.
-        settings : Settings
-            Settings of its measurements, whose air may differ. The content of layout files is stored in the journal.
-        firmware : str
-            Version of the firmware.
-        translation_m : sequence of 3 float, optional
-            Position x, y, z on the platform, in metres. The mounting is unknown if neither this nor ``rotation_xyzw``
-            is given.
-        rotation_xyzw : sequence of 4 float, optional
-            Unit quaternion that rotates the sensor frame into the platform frame.
-
-        Raises
-        ------
-        ArgumentError
-            The sensor is registered already, or a recording cannot contain it.
-        DataError
-            The journal is not writable.
+        The air of its measurements may differ from ``settings``; the content of layout files is stored in the journal.
+        ``translation_m`` is the position x, y, z on the platform, and the unit quaternion ``rotation_xyzw`` rotates the
+        sensor frame into the platform frame; without both, the mounting is unknown. Raises ArgumentError if the sensor
+        is registered already, or a recording cannot contain it; or DataError if the journal is not writable.
         """
         made = JournalSensor.from_settings(
             name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
@@ -81,22 +62,11 @@ class WritableJournal(ReadableJournal):
     def append(self, entries: Sequence[JournalEntry]) -> None:
         """Store measurements durably, all or none.
 
-        Parameters
-        ----------
-        entries : sequence of JournalEntry
-            Measurements of any sensors in any order. The sequence numbers of a sensor rise within a session. ``crc32``
-            is filled in if it is None.
-
-        Raises
-        ------
-        ArgumentError
-            A measurement does not match its sensor, or its number does not rise.
-        DiskFullError
-            The disk is full or nearly full, and nothing was written. Free some space, and append again.
-        DataError
-            The disk is full or fails. Earlier measurements are safe.
-        JournalInUseError
-            Another process has removed or replaced the journal.
+        Sensors may be in any order; the sequence numbers of a sensor rise within a session. ``crc32`` is filled in if
+        it is None. Raises ArgumentError if a measurement does not match its sensor, or its number does not rise;
+        DiskFullError if the disk is full or nearly full, and nothing was written (free some space, and append again);
+        DataError if the disk is full or fails (earlier measurements are safe); or JournalInUseError if another process
+        has removed or replaced the journal.
         """
         with self._lock:
             last = dict(self._last)
@@ -140,25 +110,15 @@ class WritableJournal(ReadableJournal):
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
         """Store durably why numbers of a sensor's session are missing, ``first`` and ``last`` included.
 
-        Raises
-        ------
-        ArgumentError
-            The sensor or session is unknown, ``last`` comes before ``first``, or the reason is not a line of at most 64
-            bytes.
-        DataError
-            The journal is not writable.
+        Raises ArgumentError if the sensor or session is unknown, ``last`` comes before ``first``, or the reason is not
+        a line of at most 64 bytes; or DataError if the journal is not writable.
         """
         self.note_gaps([SequenceGap(sensor, first, last, reason, session_id)])
 
     def note_gaps(self, gaps: Sequence[SequenceGap]) -> None:
         """Store gaps durably, all or none.
 
-        Raises
-        ------
-        ArgumentError
-            The sensor is unknown.
-        DataError
-            The journal is not writable.
+        Raises ArgumentError if the sensor is unknown, or DataError if the journal is not writable.
         """
         with self._lock:
             rows = [
@@ -174,14 +134,8 @@ class WritableJournal(ReadableJournal):
     def append_poses(self, poses: Sequence[JournalPose]) -> None:
         """Store poses of platforms durably, all or none.
 
-        Raises
-        ------
-        DiskFullError
-            The disk is full or nearly full, and nothing was written.
-        DataError
-            The disk is full or fails.
-        JournalInUseError
-            Another process has removed or replaced the journal.
+        Raises DiskFullError if the disk is full or nearly full, and nothing was written; DataError if the disk is full
+        or fails; or JournalInUseError if another process has removed or replaced the journal.
         """
         with self._lock:
             sizes_bytes = [sum(pose.n_bytes for pose in poses)]
@@ -198,28 +152,9 @@ class WritableJournal(ReadableJournal):
         """Delete measurements of a sensor's session that another node has stored, and gaps; durably, all or none.
 
         After the first call, row numbers have holes, because rows of several sensors are interleaved. The journal then
-        has version `VERSION`, and readers count rows instead.
-
-        Parameters
-        ----------
-        sensor : str
-            Name of the sensor.
-        session_id : int
-            Identifier of the session.
-        up_to : int
-            Last sequence number to delete. A gap that extends beyond it is kept unchanged.
-
-        Returns
-        -------
-        int
-            Number of deleted measurements.
-
-        Raises
-        ------
-        ArgumentError
-            The sensor is unknown.
-        DataError
-            The journal is not writable.
+        has version `VERSION`, and readers count rows instead. ``up_to`` is the last sequence number to delete; a gap
+        that extends beyond it is kept unchanged. Returns the number of deleted measurements. Raises ArgumentError if
+        the sensor is unknown, or DataError if the journal is not writable.
         """
         known = self._sensor(sensor)
         which = self._ids[known.name], session_id, up_to
@@ -250,10 +185,7 @@ class WritableJournal(ReadableJournal):
     def appendable_bytes(self) -> int:
         """Return the approximate number of bytes of samples that can be appended while sealing stays possible.
 
-        Raises
-        ------
-        DataError
-            The folder of the recording does not exist.
+        Raises DataError if the folder of the recording does not exist.
         """
         with self._lock:
             return _free_space.appendable_bytes(self.path, self.target, seals_bytes=self._recording_bytes())

@@ -36,19 +36,7 @@ COMPLETE_VERSION: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column of a table.
-
-    Attributes
-    ----------
-    name : str
-        Name of the column.
-    kind : str
-        Type in the notation of SQLite.
-    description : str
-        Description.
-    units : str
-        Unit in the notation of UDUNITS; empty, the default, for numbers without a unit.
-    """
+    """Column of a table: ``kind`` in the notation of SQLite, ``units`` in that of UDUNITS, empty without a unit."""
 
     name: str
     kind: str

@@ -24,18 +24,9 @@ _BLOCK_BYTES: Final = 512  # Size of a sector, which a disk writes as a whole.
 
 @dataclass(slots=True)
 class SequenceRange:
-    """Numbers of one session of a sensor.
+    """First and last number of the stored measurements and gaps of a sensor's session.
 
-    Attributes
-    ----------
-    sensor : str
-        Name of the sensor.
-    session_id : int
-        Identifier of the session.
-    first, last : int
-        First and last number of the stored measurements and gaps.
-    discarded : int
-        Number up to which measurements may have been deleted; -1, the default, if none was.
+    Measurements up to ``discarded`` may have been deleted; -1 if none was.
     """
 
     sensor: str
@@ -51,17 +42,7 @@ _FIELDS: Final = tuple(field.name for field in fields(SequenceRange))
 class Tally:
     """File with one block for each session, updated after each commit.
 
-    Parameters
-    ----------
-    journal : Path
-        Path of the journal.
-
-    Attributes
-    ----------
-    ranges : dict of (sensor, session_id) to SequenceRange
-        Numbers of each session.
-    damage : str
-        Known losses that no gap of the journal covers; empty if there are none.
+    ``damage`` describes known losses that no gap of the journal covers; it is empty if there are none.
     """
 
     def __init__(self, journal: Path) -> None:
@@ -114,10 +95,7 @@ class Tally:
     def discard(self, sensor: str, session_id: int, up_to: int) -> None:
         """Register durably that numbers may be deleted.
 
-        Raises
-        ------
-        OSError
-            The file cannot be written.
+        Raises OSError if the file cannot be written.
         """
         mark = self.ranges.get((sensor, session_id))
         if mark is not None and up_to > mark.discarded:
@@ -128,15 +106,8 @@ class Tally:
     def limit(self, acked: Mapping[tuple[str, int], int]) -> None:
         """Remove numbers above the acknowledged ones, because a failed journal does not contain them reliably.
 
-        Parameters
-        ----------
-        acked : mapping of (sensor, session_id) to int
-            Highest acknowledged number of each session that has one.
-
-        Raises
-        ------
-        OSError
-            The file cannot be written.
+        ``acked`` has the highest acknowledged number of each (sensor, session_id) that has one. Raises OSError if the
+        file cannot be written.
         """
         for run, mark in self.ranges.items():
             last = max(acked.get(run, -1), mark.first - 1)

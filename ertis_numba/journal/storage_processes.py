@@ -32,32 +32,14 @@ Progress = Callable[[int, int], None]
 class SealingResult:
     """Result of sealing a journal.
 
-    Attributes
-    ----------
-    journal : Path
-        Path of the journal.
-    recording : Path or None
-        Path of the recording; None if the journal had no measurement.
-    measurements : int
-        Number of measurements in the recording, by default 0.
-    missing : int
-        Number of missing measurements according to the recording, by default 0.
-    damaged : int
-        Number of missing measurements that were damaged in the journal, by default 0.
-    set_aside : Path or None
-        New path of the journal if it has damaged poses, or damaged or refused measurements; otherwise None, and the
-        journal was removed.
-    lost : int
-        Number of missing measurements that the journal had noted before its log was damaged, by default 0. Each number
-        belongs to a stored measurement or a gap, or was skipped by the sensor.
-    damage : str
-        Losses from a damaged log that no gap of the recording covers; empty if there are none.
-    refused : dict of str to str
-        Reasons why a recording cannot contain the measurements of some sensors, by sensor.
-    without_pose : int
-        Number of measurements without a pose, of sensors that have poses, by default 0.
-    pose_damage : str
-        Number of damaged poses, or the reason why all poses were left out; empty if there was no damage.
+    ``recording`` is None if the journal had no measurement. ``missing`` counts the missing measurements of the
+    recording, ``damaged`` those of them that were damaged in the journal, and ``lost`` those that the journal had noted
+    before its log was damaged: each number belongs to a stored measurement or a gap, or was skipped by the sensor.
+    ``set_aside`` is the new path of a journal that has damaged poses, or damaged or refused measurements; otherwise it
+    is None, and the journal was removed. ``damage`` describes losses from a damaged log that no gap of the recording
+    covers. ``refused`` has the reason why a recording cannot contain the measurements of a sensor, by sensor.
+    ``without_pose`` counts the measurements without a pose, of sensors that have poses. ``pose_damage`` is the number
+    of damaged poses, or the reason why all poses were left out; empty if there was no damage.
     """
 
     journal: Path
@@ -155,32 +137,11 @@ def seal_in_subprocess(
     Ctrl-C in a terminal does not reach that process. However it ends, the measurements are in the journal or in the
     recording, and sealing can be repeated.
 
-    Parameters
-    ----------
-    journal : Path
-        Path of the journal.
-    overwrite : bool
-        Replace an existing file, even if it has other content.
-    rests : float, optional
-        Run at low priority, and pause after each step for this multiple of its duration.
-    progress : callable, optional
-        Called with the number of written measurements and of all measurements, about a hundred times.
-
-    Returns
-    -------
-    SealingResult
-        Result.
-
-    Raises
-    ------
-    JournalInUseError
-        Another process has the journal open.
-    DataError
-        Sealing failed; the journal is still there.
-    OSError
-        No process can be started.
-    KeyboardInterrupt
-        The process was interrupted; the message states where the measurements are.
+    ``overwrite`` replaces an existing file, even if it has other content. With ``rests``, the process runs at low
+    priority, and pauses after each step for this multiple of its duration. ``progress`` is called about a hundred times
+    with the number of written measurements and of all measurements. Raises JournalInUseError if another process has the
+    journal open, DataError if sealing failed (the journal is still there), OSError if no process can be started, and
+    KeyboardInterrupt if it was interrupted; its message states where the measurements are.
     """
     replies: list[Sealed | StorageFailed] = []
     try:
@@ -228,13 +189,7 @@ def _interrupt_message(journal: Path, replies: list[Sealed | StorageFailed]) -> 
 
 
 def sessions_in_recordings(recordings: Iterable[Path]) -> list[tuple[str, int, int]]:
-    """Return the sessions in recordings, read by a separate process; see `FoundSessions`.
-
-    Raises
-    ------
-    DataError
-        A recording cannot be read.
-    """
+    """Return the sessions in recordings, read by a separate process; see `FoundSessions`."""
     child: Child[Any] = Child(_READING, FoundSessions | StorageFailed, keep_stderr=True)
     try:
         child.pipe.send(ReadSessions(list(recordings)))

@@ -31,23 +31,9 @@ class Child(Generic[Kind]):
 
     It is a new interpreter rather than a fork, which OpenMP, HDF5 and ZeroMQ would not survive. Unlike a process of
     `multiprocessing`, it does not import the main program. It has a session of its own, so that Ctrl-C in a terminal
-    does not reach it.
-
-    Parameters
-    ----------
-    module : str
-        Module to run; it calls `connect`.
-    kinds : type
-        Messages that it sends.
-    environment : dict, optional
-        Variables in addition to those of this process.
-    keep_stderr : bool
-        Keep the last line of its stderr for `wait`, instead of sharing the stderr of this process.
-
-    Attributes
-    ----------
-    pipe : Pipe
-    pid : int
+    does not reach it. The module calls `connect`, and sends messages of ``kinds``. ``environment`` adds variables to
+    those of this process. ``keep_stderr`` keeps the last line of its stderr for `wait`, instead of sharing the stderr
+    of this process.
     """
 
     def __init__(
@@ -144,15 +130,9 @@ def connect(
 ) -> "Pipe[Any]":
     """Return the pipe to the parent process, in a process that `Child` has started.
 
-    Parameters
-    ----------
-    kinds : type
-        Messages that the parent sends.
-    outlives_parent : bool
-        Continue when the parent has ended or has closed the pipe, and accept its interrupts. By default, this process
-        ends with the parent even if that is killed, and ignores signals that ask it to end.
-    on_parent_end : callable
-        Called in a thread before this process ends with its parent.
+    The parent sends messages of ``kinds``. With ``outlives_parent``, this process continues when the parent has ended
+    or has closed the pipe, and accepts its interrupts. By default, it ends with the parent even if that is killed, and
+    ignores signals that ask it to end; ``on_parent_end`` is called in a thread before that.
     """
     # Registered first, so it runs after all other exit handlers. Without it, Python's last garbage collection scans all
     # modules, which takes 0.1 to 0.3 s.

@@ -31,19 +31,9 @@ class Pipe(Generic[Kind]):
     Messages are MessagePack, never pickle: a corrupted child cannot make its parent run code. Paths travel as bytes,
     because names of files need not be valid text.
 
-    Parameters
-    ----------
-    end : socket.socket
-        One socket of a pair.
-    kinds : type
-        Received messages: a union of tagged `msgspec.Struct`.
-
-    Attributes
-    ----------
-    files : deque of int
-        Received descriptors, in the order of their messages.
-    closed : bool
-        The other process has ended, or has sent an invalid message.
+    ``end`` is one socket of a pair; ``kinds`` is a union of tagged `msgspec.Struct`, the received messages. ``files``
+    are received descriptors, in the order of their messages. ``closed`` is true if the other process has ended, or has
+    sent an invalid message.
     """
 
     def __init__(self, end: socket.socket, kinds: Any) -> None:

@@ -14,25 +14,10 @@ Kind = TypeVar("Kind")
 class SupervisedProcess(Generic[Kind]):
     """Child that is killed when it misses a deadline, and that is replaced when it has ended.
 
-    No method blocks, except `close`: the owner polls `fds`, and calls `check` several times a second.
-
-    Parameters
-    ----------
-    module : str
-        Module to run, as for `Child`.
-    kinds : type
-        Messages that it sends.
-    delays_s : sequence of float
-        Delays before it is replaced, by the number of earlier ends since the last `succeeded`. The last one repeats.
-    environment : dict, optional
-        Variables in addition to those of this process.
-
-    Attributes
-    ----------
-    child : Child or None
-        None while there is no process.
-    restarts : int
-        Number of processes that have ended.
+    No method blocks, except `close`: the owner polls `fds`, and calls `check` several times a second. ``module``,
+    ``kinds`` and ``environment`` are as for `Child`. ``delays_s`` are the delays before it is replaced, by the number
+    of earlier ends since the last `succeeded`; the last one repeats. ``child`` is None while there is no process;
+    ``restarts`` counts the processes that have ended.
     """
 
     def __init__(

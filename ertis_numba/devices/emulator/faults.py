@@ -34,18 +34,10 @@ class Unplug:
 
 @dataclass(frozen=True, slots=True)
 class BlockFault:
-    """One fault in a block.
+    """One fault in a block, of one of `KINDS`.
 
-    Attributes
-    ----------
-    kind : str
-        One of `KINDS`.
-    place : int
-        First affected byte, counted after earlier faults.
-    n_bytes : int
-        Number of affected bytes.
-    detail : str
-        For a flip the part of the block, for a swap the place of the added bytes.
+    ``place`` is the first affected byte, counted after earlier faults, and ``n_bytes`` the number of affected bytes.
+    ``detail`` is for a flip the part of the block, and for a swap the place of the added bytes.
     """
 
     kind: str
@@ -60,15 +52,7 @@ class BlockFault:
 
 @dataclass(frozen=True, slots=True)
 class Spoilt:
-    """A block to be sent, with faults.
-
-    Attributes
-    ----------
-    pieces : tuple of bytes, Stall or Unplug
-        In this order.
-    faults : tuple of BlockFault
-        Applied faults; empty for an unchanged block.
-    """
+    """A block to be sent in pieces, in their order, with the applied faults; without any, it is unchanged."""
 
     pieces: tuple[bytes | Stall | Unplug, ...]
     faults: tuple[BlockFault, ...]
@@ -93,18 +77,9 @@ class Faults:
     sent; ``drop``: nothing of it is sent. ``stall``: a pause. ``unplug``: the sensor is removed in the middle. Each is
     drawn independently, so that a block may have several.
 
-    Parameters
-    ----------
-    seed : int
-    kinds : mapping of str to float
-        Probability per block of each of `KINDS`, 0 by default. ``short_reads``: True for pieces of 1 to 4,095 bytes by
-        chance, which is no fault; else pieces are as long as can be.
-    longest_stall_s : float
-
-    Raises
-    ------
-    ArgumentError
-        There is no such kind, or a probability is not within 0 and 1.
+    ``kinds`` has the probability per block of each of `KINDS`, 0 by default. Its ``short_reads`` is true for pieces of
+    1 to 4,095 bytes by chance, which is no fault; else pieces are as long as can be. Raises ArgumentError if there is
+    no such kind, or a probability is not within 0 and 1.
     """
 
     def __init__(

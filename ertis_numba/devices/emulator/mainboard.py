@@ -27,18 +27,9 @@ _BUFFERED = 2  # Limit on measurements that wait for a reader.
 class Quirks:
     """Faulty behaviour of a device apart from its data.
 
-    Attributes
-    ----------
-    silent : bool
-        Obey commands, but answer nothing.
-    wrong_hash : bool
-        Report a wrong hash of the call, however often it is loaded.
-    answer_delay_s : float
-        Delay of each answer.
-    bytes_per_s : float, optional
-        Data rate; as fast as the host reads by default.
-    away_s : float
-        Time until it returns after a fault has unplugged it.
+    ``silent`` obeys commands but answers nothing; ``wrong_hash`` reports a wrong hash of the call, however often it is
+    loaded. ``answer_delay_s`` delays each answer. ``bytes_per_s`` is the data rate; as fast as the host reads by
+    default. The device returns ``away_s`` after a fault has unplugged it.
     """
 
     silent: bool = False
@@ -67,20 +58,9 @@ class _PendingRecording:
 class Mainboard:
     """Device that obeys commands and records, from power-up until it is unplugged.
 
-    Parameters
-    ----------
-    measurements : Measurements
-    accepts : callable, optional
-        Called with a changed configuration, after a call was loaded and before a measurement. If it returns False, the
-        device reports a wrong hash of the call and does not measure.
-
-    Attributes
-    ----------
-    registers : Registers
-    outputs : deque of Output
-        What waits to be sent, in order.
-    refused : int
-        Commands that were none, and those whose numbers the device cannot use.
+    ``accepts`` is called with a changed configuration, after a call was loaded and before a measurement. If it returns
+    False, the device reports a wrong hash of the call and does not measure. ``outputs`` wait to be sent, in order.
+    ``refused`` counts commands that were none, and those whose numbers the device cannot use.
     """
 
     def __init__(self, measurements: Measurements, accepts: Accepts | None = None) -> None:

@@ -42,13 +42,7 @@ _NUMBERS = {  # By command: register and range of the first number.
 class DeviceConfig:
     """Call and record that the host has configured.
 
-    Attributes
-    ----------
-    codes : (sample,) uint16
-        Samples of the call; all 0 if none was loaded.
-    dac_rate_hz : int
-    n_samples : int
-    pdm_rate_hz : float
+    ``codes`` has shape (sample,): samples of the call, all 0 if none was loaded.
     """
 
     codes: NDArray[np.uint16]
@@ -65,10 +59,7 @@ class DeviceConfig:
     def call(self) -> Call:
         """Return the loaded call as a custom waveform.
 
-        Raises
-        ------
-        ArgumentError
-            The samples are too many, or have no usable band.
+        Raises ArgumentError if the samples are too many, or have no usable band.
         """
         return call_from_codes(self.codes, float(self.dac_rate_hz))
 
@@ -79,20 +70,9 @@ class Registers:
     The initial state of a real device is known for the amplifier (on) and the external trigger (off); the rest is
     assumed. So are the answers to settings, here 1. A refused command has no effect, and the answer is 0.
 
-    Attributes
-    ----------
-    n_bytes : int
-        Size of the words of one measurement.
-    clock : int
-        0: 4.5 MHz, 1: 1.125 MHz.
-    dac_rate_hz, n_codes, emissions : int
-    codes : (65535,) uint16
-        Samples of the call; the first ``n_codes`` count.
-    active, amplifier : int
-    armed, pin : int
-        1 if SYNC pulses trigger measurements, and the number of the input.
-    counter : int
-        Number of the next measurement.
+    ``n_bytes`` is the size of the words of one measurement; ``clock`` is 0 for 4.5 MHz and 1 for 1.125 MHz. ``codes``
+    has shape (65535,) uint16: samples of the call, of which the first ``n_codes`` count. ``armed`` is 1 if SYNC pulses
+    trigger measurements, and ``pin`` is the number of the input. ``counter`` is the number of the next measurement.
     """
 
     def __init__(self) -> None:

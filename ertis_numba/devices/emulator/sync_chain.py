@@ -23,25 +23,9 @@ class SyncChain:
     step is far below the resolution here. Samples from a scene contain it already.
 
     Pulses are numbered from the first that a device accepted. All devices send the samples of the same number.
-
-    Parameters
-    ----------
-    devices : sequence of Emulator
-        In the order of the chain.
-    rate_hz : float
-    before : callable, optional
-        Called with the number of each pulse before the pulse. If it takes longer than a period, the pulses meanwhile
-        are left out.
-
-    Attributes
-    ----------
-    pulses : int
-        Pulses that some device took.
-
-    Raises
-    ------
-    ArgumentError
-        The rate is not within 0.001 and 1000 Hz.
+    ``devices`` are in the order of the chain. ``before`` is called with the number of each pulse before the pulse; if
+    it takes longer than a period, the pulses meanwhile are left out. ``pulses`` counts those that some device took.
+    Raises ArgumentError if the rate is not within 0.001 and 1000 Hz.
     """
 
     def __init__(

@@ -20,14 +20,8 @@ class Terminal:
     """Raw pseudo terminal.
 
     The host's side stays open here, so that a host may open and close it for every command. Unread bytes then wait in
-    the system's buffer of about 12 kB; a real port would discard them.
-
-    Attributes
-    ----------
-    master : int
-        File descriptor to read and write without waiting.
-    port : str
-        Path that a host opens.
+    the system's buffer of about 12 kB; a real port would discard them. ``master`` is a file descriptor to read and
+    write without waiting; a host opens the path ``port``.
     """
 
     def __init__(self) -> None:
