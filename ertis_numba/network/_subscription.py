@@ -47,17 +47,9 @@ _AT_ONCE: Final = 64
 class SubscriberCounts:
     """Counts of an application's products.
 
-    Attributes
-    ----------
-    received : int
-        Products that the application has taken.
-    dropped : int
-        Products that the publisher dropped because the application was slow.
-    missed : int
-        Numbers that never arrived; equal to ``dropped`` except for those still on their way.
-    reconnects : int
-    damaged : int
-        Invalid messages; each ends a connection.
+    ``received`` counts products that the application has taken, and ``dropped`` those that the publisher dropped
+    because the application was slow. ``missed`` counts numbers that never arrived: it equals ``dropped`` except for
+    those still on their way. ``damaged`` counts invalid messages; each ends a connection.
     """
 
     received: int = 0
@@ -81,17 +73,7 @@ class _Numbers:
 class Subscription:
     """Client that requests products and reads them in one thread; another thread may call only `taken`.
 
-    Parameters
-    ----------
-    address : str
-    sensors : tuple of str or None
-    products : tuple of str
-    keys : ClientKeys or None
-    on_note : callable
-    credit : int
-    counts : SubscriberCounts
-    deliver : callable
-        Gets each `Arrival`.
+    ``deliver`` gets each `Arrival`.
     """
 
     def __init__(
@@ -143,10 +125,7 @@ class Subscription:
     def turn(self, woken: WakeupSocket, now_s: float) -> None:
         """Do pending work, or wait up to a tenth of a second.
 
-        Raises
-        ------
-        RefusedError
-            The publisher refuses this application, and has never accepted it.
+        Raises RefusedError if the publisher refuses this application, and has never accepted it.
         """
         connection = self._connection
         if connection is None:

@@ -29,18 +29,9 @@ _HTTP_HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-9.-]*)(
 def endpoint(text: str, *, name: str = "address") -> str:
     """Return an address in the form of ZeroMQ.
 
-    Parameters
-    ----------
-    text : str
-        ``tcp://HOST:PORT``. A node that listens may give port 0 or ``*`` for a free port, and host ``*`` for all
-        interfaces.
-    name : str
-        Name of the address in errors, such as the option by which users give it.
-
-    Raises
-    ------
-    ArgumentError
-        The text is not an address.
+    ``text`` is ``tcp://HOST:PORT``. A node that listens may give port 0 or ``*`` for a free port, and host ``*`` for
+    all interfaces. ``name`` is that of the address in errors, such as the option by which users give it. Raises
+    ArgumentError if the text is not an address.
     """
     found = _ADDRESS.fullmatch(text) if isinstance(text, str) else None
     if found is None or (found[2] != "*" and int(found[2]) > 65535):
@@ -80,12 +71,7 @@ def is_loopback(endpoint: str) -> bool:
 def is_own_host(given: str, host: str) -> bool:
     """Return True if the Host of an HTTP request is a loopback name or address, or the server's own host.
 
-    Parameters
-    ----------
-    given : str
-        Host of the request, with or without a port.
-    host : str
-        Host of the server, without brackets.
+    ``given`` is the Host of the request, with or without a port; ``host`` is that of the server, without brackets.
     """
     found = _HTTP_HOST.fullmatch(given)
     if found is None:
@@ -95,13 +81,7 @@ def is_own_host(given: str, host: str) -> bool:
 
 
 def require_keys(endpoint: str, *, keys: object | None) -> None:
-    """Refuse an address that other machines can reach if there are no keys.
-
-    Raises
-    ------
-    ArgumentError
-        Other machines can reach the address, and ``keys`` is None.
-    """
+    """Refuse an address that other machines can reach if there are no keys."""
     if keys is None and not is_loopback(endpoint):
         raise ArgumentError(
             f"address {endpoint} can be reached from other machines, but there are no keys; create keys with "

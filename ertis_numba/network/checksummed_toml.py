@@ -14,23 +14,14 @@ __all__ = ["Checked"]
 class Checked(TomlDocument, frozen=True, kw_only=True):
     """TOML document with an optional CRC-32 of its content.
 
-    Attributes
-    ----------
-    check : str
-        CRC-32 in the file; empty for a document in memory.
+    ``check`` is the CRC-32 in the file; empty for a document in memory.
     """
 
     check: str = ""
 
     @classmethod
     def from_toml(cls, text: str, source: str | None = None, *, find_line: bool = True) -> Self:
-        """Read a document and compare its checksum, if it has one.
-
-        Raises
-        ------
-        SettingsError
-            The text cannot be used, or its checksum is wrong.
-        """
+        """Read a document and compare its checksum, if it has one."""
         if not text.strip():
             raise SettingsError(
                 f"{source or cls.label()} is empty; copy it again, or create a new one with 'ertis keys'"

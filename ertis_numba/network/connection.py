@@ -21,31 +21,11 @@ class Connection:
     ZeroMQ connects and reconnects in the background. A client that has been refused, or hears nothing, closes its
     connection and makes a new one.
 
-    Parameters
-    ----------
-    context : zmq.Context
-    address : str
-    keys : ClientKeys or None
-        None on loopback only.
-    max_bytes : int
-        Longest frame.
-
-    Attributes
-    ----------
-    opened_s : float
-    sent_s : float or None
-        Time of the first message that was sent, which requires a peer.
-    heard_s : float or None
-        Time of the last valid message; its reader sets it.
-    is_blocked : bool
-        There was no room for a message. `wait` ends when there is room again.
-
-    Raises
-    ------
-    ArgumentError
-        The address cannot be used, or requires keys.
-    NetworkError
-        The address can never be connected to.
+    Without ``keys``, it connects on loopback only. ``max_bytes`` is the size of the longest frame. ``sent_s`` is the
+    time of the first message that was sent, which requires a peer; None before. ``heard_s`` is the time of the last
+    valid message; its reader sets it. ``is_blocked`` is true if there was no room for a message; `wait` ends when there
+    is room again. Raises ArgumentError if the address cannot be used, or requires keys; or NetworkError if the address
+    can never be connected to.
     """
 
     def __init__(

@@ -176,13 +176,7 @@ def default_folder() -> Path:
 
 
 def public_key(given: str | Path) -> tuple[str, str]:
-    """Return a public key and the name of its owner, from a file or from the key itself, which has no name.
-
-    Raises
-    ------
-    SettingsError
-        The file cannot be read or used.
-    """
+    """Return a public key and the name of its owner, from a file or from the key itself, which has no name."""
     if _is_key(str(given)):
         return str(given), ""
     path = Path(given)
@@ -205,13 +199,7 @@ def public_key(given: str | Path) -> tuple[str, str]:
 
 
 def require_name(name: str) -> None:
-    """Refuse a name that a key cannot have.
-
-    Raises
-    ------
-    ArgumentError
-        The name cannot be used.
-    """
+    """Refuse a name that a key cannot have."""
     if not _NAME.fullmatch(name):
         raise ArgumentError(f"key name {name!r} cannot be used; use up to 64 letters, digits and _ . @ + -")
 
@@ -225,12 +213,6 @@ def _is_key(key: str) -> bool:
 
 
 def require_key(key: str) -> None:
-    """Refuse a text that is not a key.
-
-    Raises
-    ------
-    ArgumentError
-        The text is not a key.
-    """
+    """Refuse a text that is not a key."""
     if not _is_key(key):
         raise ArgumentError(f"{key[:48]!r} is not a key; use the 40 characters from 'ertis keys list'")

@@ -31,10 +31,6 @@ class EventLog:
 
         log = logger("central_node")
         log.warning("conflict", sensor="front", session_id=7, sequence=41, text="both are kept")
-
-    Parameters
-    ----------
-    name : str
     """
 
     def __init__(self, name: str) -> None:

@@ -51,14 +51,9 @@ def as_line(text: str) -> str:
 class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower):
     """Header of a message. Its class declares the message once: tables, checks of roles and handlers derive from it.
 
-    Attributes
-    ----------
-    routes : tuple of (sender, receiver)
-        Nodes that send and receive the message.
-    payload : str
-        Content of its payload frames, for the documentation; empty without payload.
-    product : str
-        Product that the message brings to applications; empty for other messages.
+    ``routes`` are (sender, receiver): nodes that send and receive the message. ``payload`` describes its payload
+    frames, for the documentation; empty without payload. ``product`` is the product that the message brings to
+    applications; empty for other messages.
     """
 
     routes: ClassVar[tuple[tuple[Party, Party], ...]] = ()
@@ -79,16 +74,9 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 class OfMeasurement(Message, frozen=True, kw_only=True):
     """Header fields of a message about a measurement.
 
-    Attributes
-    ----------
-    sensor, session_id, sequence, sync_count
-        As in `ertis_numba.frames.Stamp`.
-    timestamp_ns, uncertainty_ns : int
-        Start of the emission, since 1970-01-01 UTC by the sensor node's clock.
-    monotonic_ns : int
-        Complete arrival at the sensor node, by its monotonic clock.
-    behaviour : {"active", "passive", "unknown"}
-        As in `ertis_numba.frames.Stamp`.
+    ``sensor``, ``session_id``, ``sequence``, ``sync_count`` and ``behaviour`` are as in `ertis_numba.frames.Stamp`. The
+    emission starts at ``timestamp_ns`` with ``uncertainty_ns``, since 1970-01-01 UTC by the sensor node's clock.
+    ``monotonic_ns`` is the complete arrival at the sensor node, by its monotonic clock.
     """
 
     sensor: Name

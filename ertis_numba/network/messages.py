@@ -93,18 +93,9 @@ SILENCE_LIMIT_S: Final = 3.0
 class Hello(Message, frozen=True, kw_only=True):
     """A sensor node has measurements of a sensor. Payload: the sensor's settings as TOML.
 
-    Attributes
-    ----------
-    sensor : str
-    session_id : int
-        Session of the sensor; with its sequence numbers, the identity of a measurement.
-    next_sequence : int
-        Oldest number that the node still has, or the next one.
-    settings_crc32 : int
-        CRC-32 of the payload.
-    firmware : str
-    translation_m, rotation_xyzw
-        Mounting of the sensor on its platform; None if it is unknown.
+    ``session_id`` and its sequence numbers are the identity of a measurement. ``next_sequence`` is the oldest number
+    that the node still has, or the next one. ``settings_crc32`` is the CRC-32 of the payload. ``translation_m`` and
+    ``rotation_xyzw`` are the mounting of the sensor on its platform; None if it is unknown.
     """
 
     routes = (("sensor", "central"),)
@@ -122,16 +113,9 @@ class Hello(Message, frozen=True, kw_only=True):
 class Welcome(Message, frozen=True, kw_only=True):
     """The central node accepts measurements of a sensor.
 
-    Attributes
-    ----------
-    sensor, session_id
-    state : {"storage", "processing", "fault", "closing"}
-    acks : {"stored", "accepted"}
-        Meaning of an `Ack`: on disk, or in memory.
-    window : int
-        Limit on unacknowledged measurements.
-    acked_through : int
-        Highest number up to which each measurement is stored, or known to be missing; -1 if there is none.
+    ``acks`` is the meaning of an `Ack`: ``stored`` on disk, or ``accepted`` in memory. ``window`` limits the
+    unacknowledged measurements. Up to ``acked_through``, each measurement is stored, or known to be missing; -1 if
+    there is none.
     """
 
     routes = (("central", "sensor"),)
@@ -147,12 +131,8 @@ class Welcome(Message, frozen=True, kw_only=True):
 class Data(OfMeasurement, frozen=True, kw_only=True):
     """A measurement. Payload: its samples, little-endian.
 
-    Attributes
-    ----------
-    temperature_c, humidity_percent, pressure_pa : float
-        State of the air.
-    crc32 : int
-        CRC-32 of the payload.
+    ``temperature_c``, ``humidity_percent`` and ``pressure_pa`` are the state of the air; ``crc32`` is that of the
+    payload.
     """
 
     routes = (("sensor", "central"),)
@@ -186,15 +166,9 @@ class Gap(Message, frozen=True, kw_only=True):
 class Ack(Message, frozen=True, kw_only=True):
     """Cumulative acknowledgement of a sensor's session; a repeated or late one is harmless.
 
-    Attributes
-    ----------
-    sensor, session_id
-    acked_through : int
-        As in `Welcome`.
-    status : {"stored", "accepted"}
-        Place of the acknowledged measurements: on disk, or in memory.
-    dropped : tuple of (sequence, reason)
-        Measurements that the node has discarded since the previous ack.
+    ``acked_through`` is as in `Welcome`. ``status`` is the place of the acknowledged measurements: ``stored`` on disk,
+    or ``accepted`` in memory. ``dropped`` are the measurements that the node has discarded since the previous ack, as
+    (sequence, reason).
     """
 
     routes = (("central", "sensor"),)
@@ -209,20 +183,10 @@ class Ack(Message, frozen=True, kw_only=True):
 class PlatformPose(Message, frozen=True, kw_only=True):
     """Pose of a platform at a time, to be stored with the measurements of its sensors.
 
-    Attributes
-    ----------
-    sensors : tuple of str
-        Sensors on the platform. The key must be allowed to send for each of them.
-    session_id : int
-        Session of the sender, which remains when it connects again.
-    timestamp_ns : int
-        Time since 1970-01-01 UTC.
-    position_m, rotation_xyzw
-        As in `ertis_numba.frames.Trajectory`.
-    covariance : tuple of float
-        Rows of the covariance of `Trajectory`; None if it is unknown.
-    source : str
-        Origin of the pose.
+    The key must be allowed to send for each of ``sensors``, those on the platform. ``session_id`` is that of the
+    sender, which remains when it connects again. ``timestamp_ns`` counts from 1970-01-01 UTC. ``position_m`` and
+    ``rotation_xyzw`` are as in `ertis_numba.frames.Trajectory`. ``covariance`` has the rows of its covariance; None if
+    it is unknown. ``source`` is the origin of the pose.
     """
 
     routes = (("sensor", "central"),)
@@ -271,16 +235,9 @@ class Bye(Message, frozen=True, kw_only=True):
 class Refused(Message, frozen=True, kw_only=True):
     """The central node refused a message.
 
-    Attributes
-    ----------
-    code : {"version", "message", "role", "serial", "hello", "settings", "size", "sensor"}
-        Reason, for programs. ``hello``: the session is unknown; the node should send `Hello` again. ``sensor``: no
-        sensor node sends the sensor that the message is for.
-    reason : str
-        Reason, for people: what was got, what is accepted, the remedy.
-    sensor : str
-        Sensor that the message was about, if any.
-    session_id : int
+    ``code`` is the reason for programs. ``hello``: the session is unknown; the node should send `Hello` again.
+    ``sensor``: no sensor node sends the sensor that the message is for. ``reason`` is for people: what was got, what is
+    accepted, the remedy. ``sensor`` is the one that the message was about, if any.
     """
 
     routes = (("central", "sensor"), ("central", "application"), ("publisher", "application"))
@@ -294,13 +251,8 @@ class Refused(Message, frozen=True, kw_only=True):
 class Configure(Message, frozen=True, kw_only=True):
     """Request for new settings of a sensor, which the central node forwards. Payload: the settings as TOML.
 
-    Attributes
-    ----------
-    sensor : str
-    request_id : int
-        Random number, by which the answer is recognised.
-    max_bytes : int
-        Size of the largest measurement that the central node accepts, which fills it in; 0 from an admin.
+    The answer is recognised by ``request_id``, a random number. The central node fills in ``max_bytes``, the size of
+    the largest measurement that it accepts; it is 0 from an admin.
     """
 
     routes = (("admin", "central"), ("central", "sensor"))
@@ -314,15 +266,9 @@ class Configure(Message, frozen=True, kw_only=True):
 class Configured(Message, frozen=True, kw_only=True):
     """Answer to a `Configure`.
 
-    Attributes
-    ----------
-    sensor : str
-        As in the request.
-    request_id : int
-    sensors : tuple of str
-        Sensors with the new settings: those of the sensor node, at most 32. Empty if there are none.
-    error : str
-        Reason why the former settings are still in use; otherwise empty.
+    ``sensor`` and ``request_id`` are as in the request. ``sensors`` are those with the new settings, which are those of
+    the sensor node, at most 32; empty if there are none. ``error`` is the reason why the former settings are still in
+    use; otherwise empty.
     """
 
     routes = (("sensor", "central"), ("central", "admin"))
@@ -358,18 +304,8 @@ def encode(message: Message) -> bytes:
 def decode(header: "bytes | memoryview", wanted: Sequence[type[Message]] | None = None) -> Any:
     """Return the message of a header frame.
 
-    Parameters
-    ----------
-    header : bytes or memoryview
-    wanted : sequence of type, optional
-        Accepted messages; any by default.
-
-    Raises
-    ------
-    FormatVersionError
-        Another version sent the message.
-    DataError
-        The frame is not a header of this protocol, or not an accepted message.
+    ``wanted`` are the accepted messages; any by default. Raises FormatVersionError if another version sent the message;
+    or DataError if the frame is not a header of this protocol, or not an accepted message.
     """
     if len(header) > HEADER_BYTES:
         raise DataError(f"a header has {len(header)} bytes; the limit is {HEADER_BYTES}")

@@ -40,29 +40,14 @@ _NOW_OF_SENSOR: Final = {
 class Metrics:
     """Server of a central node's status as metrics, over HTTP and on this machine only.
 
-    Requests whose Host is not a loopback name or address are refused with 421.
+    Requests whose Host is not a loopback name or address are refused with 421. ``address`` is ``HOST:PORT``; port 0
+    selects a free one, and the attribute has the actual port once the server has started. ``latest`` returns the
+    status; other threads call it.
 
     ::
 
         with Metrics("127.0.0.1:9101", node.status):
             ...
-
-    Parameters
-    ----------
-    address : str
-        ``HOST:PORT``; port 0 selects a free one.
-    latest : callable
-        Returns the status. Other threads call it.
-
-    Attributes
-    ----------
-    address : str
-        ``HOST:PORT`` with the actual port, once the server has started.
-
-    Raises
-    ------
-    ArgumentError
-        Other machines can reach the address, or prometheus-client is not installed.
     """
 
     def __init__(self, address: str, latest: Callable[[], Status]) -> None:
@@ -78,13 +63,7 @@ class Metrics:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Start serving.
-
-        Raises
-        ------
-        NetworkError
-            The address is in use.
-        """
+        """Start serving."""
         from prometheus_client import CollectorRegistry, make_wsgi_app  # noqa: PLC0415  an extra
 
         from ertis_numba.network._metrics_server import Handler, Server  # noqa: PLC0415  only metrics need HTTP

@@ -10,10 +10,7 @@ __all__ = ["Owner"]
 class Owner:
     """Process that has opened an object. Its sockets and threads do not work in a fork, which would wait for ever.
 
-    Parameters
-    ----------
-    name : str
-        Name of the object in errors.
+    ``name`` is that of the object in errors.
     """
 
     def __init__(self, name: str) -> None:

@@ -26,15 +26,8 @@ PRODUCTS: Final[tuple[Product, ...]] = get_args(Product)
 class Subscribe(Message, frozen=True, kw_only=True):
     """An application subscribes to products; sent each second, and whenever it has consumed a product.
 
-    Attributes
-    ----------
-    sensors : tuple of str, optional
-        All by default.
-    products : tuple of {"energyscape", "points", "raw", "group", "status"}
-    consumed : int
-        Products that the application has taken since the connection was made.
-    credit : int
-        Number of further products that the publisher may send.
+    ``sensors`` are all by default. ``consumed`` counts the products that the application has taken since the connection
+    was made; ``credit`` is the number of further products that the publisher may send.
     """
 
     routes = (("application", "publisher"),)
@@ -49,13 +42,7 @@ class Description(Message, frozen=True, kw_only=True):
     """Sensor description, sent before the first product that refers to it.
 
     Payloads: settings as TOML, then azimuth, elevation and range as little-endian float64, which are empty for products
-    without such axes.
-
-    Attributes
-    ----------
-    number : int
-        Number by which products refer to it, until the connection ends.
-    sensor, translation_m, rotation_xyzw
+    without such axes. Products refer to it by ``number``, until the connection ends.
     """
 
     routes = (("publisher", "application"),)
@@ -80,12 +67,8 @@ class _Product(OfMeasurement, frozen=True, kw_only=True):
 class Image(_Product, frozen=True, kw_only=True):
     """An energyscape. Payloads: its amplitudes, little-endian, cut into frames.
 
-    Attributes
-    ----------
-    shape : (direction, range)
-    dtype : {"float32", "float16"}
-    received_ns, published_ns : int
-        Arrival of the measurement at the central node, and departure of the image, by a monotonic clock there.
+    ``shape`` is (direction, range). ``received_ns`` and ``published_ns`` are the arrival of the measurement at the
+    central node, and the departure of the image, by a monotonic clock there.
     """
 
     routes = (("publisher", "application"),)
@@ -101,11 +84,7 @@ class Image(_Product, frozen=True, kw_only=True):
 class Points(_Product, frozen=True, kw_only=True):
     """A point cloud. Payload: ``(point, 4)`` little-endian float32, each x, y, z in m and the amplitude.
 
-    Attributes
-    ----------
-    n_points : int
-    received_ns, published_ns : int
-        As in `Image`.
+    ``received_ns`` and ``published_ns`` are as in `Image`.
     """
 
     routes = (("publisher", "application"),)
@@ -118,13 +97,7 @@ class Points(_Product, frozen=True, kw_only=True):
 
 
 class Raw(_Product, frozen=True, kw_only=True):
-    """A measurement as received. Payload: its samples, little-endian.
-
-    Attributes
-    ----------
-    temperature_c, humidity_percent, pressure_pa : float
-    crc32 : int
-    """
+    """A measurement as received. Payload: its samples, little-endian."""
 
     routes = (("publisher", "application"),)
     payload = "samples"
@@ -139,21 +112,11 @@ class Raw(_Product, frozen=True, kw_only=True):
 class Group(Message, frozen=True, kw_only=True):
     """Simultaneous measurements, once all have arrived or no more are expected.
 
-    Attributes
-    ----------
-    number, dropped
-        As in `Image`.
-    group : int
-        Pulse of the SYNC chain, as all sensors count it.
-    members : tuple of (sensor, session_id, sequence)
-        Measurements that have arrived.
-    missing : tuple of str
-        Sensors without a measurement.
-    spread_ns : int
-        Time between the first and the last timestamp.
-    flags : tuple of {"incomplete", "clock", "pulse"}
-        Faults: sensors are missing; timestamps disagree although counters agree; a sensor has lost a pulse or seen one
-        twice.
+    ``number`` and ``dropped`` are as in `Image`. ``group`` is the pulse of the SYNC chain, as all sensors count it.
+    ``members`` are the measurements that have arrived, as (sensor, session_id, sequence), and ``missing`` the sensors
+    without one. ``spread_ns`` is the time between the first and the last timestamp. ``flags`` are faults:
+    ``incomplete``, sensors are missing; ``clock``, timestamps disagree although counters agree; ``pulse``, a sensor has
+    lost a pulse or seen one twice.
     """
 
     routes = (("publisher", "application"),)
@@ -176,10 +139,7 @@ class Group(Message, frozen=True, kw_only=True):
 class Report(Message, frozen=True, kw_only=True):
     """Status of the central node. Payload: `ertis_numba.network.status.Status` as MessagePack.
 
-    Attributes
-    ----------
-    number, dropped
-        As in `Image`; 0 in the answer to `AskStatus`.
+    ``number`` and ``dropped`` are as in `Image`; 0 in the answer to `AskStatus`.
     """
 
     routes = (("central", "application"), ("publisher", "application"))

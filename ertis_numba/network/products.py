@@ -34,20 +34,11 @@ _COLUMNS = 4  # Columns of a point: x, y, z and amplitude.
 class Arrival:
     """A received product.
 
-    Attributes
-    ----------
-    item : Energyscape, PointCloud, Measurement, Group or Status
-    header : Image, Points, Raw, Group or Report
-        As in `ertis_numba.network.messages`.
-    arrived_ns : int
-        Complete arrival, by the monotonic clock (`time.monotonic_ns`). A sensor node on this machine uses the same
-        clock for ``header.monotonic_ns``.
-    arrived_utc_ns : int
-        The same by the system clock.
-    connection : int
-        Number of the connection; product numbers count from 0 in each.
-    translation_m, rotation_xyzw
-        Mounting of the sensor on its platform; None if it is unknown.
+    ``item`` is an Energyscape, PointCloud, Measurement, Group or Status, and ``header`` its message in
+    `ertis_numba.network.messages`. ``arrived_ns`` is the complete arrival by the monotonic clock (`time.monotonic_ns`),
+    which a sensor node on this machine also uses for ``header.monotonic_ns``; ``arrived_utc_ns`` is the same by the
+    system clock. ``connection`` is the number of the connection; product numbers count from 0 in each.
+    ``translation_m`` and ``rotation_xyzw`` are the mounting of the sensor on its platform; None if it is unknown.
     """
 
     item: Item
@@ -117,10 +108,7 @@ class ProductReader:
     def describe(self, header: Description, payload: Payload) -> None:
         """Store a description for later products.
 
-        Raises
-        ------
-        DataError
-            The description cannot be used.
+        Raises DataError if the description cannot be used.
         """
         # Each change of settings brings a description. A connection that lasts for months must not keep them all.
         of_sensor = [number for number, kept in self._described.items() if kept.header.sensor == header.sensor]
@@ -136,10 +124,7 @@ class ProductReader:
     def read(self, header: Header, payload: Payload) -> Item:
         """Return the frame of a message.
 
-        Raises
-        ------
-        DataError
-            The payload contradicts its header, or has no description.
+        Raises DataError if the payload contradicts its header, or has no description.
         """
         return _DECODERS[type(header)](self, header, payload)
 

@@ -22,10 +22,7 @@ Pulse = TypeVar("Pulse")
 class PulseQueue(Generic[Pulse]):
     """Queue that keeps the latest pulses, or all of them while the application prepares; thread-safe.
 
-    Attributes
-    ----------
-    n_skipped : int
-        Pulses that were discarded.
+    ``n_skipped`` counts pulses that were discarded.
     """
 
     def __init__(self) -> None:
@@ -48,10 +45,7 @@ class PulseQueue(Generic[Pulse]):
     def take(self, timeout_s: float | None = None) -> Pulse | None:
         """Return the next pulse; None after ``timeout_s``, once the queue is closed, or after the last one.
 
-        Raises
-        ------
-        Exception
-            That of `fail`.
+        Raises the error of `fail`.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._failure or self._closed or self._ended, timeout_s)

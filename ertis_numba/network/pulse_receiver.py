@@ -30,14 +30,8 @@ _STOP_S: Final = 5.0
 class ReceivedPulse:
     """Images of a SYNC pulse, and the mountings of all sensors so far.
 
-    Attributes
-    ----------
-    images : mapping of str to Energyscape
-        Images by sensor.
-    mountings : mapping of str to (translation_m, rotation_xyzw)
-        Mountings by sensor, in the order in which they became known.
-    first_ns : int
-        Emission, by the monotonic clock of the sensor node.
+    ``images`` are by sensor. ``mountings`` are (translation_m, rotation_xyzw) by sensor, in the order in which they
+    became known. ``first_ns`` is the emission, by the monotonic clock of the sensor node.
     """
 
     images: Mapping[str, Energyscape]
@@ -68,32 +62,12 @@ class PulseReceiver:
     until up to three later pulses have begun, or until no image has come for 0.25 s. An application that is too slow
     gets the latest pulses. A sensor without a mounting, and one that sends images with NaN, is left out with a note.
 
-    Parameters
-    ----------
-    address : str
-        Address at which the central node publishes, ``tcp://HOST:PORT``.
-    mountings : mapping of str to (translation_m, rotation_xyzw), optional
-        Mountings by sensor instead of those that the central node sends.
-    sensors : sequence of str, optional
-        All by default.
-    keys : ClientKeys, optional
-        None on loopback only.
-    on_note : callable, optional
-        Called by a thread with a line for each change of the connection.
-    on_image : callable, optional
-        Called by the thread with each image that awaits others of its pulse, unless a pulse waits for `receive`.
-
-    Attributes
-    ----------
-    counts : SubscriberCounts
-        Counts of the images.
-    queue : PulseQueue
-        Pulses that wait for `receive`.
-
-    Raises
-    ------
-    ArgumentError
-        The address or a sensor cannot be used, or the address requires keys.
+    ``address`` is that at which the central node publishes, ``tcp://HOST:PORT``. ``mountings``, (translation_m,
+    rotation_xyzw) by sensor, replace those that the central node sends. ``sensors`` are all by default; ``keys`` are
+    None on loopback only. A thread calls ``on_note`` with a line for each change of the connection, and ``on_image``
+    with each image that awaits others of its pulse, unless a pulse waits for `receive`. ``counts`` are those of the
+    images; ``queue`` has pulses that wait for `receive`. Raises ArgumentError if the address or a sensor cannot be
+    used, or the address requires keys.
     """
 
     def __init__(
@@ -136,15 +110,8 @@ class PulseReceiver:
     def receive(self, timeout_s: float | None = None) -> ReceivedPulse | None:
         """Return the images of the next pulse; None after ``timeout_s``, or once the receiver is closed.
 
-        Parameters
-        ----------
-        timeout_s : float, optional
-            Time to wait; unlimited by default.
-
-        Raises
-        ------
-        RefusedError
-            The central node has refused this application from the start.
+        ``timeout_s`` is unlimited by default. Raises RefusedError if the central node has refused this application from
+        the start.
         """
         self._owner.require_this_process()
         group = self.queue.take(timeout_s)

@@ -27,12 +27,7 @@ class _Source(Protocol[Item_co]):
 
 
 class ResultSubscriber(ReceivingLoop[Item_co], Generic[Received, Item_co]):
-    """Application node that computes results from the items of a receiver.
-
-    Parameters
-    ----------
-    source : PulseReceiver or Subscriber
-    """
+    """Application node that computes results from the items of a receiver."""
 
     def __init__(self, source: _Source[Received]) -> None:
         self._source = source

@@ -75,26 +75,10 @@ def server(
 ) -> "zmq.Socket[bytes]":
     """Return a ROUTER that listens.
 
-    With keys, its context needs a `ertis_numba.network.zap_authenticator.ZapAuthenticator` made before.
-
-    Parameters
-    ----------
-    context : zmq.Context
-    endpoint : str
-    keys : ServerKeys or None
-        None on loopback only.
-    max_bytes : int
-        Longest frame. It also bounds the memory that an unauthenticated peer can occupy, so give no more than
-        necessary.
-    option : str
-        Option by which users give the address.
-
-    Raises
-    ------
-    ArgumentError
-        The address cannot be used, or requires keys.
-    NetworkError
-        Another program uses the address.
+    With keys, its context needs a `ertis_numba.network.zap_authenticator.ZapAuthenticator` made before. Without
+    ``keys``, it listens on loopback only. ``max_bytes``, the longest frame, also bounds the memory that an
+    unauthenticated peer can occupy, so give no more than necessary. ``option`` is that by which users give the address.
+    Raises ArgumentError if the address cannot be used, or requires keys; or NetworkError if another program uses it.
     """
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)
@@ -135,23 +119,9 @@ def client(
 ) -> "zmq.Socket[bytes]":
     """Return a DEALER that connects and reconnects; a `Monitor` of it reports failures.
 
-    It does not reconnect after a refusal: create a new one to try again.
-
-    Parameters
-    ----------
-    context : zmq.Context
-    endpoint : str
-    keys : ClientKeys or None
-        None on loopback only.
-    max_bytes : int
-        Longest frame.
-
-    Raises
-    ------
-    ArgumentError
-        The address cannot be used, or requires keys.
-    NetworkError
-        The address can never be connected to.
+    It does not reconnect after a refusal: create a new one to try again. Without ``keys``, it connects on loopback
+    only. ``max_bytes`` is the longest frame. Raises ArgumentError if the address cannot be used, or requires keys; or
+    NetworkError if it can never be connected to.
     """
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)
@@ -218,14 +188,8 @@ class _Events:
 class Monitor(_Events):
     """Monitor of a client's failed and interrupted connections.
 
-    Attributes
-    ----------
-    socket : zmq.Socket
-        Socket to poll; call `read` when it is readable.
-    n_disconnections : int
-        Number of connections that have ended, as far as read.
-    final : bool
-        The client has given up: only a new socket tries again.
+    Poll ``socket``, and call `read` when it is readable. ``n_disconnections`` counts connections that have ended, as
+    far as read. ``final`` is true if the client has given up: only a new socket tries again.
     """
 
     def __init__(self, client: "zmq.Socket[bytes]") -> None:

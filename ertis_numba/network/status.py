@@ -34,10 +34,7 @@ class Percentiles(msgspec.Struct, frozen=True, kw_only=True):
 class Latencies:
     """Collector of recent durations.
 
-    Parameters
-    ----------
-    size : int
-        Number of durations to keep.
+    ``size`` is the number of durations to keep.
     """
 
     def __init__(self, size: int = 1024) -> None:
@@ -180,13 +177,7 @@ class Status(msgspec.Struct, kw_only=True):
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
-        """Return the status from MessagePack.
-
-        Raises
-        ------
-        DataError
-            The content is not a status.
-        """
+        """Return the status from MessagePack."""
         try:
             return msgspec.msgpack.decode(data, type=cls)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:

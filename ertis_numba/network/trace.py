@@ -19,11 +19,6 @@ class TraceWriter:
     """Writer of one line per mark: stage, sensor, sequence and time; a killed process loses none.
 
     A mark that cannot be written, as on a full disk, is omitted, because the event loops of nodes write them.
-
-    Raises
-    ------
-    ArgumentError
-        The folder does not exist, or nothing can be written there.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -42,6 +42,10 @@ _AUTH: Final = int(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
 class ZapAuthenticator:
     """Handler that accepts listed keys and identifies the sender of a message.
 
+    Without ``keys``, every peer has all permissions. Poll ``socket``. ``refused`` counts connections and messages by
+    reason; callers add refused messages. ``note`` is the error of the allow list, which keeps all nodes out; empty if
+    there is none.
+
     ::
 
         gate = ZapAuthenticator(context, keys)          # before any server
@@ -50,28 +54,6 @@ class ZapAuthenticator:
         gate.self_test(sockets.bound(socket))
         # in the loop: gate.serve() when gate.socket is readable; gate.tick() several times a second;
         # gate.who(frames) for each message.
-
-    Parameters
-    ----------
-    context : zmq.Context
-    keys : ServerKeys or None
-        None if nodes have no keys; every peer then has all permissions.
-
-    Attributes
-    ----------
-    socket : zmq.Socket or None
-        Socket to poll.
-    refused : Counter of str
-        Refused connections and messages by reason; callers add refused messages.
-    note : str
-        Error of the allow list, which keeps all nodes out; empty if there is none.
-
-    Raises
-    ------
-    SettingsError
-        The allow list cannot be read or used.
-    ArgumentError
-        The context has an authenticator already.
     """
 
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: ServerKeys | None) -> None:
@@ -138,10 +120,7 @@ class ZapAuthenticator:
     def who(self, frames: Sequence[zmq.Frame]) -> Permission | None:
         """Return the current permissions of a message's sender; None, and counted, if there are none.
 
-        Parameters
-        ----------
-        frames : sequence of zmq.Frame
-            Frames from a ROUTER without copying: the routing id, then the message.
+        ``frames`` come from a ROUTER without copying: the routing id, then the message.
         """
         if not frames or was_chosen(frames[0].bytes):
             self.refused["chosen routing id"] += 1
@@ -198,15 +177,8 @@ class ZapAuthenticator:
     def self_test(self, endpoint: str) -> None:
         """Verify that connections with an unknown key, and without a key, are refused.
 
-        Parameters
-        ----------
-        endpoint : str
-            Address of a server in this context.
-
-        Raises
-        ------
-        NetworkError
-            A connection was accepted, or nothing answered.
+        ``endpoint`` is the address of a server in this context. Raises NetworkError if a connection was accepted, or
+        nothing answered.
         """
         if self._keys is None:
             return

@@ -61,16 +61,9 @@ _PEERS_OF_KEY: Final = 64
 
 
 class Unwanted(Exception):  # noqa: N818  it is an answer
-    """Refused message.
+    """Refused message, with a code of `ertis_numba.network.messages.Refused`.
 
-    Parameters
-    ----------
-    code : str
-        As in `ertis_numba.network.messages.Refused`.
-    reason : str
-        Reason for the sender, in one line.
-    kind : str
-        Category in the counts.
+    ``reason`` is one line for the sender, and ``kind`` the category in the counts.
     """
 
     def __init__(self, code: Any, reason: str, kind: str) -> None:
@@ -87,13 +80,7 @@ class Unwanted(Exception):  # noqa: N818  it is an answer
 class ReceivedMessage:
     """Sender and frames of a message.
 
-    Attributes
-    ----------
-    frames : list of zmq.Frame
-        Sender, header and payload.
-    who : Permission
-    arrived_ns : int
-        Time of arrival, by `time.monotonic_ns`.
+    ``frames`` are sender, header and payload; ``arrived_ns`` is the time of arrival by `time.monotonic_ns`.
     """
 
     frames: list[zmq.Frame]
@@ -112,13 +99,7 @@ class ReceivedMessage:
 
 
 def handlers_of(node: object) -> dict[type[Message], Callable[[Any, ReceivedMessage], None]]:
-    """Return the handlers of all messages to the central node: its methods ``_on_KIND``.
-
-    Raises
-    ------
-    TypeError
-        A message has no handler.
-    """
+    """Return the handlers of all messages to the central node: its methods ``_on_KIND``."""
     missing = [kind.kind() for kind in ACCEPTED if not hasattr(node, f"_on_{kind.kind()}")]
     if missing:
         raise TypeError(

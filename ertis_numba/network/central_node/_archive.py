@@ -43,23 +43,10 @@ _STUCK_S: Final = 5.0
 class Archive:
     """Storage of measurements in journals, which become recordings.
 
-    Parameters
-    ----------
-    folder : str or Path
-        Folder, created if it is missing. Only one archive can use it at a time.
-    name : str
-        Prefix of recording names, before the time.
-    rotate_bytes : float
-        Number of bytes of data and poses after which a recording is full.
-    rotate_s : float
-        Duration after which a recording is full.
-    seal : bool
-        Make recordings; False leaves the journals to ``ertis recover``.
-
-    Raises
-    ------
-    ArgumentError
-        The name cannot be a file name, or a number is invalid.
+    Only one archive can use ``folder`` at a time; it is created if it is missing. ``name`` is the prefix of recording
+    names, before the time. A recording is full after ``rotate_bytes`` of data and poses, or after ``rotate_s``. Without
+    ``seal``, journals are left to ``ertis recover``. Raises ArgumentError if the name cannot be a file name, or a
+    number is invalid.
     """
 
     def __init__(
@@ -96,14 +83,8 @@ class Archive:
     def open(self) -> int:
         """Open the folder, recover journals left by a crash, and return a descriptor to poll.
 
-        Call `read` when it is readable.
-
-        Raises
-        ------
-        JournalInUseError
-            Another process uses the folder, or a journal in it that this archive needs.
-        DataError
-            The folder is not writable, or its content cannot be read.
+        Call `read` when it is readable. Raises JournalInUseError if another process uses the folder, or a journal in it
+        that this archive needs.
         """
         try:
             make_folder(self.folder)

@@ -22,11 +22,7 @@ _Result = TypeVar("_Result")
 class Guarded:
     """Image processing whose errors are reported and cost measurements at most.
 
-    Parameters
-    ----------
-    images : ImageProcessing
-    on_error : callable
-        Called with the exception.
+    ``on_error`` is called with the exception.
     """
 
     def __init__(self, images: "ImageProcessing", on_error: Callable[[Exception], None]) -> None:

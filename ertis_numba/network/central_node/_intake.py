@@ -30,25 +30,9 @@ _NEVER: Final = "never reached the central node"
 class Intake:
     """Receiver of measurements from greeted nodes, each number once and in order.
 
-    Parameters
-    ----------
-    store : Archive or None
-        None if nothing is stored; accepted measurements are then acknowledged at once.
-    viewer : Guarded or None
-    send : callable
-        Called with a peer and a message to it.
-    notify : callable
-        Called with the name of an event and its fields.
-    on_stored : callable
-        Called with stored items.
-    max_bytes : int
-        Size of the largest accepted measurement.
-
-    Attributes
-    ----------
-    tracks : dict of str to SensorTrack
-    peers : dict of bytes to PeerConnection
-    acks : Acks
+    Without a ``store``, accepted measurements are acknowledged at once. ``send`` is called with a peer and a message to
+    it, ``notify`` with the name of an event and its fields, and ``on_stored`` with stored items. ``max_bytes`` is the
+    size of the largest accepted measurement. ``tracks`` are by sensor, ``peers`` by peer.
     """
 
     def __init__(
@@ -79,29 +63,15 @@ class Intake:
     def read(self, hello: Hello, payload: list[bytes]) -> JournalSensor:
         """Return the sensor of a hello; any thread may call this.
 
-        Raises
-        ------
-        Unwanted
-            The greeting cannot be accepted.
+        Raises Unwanted if the greeting cannot be accepted.
         """
         return source_in(hello, payload, max_bytes=self._max_bytes)
 
     def greet(self, peer_id: bytes, hello: Hello, source: JournalSensor, key: str = "") -> Stream:
         """Accept a hello, and return the session.
 
-        Parameters
-        ----------
-        peer_id : bytes
-        hello : Hello
-        source : JournalSensor
-            Sensor from `read`.
-        key : str
-            Key of the peer; the number of peers per key is limited more strictly than the number of peers.
-
-        Raises
-        ------
-        Unwanted
-            The hello cannot be accepted.
+        ``source`` is the sensor from `read`. The number of peers per ``key`` is limited more strictly than the number
+        of peers. Raises Unwanted if the hello cannot be accepted.
         """
         run = SensorSession(hello.sensor, hello.session_id)
         peer = self.peers.get(peer_id)
@@ -160,10 +130,7 @@ class Intake:
     def measure(self, peer_id: bytes, data: Data, payload: list[memoryview], arrived_ns: int) -> None:
         """Accept a measurement.
 
-        Raises
-        ------
-        Unwanted
-            The measurement cannot be accepted.
+        Raises Unwanted if the measurement cannot be accepted.
         """
         stream = self._stream(peer_id, data)
         mark("arrived", data.sensor, data.sequence)
@@ -214,13 +181,7 @@ class Intake:
         self._wait(item, stream)
 
     def miss(self, peer_id: bytes, gap: Gap) -> None:
-        """Register missing numbers.
-
-        Raises
-        ------
-        Unwanted
-            The gap cannot be accepted.
-        """
+        """Register missing numbers."""
         stream = self._stream(peer_id, gap)
         self._reach(stream)
         if gap.last <= stream.taken or gap.first > stream.taken + 1:

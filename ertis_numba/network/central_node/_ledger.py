@@ -86,31 +86,11 @@ class Ledger:
     The file has a line for each entry: its CRC-32 in hexadecimal, and the entry as a JSON array. The reader omits
     entries with a wrong CRC-32. The file keeps only the newest 64 sessions of each sensor.
 
-    Parameters
-    ----------
-    folder : Path
-
-    Attributes
-    ----------
-    is_new : bool
-        The file did not exist.
-    damage : str
-        Omitted entries, and the consequence; empty if the file is sound.
-    acked_through : dict of SensorSession to int
-        The session that grew last comes last.
-    open, unsealed : list of str
-        Names of journals that may contain more than ``acked_through``, and of those to seal.
-    gaps : list of SequenceGap
-        Missing numbers that no recording contains yet.
-    tails : dict of SensorSession to dict of int to int
-        CRC-32 of the newest measurements of sessions, by number.
-
-    Raises
-    ------
-    DataError
-        The file cannot be read.
-    FormatVersionError
-        A newer version wrote it.
+    ``is_new`` is true if the file did not exist; ``damage`` describes omitted entries and the consequence, and is empty
+    if the file is sound. In ``acked_through``, the session that grew last comes last. ``open`` and ``unsealed`` are
+    names of journals that may contain more than ``acked_through``, and of those to seal. ``gaps`` are missing numbers
+    that no recording contains yet. ``tails`` has the CRC-32 of the newest measurements of sessions, by number. Raises
+    DataError if the file cannot be read, or FormatVersionError if a newer version wrote it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -265,15 +245,7 @@ _LINES: Final[msgspec.json.Decoder[_Line]] = msgspec.json.Decoder(_Line)
 
 
 class Lock:
-    """Lock of a folder for one process; it ends with the process.
-
-    Raises
-    ------
-    JournalInUseError
-        Another process has locked the folder.
-    DataError
-        The folder is not writable.
-    """
+    """Lock of a folder for one process; it ends with the process."""
 
     def __init__(self, folder: Path) -> None:
         path = folder / _LOCK
@@ -303,10 +275,7 @@ class Lock:
 def read_acked_through(recordings: Iterable[Path]) -> dict[SensorSession, int]:
     """Return the highest acknowledged number of each session in recordings, read by a separate process.
 
-    Raises
-    ------
-    DataError
-        A recording cannot be read.
+    Raises DataError if a recording cannot be read.
     """
     paths = list(recordings)
     acked_through: dict[SensorSession, int] = {}

@@ -68,33 +68,14 @@ _FINISH_S: Final = 5.0
 class CentralNode:
     """Receiver of sensor nodes' measurements; use it in a ``with`` statement, and call `run`.
 
-    Parameters
-    ----------
-    listen : str
-        Address for sensor nodes, ``tcp://HOST:PORT``.
-    keys : ServerKeys, optional
-        Required for addresses that other machines can reach.
-    archive : Archive, optional
-        Storage of measurements; acks then confirm storage.
-    processing : ImageProcessing, optional
-        Processing of measurements into images.
-    max_bytes : int
-        Size of the largest accepted measurement.
-    window : int
-        Limit on unacknowledged measurements of a session.
-    on_event : callable, optional
-        Called with each event, a dict with the key ``event``: listening, joined, left, fault, resumed, sealed,
-        unsealed, conflict, configure (an admin changes settings), refused, shared (two nodes send one sensor), keys
-        (state of the allow list), internal (an internal error).
-    on_stored : callable, optional
-        Called with stored measurements: sensor, session_id, sequence and CRC-32 of each.
-
-    Attributes
-    ----------
-    address : str
-        Actual address, in the form that nodes on this machine use.
-    latest : Status
-        Recent status, for threads other than that of `run`.
+    ``listen`` is the address for sensor nodes, ``tcp://HOST:PORT``; addresses that other machines can reach require
+    ``keys``. With an ``archive``, acks confirm storage; with ``processing``, measurements become images. ``max_bytes``
+    is the size of the largest accepted measurement, and ``window`` limits the unacknowledged measurements of a session.
+    ``on_event`` is called with each event, a dict with the key ``event``: listening, joined, left, fault, resumed,
+    sealed, unsealed, conflict, configure (an admin changes settings), refused, shared (two nodes send one sensor), keys
+    (state of the allow list), internal (an internal error). ``on_stored`` is called with sensor, session_id, sequence
+    and CRC-32 of each stored measurement. ``address`` is the actual address, in the form that nodes on this machine
+    use; ``latest`` is a recent status, for threads other than that of `run`.
     """
 
     def __init__(
@@ -201,15 +182,8 @@ class CentralNode:
     def run(self, duration_s: float | None = None) -> None:
         """Receive measurements until `stop` is called, and then wait until they are on disk.
 
-        Parameters
-        ----------
-        duration_s : float, optional
-            Longest time in seconds.
-
-        Raises
-        ------
-        ArgumentError
-            The central node is not open, or the time is not above zero.
+        ``duration_s`` is the longest time. Raises ArgumentError if the central node is not open, or the time is not
+        above zero.
         """
         if not self._server.is_open and not self._stopping.is_set():
             raise ArgumentError("the central node is not open; use it in a with statement")

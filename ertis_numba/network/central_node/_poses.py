@@ -33,10 +33,6 @@ class PoseIntake:
     """Receiver of poses. Each sensor has one sender at a time, until this sender has been silent for some seconds.
 
     The session identifies a sender, because a sender that connects again is another peer.
-
-    Parameters
-    ----------
-    store : Archive or None
     """
 
     def __init__(self, store: Archive | None) -> None:
@@ -44,13 +40,7 @@ class PoseIntake:
         self._senders: dict[int, _Sender] = {}  # By session.
 
     def add(self, peer_id: bytes, pose: PlatformPose, who: Permission) -> None:
-        """Queue a pose to be stored.
-
-        Raises
-        ------
-        Unwanted
-            The pose cannot be accepted.
-        """
+        """Queue a pose to be stored."""
         if self._store is None:
             raise Unwanted(
                 "message",

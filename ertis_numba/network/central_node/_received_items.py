@@ -34,24 +34,11 @@ class SensorSession(NamedTuple):
 class ReceivedItem:
     """Item to store.
 
-    Attributes
-    ----------
-    run : SensorSession
-    first, last : int
-        Numbers acknowledged once it is stored.
-    content : JournalEntry or SequenceGap
-    source : JournalSensor
-        Sensor for the journal.
-    arrived_s : float
-        Time of arrival, by `time.monotonic`.
-    owner : bytes
-        Peer that sent it.
-    turn : int
-        Number of the transmission: rises if a session has to be sent again, which invalidates earlier items.
-    again : bool
-        The number was acknowledged before: stored only if the measurement differs.
-    done : bool
-        True if the result of the item was reported.
+    ``first`` to ``last`` are the numbers acknowledged once it is stored, and ``source`` is the sensor for the journal.
+    It came from the peer ``owner`` at ``arrived_s``, by `time.monotonic`. ``turn``, the number of the transmission,
+    rises if a session has to be sent again, which invalidates earlier items. ``again`` is true if the number was
+    acknowledged before: the item is stored only if the measurement differs. ``done`` is true if the result of the item
+    was reported.
     """
 
     run: SensorSession

@@ -29,24 +29,8 @@ _LOG_INTERVAL_S: Final = 1.0  # Interval between events about internal errors.
 class Condition:
     """State and status of a central node.
 
-    Parameters
-    ----------
-    listen : str
-        Requested address.
-    server_socket : ServerSocket
-    intake : Intake
-    archive : Archive or None
-    images : Guarded or None
-    keys : bool
-        True if the node has keys.
-
-    Attributes
-    ----------
-    begun_s : float
-        Time of opening, by `time.monotonic`.
-    fault : str
-        Latest error of the archive; empty while it can store.
-    closing : bool
+    ``listen`` is the requested address, and ``keys`` is true if the node has keys. ``begun_s`` is the time of opening
+    by `time.monotonic`. ``fault`` is the latest error of the archive; empty while it can store.
     """
 
     def __init__(
@@ -129,12 +113,8 @@ def _memory_bytes() -> int:
 class EventReporter:
     """Reporter of changes as events.
 
-    Parameters
-    ----------
-    on_event : callable
-        Called with each event.
-    on_stored : callable, optional
-        Called with sensor, session_id, sequence and CRC-32 of stored measurements.
+    ``on_event`` is called with each event, and ``on_stored`` with sensor, session_id, sequence and CRC-32 of stored
+    measurements.
     """
 
     def __init__(

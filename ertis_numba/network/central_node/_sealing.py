@@ -35,17 +35,8 @@ _SHARE: Final = 0.25
 class Sealing:
     """Thread that seals one journal after the other, each in a separate process.
 
-    Parameters
-    ----------
-    on_sealed : callable
-        Called in the thread.
-    on_failed : callable
-        Called in the thread with a line on the reason.
-
-    Attributes
-    ----------
-    sealed, failed, set_aside : int
-        Counts so far.
+    Both functions are called in the thread, ``on_failed`` with a line on the reason. ``sealed``, ``failed`` and
+    ``set_aside`` are counts so far.
     """
 
     def __init__(self, on_sealed: Callable[[SealingResult], None], on_failed: Callable[[str], None]) -> None:

@@ -22,14 +22,7 @@ _LINGER_MS: Final = 500
 class ServerSocket:
     """Socket that receives messages of listed keys; never blocks.
 
-    Parameters
-    ----------
-    keys : ServerKeys or None
-
-    Attributes
-    ----------
-    address : str
-        Actual address, in the form that nodes on this machine use.
+    ``address`` is the actual address, in the form that nodes on this machine use.
     """
 
     def __init__(self, keys: ServerKeys | None) -> None:
@@ -124,10 +117,7 @@ class ServerSocket:
     def send(self, peer_id: bytes, message: Message, *payload: bytes) -> bool:
         """Send a message if possible without blocking; important messages are repeated.
 
-        Returns
-        -------
-        bool
-            False if the peer is gone.
+        Returns False if the peer is gone.
         """
         if self._socket is None:
             return True

@@ -18,10 +18,7 @@ _PREFIX: Final = "no image could be computed from measurements with them: "
 class SettingsCheck:
     """Checker of the settings in requests, in the order of the requests.
 
-    Parameters
-    ----------
-    require : callable
-        Called in the thread with settings; raises an ArgumentError if they cannot be used.
+    ``require`` is called in the thread with settings; it raises an ArgumentError if they cannot be used.
     """
 
     def __init__(self, require: Callable[[Settings], None]) -> None:

@@ -32,18 +32,8 @@ _DROPS: Final = 32  # Limit on the drops in one ack.
 def source_of(hello: Hello, text: bytes, *, max_bytes: int) -> JournalSensor:
     """Return the sensor of a hello.
 
-    Parameters
-    ----------
-    hello : Hello
-    text : bytes
-        Settings as TOML.
-    max_bytes : int
-        Size of the largest accepted measurement.
-
-    Raises
-    ------
-    ArgumentError
-        The settings cannot be used.
+    ``text`` has the settings as TOML; ``max_bytes`` is the size of the largest accepted measurement. Raises
+    ArgumentError if the settings cannot be used.
     """
     return _source(hello.sensor, text, hello.firmware, hello.translation_m, hello.rotation_xyzw, max_bytes)
 
@@ -148,23 +138,11 @@ def _median_interval_s(times_s: Sequence[float]) -> float:
 class Stream:
     """A greeted session.
 
-    Attributes
-    ----------
-    run : SensorSession
-    source : JournalSensor
-    track : SensorTrack
-    acked_through, taken : int
-        Number up to which everything is acknowledged, and will be once the waiting items are stored.
-    begins : int
-        Oldest number that the node has.
-    owner : bytes
-        Peer that sent the latest hello.
-    shown : int
-        Number up to which measurements were counted and shown; repeated ones are not shown again.
-    turn : int
-        Number of the current transmission; see `ReceivedItem`.
-    dropped : deque of (sequence, reason)
-        Latest measurements discarded by processing and not yet reported to the node.
+    Everything is acknowledged up to ``acked_through``, and will be up to ``taken`` once the waiting items are stored.
+    ``begins`` is the oldest number that the node has, and ``owner`` the peer that sent the latest hello. Measurements
+    up to ``shown`` were counted and shown; repeated ones are not shown again. ``turn`` is the number of the current
+    transmission; see `ReceivedItem`. ``dropped`` has the latest measurements discarded by processing and not yet
+    reported to the node, as (sequence, reason).
     """
 
     run: SensorSession
@@ -189,10 +167,7 @@ class Stream:
     def settings(self, data: Data) -> Settings:
         """Return the settings of a measurement.
 
-        Raises
-        ------
-        ArgumentError
-            The air is impossible.
+        Raises ArgumentError if the air is impossible.
         """
         air = (data.temperature_c, data.humidity_percent, data.pressure_pa)
         if self._air is None or self._air[0] != air:
@@ -216,15 +191,8 @@ class Stream:
 class PeerConnection:
     """Connection of a sensor node.
 
-    Attributes
-    ----------
-    streams : dict of SensorSession to Stream
-    heard_s : float
-        Time of its last message, by `time.monotonic`.
-    waiting_bytes : int
-        Bytes from it that wait for the disk.
-    key : str
-        Key of the sensor node; empty without keys.
+    ``heard_s`` is the time of its last message, by `time.monotonic`; ``waiting_bytes`` from it wait for the disk.
+    ``key`` is empty without keys.
     """
 
     streams: dict[SensorSession, Stream] = field(default_factory=dict)
@@ -236,17 +204,8 @@ class PeerConnection:
 class Acks:
     """Pending acks, one per session for any number of measurements.
 
-    Parameters
-    ----------
-    send : callable
-        Called with a peer and a message to it.
-    status : {"stored", "accepted"}
-        Place of acknowledged measurements: on disk, or in memory.
-
-    Attributes
-    ----------
-    latencies : Latencies
-        Time from the arrival of a measurement to its ack.
+    ``send`` is called with a peer and a message to it. ``status`` is the place of acknowledged measurements: ``stored``
+    on disk, or ``accepted`` in memory. ``latencies`` are times from the arrival of a measurement to its ack.
     """
 
     def __init__(self, send: Callable[[bytes, Message], object], status: Literal["stored", "accepted"]) -> None:
@@ -293,10 +252,7 @@ class Acks:
 class Sharing:
     """Detector of sensors that several nodes send; reports each once.
 
-    Parameters
-    ----------
-    notify : callable
-        Called with the name of an event and its fields.
+    ``notify`` is called with the name of an event and its fields.
     """
 
     def __init__(self, notify: Callable[..., None]) -> None:

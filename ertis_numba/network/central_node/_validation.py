@@ -23,16 +23,8 @@ MAX_WAITING_BYTES: Final = 64_000_000
 class Greeting:
     """Hello message, with its result.
 
-    Attributes
-    ----------
-    frames : list of zmq.Frame
-        Frames of the message, by which the authenticator identifies its sender again.
-    hello : Hello
-    payload : list of bytes
-    key : str
-        Public key of the peer; empty without keys.
-    result : JournalSensor or Exception
-        Sensor of the settings, or the error.
+    The authenticator identifies its sender again by ``frames``. ``key`` is the public key of the peer; empty without
+    keys. ``result`` is the sensor of the settings, or the error.
     """
 
     frames: list[zmq.Frame]
@@ -55,10 +47,7 @@ class Greeting:
 class Greetings:
     """Reader of the settings in Hello messages, one at a time; peers take turns.
 
-    Parameters
-    ----------
-    read : callable
-        Called in the thread with the message and its payload; returns the sensor or raises an error.
+    ``read`` is called in the thread with the message and its payload; it returns the sensor or raises an error.
     """
 
     def __init__(self, read: Callable[[Hello, list[bytes]], JournalSensor]) -> None:
@@ -92,13 +81,7 @@ class Greetings:
             self._wakeup_socket = None
 
     def offer(self, greeting: Greeting) -> None:
-        """Queue a greeting; never blocks.
-
-        Raises
-        ------
-        Unwanted
-            The queue is full.
-        """
+        """Queue a greeting; never blocks."""
         with self._change:
             waiting = self._waiting.setdefault(greeting.peer_id, deque())
             if len(waiting) >= MAX_WAITING_OF_PEER or self._bytes + greeting.n_bytes > MAX_WAITING_BYTES:

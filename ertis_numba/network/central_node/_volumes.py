@@ -46,25 +46,11 @@ def sessions_in(journal: Journal) -> dict[SensorSession, int]:
 
 
 class Volume:
-    """Journal in use.
+    """Journal in use, owned by this object.
 
-    Parameters
-    ----------
-    journal : Journal
-        Owned by this object.
-
-    Attributes
-    ----------
-    acked : dict of SensorSession to int
-        Highest number of each session that `append` or `note_gaps` has stored.
-    n_bytes : int
-        Bytes of data and poses in it.
-    begun_s : float
-        Time of opening, by `time.monotonic`.
-    next_pose : int
-        First number of `RecentPoses` that it lacks; 0 before any.
-    posed : frozenset of str
-        Sensors of which it has the poses before `next_pose`.
+    ``acked`` has the highest number of each session that `append` or `note_gaps` has stored. ``n_bytes`` counts data
+    and poses in it. ``begun_s`` is the time of opening, by `time.monotonic`. ``next_pose`` is the first number of
+    `RecentPoses` that it lacks; 0 before any. ``posed`` are the sensors of which it has the poses before `next_pose`.
     """
 
     def __init__(self, journal: Journal) -> None:
@@ -104,10 +90,7 @@ class Volume:
     def append(self, items: list[ReceivedItem]) -> None:
         """Store measurements or gaps durably, all or none; see `Journal.append`.
 
-        Parameters
-        ----------
-        items : list of ReceivedItem
-            Either measurements or gaps.
+        ``items`` are either measurements or gaps.
         """
         for item in items:
             self._add(item.source)
@@ -173,10 +156,7 @@ def same(one: JournalSensor, other: JournalSensor) -> bool:
 class Checksums:
     """CRC-32 of the newest measurements by session and number.
 
-    Parameters
-    ----------
-    tails : mapping of SensorSession to dict of int to int
-        CRC-32 by session and number, from earlier processes.
+    ``tails`` has those from earlier processes.
     """
 
     def __init__(self, tails: Mapping[SensorSession, Mapping[int, int]]) -> None:
@@ -214,10 +194,6 @@ class UnrecordedGaps:
 
     The next recording with a measurement of the sensor contains them. Until then the ledger keeps them, so that the
     reasons for missing numbers are never lost. A gap that is recorded twice, after a crash, is harmless.
-
-    Parameters
-    ----------
-    gaps : iterable of SequenceGap
     """
 
     def __init__(self, gaps: Iterable[SequenceGap]) -> None:

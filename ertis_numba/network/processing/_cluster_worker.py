@@ -31,14 +31,8 @@ _chains: "OrderedDict[tuple[str, str, str], SharedPipeline]" = OrderedDict()
 class ClusterResult:
     """Result of processing a measurement.
 
-    Attributes
-    ----------
-    image : (direction, range) float32 or float16
-    points : (point, 4) float32
-        Empty unless points were requested.
-    took_s : float
-    worker : str
-        Address of the worker.
+    ``image`` is (direction, range) float32 or float16. ``points`` is (point, 4) float32, empty unless points were
+    requested. ``worker`` is the address of the worker.
     """
 
     image: NDArray[Any]

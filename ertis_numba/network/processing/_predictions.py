@@ -23,10 +23,7 @@ _EVENTS: Final[dict["Subject", Literal["call_mismatch", "start_mismatch", "layou
 class Predictions:
     """Checks of some measurements of sensors, one at a time.
 
-    Attributes
-    ----------
-    busy : bool
-        True while a prediction is not finished, or not yet drained.
+    ``busy`` is true while a prediction is not finished, or not yet drained.
     """
 
     def __init__(self, device: str) -> None:

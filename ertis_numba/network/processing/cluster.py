@@ -68,25 +68,9 @@ class Cluster:
     throughput. A worker that misses the deadline, or whose connection breaks, gets no jobs until it is reached again.
     Anyone who reaches a scheduler can run code on its workers: keep it among trusted machines, or use dask's TLS.
 
-    Parameters
-    ----------
-    options : ProcessingOptions
-        Deadlines, device, type of images, and the scheduler's address ``cluster``.
-    log : callable
-        Called with a line for each event.
-
-    Attributes
-    ----------
-    choice : str
-    respawned : int
-        Workers that have left, or did not answer.
-
-    Raises
-    ------
-    DeviceError
-        dask.distributed is not installed.
-    NetworkError
-        No scheduler answers.
+    ``options`` has deadlines, device, type of images, and the scheduler's address ``cluster``. ``log`` is called with a
+    line for each event. ``respawned`` counts workers that have left, or did not answer. Raises DeviceError if
+    dask.distributed is not installed, or NetworkError if no scheduler answers.
     """
 
     def __init__(self, options: ProcessingOptions, log: Callable[[str], None]) -> None:

@@ -52,12 +52,8 @@ class Groups:
     clock. A system clock that is set by an hour therefore moves no measurement into another group. If a timestamp is
     impossible, the time of arrival counts: it lies in the future, or long ago although no older measurements are being
     caught up with. A count that contradicts the time is aligned again, like that of a new session. Wrong data of one
-    sensor never moves groups of others.
-
-    Attributes
-    ----------
-    closed : Counter of str
-        Groups by ``complete``, or their flags; ``measurement too late`` counts measurements of closed groups.
+    sensor never moves groups of others. ``closed`` counts groups by ``complete``, or their flags; its ``measurement too
+    late`` counts measurements of closed groups.
     """
 
     def __init__(self) -> None:

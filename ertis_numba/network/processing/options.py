@@ -19,42 +19,16 @@ __all__ = ["ProcessingOptions"]
 class ProcessingOptions:
     """Options of image processing.
 
-    Attributes
-    ----------
-    publish : str
-        Address for applications.
-    keys : ServerKeys, optional
-        None on loopback only.
-    processing : dict
-        Fields of `ertis_numba.settings.Processing` that override a sensor's own.
-    max_error_db : float, optional
-        Error budget of images; the sensor's own by default.
-    without : ExcludedChannels
-        Channels to exclude, of all sensors or of some; none by default.
-    device : {"auto", "cpu", "cuda", "numpy"}
-    plan : {"nominal", "measured"}
-        Costs by which plans are chosen, as for `ertis_numba.Pipeline`.
-    workers : int, optional
-        Number of processes; by default one for each core, or one for a GPU.
-    threads : int, optional
-        Threads of all workers together; all cores by default.
-    deadline_s : float
-        Timeout of a measurement, after which its worker is killed.
-    prepare_s : float
-        Timeout of preparing for a sensor, the compilation of kernels included.
-    dtype : {"float32", "float16"}
-        Type of published images.
-    quarantine : Path, optional
-        Folder of the dead-letter queue, for measurements that made two workers fail.
-    expected : Settings, optional
-        Settings of a likely sensor: workers prepare for it in advance.
-    cluster : str, optional
-        Address of a dask scheduler whose workers replace local ones.
-
-    Raises
-    ------
-    ArgumentError
-        An option cannot be used, or the file of the directions cannot be read.
+    ``publish`` is the address for applications; ``keys`` are None on loopback only. ``processing`` has fields of
+    `ertis_numba.settings.Processing` that override a sensor's own. ``max_error_db`` is the error budget of images; the
+    sensor's own by default. ``without`` excludes channels, of all sensors or of some. ``plan`` selects the costs by
+    which plans are chosen, as for `ertis_numba.Pipeline`. ``workers`` is the number of processes: by default one for
+    each core, or one for a GPU; ``threads`` is that of all workers together, all cores by default. ``deadline_s`` is
+    the timeout of a measurement, after which its worker is killed; ``prepare_s`` is that of preparing for a sensor, the
+    compilation of kernels included. ``dtype`` is the type of published images. ``quarantine`` is the folder of the
+    dead-letter queue, for measurements that made two workers fail. Workers prepare in advance for ``expected``, the
+    settings of a likely sensor. ``cluster`` is the address of a dask scheduler whose workers replace local ones. Raises
+    ArgumentError if an option cannot be used, or the file of the directions cannot be read.
     """
 
     publish: str = DEFAULT_PUBLISH
@@ -91,10 +65,7 @@ class ProcessingOptions:
     def applied(self, settings: Settings, sensor: str = "") -> Settings:
         """Return a sensor's settings with these options applied.
 
-        Raises
-        ------
-        ArgumentError
-            The result cannot be used.
+        Raises ArgumentError if the result cannot be used.
         """
         settings = self.without.applied(settings, sensor)
         if self.processing:

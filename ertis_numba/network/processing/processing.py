@@ -57,18 +57,8 @@ class ImageProcessing:
 
     It runs in the event loop of the intake: poll `fds`, call `ready` for each readable one, and `tick` at least ten
     times a second. These calls wait for no other process and no disk. They take the time of copying a measurement, or
-    some milliseconds to start a process.
-
-    Parameters
-    ----------
-    options : ProcessingOptions
-    log : EventLog, optional
-        Log of failures; the package's own by default.
-
-    Attributes
-    ----------
-    address : str
-        Address for applications.
+    some milliseconds to start a process. ``log`` gets failures; it is the package's own by default. ``address`` is that
+    for applications.
     """
 
     def __init__(self, options: ProcessingOptions, log: EventLog | None = None) -> None:
@@ -104,15 +94,8 @@ class ImageProcessing:
     def start(self, stopping: Callable[[], bool] = lambda: False) -> None:
         """Start the processes; applications can subscribe when this returns.
 
-        Parameters
-        ----------
-        stopping : callable, optional
-            Polled five times a second; once it returns True, this returns without waiting for the processes.
-
-        Raises
-        ------
-        NetworkError
-            The address cannot be listened at.
+        ``stopping`` is polled five times a second; once it returns True, this returns without waiting for the
+        processes. Raises NetworkError if the address cannot be listened at.
         """
         try:
             self._runner = _runner(self._options, self._log)
@@ -128,10 +111,8 @@ class ImageProcessing:
     def require_usable(self, settings: Settings) -> None:
         """Refuse settings from which no image can be computed; any thread may call this.
 
-        Raises
-        ------
-        ArgumentError
-            The image would be too large, the ranges lie outside the record, or the last stage yields no image.
+        Raises ArgumentError if the image would be too large, the ranges lie outside the record, or the last stage
+        yields no image.
         """
         applied = self._options.applied(settings)
         if applied.processing.mode != "passive":
@@ -145,13 +126,8 @@ class ImageProcessing:
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
         """Accept a measurement, and count it until it is published or dropped.
 
-        Parameters
-        ----------
-        data : Data
-        words : array
-            Samples as bytes. They are not copied, and must not change.
-        arrived_ns : int
-            Time of `time.monotonic_ns`.
+        ``words`` are samples as bytes; they are not copied, and must not change. ``arrived_ns`` is a time of
+        `time.monotonic_ns`.
         """
         kind = self._sensors.kind_of(data)
         self._emit_event(self._groups.add(data, arrived_ns))

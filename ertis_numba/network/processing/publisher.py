@@ -37,19 +37,8 @@ _CLOSED_S: Final = 2.0
 class Publisher:
     """Process that sends products to applications.
 
-    Parameters
-    ----------
-    options : ProcessingOptions
-    log : EventLog
-        Log of failures.
-
-    Attributes
-    ----------
-    address : str
-        Address for applications; it stays the same after a restart.
-    subscribers : tuple of SubscriberStatus
-    refused : dict of str to int
-        Refused messages and keys, by reason.
+    ``log`` gets failures. ``address`` is that for applications; it stays the same after a restart. ``refused`` counts
+    messages and keys by reason.
     """
 
     def __init__(self, options: ProcessingOptions, log: EventLog) -> None:
@@ -69,13 +58,7 @@ class Publisher:
         self._reports_sent = self._reports_taken = 0
 
     def start(self, stopping: Callable[[], bool] = lambda: False) -> None:
-        """Start the process, and wait until it listens or ``stopping`` returns True.
-
-        Raises
-        ------
-        NetworkError
-            It cannot listen there.
-        """
+        """Start the process, and wait until it listens or ``stopping`` returns True."""
         self._begin()
         end_s = time.monotonic() + _STARTED_S
         while (child := self._process.child) is not None and not self._serves and not stopping():

@@ -20,21 +20,10 @@ SUPERSEDED: Final = "superseded"
 class ProcessingCounts:
     """Counts of one sensor's measurements.
 
-    ``received = published + sum(dropped.values()) + in_flight`` at any time.
-
-    Attributes
-    ----------
-    received, published : int
-    passive : int
-        Published measurements without a call, of which no image was made.
-    dropped : Counter of str
-        By reason.
-    in_flight : int
-        Waiting, in a worker, or with the publisher.
-    queue : int
-        Those of them that wait for a worker.
-    times : Latencies
-        From the arrival of a measurement to the publication of its image.
+    ``received = published + sum(dropped.values()) + in_flight`` at any time. ``passive`` counts published measurements
+    without a call, of which no image was made, and ``dropped`` counts by reason. ``in_flight`` measurements wait, or
+    are in a worker or with the publisher; ``queue`` of them wait for a worker. ``times`` are from the arrival of a
+    measurement to the publication of its image.
     """
 
     received: int = 0
@@ -54,12 +43,8 @@ class ProcessingCounts:
 class Queues:
     """Waiting measurements, at most two per sensor, served in turn.
 
-    Attributes
-    ----------
-    counts : dict of str to SensorCounts
-        By sensor.
-    dropped : deque of (sensor, session_id, sequence, reason)
-        Latest drops, removed when they are reported.
+    ``counts`` are by sensor. ``dropped`` has the latest drops as (sensor, session_id, sequence, reason), removed when
+    they are reported.
     """
 
     def __init__(self) -> None:

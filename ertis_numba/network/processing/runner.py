@@ -20,13 +20,7 @@ __all__ = ["Event", "FinishedJob", "Job", "JobKind", "KindFailed", "KindReady", 
 class JobKind:
     """Measurements that one pipeline can process, or measurements of which no image is made.
 
-    Attributes
-    ----------
-    number : int
-    settings : str
-        Settings of the pipeline as TOML; empty without one.
-    words_bytes : int
-        Size of a measurement.
+    ``settings`` are those of the pipeline as TOML; empty without one. ``words_bytes`` is the size of a measurement.
     """
 
     number: int
@@ -38,25 +32,11 @@ class JobKind:
 class Job:
     """A measurement to process.
 
-    Attributes
-    ----------
-    number : int
-    data : Data
-    words : array
-        Contiguous bytes, kept until the image is done for a second try.
-    kind : JobKind
-    arrived_ns : int
-        Time of arrival by a monotonic clock.
-    points : bool
-        True if an application subscribes to the points.
-    tries : int
-        Number of failed tries.
-    predict : bool
-        Predict the error of the image, and log a warning if images may exceed the budget.
-    check_sound : bool
-        Compare the sound with the settings, and log a warning if it contradicts them.
-    slot : Slot, optional
-        Slot of samples and image, once it is `FinishedJob`; release it afterwards.
+    ``words`` are contiguous bytes, kept until the image is done for a second try. ``arrived_ns`` is by a monotonic
+    clock. ``points`` is true if an application subscribes to the points, and ``tries`` counts failed tries. ``predict``
+    predicts the error of the image, and logs a warning if images may exceed the budget; ``check_sound`` compares the
+    sound with the settings, and logs a warning if it contradicts them. ``slot`` has samples and image once it is
+    `FinishedJob`; release it afterwards.
     """
 
     number: int
@@ -115,12 +95,8 @@ Event: TypeAlias = FinishedJob | Lost | KindReady | KindFailed
 class Runner(Protocol):
     """Executor of jobs.
 
-    No method blocks, except `close`: calls take the copy of a measurement, or the start of a process.
-
-    Attributes
-    ----------
-    respawned : int
-        Number of replaced workers.
+    No method blocks, except `close`: calls take the copy of a measurement, or the start of a process. ``respawned``
+    counts replaced workers.
     """
 
     respawned: int

@@ -29,23 +29,11 @@ _PASSIVE: Final = 0  # Number of the kind of measurements without a call; kinds 
 class RegisteredSensor:
     """A sensor.
 
-    Attributes
-    ----------
-    hello : Hello
-    stated : Settings
-        Settings of its hello.
-    settings : Settings
-        The same, with air close to that of its latest measurement.
-    kind : JobKind or None
-        None if no pipeline can use its settings.
-    passive : JobKind
-        Kind of its measurements without a call, of which no image is made.
-    applied : Settings or None
-        The settings with the options of this node; None if the options do not suit them.
-    raw, image : int
-        Numbers of the descriptions of its products.
-    air : (float, float, float), optional
-        Temperature, humidity and pressure of the latest measurement.
+    ``stated`` are the settings of its hello, and ``settings`` the same with air close to that of its latest
+    measurement. ``kind`` is None if no pipeline can use its settings. ``passive`` is the kind of its measurements
+    without a call, of which no image is made. ``applied`` are the settings with the options of this node; None if the
+    options do not suit them. ``raw`` and ``image`` are the numbers of the descriptions of its products. ``air`` has
+    temperature, humidity and pressure of the latest measurement.
     """
 
     hello: Hello
@@ -62,14 +50,7 @@ class RegisteredSensor:
 class Sensors:
     """All sensors; those with equal settings share a kind, and therefore a pipeline.
 
-    Parameters
-    ----------
-    options : ProcessingOptions
-    log : EventLog
-    describe : callable
-        Called with a description before the first product.
-    prepare : callable
-        Called with each new kind.
+    ``describe`` is called with a description before the first product, and ``prepare`` with each new kind.
     """
 
     def __init__(

@@ -26,20 +26,8 @@ _TIMED: Final = 5  # Number of measurements, of which the median counts.
 class SharedPipeline:
     """Pipeline for one kind of measurements, from their bytes to images and points; thread-safe.
 
-    Parameters
-    ----------
-    settings : str
-        Settings as TOML.
-    device : {"auto", "cpu", "cuda", "numpy"}
-    plan : {"nominal", "measured"}
-
-    Attributes
-    ----------
-    pipeline : Pipeline
-    shape : (direction, range)
-        Shape of its images.
-    format : SampleFormat
-        Layout of the samples in a measurement.
+    ``settings`` are TOML. ``shape`` of its images is (direction, range); ``format`` is the layout of the samples in a
+    measurement.
     """
 
     def __init__(self, settings: str, device: str, plan: PlanCosts = "nominal") -> None:
@@ -54,13 +42,7 @@ class SharedPipeline:
     def image(
         self, words: "bytes | memoryview", out: NDArray[np.float32] | None = None, *, threads: int | None = None
     ) -> Energyscape:
-        """Return the image of a measurement that is given as bytes.
-
-        Raises
-        ------
-        DataError
-            The number of bytes does not match the settings.
-        """
+        """Return the image of a measurement that is given as bytes."""
         if len(words) != self.format.n_bytes:
             raise DataError(
                 f"a measurement has {len(words)} bytes, which does not match its settings; send Hello again"

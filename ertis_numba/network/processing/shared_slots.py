@@ -26,12 +26,7 @@ def _paged(n_bytes: int) -> int:
 class SlotView:
     """Access of one process to a slot: the samples of a measurement, its image, its points.
 
-    Parameters
-    ----------
-    descriptor : int
-        Descriptor of the memory; it may be closed afterwards.
-    words_bytes, image_bytes : int
-        Sizes.
+    ``descriptor`` is that of the memory; it may be closed afterwards.
     """
 
     def __init__(self, descriptor: int, words_bytes: int, image_bytes: int) -> None:
@@ -60,18 +55,7 @@ class SlotView:
 class Slot:
     """Memory for one measurement and its products.
 
-    Parameters
-    ----------
-    number : int
-        Number by which processes refer to it.
-    words_bytes, image_bytes : int
-        Sizes.
-
-    Attributes
-    ----------
-    descriptor : int
-        Descriptor for the processes that use it.
-    view : SlotView
+    Processes refer to it by ``number``, and use it by ``descriptor``.
     """
 
     def __init__(self, number: int, words_bytes: int, image_bytes: int) -> None:
@@ -95,10 +79,7 @@ class Slot:
 class SlotPool:
     """Slots that are used again once they are free.
 
-    Parameters
-    ----------
-    numbers : iterable of int
-        Numbers of the slots, which limit how many are in use at the same time.
+    ``numbers`` of the slots limit how many are in use at the same time.
     """
 
     def __init__(self, numbers: Iterable[int]) -> None:

@@ -42,17 +42,8 @@ Header: TypeAlias = Image | Points | Raw | Group | Report
 class QueuedProduct:
     """Product to send to its subscribers.
 
-    Attributes
-    ----------
-    product : str
-    sensor : str
-        Empty for products without a sensor.
-    header : Message
-        Header without its numbers.
-    payloads : list of bytes, memoryview or zmq.Frame
-        Frames once `share` was called.
-    description : (number, frames), optional
-        Description to send before.
+    ``sensor`` is empty for products without one. ``header`` lacks its numbers. ``payloads`` are frames once `share` was
+    called. ``description``, (number, frames), is sent before.
     """
 
     product: Product
@@ -80,11 +71,7 @@ class QueuedProduct:
 class ConnectedSubscriber:
     """A connected application.
 
-    Attributes
-    ----------
-    frames : sequence of zmq.Frame
-        Its latest message, by which its key is checked again.
-    wants : Subscribe
+    Its key is checked again by ``frames``, its latest message.
     """
 
     frames: Sequence[zmq.Frame]
@@ -152,12 +139,8 @@ class ConnectedSubscriber:
 class Subscribers:
     """All applications, with their common socket.
 
-    Parameters
-    ----------
-    socket : zmq.Socket
-        A ROUTER.
-    with_keys : bool
-        True if applications have keys, each of which may use a share of the places only.
+    ``socket`` is a ROUTER. ``with_keys`` is true if applications have keys, each of which may use a share of the places
+    only.
     """
 
     def __init__(self, socket: "zmq.Socket[bytes]", *, with_keys: bool = False) -> None:

@@ -23,28 +23,9 @@ _DELAYS_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)
 class Worker(SupervisedProcess[FromWorker]):
     """Supervised worker process.
 
-    Parameters
-    ----------
-    number : int
-
-    Attributes
-    ----------
-    number : int
-    ready : bool
-        True once it has reported that it is ready.
-    slots, free : list of Slot
-        All slots, and the empty ones.
-    kinds : set of int
-        Kinds with a pipeline.
-    preparing : JobKind or None
-        Kind that it prepares for.
-    job : Job or None
-    slot : Slot or None
-        Slot of the job.
-    mode : Mode or None
-        Mode of the job.
-    done : int
-        Number of finished jobs.
+    ``ready`` is true once it has reported that it is ready. ``slots`` are all slots, ``free`` the empty ones, and
+    ``slot`` that of the ``job``. ``kinds`` are those with a pipeline, and ``preparing`` is the one that it prepares
+    for. ``mode`` is that of the job, and ``done`` counts finished jobs.
     """
 
     def __init__(self, number: int) -> None:

@@ -30,16 +30,8 @@ _GAP_NUMBERS = 64  # Refused numbers to collect before the journal is written.
 class DiskSpool(Spool):
     """Measurements in journals of a folder, and also in memory while there is room.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder, created if it does not exist.
-    ring_bytes : int
-        Limit on data bytes in memory.
-    max_bytes : int or None
-        Limit on data bytes in the journals.
-    on_note : callable
-        Called with a line, from any thread.
+    ``folder`` is created if it does not exist. ``ring_bytes`` limits the data in memory, and ``max_bytes`` the data in
+    the journals. ``on_note`` is called with a line, from any thread.
     """
 
     def __init__(self, folder: Path, ring_bytes: int, max_bytes: int | None, *, on_note: Callable[[str], None]) -> None:

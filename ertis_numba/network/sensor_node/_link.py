@@ -38,22 +38,9 @@ _WANTED: Final = (messages.Welcome, messages.Ack, messages.Pong, messages.Refuse
 class Link(threading.Thread):
     """Sender of a spool's items, which reconnects until it is stopped.
 
-    Parameters
-    ----------
-    address : str
-    keys : ClientKeys or None
-    spool : Spool
-    on_acked, on_note : callable
-        Called from this thread; they must not raise.
-    on_settings : callable or None
-        Likewise; None to refuse requests for new settings.
-
-    Attributes
-    ----------
-    central : {"away", "storage", "processing", "fault", "closing"}
-        Last reported state of the central node.
-    reconnects : int
-        Number of reconnections after the central node was away.
+    The functions are called from this thread and must not raise; without ``on_settings``, requests for new settings are
+    refused. ``central`` is the last reported state of the central node. ``reconnects`` counts reconnections after the
+    central node was away.
     """
 
     def __init__(

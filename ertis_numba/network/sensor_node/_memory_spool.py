@@ -30,27 +30,11 @@ class SensorCounts:
     ``accepted = stored + taken + overwritten + damaged + unacked``, for measurements that this process has accepted or
     found in its spool.
 
-    Attributes
-    ----------
-    accepted : int
-        Measurements that were kept.
-    refused : int
-        Measurements refused because the spool was full.
-    stored : int
-        Measurements acknowledged as stored on the central node's disk.
-    taken : int
-        Measurements acknowledged as accepted in its memory.
-    dropped : Counter of str
-        Those of them that it has discarded, by reason.
-    overwritten : int
-        Measurements replaced in memory by later ones.
-    damaged : int
-        Damaged measurements in the spool.
-    missing : Counter of str
-        Numbers reported as missing by the source of the measurements, by reason.
-    unacked : int
-        Measurements that are kept at present.
-    unacked_bytes : int
+    ``refused`` counts measurements refused because the spool was full. Measurements were acknowledged as ``stored`` on
+    the central node's disk, or ``taken`` into its memory; ``dropped`` counts those of them that it has discarded, by
+    reason. Later measurements replaced ``overwritten`` ones in memory, and ``damaged`` ones were found in the spool.
+    ``missing`` counts the numbers reported as missing by the source of the measurements, by reason. ``unacked``
+    measurements are kept at present.
     """
 
     accepted: int = 0
@@ -68,20 +52,9 @@ class SensorCounts:
 class Spool:
     """Measurements in memory; the oldest become gaps if there is no more room.
 
-    Parameters
-    ----------
-    max_bytes : int
-        Limit on data bytes in memory.
-
-    Attributes
-    ----------
-    turn : threading.RLock
-        Lock for access to `runs` and `counts`.
-    acked : threading.Condition
-        Condition of that lock, notified of each acknowledgement.
-    runs : dict of (sensor, session_id) to OutgoingSession
-        Oldest first.
-    counts : dict of str to SensorCounts
+    ``max_bytes`` limits the data in memory. ``turn`` is the lock for access to `runs` and `counts`; ``acked``, a
+    condition of that lock, is notified of each acknowledgement. ``runs`` has sessions by (sensor, session_id), oldest
+    first; ``counts`` are by sensor.
     """
 
     def __init__(self, max_bytes: int) -> None:

@@ -23,16 +23,8 @@ _MAX_PATIENCE_S = 8.0
 class UnackedItem:
     """Measurement or gap that waits for its acknowledgement.
 
-    Attributes
-    ----------
-    first, last : int
-        Numbers; equal for a measurement.
-    reason : str
-        Reason of a gap; empty for a measurement.
-    n_bytes : int
-        Size of its data.
-    entry : JournalEntry or None
-        The measurement, if it is in memory.
+    ``first`` and ``last`` are its numbers, equal for a measurement. ``reason`` is that of a gap; empty for a
+    measurement. ``n_bytes`` is the size of its data. ``entry`` is the measurement, if it is in memory.
     """
 
     first: int
@@ -49,25 +41,10 @@ class OutgoingSession:
     Positions are kept as numbers, so that items may be moved or replaced meanwhile. Callers ensure that only one thread
     uses a session at a time.
 
-    Attributes
-    ----------
-    sensor : JournalSensor
-    session_id : int
-    journal : Journal or None
-    items : deque of UnackedItem
-    following : int or None
-        Number after the last item; None before the first.
-    acked_through : int
-        Number up to which the central node has everything.
-    sent : int
-        Number up to which everything was sent.
-    reached : int
-        Number up to which anything was ever sent: an ack beyond it belongs to other items.
-    stage : {"new", "asked", "welcome", "waiting"}
-        Stage of the handshake with the central node.
-    since_s : float
-        Start of the stage; for "waiting", its end.
-    window : int
+    ``following`` is the number after the last item; None before the first. Up to ``acked_through``, the central node
+    has everything; up to ``sent``, everything was sent; up to ``reached``, anything was ever sent: an ack beyond it
+    belongs to other items. ``stage`` is that of the handshake with the central node; it began at ``since_s``, or for
+    "waiting" ends then.
     """
 
     sensor: JournalSensor

@@ -20,13 +20,7 @@ _MAX_SENSORS = 32
 
 @dataclass(frozen=True, slots=True)
 class SettingsRequest:
-    """Request for new settings of a sensor; answer it with `accept` or `refuse`.
-
-    Attributes
-    ----------
-    sensor : str
-    settings : Settings
-    """
+    """Request for new settings of a sensor; answer it with `accept` or `refuse`."""
 
     sensor: str
     settings: Settings
@@ -46,12 +40,8 @@ class SettingsRequest:
 class RequestQueue:
     """Reader of requests, and queue of their answers.
 
-    Parameters
-    ----------
-    on_request : callable or None
-        Called with each valid request; None if the node does not accept any.
-    wake : callable
-        Called when there is an answer to send.
+    ``on_request`` is called with each valid request; None if the node does not accept any. ``wake`` is called when
+    there is an answer to send.
     """
 
     def __init__(self, on_request: Callable[[SettingsRequest], None] | None, wake: Callable[[], None]) -> None:

@@ -22,16 +22,9 @@ _FIRMWARE_CHARACTERS = 64
 class Acknowledged:
     """Acknowledgement by the central node.
 
-    Attributes
-    ----------
-    sensor : str
-    session_id : int
-    acked_through : int
-        Number up to which everything is stored or accepted, or known to be missing.
-    status : {"stored", "accepted"}
-        Place of the acknowledged measurements: on the central node's disk, or in its memory.
-    dropped : tuple of (sequence, reason)
-        Measurements discarded since the previous acknowledgement.
+    Up to ``acked_through``, everything is stored or accepted, or known to be missing. ``status`` is the place of the
+    acknowledged measurements: ``stored`` on the central node's disk, or ``accepted`` in its memory. ``dropped`` are
+    measurements discarded since the previous acknowledgement, as (sequence, reason).
     """
 
     sensor: str
