@@ -21,15 +21,8 @@ _UNREADABLE: Final = (OSError, RuntimeError, LookupError, AttributeError, TypeEr
 def find_damage(path: Path) -> str:
     """Return the first damaged object of a file and its damage, as one line; empty if there is none.
 
-    Raises
-    ------
-    ForeignDataError
-        A dataset is stored in another file.
-
-    Notes
-    -----
     HDF5 stores checksums of everything except the references from variables to their axes. The check therefore compares
-    them with the expected names of the axes.
+    them with the expected names of the axes. Raises ForeignDataError if a dataset is stored in another file.
     """
     place = "/"
     try:

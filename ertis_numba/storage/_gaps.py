@@ -45,10 +45,7 @@ class SensorSequences:
 class SequenceNumbers:
     """Sequence numbers of one session of a sensor, in order of arrival, and the missing ones.
 
-    Attributes
-    ----------
-    jumps : list of (first, last)
-        Missing numbers between successive ones.
+    ``jumps`` are the missing numbers between successive ones, as (first, last).
     """
 
     def __init__(self) -> None:
@@ -83,11 +80,7 @@ class SequenceNumbers:
 
         If the numbers rise, the missing part of a noted gap is outside of their interval or in a jump. Otherwise, as in
         recordings without session identifiers, equal numbers cannot be distinguished, and all noted gaps are missing.
-
-        Parameters
-        ----------
-        noted : iterable of (first, last, reason)
-            Noted gaps. If two overlap, the one that begins first has priority.
+        If two gaps in ``noted``, (first, last, reason), overlap, the one that begins first has priority.
         """
         known = list(_disjoint(noted))
         if self._first is not None and not self._late:

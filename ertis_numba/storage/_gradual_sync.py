@@ -19,14 +19,8 @@ class GradualSync:
     """Gradual sync of a growing file, with a pause after each step.
 
     A single sync would write all buffered data at once, and the sync of another small file would have to wait. A
-    journal's commit then took 370 ms instead of 47 ms.
-
-    Parameters
-    ----------
-    path : Path
-        Path of the file, which need not exist yet.
-    rests : float
-        Duration of a pause, relative to that of the step.
+    journal's commit then took 370 ms instead of 47 ms. The file need not exist yet. ``rests`` is the duration of a
+    pause, relative to that of the step.
     """
 
     def __init__(self, path: Path, rests: float) -> None:

@@ -30,14 +30,8 @@ def damaged_poses(count: int) -> str:
 class JournalRows:
     """Measurements of one sensor of a journal, without damaged ones.
 
-    The attributes are valid once all measurements have been read.
-
-    Attributes
-    ----------
-    keys : list of JournalKey
-        Keys of all measurements, damaged ones included.
-    damaged : list of DamagedMeasurement
-        Damaged measurements.
+    The attributes are valid once all measurements have been read. ``keys`` are those of all measurements, ``damaged``
+    ones included.
     """
 
     def __init__(self, journal: Journal, sensor: str) -> None:

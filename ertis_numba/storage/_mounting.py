@@ -31,11 +31,6 @@ def read_mounting(group: h5py.Group, path: Path) -> _Found:
 
     Older files have no attribute ``mounting``, and store the origin if no mounting was given. In these files, the
     origin therefore counts as unknown, unless the sensor was simulated.
-
-    Raises
-    ------
-    DamagedError
-        The attributes are not a valid mounting.
     """
     stated = group.attrs
     status = str(to_python(stated["mounting"])) if "mounting" in stated else ""

@@ -20,13 +20,7 @@ _UNKNOWN: Final = -1
 
 
 def require_uniform(image: Energyscape, first: Energyscape) -> None:
-    """Refuse an image with points after one without, and the reverse: readers could not tell none from unknown.
-
-    Raises
-    ------
-    ArgumentError
-        Only one of the images has points.
-    """
+    """Refuse an image with points after one without, and the reverse: readers could not tell none from unknown."""
     if (image.points is None) != (first.points is None):
         has, lacks = ("the first image has", "another") if image.points is None else ("an image has", "the first")
         raise ArgumentError(
@@ -61,19 +55,8 @@ def write_points(group: h5py.Group, clouds: Sequence[PointCloud]) -> None:
 class PointReader:
     """Points of the images of a sensor.
 
-    Parameters
-    ----------
-    group : h5py.Group
-        Group of the sensor, which has points.
-    path : Path
-        Path of the file, for errors.
-    settings : Settings
-        Settings of the images.
-
-    Raises
-    ------
-    DamagedError
-        A part of the points is missing, or the counts do not match the points.
+    ``group`` is that of the sensor, which has points; ``path`` is used in errors. Raises DamagedError if a part of the
+    points is missing, or the counts do not match the points.
     """
 
     def __init__(self, group: h5py.Group, path: Path, settings: Settings) -> None:

@@ -39,13 +39,7 @@ _MAX_SOURCE_BYTES: Final = MAX_TEXT_BYTES["pose_source"]
 
 
 def checked_poses(poses: object) -> Poses | None:
-    """Return poses, after a check of their type and source.
-
-    Raises
-    ------
-    ArgumentError
-        They are neither a trajectory nor trajectories by name of the sensor, or a source is too long.
-    """
+    """Return poses, after a check of their type and source."""
     if poses is None:
         return None
     several: Iterable[Any] = poses.values() if isinstance(poses, Mapping) else (poses,)
@@ -69,13 +63,7 @@ def poses_of(poses: Poses | None, sensor: str) -> Trajectory | None:
 
 
 def require_times(trajectory: Trajectory, time_ns: NDArray[np.int64], sensor: str) -> None:
-    """Refuse measurements outside a trajectory, unless it may have gaps.
-
-    Raises
-    ------
-    ArgumentError
-        The trajectory does not cover all measurements.
-    """
+    """Refuse measurements outside a trajectory, unless it may have gaps."""
     if not len(time_ns) or trajectory.max_gap_s is not None:
         return
     first_ns, last_ns = int(trajectory.time_ns[0]), int(trajectory.time_ns[-1])
@@ -96,14 +84,8 @@ def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
     """Store the pose at each measurement of a sensor; the group has its rows, but no poses.
 
     A sensor without measurements has no poses. If the trajectory has a `max_gap_s`, measurements that it does not cover
-    have NaN.
-
-    Raises
-    ------
-    ArgumentError
-        The trajectory does not cover all measurements.
-    ForeignDataError
-        The axes of the group are links.
+    have NaN. Raises ArgumentError if the trajectory does not cover all measurements, or ForeignDataError if the axes of
+    the group are links.
     """
     time_ns = np.asarray(group["time"][:], np.int64)
     require_times(trajectory, time_ns, group.name.rpartition("/")[2])
@@ -132,11 +114,6 @@ def read_poses(group: h5py.Group, path: Path) -> Trajectory | None:
     """Return the poses at the measurements of a sensor, by increasing time; None if there are none.
 
     Measurements without a pose are left out. The `max_gap_s` of the trajectory is then `MAX_GAP_S`.
-
-    Raises
-    ------
-    DamagedError
-        A part of the poses is missing, or a number is not that of a pose.
     """
     found = [name for name in ("pose_position", "pose_rotation", "pose_source") if name in group]
     if not found:

@@ -13,13 +13,7 @@ __all__ = ["provenance", "recorded_mountings"]
 
 
 def provenance(readers: Sequence[RecordingReader]) -> dict[str, str]:
-    """Return the attributes of a file that describe its recording.
-
-    Raises
-    ------
-    ArgumentError
-        The readers are not those of one recording.
-    """
+    """Return the attributes of a file that describe its recording."""
     if not readers:
         return {"source": "", "history": ""}
     first = readers[0]

@@ -35,20 +35,10 @@ Result = TypeVar("Result", Energyscape, AcousticMap)
 class ResultFile:
     """Declaration of a kind of file, which its writer and its reader inherit.
 
-    Attributes
-    ----------
-    _kind, _data, _table
-        As for `FileWriter`; the table ends with the variables of poses.
-    _type : type
-        Class of a row.
-    _name : str
-        Name of a row in errors, with its article.
-    _axes : mapping of str to str
-        Field of a row by the variable that stores it once.
-    _columns : mapping of str to str
-        Field of a row by the variable with one number per row.
-    _lengths : mapping of str to int or str
-        Length of each axis of the table: a number, or a variable that has this first axis.
+    ``_kind``, ``_data`` and ``_table`` are as for `FileWriter`; the table ends with the variables of poses. ``_type``
+    is the class of a row, and ``_name`` its name in errors, with its article. ``_axes`` has the field of a row by the
+    variable that stores it once, and ``_columns`` by the variable with one number per row. ``_lengths`` has the length
+    of each axis of the table: a number, or a variable that has this first axis.
     """
 
     _kind: ClassVar[str]

@@ -40,14 +40,8 @@ _LIMITS = {
 class RowWriter:
     """Writer of measurements to the variables of a sensor.
 
-    Parameters
-    ----------
-    group : h5py.Group
-        Group of the sensor.
-    data : str
-        Name of the variable with one array per measurement.
-    numbered : bool
-        Require sequence numbers to be unique within a session.
+    ``data`` is the name of the variable with one array per measurement. ``numbered`` requires sequence numbers to be
+    unique within a session.
     """
 
     def __init__(self, group: h5py.Group, data: str, *, numbered: bool) -> None:
@@ -108,14 +102,7 @@ class RowWriter:
 class RowReader:
     """Reader of measurements, which checks each against its CRC-32.
 
-    Parameters
-    ----------
-    group : h5py.Group
-        Group of the sensor.
-    data : str
-        Name of the variable with one array per row.
-    name : str
-        Name of a row in errors.
+    ``data`` is the name of the variable with one array per row; ``name`` is that of a row in errors.
     """
 
     def __init__(self, group: h5py.Group, data: str, name: str = "measurement") -> None:
@@ -128,13 +115,7 @@ class RowReader:
         return int(self._data.shape[0])
 
     def row(self, index: int) -> NDArray[Any]:
-        """Return the array of one measurement.
-
-        Raises
-        ------
-        DamagedError
-            The array does not match its CRC-32.
-        """
+        """Return the array of one measurement."""
         row = np.asarray(self._data[index])
         wanted, got = int(self.column("crc32", index)), zlib.crc32(row.data)
         if got != wanted:

@@ -41,28 +41,10 @@ _COUNTS: Final = ("n_groups", "time_ns")
 def write_map_file(
     path: str | Path, occupancy: OccupancyMap, *, truth: GroundTruth | None = None, overwrite: bool = False
 ) -> Path:
-    """Write an occupancy map as HDF5.
+    """Write an occupancy map as HDF5, and return the path.
 
-    Parameters
-    ----------
-    path : str or Path
-    occupancy : OccupancyMap
-    truth : GroundTruth, optional
-        Ground truth of each pulse in the frame of the map, from `PlacedTruth`.
-    overwrite : bool
-        Replace an existing file.
-
-    Returns
-    -------
-    Path
-        The path.
-
-    Raises
-    ------
-    ArgumentError
-        The file exists.
-    DataError
-        The disk is full or cannot be written.
+    ``truth`` is the ground truth of each pulse in the frame of the map, from `PlacedTruth`. Raises ArgumentError if the
+    file exists and ``overwrite`` is false; or DataError if the disk is full or cannot be written.
     """
     checks.instance("occupancy", occupancy, OccupancyMap, "Mapper.map returns")
     axes, table = _AXES[: occupancy.n_dimensions], _table(occupancy.n_dimensions)
@@ -167,14 +149,7 @@ def read_map(path: str | Path) -> OccupancyMap:
 def read_map_truth(path: str | Path) -> GroundTruth | None:
     """Read the ground truth of an occupancy map, one row per pulse; None if its recordings were not simulated.
 
-    Parameters
-    ----------
-    path : str or Path
-        File of a map that `read_map` accepts.
-
-    Returns
-    -------
-    GroundTruth or None
+    The file is one that `read_map` accepts.
     """
     path = Path(path)
     with open_file(path, _NAME) as file, reading(file, path):

@@ -30,10 +30,7 @@ _DIFFERS_DEG: Final = 0.1
 def surfaces_at(truth: GroundTruth, row: int, time_ns: int) -> Surfaces:
     """Return the surfaces of the scene at a time, in the frame of a row of the ground truth of fused images or maps.
 
-    Raises
-    ------
-    SettingsError
-        Another version of this package wrote the scene, with other keys.
+    Raises SettingsError if another version of this package wrote the scene, with other keys.
     """
     position_m, rotation_xyzw = truth.frames[row]
     surfaces = surfaces_of(_scene_of(truth.scene), time_ns / _NS_PER_S)
@@ -52,22 +49,11 @@ class PlacedTruth:
     Its reflectors are those that the image of a sensor can show at the place of the reflector: echoes of its own call
     over a single surface. Those of several sensors are merged.
 
-    Parameters
-    ----------
-    readers : sequence of RecordingReader or EnergyscapeReader
-        Recordings or images of all sensors.
-    mountings : mapping of str to (translation_m, rotation_xyzw)
-        Mountings of the sensors, which define the frame of the platform.
-    trajectory : Trajectory, optional
-        Poses of the platform in the frame of a map; none for fused images. If they are not those of the scene, such as
-        poses of an odometry that begins at the origin, the scene is moved to fit them best.
-
-    Attributes
-    ----------
-    missing : str
-        Reason for which there is no ground truth; empty if there is one.
-    is_partial : bool
-        True if there is none although some recordings are simulated.
+    ``readers`` are the recordings or images of all sensors. ``mountings``, (translation_m, rotation_xyzw) by sensor,
+    define the frame of the platform. ``trajectory`` has the poses of the platform in the frame of a map; none for fused
+    images. If they are not those of the scene, such as poses of an odometry that begins at the origin, the scene is
+    moved to fit them best. ``missing`` is the reason for which there is no ground truth; empty if there is one.
+    ``is_partial`` is true if there is none although some recordings are simulated.
     """
 
     def __init__(
@@ -82,15 +68,7 @@ class PlacedTruth:
         self._given: list[list[tuple[Floats, Rotation]]] = []  # … and in the frame of the images or of the map.
 
     def add(self, images: Mapping[str, Energyscape], rows: Mapping[str, int]) -> None:
-        """Add one pulse.
-
-        Parameters
-        ----------
-        images : mapping of str to Energyscape
-            Images of the pulse, by sensor.
-        rows : mapping of str to int
-            Their indices in the files.
-        """
+        """Add one pulse: images by sensor, and their indices in the files."""
         if self._scene is None:
             return
         place_m, turn = np.zeros(3), Rotation.identity()
@@ -118,10 +96,7 @@ class PlacedTruth:
     def truth(self, height_m: tuple[float, float] | None = None) -> GroundTruth | None:
         """Return the ground truth of all pulses, in the frame of the platform or of the map; None if there is none.
 
-        Parameters
-        ----------
-        height_m : (float, float), optional
-            Lowest and highest height of reflectors in this frame; all by default.
+        ``height_m`` has the lowest and highest height of reflectors in this frame; all by default.
         """
         if self._scene is None or not self._rows:
             return None

@@ -125,26 +125,9 @@ def add_poses(
 def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: bool = False) -> int:
     """Refuse a recording to which poses cannot be added, and return the number of its measurements.
 
-    Parameters
-    ----------
-    path : str or Path
-        Path of the recording.
-    trajectory : Trajectory
-        Poses of the platform.
-    replace : bool
-        Accept a recording that has poses already.
-
-    Returns
-    -------
-    int
-        Number of measurements of all sensors.
-
-    Raises
-    ------
-    ArgumentError
-        The trajectory does not cover the recording, or the recording has poses already.
-    DataError
-        The recording cannot be read.
+    ``replace`` accepts a recording that has poses already. The measurements of all sensors count. Raises ArgumentError
+    if the trajectory does not cover the recording, or the recording has poses already; or DataError if the recording
+    cannot be read.
     """
     n_measurements = 0
     for sensor in sensor_names(path, "a recording"):
@@ -169,15 +152,7 @@ def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: 
 def count_in_gaps(trajectory: Trajectory, time_ns: ArrayLike) -> int:
     """Return the number of times whose poses are interpolated between poses more than a second apart.
 
-    Parameters
-    ----------
-    trajectory : Trajectory
-    time_ns : (n,) int64
-        Times in nanoseconds since 1970-01-01 UTC.
-
-    Returns
-    -------
-    int
+    ``time_ns`` has shape (n,) int64 and counts from 1970-01-01 UTC.
     """
     is_near = trajectory.replace(max_gap_s=MAX_GAP_S).covers(time_ns)
     return int(np.count_nonzero(trajectory.covers(time_ns) & ~is_near))

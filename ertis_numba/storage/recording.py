@@ -228,21 +228,9 @@ def create_sensor_variables(
 ) -> None:
     """Create all variables of a sensor, without rows.
 
-    Parameters
-    ----------
-    group : h5py.Group
-        Group of the sensor. Its name is that of the sensor.
-    settings : Settings
-        Settings from `ertis_numba.geometry.storable`.
-    firmware : str
-        Version of the firmware.
-    mounting : mapping of str to array
-        Mounting from `ertis_numba.geometry.mounting`; empty if unknown.
-
-    Raises
-    ------
-    ArgumentError
-        A row exceeds the limit of HDF5.
+    The name of ``group`` is that of the sensor. ``settings`` come from `ertis_numba.geometry.storable`, and
+    ``mounting`` from `ertis_numba.geometry.mounting`; it is empty if unknown. Raises ArgumentError if a row exceeds the
+    limit of HDF5.
     """
     layout, words, samples = microphones(settings.array), sample_format(settings), call_samples(settings.call)
     data, table = _data_and_table(pdm=settings.recording.is_pdm)

@@ -66,20 +66,10 @@ _UNLIMITED: Final = ("time", "gap")
 class Variable:
     """Array of a file.
 
-    Attributes
-    ----------
-    name : str
-        Name of the variable.
-    dims : tuple of str
-        Axes. A variable with the name of its only axis is the coordinate of that axis.
-    dtype : str
-        NumPy type, ``str`` for text, or empty if the settings determine it.
-    description : str
-        Description, stored as the attribute ``long_name``.
-    units : str
-        Unit in the notation of UDUNITS; empty, the default, for numbers without a unit.
-    optional : bool
-        True if older files lack it; False by default.
+    ``dims`` are its axes; a variable with the name of its only axis is the coordinate of that axis. ``dtype`` is a
+    NumPy type, ``str`` for text, or empty if the settings determine it. ``description`` is stored as the attribute
+    ``long_name``. ``units`` are in the notation of UDUNITS; empty for numbers without a unit. ``optional`` is true if
+    older files lack it.
     """
 
     name: str
@@ -295,12 +285,7 @@ FORMER_NAMES: Final = {"amplitude": "energy", "session_id": "epoch", "gap_sessio
 
 
 class SensorGroup(h5py.Group):  # type: ignore[misc]  # h5py has no annotations
-    """Group of a sensor whose variables answer to their present names, in files of all format versions.
-
-    Parameters
-    ----------
-    group : h5py.Group
-    """
+    """Group of a sensor whose variables answer to their present names, in files of all format versions."""
 
     def __init__(self, group: h5py.Group) -> None:
         super().__init__(group.id)
@@ -333,19 +318,9 @@ def create_variables(
 ) -> None:
     """Create the variables of ``table`` in ``group``, with a named scale for each axis.
 
-    Parameters
-    ----------
-    group : h5py.Group
-        Group in which to create the variables.
-    table : iterable of Variable
-        Variables to create.
-    sizes : mapping of str to int
-        Length of each axis. An axis without a length is omitted, unless it grows with the file. If the rows along time
-        are samples or images, each row is a chunk. Axes that the group has are used.
-    dtypes : mapping of str to str or dtype, optional
-        Types by name of the variable, in place of those in the table.
-    texts : mapping of str to str, optional
-        Content of the text variables, by name.
+    ``sizes`` has the length of each axis. An axis without a length is omitted, unless it grows with the file. If the
+    rows along time are samples or images, each row is a chunk. Axes that the group has are used. ``dtypes`` by name of
+    the variable replace those in the table, and ``texts`` has the content of the text variables, by name.
     """
     scales: dict[str, h5py.Dataset] = {}
     variables = [(variable, _dims(variable, sizes)) for variable in table]
@@ -465,11 +440,8 @@ def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable
 def content_uuid(contents: Mapping[str, str]) -> str:
     """Return the identity of a file, a UUID of version 8 that its content determines (RFC 9562, section 5.8).
 
-    Parameters
-    ----------
-    contents : mapping of str to str
-        `content_sha256` of each sensor, by name. Neither the name of a single sensor nor the order of several has an
-        effect.
+    ``contents`` has the `content_sha256` of each sensor, by name. Neither the name of a single sensor nor the order of
+    several has an effect.
     """
     (content,) = contents.values() if len(contents) == 1 else (_joined(contents),)
     made = bytearray(bytes.fromhex(content)[:16])
@@ -486,10 +458,7 @@ def _joined(contents: Mapping[str, str]) -> str:
 def sensor_path(name: str) -> str:
     """Return the group of a sensor.
 
-    Raises
-    ------
-    ArgumentError
-        The name cannot be the name of a group.
+    Raises ArgumentError if the name cannot be the name of a group.
     """
     return f"/sensors/{checks.sensor_name(name)}"
 

@@ -61,29 +61,10 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     journal is also kept if poses in it are damaged, or if a recording cannot contain one of its sensors; the other
     sensors are sealed. Measurements that were sealed before are not written again.
 
-    Parameters
-    ----------
-    path : str or Path
-        Path of the journal.
-    overwrite : bool
-        Replace an existing file, even if it has other content.
-    progress : callable, optional
-        Called with the number of written measurements and of all measurements.
-
-    Returns
-    -------
-    SealingResult
-        Result.
-
-    Raises
-    ------
-    JournalInUseError
-        Another process has the journal open.
-    DataError
-        The journal cannot be read, the recording cannot be written, or its name is taken by other content. The journal
-        stays.
-    ArgumentError
-        The recording cannot have this name.
+    ``overwrite`` replaces an existing file, even if it has other content. ``progress`` is called with the number of
+    written measurements and of all measurements. Raises JournalInUseError if another process has the journal open;
+    DataError if the journal cannot be read, the recording cannot be written, or its name is taken by other content (the
+    journal stays); or ArgumentError if the recording cannot have this name.
     """
     path = Path(path)
     before = path.with_name(path.name.removesuffix(SUFFIX))

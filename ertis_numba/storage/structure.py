@@ -32,23 +32,8 @@ MAX_ROW_BYTES: Final = 2**32 - 1
 def local_member(group: h5py.Group, name: str, kind: type[Any]) -> Any:
     """Return a member of a group; refuse links, and members with several names.
 
-    Parameters
-    ----------
-    group : h5py.Group
-        Group that contains the member.
-    name : str
-        Name of the member.
-    kind : type
-        Required type, ``h5py.Group`` or ``h5py.Dataset``.
-
-    Raises
-    ------
-    ForeignDataError
-        The member is a link, or has several names.
-    DamagedError
-        The member has another type.
-    KeyError
-        The member does not exist.
+    ``kind`` is the required type, ``h5py.Group`` or ``h5py.Dataset``. Raises ForeignDataError if the member is a link,
+    or has several names; DamagedError if it has another type; or KeyError if it does not exist.
     """
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
@@ -68,13 +53,7 @@ def local_member(group: h5py.Group, name: str, kind: type[Any]) -> Any:
 
 
 def sensors_of(file: h5py.File) -> tuple[str, ...]:
-    """Return the names of the sensors in a file, in its order.
-
-    Raises
-    ------
-    DamagedError
-        There are too many sensors, or a name is not a valid name of a sensor.
-    """
+    """Return the names of the sensors in a file, in its order."""
     group = local_member(file, "sensors", h5py.Group)
     if len(group) > MAX_SENSORS:
         raise DamagedError(f"{len(group)} sensors; the limit is {MAX_SENSORS}")
@@ -85,13 +64,7 @@ def sensors_of(file: h5py.File) -> tuple[str, ...]:
 
 
 def require_attributes(owner: h5py.File | h5py.Group) -> None:
-    """Refuse an object with too many attributes, or with one that is too long.
-
-    Raises
-    ------
-    DamagedError
-        There are too many attributes, or one is too long.
-    """
+    """Refuse an object with too many attributes, or with one that is too long."""
     n_attributes = h5py.h5a.get_num_attrs(owner.id)
     if n_attributes > MAX_ATTRIBUTES:
         raise DamagedError(f"{owner.name} has {n_attributes} attributes; the limit is {MAX_ATTRIBUTES}")
@@ -108,19 +81,9 @@ def require_attributes(owner: h5py.File | h5py.Group) -> None:
 def require_variables(group: h5py.Group, table: Iterable[Variable]) -> None:
     """Refuse variables that are not stored in the file as this package stores them.
 
-    Parameters
-    ----------
-    group : h5py.Group
-        Group of a sensor.
-    table : iterable of Variable
-        Variables that may be read; missing ones are skipped.
-
-    Raises
-    ------
-    ForeignDataError
-        A variable is stored in another file, or is compressed.
-    DamagedError
-        A variable is incomplete, or has another type or number of axes.
+    ``group`` is that of a sensor. ``table`` lists the variables that may be read; missing ones are skipped. Raises
+    ForeignDataError if a variable is stored in another file, or is compressed; or DamagedError if it is incomplete, or
+    has another type or number of axes.
     """
     if len(group) > MAX_MEMBERS:
         raise DamagedError(f"{group.name} has {len(group)} members; the limit is {MAX_MEMBERS}")
@@ -172,15 +135,7 @@ def _require_kind(dataset: h5py.Dataset, variable: Variable) -> None:
 
 
 def stored_bytes(dataset: h5py.Dataset, *, may_be_filtered: bool = False) -> int:
-    """Return the stored size of a dataset; refuse one that is in another file, compressed, or incomplete.
-
-    Raises
-    ------
-    ForeignDataError
-        The dataset is stored in another file, or is compressed.
-    DamagedError
-        The dataset is incomplete.
-    """
+    """Return the stored size of a dataset; refuse one that is in another file, compressed, or incomplete."""
     if dataset.is_virtual or dataset.external:
         raise ForeignDataError(f"{dataset.name} lies in other files; copy the data into one file")
     stored, wanted = dataset.id.get_storage_size(), dataset.size * dataset.dtype.itemsize

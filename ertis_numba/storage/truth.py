@@ -97,22 +97,9 @@ class GroundTruth:
 class GroundTruthLog:
     """Ground truth that grows with each measurement, in a temporary file; use it in a ``with`` statement.
 
-    Parameters
-    ----------
-    scene : str
-        Scene as TOML.
-    seed : int
-        Seed of the simulation.
-    left_out : tuple of str
-        Effects that were not simulated although they change the image slightly; none by default.
-    folder : Path, optional
-        Folder of the temporary file, by default that of the system. The file has no name, and is removed with the
-        process.
-
-    Attributes
-    ----------
-    sources : tuple of TrueSource
-        Sources of sound during the first measurement.
+    ``scene`` is TOML. ``left_out`` are effects that were not simulated although they change the image slightly.
+    ``folder`` is that of the temporary file, by default that of the system; the file has no name, and is removed with
+    the process. ``sources`` are sources of sound during the first measurement.
     """
 
     def __init__(self, scene: str, seed: int, *, left_out: tuple[str, ...] = (), folder: Path | None = None) -> None:
@@ -161,11 +148,6 @@ class GroundTruthLog:
         """Add the reflectors of the next measurement, the strongest first, and the sources of sound.
 
         All measurements have the same sources, at any positions.
-
-        Raises
-        ------
-        ArgumentError
-            The sources have other names than those of the first measurement.
         """
         if not self._rows:
             self.sources = tuple(sources)
@@ -231,13 +213,7 @@ class GroundTruthLog:
 
 
 def write_truth(group: h5py.Group, truth: GroundTruth | GroundTruthLog, n_measurements: int) -> None:
-    """Write the ground truth of a sensor into its group.
-
-    Raises
-    ------
-    ArgumentError
-        The truth has another number of measurements than the file.
-    """
+    """Write the ground truth of a sensor into its group."""
     if isinstance(truth, GroundTruth):
         with GroundTruthLog(truth.scene, truth.seed, left_out=truth.left_out) as log:
             for row, reflectors in enumerate(truth.reflectors):

@@ -21,23 +21,10 @@ _SQLITE = b"SQLite format 3\0"
 class SensorReport:
     """Result for one sensor.
 
-    Attributes
-    ----------
-    sensor : str
-        Name of the sensor.
-    measurements : int
-        Number of measurements, damaged ones included.
-    gaps : tuple of SequenceGap
-        Missing sequence numbers with their reasons.
-    damaged : tuple of DamagedMeasurement
-        Damaged measurements.
-    out_of_order : tuple of int
-        Indices of measurements whose sequence number is not above the previous one of the session.
-    fault : str
-        Reason why nothing of this sensor can be read; otherwise empty.
-    remark : str
-        Damage to the file or to poses, and losses from its journal that no gap covers, for all sensors; empty if there
-        are none.
+    ``measurements`` counts damaged ones too, ``gaps`` are missing sequence numbers with their reasons, and
+    ``out_of_order`` has the indices of measurements whose sequence number is not above the previous one of the session.
+    ``fault`` is the reason why nothing of this sensor can be read; otherwise empty. ``remark`` is damage to the file or
+    to poses, and losses from its journal that no gap covers, for all sensors; empty if there are none.
     """
 
     sensor: str
@@ -64,11 +51,6 @@ def verify(path: str | Path) -> list[SensorReport]:
 
     For a recording, this checks the hash over the content of each sensor, the CRC-32 of each measurement, and the order
     of the sequence numbers. For a journal, it checks the CRC-32 of each record, each measurement and each pose.
-
-    Raises
-    ------
-    DataError
-        The file cannot be read at all, the disk fails, or another process has the journal open.
     """
     path = Path(path)
     if _is_journal(path):
