@@ -49,18 +49,7 @@ class ABRender:
         """Return the greatest change of a sensor's image by an effect, in decibels.
 
         The result is None if the sensor's settings yield no image, for example because its range window is beyond the
-        end of its records.
-
-        Parameters
-        ----------
-        index : int
-            Index of the measurement.
-        name : str
-            Name of the sensor.
-        others : frozenset of str
-            The other effects that are simulated.
-        effect : str
-            The effect to test.
+        end of its records. ``others`` are the other effects that are simulated.
         """
         sensor, both = self._scene.sensor(name), (others, others | {effect})
         try:
@@ -121,15 +110,10 @@ def image_change_db(
     both images have over all directions and 5 cm of range, but at least ``floor``. A change that is masked by the side
     lobes of a stronger echo therefore hardly counts.
 
-    Parameters
-    ----------
-    before, after : (direction, range) float32
-    spacing_m : float
-        Spacing of the ranges.
-    floor : float
-        Amplitude of the weakest reflector to be preserved.
-    noise : float or (range,) float32
-        Difference that noise alone causes; it is subtracted.
+    - ``before``, ``after`` (direction, range) float32
+    - ``spacing_m``: spacing of the ranges.
+    - ``floor``: amplitude of the weakest reflector to be preserved.
+    - ``noise`` float or (range,) float32: difference that noise alone causes; it is subtracted.
     """
     beside = np.maximum(_local(np.minimum(before, after), spacing_m), floor)
     change = np.maximum(np.abs(after - before) - noise, 0.0)

@@ -58,16 +58,12 @@ class CallFilter(Protocol):
 class Arrivals:
     """Copies of one call, or of one frame of noise, at the microphones.
 
-    Attributes
-    ----------
-    delay_s : (path, mic) float64
-        Delay from the start of the record, including the microphone's own delay.
-    amplitude : (path, mic, frequency) float64 or complex128
-        Amplitude at each frequency, or one value for all, including the microphone's sensitivity.
-    stretch : (path, mic) float64 or None
-        Received duration relative to the emitted duration; None if nothing moves and clocks agree.
-    filters : tuple of CallFilter
-        Filters of the call by its emitter.
+    - ``delay_s`` (path, mic): delay from the start of the record, including the microphone's own delay.
+    - ``amplitude`` (path, mic, frequency) float64 or complex128: amplitude at each frequency, or one value for all,
+      including the microphone's sensitivity.
+    - ``stretch`` (path, mic) or None: received duration relative to the emitted duration; None if nothing moves and
+      clocks agree.
+    - ``filters``: filters of the call by its emitter.
     """
 
     call: Call | NoiseFrame
@@ -92,20 +88,8 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clo
     """Return all copies of calls that arrive at the microphones.
 
     Delays are rounded to picoseconds. This is far finer than a measurement can resolve. It is coarse enough to hide the
-    last digits of sines and roots, which differ between processors.
-
-    Parameters
-    ----------
-    active : set of str
-        The effects that are simulated.
-    frequency_hz : (frequency,) float64
-        Frequencies at which filters are evaluated.
-    clock : CostStopwatch
-        Accumulates the time spent on each effect.
-
-    Returns
-    -------
-    list of Arrivals
+    last digits of sines and roots, which differ between processors. Filters are evaluated at ``frequency_hz``
+    (frequency,).
     """
     gain, _ = gains(shot, active, clock)
     found: list[Arrivals] = []
@@ -163,21 +147,9 @@ def echoes(
 ) -> list[Paths]:
     """Return the paths of an emitter's call over targets and walls.
 
-    The direct path is included only for the emitter of another sensor.
-
-    Parameters
-    ----------
-    active : set of str
-        The effects that are simulated.
-    number : int
-        Index of the emitting sensor.
-    n_frequencies : int
-        Number of frequencies at which amplitudes will be computed.
-
-    Raises
-    ------
-    ArgumentError
-        There are too many paths or amplitudes.
+    The direct path is included only for the emitter of another sensor. ``number`` is the index of the emitting sensor.
+    Amplitudes will be computed at ``n_frequencies`` frequencies. Raise ArgumentError if there are too many paths or
+    amplitudes.
     """
     firsts, seconds, specular = views_of(shot, active, number, transmitter_of(shot, active, number), clock)
     over = by_targets
@@ -202,14 +174,7 @@ def views_of(
 ) -> Views:
     """Return the emitter and the microphones as seen from the targets, and the emitter from the microphones.
 
-    Parameters
-    ----------
-    active : set of str
-        The effects that are simulated.
-    number : int
-        Number of the emitter, different for each of the snapshot.
-    transmitter : Transmitters
-        The emitter without mirror images.
+    The emitter is without mirror images; ``number`` distinguishes the emitters of the snapshot.
     """
     views: Views = (
         images(transmitter, shot.targets.positions_m, shot.mirrors, 0),
@@ -298,18 +263,9 @@ def arrived(
 
     Copies that end before the record begins are left out. Clocks that differ can cause such copies.
 
-    Parameters
-    ----------
-    active : set of str
-        The effects that are simulated.
-    number : int
-        Index of the emitting sensor.
-    delay_s : (path, mic) float64
-        Delay of the sound.
-    amplitude : (path, mic, frequency) float64 or complex128
-        Amplitude, including the microphone's sensitivity.
-    stretch : (path, mic) float64, optional
-        Received duration relative to the emitted duration.
+    - ``delay_s`` (path, mic): delay of the sound.
+    - ``amplitude`` (path, mic, frequency) float64 or complex128: amplitude, including the microphone's sensitivity.
+    - ``stretch`` (path, mic): received duration relative to the emitted duration.
     """
     sensor = shot.scene.sensors[number]
     for _, act in acting("clock_times", active):

@@ -15,12 +15,10 @@ _KEY_BYTES = 1000  # of a key, which contains a set of effects
 
 
 class Cache:
-    """Results by key; if they exceed a total size, the least recently used are discarded.
+    """Results by key; the least recently used are discarded if all exceed ``max_bytes``.
 
-    Parameters
-    ----------
-    max_bytes : int, optional
-        Largest total size of the results and keys in bytes; 128 MiB by default. A larger result is kept alone.
+    ``max_bytes``: largest total size of the results and keys in bytes; 128 MiB by default. A larger result is kept
+    alone.
     """
 
     def __init__(self, max_bytes: int = _MAX_BYTES) -> None:

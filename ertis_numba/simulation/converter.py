@@ -15,14 +15,9 @@ QUANTISATION_DBFS = {"int16": -20 * np.log10(2.0**15 * np.sqrt(12)), "float32": 
 class Converter:
     """Converts the signals of some microphones to PCM samples, block by block.
 
-    Parameters
-    ----------
-    recording : Recording
-        Recording settings; the encoding selects the converter.
-    keys : (mic,) uint64
-        Seed of each microphone's noise.
-    noise_rms : float
-        RMS of the white noise added to each signal, full scale 1.
+    - ``recording``: recording settings; the encoding selects the converter.
+    - ``keys`` (mic,) uint64: seed of each microphone's noise.
+    - ``noise_rms``: RMS of the white noise added to each signal, full scale 1.
     """
 
     def __init__(self, recording: Recording, keys: NDArray[np.uint64], noise_rms: float) -> None:
@@ -35,11 +30,8 @@ class Converter:
     def process(self, signals: NDArray[np.float64], *, out: NDArray[np.int16] | NDArray[np.float32]) -> None:
         """Write the samples of the next block; values beyond full scale are clipped.
 
-        Parameters
-        ----------
-        signals : (mic, sample) float64
-            Full scale 1, finite. They may extend beyond the block.
-        out : (sample, mic) int16 or float32
+        ``signals`` (mic, sample): full scale 1, finite. They may extend beyond the block. ``out`` (sample, mic) int16
+        or float32.
         """
         for mic, noise in enumerate(self._noise):
             heard = signals[mic, : len(out)]

@@ -19,17 +19,11 @@ Floats = NDArray[np.float64]
 class Echoes:
     """Echoes in an image, one per path.
 
-    Attributes
-    ----------
-    gain : (path, frequency) float64 or complex128
-    delay_s : (path,) float64
-        Delay at the centre of the array.
-    direction : (path, axis) float64
-        Unit vector towards the source of the sound, in the sensor frame.
-    coverage : (path,) float64
-        Gain of the best beam for a wave from this direction, at most 1.
-    power : (frequency,) float64
-        Fraction of the matched call's power at each frequency.
+    - ``gain`` (path, frequency) float64 or complex128
+    - ``delay_s`` (path,): delay at the centre of the array.
+    - ``direction`` (path, axis): unit vector towards the source of the sound, in the sensor frame.
+    - ``coverage`` (path,): gain of the best beam for a wave from this direction, at most 1.
+    - ``power`` (frequency,): fraction of the matched call's power at each frequency.
     """
 
     names: tuple[str, ...]
@@ -66,12 +60,8 @@ class Echoes:
 class Ways:
     """Paths of one emitter's call to the centre of the array.
 
-    Attributes
-    ----------
-    delay_s : (path,) float64
-    direction : (path, axis) float64
-    coverage : (path,) float64
-        The last four are those of `Echoes`, for the paths one after the other.
+    All but ``paths`` have one entry per path, one after the other, as in `Echoes`: ``delay_s`` (path,), ``direction``
+    (path, axis) and ``coverage`` (path,).
     """
 
     paths: list[Paths]

@@ -34,23 +34,13 @@ _ROUNDS = 6  # two usually suffice; effects that depend on each other take more
 class Verdict:
     """Decision about one effect.
 
-    Attributes
-    ----------
-    name : str
-        Name of the effect.
-    on : bool
-        True if the effect is simulated.
-    reason : str
-        Explanation for the user.
-    estimate_db : float or None
-        Change of the image in decibels. None if the effect cannot be left out or applies to nothing in the scene.
-    forced : bool
-        True if the scene overrides the estimate: by ``effects``, by a key that requests the effect, or by a tolerance
-        of 0.
-    ab_rendered : bool
-        True if an A/B render measured the change, because the estimate was too close to the tolerance.
-    coupled : bool
-        True if the decision about this effect depends on another effect and vice versa. Both are then on, to be safe.
+    - ``estimate_db``: change of the image in decibels. None if the effect cannot be left out or applies to nothing in
+      the scene.
+    - ``forced``: True if the scene overrides the estimate: by ``effects``, by a key that requests the effect, or by a
+      tolerance of 0.
+    - ``ab_rendered``: True if an A/B render measured the change, because the estimate was too close to the tolerance.
+    - ``coupled``: True if the decision about this effect depends on another effect and vice versa. Both are then on, to
+      be safe.
     """
 
     name: str
@@ -66,12 +56,7 @@ class Verdict:
 class EffectPlan:
     """Effects that are simulated for a scene, with reasons.
 
-    Attributes
-    ----------
-    verdicts : tuple of Verdict
-        One per effect.
-    notes : tuple of str
-        Validity limits of the models that the scene exceeds.
+    ``notes``: validity limits of the models that the scene exceeds.
     """
 
     verdicts: tuple[Verdict, ...]
@@ -96,21 +81,13 @@ def make_plan(scene: Scene) -> EffectPlan:
 
     The other effects are estimated for all sensors at the beginning, at the end, in between and at waypoints. The
     greatest change counts. Effects are estimated one after the other, each given those before it: geometry first, then
-    filters of echoes, then additional sound. Estimation repeats, given all other effects, until no decision changes.
-    An effect that changes the recorded sound of a source by more than the tolerance is on, even if no image shows it.
+    filters of echoes, then additional sound. Estimation repeats, given all other effects, until no decision changes. An
+    effect that changes the recorded sound of a source by more than the tolerance is on, even if no image shows it.
 
     If an estimate is not certain enough, A/B renders measure the change. They render and process the measurements with
     the greatest estimates, with and without the effect. They also use the loudest measurement, because estimates do not
-    model converters.
-
-    Returns
-    -------
-    EffectPlan
-
-    Raises
-    ------
-    ArgumentError
-        A surface touches or encloses a microphone or an emitter, or the scene exceeds a limit.
+    model converters. Raise ArgumentError if a surface touches or encloses a microphone or an emitter, or the scene
+    exceeds a limit.
 
     Examples
     --------

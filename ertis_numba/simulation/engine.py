@@ -33,22 +33,9 @@ _CHANNELS = 128  # rendered at a time, so that memory does not grow with the arr
 class Engine:
     """Renders the measurements of one sensor with given effects.
 
-    Parameters
-    ----------
-    sensor : Sensor
-        One of the scene's sensors.
-    active : frozenset of str
-        The effects to simulate.
-    threads : int, optional
-        Number of threads; all cores by default. The bits do not depend on it.
-
-    Attributes
-    ----------
-    clock : CostStopwatch
-        Time spent on each effect so far.
-    loudest : float
-        Highest amplitude at a modulator or converter so far, full scale 1. Modulators are linear up to about 0.6,
-        converters up to 1.
+    - ``threads``: number of threads; all cores by default. The bits do not depend on it.
+    - ``loudest``: highest amplitude at a modulator or converter so far, full scale 1. Modulators are linear up to about
+      0.6, converters up to 1.
     """
 
     def __init__(self, scene: Scene, sensor: Sensor, active: frozenset[str], *, threads: int | None = None) -> None:
@@ -109,12 +96,7 @@ class Engine:
     def converted(self, signals: NDArray[np.float64], draw: int) -> NDArray[Any]:
         """Return the raw samples for signals that already contain all noise other than that of the conversion.
 
-        Parameters
-        ----------
-        signals : (mic, sample) float64
-            Full scale 1.
-        draw : int
-            Seed of the modulators' dither.
+        ``signals`` (mic, sample): full scale 1. ``draw``: seed of the modulators' dither.
         """
         form = sample_format(self._settings)
         words = np.zeros(form.shape_2d, form.dtype)

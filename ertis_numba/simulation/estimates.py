@@ -19,14 +19,8 @@ Floats = NDArray[np.float64]
 class Estimate:
     """Estimated change of an image by an effect.
 
-    Attributes
-    ----------
-    change_db : float
-        Greatest change of the image in decibels.
-    reason : str
-        Explanation for the user.
-    sure : float
-        Factor by which the estimate may be wrong; 20 by default.
+    ``change_db``: greatest change of the image in decibels. ``sure``: factor by which the estimate may be wrong; 20 by
+    default.
     """
 
     change_db: float

@@ -44,15 +44,8 @@ _MODULATOR_DBFS, _MAX_NOISE_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}, -10
 class Sight:
     """Estimated image of one sensor at one time, with given effects.
 
-    Parameters
-    ----------
-    active : frozenset of str
-        The effects that are simulated.
-
-    Attributes
-    ----------
-    frequency_hz, power : (frequency,) float64
-        Frequencies of the matched call, and the fraction of its power at each; the powers add up to 1.
+    ``frequency_hz``, ``power`` (frequency,): frequencies of the matched call, and the fraction of its power at each;
+    the powers add up to 1.
     """
 
     def __init__(self, shot: Snapshot, active: frozenset[str]) -> None:
@@ -241,14 +234,10 @@ class Sight:
     ) -> float:
         """Return the highest amplitude that white noise, or noise with a spectrum, reaches in the image.
 
-        Parameters
-        ----------
-        dbfs : float
-            RMS of the noise in dBFS, over the whole band up to half of the sample rate or over ``band``.
-        coherent : bool
-            True if the noise comes from one place; a beam then does not reduce it.
-        band : (frequency_hz, power), optional
-            Equally spaced frequencies, and the power at each on an arbitrary scale; white noise by default.
+        - ``dbfs``: RMS of the noise in dBFS, over the whole band up to half of the sample rate or over ``band``.
+        - ``coherent``: True if the noise comes from one place; a beam then does not reduce it.
+        - ``band`` (frequency_hz, power): equally spaced frequencies, and the power at each on an arbitrary scale; white
+          noise by default.
         """
         matched, rate_hz, n_fft = pulse.match(self.settings)
         heard_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
@@ -281,15 +270,8 @@ class Sight:
     def near_field(self, amplitude: Floats, delay_s: Floats) -> tuple[Floats, Floats]:
         """Return the highest amplitude in any beam of a sound from within the array, after the image begins.
 
-        Parameters
-        ----------
-        amplitude, delay_s : (mic,) float64
-            Amplitude and delay at each microphone.
-
-        Returns
-        -------
-        time_s, level : (time,) float64
-            Times after the start of the record, and the highest amplitude at each.
+        ``amplitude``, ``delay_s`` (mic,): amplitude and delay at each microphone. ``time_s``, ``level`` (time,): times
+        after the start of the record, and the highest amplitude at each.
         """
         begin_s = 2 * self.settings.processing.range_m[0] / self.shot.speed_m_s
         time_s = begin_s + np.linspace(0.0, self.settings.call.duration_s, _LAGS)
@@ -304,11 +286,7 @@ class Sight:
     def beam_change(self, directions: Floats, weight: Floats | NDArray[np.complex128]) -> float:
         """Return the greatest change of beams relative to the reflector, when weights apply to the microphones.
 
-        Parameters
-        ----------
-        directions : (path, axis) float64
-            Unit vectors towards the reflectors.
-        weight : (mic, frequency) complex128
+        ``directions`` (path, axis): unit vectors towards the reflectors. ``weight`` (mic, frequency) complex128.
         """
         nodes = slice(pulse.N_NODES % 8 // 2, None, 8)
         power = self.power[nodes] / self.power[nodes].sum()
@@ -339,21 +317,14 @@ class Sight:
     ) -> tuple[int, float]:
         """Return the path that changes most relative to the image around it, and the ratio.
 
-        The envelope of each path changes. Where a path overlaps the side lobes of others, the phase of its carrier
-        also matters.
+        The envelope of each path changes. Where a path overlaps the side lobes of others, the phase of its carrier also
+        matters.
 
-        Parameters
-        ----------
-        before, after : Echoes
-            The same paths with different effects.
-        around : Surroundings
-            The image to which each change is relative.
-        reach : (path,) float64
-            Fraction of each echo that reaches into the range window.
-        turn_s : (path,) float64, optional
-            Time by which each carrier is shifted; the change of the delay by default.
-        aside : (path,) float64, optional
-            Other changes of each path; 0 by default.
+        - ``before``, ``after``: the same paths with different effects.
+        - ``around``: the image to which each change is relative.
+        - ``reach`` (path,): fraction of each echo that reaches into the range window.
+        - ``turn_s`` (path,): time by which each carrier is shifted; the change of the delay by default.
+        - ``aside`` (path,): other changes of each path; 0 by default.
         """
         shift_s = after.delay_s - before.delay_s
         turn_s = np.abs(shift_s) if turn_s is None else turn_s

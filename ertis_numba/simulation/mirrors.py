@@ -28,16 +28,10 @@ _NO_WALL = -1
 class Seen(Generic[End]):
     """Ways from one end of sound paths to some places, direct or mirrored in walls.
 
-    Attributes
-    ----------
-    ends : Transmitters or Receivers
-        The end itself, and its mirror images that are visible from some place.
-    image, place : (way,) int
-        The image and the place that each way joins.
-    mirrors : (wall, way) int
-        The wall at each mirror point, starting at the end; `_NO_WALL` beyond the last.
-    corners_m : (corner, way, axis) float64
-        Corners of each way from the end to the place, both included. The place repeats beyond the last wall.
+    - ``image``, ``place`` (way,) int: the image and the place that each way joins.
+    - ``mirrors`` (wall, way) int: the wall at each mirror point, starting at the end; `_NO_WALL` beyond the last.
+    - ``corners_m`` (corner, way, axis): corners of each way from the end to the place, both included. The place repeats
+      beyond the last wall.
     """
 
     ends: End
@@ -83,21 +77,9 @@ def images(end: End, places_m: Floats, mirrors: Mirrors, largest: int) -> Seen[E
     """Return the ways to an end and to its images of up to ``largest`` reflections that are visible from some place.
 
     The image of an image is ``p' = p - 2 ((p - q)·n) n`` (J. B. Allen, D. A. Berkley, Image method for efficiently
-    simulating small-room acoustics, JASA 65, 1979). It is valid where every mirror point lies within its wall
-    (J. Borish, Extension of the image model to arbitrary polyhedra, JASA 75, 1984).
-
-    Parameters
-    ----------
-    end : Transmitters or Receivers
-        The end without images.
-    places_m : (place, axis) float64
-    largest : int
-        Maximum number of reflections.
-
-    Raises
-    ------
-    ArgumentError
-        There are too many chains of walls.
+    simulating small-room acoustics, JASA 65, 1979). It is valid where every mirror point lies within its wall (J.
+    Borish, Extension of the image model to arbitrary polyhedra, JASA 75, 1984). ``end`` is without images; ``places_m``
+    is (place, axis). Raise ArgumentError if there are too many chains of walls.
     """
     n_places = len(places_m)
     require_few_mirrors(len(mirrors), largest, n_places)
@@ -151,11 +133,8 @@ def _parts(n_chains: int, n_places: int) -> Iterator[slice]:
 def _longer(chains: Indices, tips_m: Floats, mirrors: Mirrors) -> tuple[Indices, Floats]:
     """Extend every chain by one more image, in each wall except its last.
 
-    Parameters
-    ----------
-    chains : (wall, chain) int
-    tips_m : (image, chain, axis) float64
-        Positions of the end and its images in the walls of the chain.
+    ``chains`` (wall, chain) int. ``tips_m`` (image, chain, axis): positions of the end and its images in the walls of
+    the chain.
     """
     number = np.tile(np.arange(len(mirrors)), chains.shape[1])
     chain = np.repeat(np.arange(chains.shape[1]), len(mirrors))
@@ -170,12 +149,8 @@ def _longer(chains: Indices, tips_m: Floats, mirrors: Mirrors) -> tuple[Indices,
 def _traced(chains: Indices, tips_m: Floats, mirrors: Mirrors, places_m: Floats) -> tuple[Indices, Indices, Floats]:
     """Trace the sound back from the places over the walls to the end itself.
 
-    Returns
-    -------
-    chain, place : (way,) int
-        The chains that are visible from each place.
-    corners_m : (corner, way, axis) float64
-        The corners of these ways, starting at the end.
+    ``chain``, ``place`` (way,) int: the chains that are visible from each place. ``corners_m`` (corner, way, axis): the
+    corners of these ways, starting at the end.
     """
     chain = np.repeat(np.arange(chains.shape[1]), len(places_m))
     place = np.tile(np.arange(len(places_m)), chains.shape[1])

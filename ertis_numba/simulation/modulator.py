@@ -21,21 +21,14 @@ _GAIN_STEP = 2.0**-20  # gains are rounded, so that differences between processo
 class Modulator:
     """One modulator per enabled microphone; its state carries over from block to block.
 
-    Parameters
-    ----------
-    keys : (mic,) uint64
-        Seed of each microphone's noise and dither.
-    noise_rms : (mic,) float64
-        RMS of the white noise added to each signal, full scale 1; 0 adds none and takes no time.
-    order : int
-        Order of the loop, 1 to 4.
-    dither : float
-        Width of the uniform dither at the quantiser, full scale 1. It breaks up idle tones. Values above 0.5 reduce
-        the dynamic range.
-    band : float
-        Upper edge of the band in which noise is minimised, in cycles per sample.
-    threads : int, optional
-        Number of threads; all cores by default. The bits do not depend on it.
+    The bits do not depend on the number of threads.
+
+    - ``keys`` (mic,) uint64: seed of each microphone's noise and dither.
+    - ``noise_rms`` (mic,): RMS of the white noise added to each signal, full scale 1; 0 adds none and takes no time.
+    - ``order``: order of the loop, 1 to 4.
+    - ``dither``: width of the uniform dither at the quantiser, full scale 1. It breaks up idle tones. Values above 0.5
+      reduce the dynamic range.
+    - ``band``: upper edge of the band in which noise is minimised, in cycles per sample.
     """
 
     def __init__(
@@ -63,12 +56,8 @@ class Modulator:
     def process(self, signals: NDArray[np.float64], *, out: NDArray[np.unsignedinteger]) -> None:
         """Write the words of the next block; bits without an enabled microphone are set to 0.
 
-        Parameters
-        ----------
-        signals : (mic, sample) float64
-            Full scale 1, finite. The bits follow them up to about 0.6; above, the loop overloads and recovers.
-            They may extend beyond the block.
-        out : (sample, word) uint8, uint16, uint32 or uint64
+        ``signals`` (mic, sample): full scale 1, finite. The bits follow them up to about 0.6; above, the loop overloads
+        and recovers. They may extend beyond the block. ``out`` (sample, word) uint8, uint16, uint32 or uint64.
         """
         octets = out.view(np.uint8)  # words are little-endian, like the processors that this package supports
         checks.shape("signals", (len(signals), min(signals.shape[1], len(out))), (len(self._states), len(out)))

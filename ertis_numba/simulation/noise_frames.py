@@ -28,11 +28,6 @@ class NoiseFrame:
     """One frame of the noise of a source, with an RMS of 1 before its window.
 
     Frames overlap by half, and the squares of their windows add up to 1.
-
-    Attributes
-    ----------
-    seed : tuple of int
-        Seed of the random numbers.
     """
 
     noise: Noise

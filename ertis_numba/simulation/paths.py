@@ -19,20 +19,14 @@ Floats = NDArray[np.float64]
 class Paths:
     """Paths between emitters and sets of microphones, or between their mirror images.
 
-    Attributes
-    ----------
-    receiver : Receivers
-        One image of the emitter and of the microphones per path.
-    targets : Targets
-        One per path, or none: paths without targets are direct, counted as the second leg.
-    first_m, second_m : (path, mic) float64
-        Lengths of the legs before and after the target.
-    leaving, arriving : (path, mic, axis) float64
-        Unit vectors along the first and the last leg, in the direction of the sound, between the mirror images.
-    transmitter_corners_m, receiver_corners_m : (wall, path) float64
-        Distances of the mirror points from either end, along the path.
-    surface : bool
-        True if legs end on the surface of spheres; False, the default, if they end at the centres.
+    - ``receiver``: one image of the emitter and of the microphones per path.
+    - ``targets``: one per path, or none: paths without targets are direct, counted as the second leg.
+    - ``first_m``, ``second_m`` (path, mic): lengths of the legs before and after the target.
+    - ``leaving``, ``arriving`` (path, mic, axis): unit vectors along the first and the last leg, in the direction of
+      the sound, between the mirror images.
+    - ``transmitter_corners_m``, ``receiver_corners_m`` (wall, path): distances of the mirror points from either end,
+      along the path.
+    - ``surface``: True if legs end on the surface of spheres; False, the default, if they end at the centres.
     """
 
     transmitter: Transmitters
@@ -72,12 +66,8 @@ def pairs(
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the ways to and from each place that form a path of up to ``largest`` walls: (path,) int each.
 
-    Paths are in the order of the emitter's images, then the microphones' images, then the places.
-
-    Raises
-    ------
-    ArgumentError
-        There are too many paths.
+    Paths are in the order of the emitter's images, then the microphones' images, then the places. Raise ArgumentError
+    if there are too many paths.
     """
     rank = seconds.place * (largest + 1) + seconds.n_mirrors
     sorted_ways = np.argsort(rank, kind="stable")
@@ -96,12 +86,8 @@ def pairs(
 def by_targets(first: Seen[Transmitters], second: Seen[Receivers], targets: Targets) -> Paths:
     """Return the paths over some targets, at least one.
 
-    Parameters
-    ----------
-    first, second : Seen
-        Ways from the emitter to the targets, and from the microphones to the same targets; one per path.
-    targets : Targets
-        All targets of the scene.
+    ``targets`` are all of the scene. ``first``, ``second``: ways from the emitter to the targets, and from the
+    microphones to the same targets; one per path.
     """
     return turning(first, second, targets, targets.positions_m[first.place, None, :], surface=False)
 
@@ -136,16 +122,8 @@ def without_target(
 ) -> Paths:
     """Return the direct paths from an emitter or its mirror images to the microphones.
 
-    Parameters
-    ----------
-    transmitter : Transmitters
-        One per path.
-    receiver : Receivers
-        The microphones without mirror images.
-    targets : Targets
-        All targets of the scene.
-    corners_m : (wall, path) float64, optional
-        Distances of the mirror points from the emitter, along the path.
+    ``transmitter`` has one image per path, ``receiver`` none; ``targets`` are all of the scene. ``corners_m``
+    (wall, path): distances of the mirror points from the emitter, along the path.
     """
     n_paths = len(transmitter.position_m)
     none = np.zeros((0, n_paths))

@@ -24,13 +24,9 @@ _NS_PER_S = 10**9
 class MovingPose(NamedTuple):
     """Pose and motion in the world frame at one instant.
 
-    Attributes
-    ----------
-    position_m, velocity_m_s : (axis,) float64
-    rotation : (3, 3) float64
-        Rotation from the frame of the object to the world frame.
-    spin_rad_s : (axis,) float64
-        Angular velocity.
+    - ``position_m``, ``velocity_m_s`` (axis,)
+    - ``rotation`` (3, 3): rotation from the frame of the object to the world frame.
+    - ``spin_rad_s`` (axis,): angular velocity.
     """
 
     position_m: Floats
@@ -41,14 +37,9 @@ class MovingPose(NamedTuple):
     def at(self, offset_m: Floats, rotation: Floats) -> "MovingPose":
         """Return the pose of an object that is fixed to this one.
 
-        ``p' = p + R o`` and ``v' = v + ω × R o`` for an offset o.
-
-        Parameters
-        ----------
-        offset_m : (axis,) float64
-            Position of the other object in the frame of this one.
-        rotation : (3, 3) float64
-            Rotation from the frame of the other object to the frame of this one.
+        ``p' = p + R o`` and ``v' = v + ω × R o`` for an offset o. ``offset_m`` (axis,): position of the other object in
+        the frame of this one. ``rotation`` (3, 3): rotation from the frame of the other object to the frame of this
+        one.
         """
         arm_m = self.rotation @ offset_m
         return MovingPose(
@@ -131,17 +122,8 @@ class Platform(TomlTable, frozen=True, kw_only=True):
     def trajectory(self, time_s: Floats, time_ns: NDArray[np.int64] | None = None) -> Trajectory:
         """Return the poses at times of the scene.
 
-        Parameters
-        ----------
-        time_s : (pose,) float64
-            Times of the scene in seconds.
-        time_ns : (pose,) int64, optional
-            Times of the poses in the result; those of the scene by default.
-
-        Returns
-        -------
-        Trajectory
-            Its source is "scene".
+        The source of the trajectory is "scene". ``time_s`` (pose,): times of the scene in seconds. ``time_ns`` (pose,)
+        int64: times of the poses in the result; those of the scene by default.
         """
         times_s = np.asarray(time_s, np.float64)
         x, y, z, yaw_deg = (np.interp(times_s, *pair) for pair in self._axes())

@@ -20,13 +20,7 @@ MAX_AMPLITUDES = 2**26
 
 
 def require_few_mirrors(n_walls: int, order: int, n_places: int) -> None:
-    """Raise an error if the mirror images of a scene would take too long.
-
-    Raises
-    ------
-    ArgumentError
-        The number of chains of walls × places exceeds `MAX_MIRROR_POINTS`.
-    """
+    """Raise ArgumentError if the number of chains of walls × places exceeds `MAX_MIRROR_POINTS`."""
     n_chains = sum(n_walls * (n_walls - 1) ** k for k in range(order)) if n_walls else 0
     if n_chains * n_places > MAX_MIRROR_POINTS:
         raise ArgumentError(
@@ -37,13 +31,7 @@ def require_few_mirrors(n_walls: int, order: int, n_places: int) -> None:
 
 
 def require_few_paths(n_paths: int) -> None:
-    """Raise an error if the estimates of a scene would take too long.
-
-    Raises
-    ------
-    ArgumentError
-        There are more paths than `MAX_PATHS`.
-    """
+    """Raise ArgumentError if there are more paths than `MAX_PATHS`, and estimates would take too long."""
     if n_paths > MAX_PATHS:
         raise ArgumentError(
             f"the scene has at least {n_paths} sound paths to one sensor; the limit is {MAX_PATHS}. "
@@ -52,13 +40,7 @@ def require_few_paths(n_paths: int) -> None:
 
 
 def require_few_amplitudes(n_paths: int, n_mics: int, n_frequencies: int) -> None:
-    """Raise an error if one measurement of a scene would need too much memory.
-
-    Raises
-    ------
-    ArgumentError
-        The number of amplitudes exceeds `MAX_AMPLITUDES`.
-    """
+    """Raise ArgumentError if one measurement needs more than `MAX_AMPLITUDES` amplitudes, and thus too much memory."""
     if n_paths * n_mics * n_frequencies > MAX_AMPLITUDES:
         raise ArgumentError(
             f"the scene has {n_paths} sound paths to {n_mics} microphones at {n_frequencies} frequencies, in total "

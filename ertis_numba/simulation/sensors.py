@@ -215,11 +215,6 @@ class Sensor(Settings, frozen=True, kw_only=True):
         """Raise an error for faults of channels without a microphone.
 
         The check is separate because it needs the layout.
-
-        Raises
-        ------
-        ArgumentError
-            A faulty channel has no microphone.
         """
         enabled = microphones(self.array.replace(disabled=None)).enabled
         for channel in self.electronics.faulty_channels:

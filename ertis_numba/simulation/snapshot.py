@@ -23,17 +23,12 @@ Found = TypeVar("Found")
 class Transmitters:
     """Poses of an emitter and of its mirror images in walls.
 
-    Attributes
-    ----------
-    position_m, velocity_m_s : (image, axis) float64
-    facing : (image, axis) float64
-        Unit vectors along the emitter's axis.
-    sways_m_s : (wall, image, axis) float64
-        Velocity that the motion of each wall adds to the image, starting at the emitter; 0 beyond an image's last wall.
-    walls : tuple of tuple of str
-        Names of each image's walls in the order in which the sound meets them.
-    reflection : (image,) float64
-        Amplitude reflection factor of these walls.
+    - ``position_m``, ``velocity_m_s`` (image, axis)
+    - ``facing`` (image, axis): unit vectors along the emitter's axis.
+    - ``sways_m_s`` (wall, image, axis): velocity that the motion of each wall adds to the image, starting at the
+      emitter; 0 beyond an image's last wall.
+    - ``walls``: names of each image's walls in the order in which the sound meets them.
+    - ``reflection`` (image,): amplitude reflection factor of these walls.
     """
 
     position_m: Floats
@@ -57,22 +52,15 @@ class Transmitters:
 class Receivers:
     """Poses of the microphones of a sensor and of their mirror images in walls.
 
-    Attributes
-    ----------
-    positions_m : (image, mic, axis) float64
-    centre_m, velocity_m_s : (image, axis) float64
-        Centre of the microphones, and its velocity.
-    spin_rad_s : (image, axis) float64
-        Angular velocity about the centre.
-    axes : (image, 3, axis) float64
-        The sensor's x, y and z as unit vectors. An odd number of reflections makes them left-handed.
-    sways_m_s : (wall, image, axis) float64
-        Velocity that the motion of each wall adds to the image, starting at the microphones; 0 beyond an image's last
-        wall.
-    walls : tuple of tuple of str
-        Names of each image's walls in the order in which the sound meets them.
-    reflection : (image,) float64
-        Amplitude reflection factor of these walls.
+    - ``positions_m`` (image, mic, axis)
+    - ``centre_m``, ``velocity_m_s`` (image, axis): centre of the microphones, and its velocity.
+    - ``spin_rad_s`` (image, axis): angular velocity about the centre.
+    - ``axes`` (image, 3, axis): the sensor's x, y and z as unit vectors. An odd number of reflections makes them
+      left-handed.
+    - ``sways_m_s`` (wall, image, axis): velocity that the motion of each wall adds to the image, starting at the
+      microphones; 0 beyond an image's last wall.
+    - ``walls``: names of each image's walls in the order in which the sound meets them.
+    - ``reflection`` (image,): amplitude reflection factor of these walls.
     """
 
     positions_m: Floats
@@ -93,17 +81,11 @@ class Receivers:
 class Targets:
     """Points, discs and spheres of a scene.
 
-    Attributes
-    ----------
-    positions_m, velocities_m_s : (target, axis) float64
-    strength : (target,) float64
-        Amplitude of the echo at 1 m from a point, or amplitude reflection factor of a sphere.
-    radius_m : (target,) float64
-        Radius of spheres, 0 for points.
-    diameter_m : (target,) float64
-        Diameter of discs, 0 for others.
-    normals : (target, axis) float64
-        Unit normals of discs.
+    - ``positions_m``, ``velocities_m_s`` (target, axis)
+    - ``strength`` (target,): amplitude of the echo at 1 m from a point, or amplitude reflection factor of a sphere.
+    - ``radius_m`` (target,): radius of spheres, 0 for points.
+    - ``diameter_m`` (target,): diameter of discs, 0 for others.
+    - ``normals`` (target, axis): unit normals of discs.
     """
 
     names: tuple[str, ...]
@@ -127,16 +109,10 @@ class Targets:
 class Mirrors:
     """Walls that reflect sound.
 
-    Attributes
-    ----------
-    points_m, velocities_m_s : (wall, axis) float64
-        Centres of the walls, and their velocities.
-    axes : (wall, 3, axis) float64
-        Normal, width and height as unit vectors.
-    half_sizes_m : (wall, 2) float64
-        Half of width and height; infinite for an unbounded wall.
-    reflection : (wall,) float64
-        Amplitude reflection factor.
+    - ``points_m``, ``velocities_m_s`` (wall, axis): centres of the walls, and their velocities.
+    - ``axes`` (wall, 3, axis): normal, width and height as unit vectors.
+    - ``half_sizes_m`` (wall, 2): half of width and height; infinite for an unbounded wall.
+    - ``reflection`` (wall,): amplitude reflection factor.
     """
 
     names: tuple[str, ...]
@@ -154,26 +130,12 @@ class Mirrors:
 class Snapshot:
     """Scene at the start of one measurement of one sensor.
 
-    Attributes
-    ----------
-    sensor : Sensor
-        The receiving sensor.
-    time_s : float
-        Start of the emission.
-    layout : Layout
-        Microphones of the sensor.
-    channels : (mic,) int64
-        Channels of the microphones.
-    receiver : Receivers
-        The microphones, without mirror images.
-    transmitters : tuple of Transmitters
-        Emitters without mirror images, one per sensor of the scene.
-    speed_m_s : float
-        Speed of sound.
-    token : object
-        Identity of the snapshot in the cache.
-    cache : Cache
-        Intermediate results, which snapshots may share.
+    - ``time_s``: start of the emission.
+    - ``channels`` (mic,) int64: channels of the microphones.
+    - ``receiver``: the microphones, without mirror images.
+    - ``transmitters``: emitters without mirror images, one per sensor of the scene.
+    - ``token``: identity of the snapshot in the cache.
+    - ``cache``: intermediate results, which snapshots may share.
     """
 
     scene: Scene

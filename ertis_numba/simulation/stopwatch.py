@@ -9,13 +9,7 @@ __all__ = ["CostStopwatch"]
 
 
 class CostStopwatch:
-    """Accumulates computation time by name.
-
-    Attributes
-    ----------
-    cost_ms : dict of str to float
-        Milliseconds by name.
-    """
+    """Accumulates computation time in milliseconds by name."""
 
     def __init__(self) -> None:
         self.cost_ms: dict[str, float] = defaultdict(float)

@@ -22,18 +22,11 @@ class Surroundings:
     Range side lobes count, including those of echoes outside of the window. Echoes below the floor never exceed it, and
     are left out.
 
-    Attributes
-    ----------
-    floor : float
-        Amplitude of the weakest reflector that the image shows.
-    level, delay_s : (path,) float64
-        Louder echoes.
-    window_s : (first, last)
-        Delays at which the image begins and ends.
-    same_s : float
-        Difference of delays that counts as the same range.
-    lobe : function
-        Returns the highest range side lobe of the call at a lag or beyond.
+    - ``floor``: amplitude of the weakest reflector that the image shows.
+    - ``level``, ``delay_s`` (path,): louder echoes.
+    - ``window_s`` (first, last): delays at which the image begins and ends.
+    - ``same_s``: difference of delays that counts as the same range.
+    - ``lobe``: returns the highest range side lobe of the call at a lag or beyond.
     """
 
     floor: float
@@ -61,14 +54,8 @@ def change_db(part: Floats, beside: Floats) -> float:
 def greatest(bounds: Floats, exact: Callable[[NDArray[np.intp]], Floats]) -> tuple[int, float]:
     """Return the index of the greatest of some numbers, and the number; 0 and 0 if none is positive.
 
-    Numbers are computed only while their upper bounds exceed the greatest number so far.
-
-    Parameters
-    ----------
-    bounds : (path,) float64
-        Upper bounds on the numbers.
-    exact : function
-        Returns the numbers at some indices.
+    Numbers are computed only while their upper bounds exceed the greatest number so far. ``bounds`` (path,): upper
+    bounds on the numbers. ``exact``: returns the numbers at some indices.
     """
     order = np.argsort(-bounds, kind="stable")
     bounds = bounds[order] * _ROUNDED

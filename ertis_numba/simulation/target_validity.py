@@ -59,14 +59,9 @@ def _near_discs(shot: Snapshot) -> list[str]:
 
 
 def require_clear(shot: Snapshot) -> None:
-    """Raise an error for spheres that touch or enclose a microphone of the sensor or an emitter.
+    """Raise an error for spheres that enclose a microphone or an emitter, or are closer than 1 mm to one.
 
     Points cannot enclose anything. The echo of a close point is limited, and `notes` reports it.
-
-    Raises
-    ------
-    ArgumentError
-        A surface is closer than 1 mm to a microphone or an emitter, or encloses it.
     """
     targets = shot.targets
     places = {f"emitter of {other.name}": place for other, place in _emitters(shot)}

@@ -28,15 +28,6 @@ def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
     Its level is that of the mean amplitude over the microphones and the call's band, relative to the strongest echo of
     the sensor's own call. Its velocity is relative to the sensor; for echoes over walls it is only the component along
     the line of sight. Calls of other sensors are included if cross-emission is simulated.
-
-    Parameters
-    ----------
-    active : frozenset of str
-        The effects that are simulated.
-
-    Returns
-    -------
-    list of Reflector
     """
     sight = Sight(shot, active)
     levels = {number: _levels(shot, sight, number) for number in sight.emitters(active)}
@@ -95,18 +86,7 @@ def _velocity_m_s(paths: Paths) -> Floats:
 
 
 def true_sources(shot: Snapshot, active: frozenset[str]) -> list[TrueSource]:
-    """Return the sources of sound, in the order of tones, noises and sonars.
-
-    Parameters
-    ----------
-    active : frozenset of str
-        The effects that are simulated.
-
-    Returns
-    -------
-    list of TrueSource
-        Empty if interference is not simulated.
-    """
+    """Return the sources of sound, in the order of tones, noises and sonars; none without simulated interference."""
     if "interference" not in active:
         return []
     return [_true_source(shot, each) for each in all_sources(shot, active)]

@@ -65,25 +65,15 @@ Place = Literal[
 class Effect:
     """Entry of an effect in the registry.
 
-    Attributes
-    ----------
-    name : str
-        Name in scenes, reports and recordings, and of the module.
-    summary : str
-        Description for the user.
-    example : str
-        Small scene that the effect changes at each of its places, as TOML.
-    places : tuple of str
-        Functions of the module that the rendering calls.
-    keys : tuple of str
-        Keys of a scene without which the effect applies to nothing; ``*`` stands for every key. Empty if the effect may
-        apply to every scene.
-    requested : bool
-        True if these keys request the effect, so that it is simulated even if no image shows it. Recordings contain it.
-    indispensable : str
-        Reason for which every scene needs the effect; empty if it can be left out.
-    weakens : bool
-        True if the effect only lowers the amplitude of calls.
+    - ``summary``: description for the user.
+    - ``example``: small scene that the effect changes at each of its places, as TOML.
+    - ``places``: functions of the module that the rendering calls.
+    - ``keys``: keys of a scene without which the effect applies to nothing; ``*`` stands for every key. Empty if the
+      effect may apply to every scene.
+    - ``requested``: True if these keys request the effect, so that it is simulated even if no image shows it.
+      Recordings contain it.
+    - ``indispensable``: reason for which every scene needs the effect; empty if it can be left out.
+    - ``weakens``: True if the effect only lowers the amplitude of calls.
     """
 
     name: str

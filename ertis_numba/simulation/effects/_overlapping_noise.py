@@ -20,12 +20,8 @@ _SHARED = 3  # frames that extend from one block into the next
 class OverlappingFrames:
     """Sums frames that overlap by half; with `window`, their powers add up to 1.
 
-    Parameters
-    ----------
-    seed : tuple of int
-        Seed of the noise, combined with the number of the frame.
-    make : function
-        Returns the signals of one frame at the microphones, (mic, sample) float64, from a random generator.
+    ``seed``: seed of the noise, combined with the number of the frame. ``make``: returns the signals of one frame at
+    the microphones, (mic, sample) float64, from a random generator.
     """
 
     def __init__(self, seed: tuple[int, ...], make: Callable[[np.random.Generator], Floats]) -> None:
@@ -64,11 +60,7 @@ def band_bins(band_hz: tuple[float, float], rate_hz: float) -> NDArray[np.int64]
 def drawn(random: np.random.Generator, bins: NDArray[np.int64], mix: NDArray[np.float64]) -> Floats:
     """Return frames of noise with an RMS of 1 in some bins: (row, sample) float64.
 
-    Parameters
-    ----------
-    bins : (bin,) int64
-    mix : (bin, row, source) float64
-        Mixing matrix from independent sources to rows at each frequency.
+    ``mix`` (bin, row, source): mixing matrix from independent sources to rows at each frequency.
     """
     n_sources = mix.shape[2]
     parts = random.standard_normal((2, len(bins), n_sources, 1))

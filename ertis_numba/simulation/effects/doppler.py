@@ -32,15 +32,9 @@ def emission(shot: Snapshot, paths: Paths, received_s: Floats) -> Floats:
 
     The source is at ``s(t)`` and a microphone at ``m(t)``, both with constant velocity. Sound that arrives at t left u
     earlier, with ``|m(t) - s(t - u)| = c u``. With ``d = m(t) - s(t)`` and the velocity v of the source, u is the
-    positive root of ``(c² - v²) u² - 2 (d·v) u - d² = 0``. The sound meets a moving wall
-    after the same fraction of the path as without motion, which is accurate to first order in v / c.
-
-    Parameters
-    ----------
-    paths : Paths
-        Paths without targets.
-    received_s : (mic, time) float64
-        Times relative to the snapshot.
+    positive root of ``(c² - v²) u² - 2 (d·v) u - d² = 0``. The sound meets a moving wall after the same fraction of the
+    path as without motion, which is accurate to first order in v / c. ``paths`` have no targets; ``received_s``
+    (mic, time) is relative to the snapshot.
     """
     source, receiver, speed_m_s = paths.transmitter, paths.receiver, shot.speed_m_s
     # A wall moves the image from t - u until the time of reflection, so only a part of its velocity counts in v.
@@ -113,18 +107,8 @@ def _met_s(from_m: Floats, left_s: Floats, place_m: Floats, velocity_m_s: Floats
     """Return the times at which sound meets objects in uniform motion: (path, mic) float64.
 
     Sound that leaves ``a`` at t₀ meets ``p + v t`` at ``t = t₀ + u``. With ``d = p + v t₀ - a``, u is the positive root
-    of ``(c² - v²) u² - 2 (d·v) u - d² = 0``.
-
-    Parameters
-    ----------
-    from_m : (path, mic, axis) float64
-        Place that the sound leaves.
-    left_s : (path, mic) float64
-        Time at which it leaves.
-    place_m, velocity_m_s : (path, mic, axis) float64
-        Place of the object at time 0, and its velocity.
-    speed_m_s : float
-        Speed of sound.
+    of ``(c² - v²) u² - 2 (d·v) u - d² = 0``. Times are (path, mic); places and velocities (path, mic, axis). Here a is
+    ``from_m``, t₀ is ``left_s``, and p is ``place_m`` at time 0.
     """
     apart_m = place_m + velocity_m_s * left_s[..., None] - from_m
     along = np.sum(apart_m * velocity_m_s, axis=-1)

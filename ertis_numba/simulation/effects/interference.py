@@ -86,13 +86,9 @@ def _received(
 ) -> Arrivals:
     """Return the copies of a call or a frame that arrive during the record.
 
-    Parameters
-    ----------
-    start_s : float
-        Time at which its beginning leaves the source, relative to the snapshot.
-    centre_s : float
-        Time after its beginning at which the Doppler factor is evaluated.
-    response : (path, mic, frequency) float64
+    - ``start_s``: time at which its beginning leaves the source, relative to the snapshot.
+    - ``centre_s``: time after its beginning at which the Doppler factor is evaluated.
+    - ``response`` (path, mic, frequency)
     """
     gain, late_s = gains(source.shot, source.active)
     delay_s, stretch = source.arrival(start_s + centre_s)

@@ -85,15 +85,8 @@ def _disc(tilt: Floats, nearness: Floats) -> NDArray[np.complex128]:
     The echo is ``∫₀¹ J₀(v √t) exp(-j u t / 2) dt``. This is Kirchhoff's integral over a disc in Fresnel's
     approximation, as for the field near the focus of a lens (M. Born, E. Wolf, Principles of Optics, 7th edition,
     section 8.8). On the axis it is ``exp(-j u / 4) sin(u / 4) / (u / 4)``. In the far field, u is 0 and the echo has
-    the pattern of a piston, ``2 J₁(v) / v``.
-
-    Parameters
-    ----------
-    tilt : float64
-        ``v = k a |s|``. Here s is the component in the disc's plane of the sum of the unit vectors towards emitter and
-        microphone.
-    nearness : float64
-        ``u = k a² (1 / r₁ + 1 / r₂)``.
+    the pattern of a piston, ``2 J₁(v) / v``. ``tilt``: ``v = k a |s|``. Here s is the component in the disc's plane of
+    the sum of the unit vectors towards emitter and microphone. ``nearness``: ``u = k a² (1 / r₁ + 1 / r₂)``.
     """
     found = piston(tilt).astype(np.complex128)
     near = nearness > _FAR
@@ -120,16 +113,12 @@ def _rigid_sphere(radius_m: Floats, wave: Floats, cos_turn: Floats) -> NDArray[n
     The echo is the partial-wave series of a rigid sphere in a plane wave,
     ``f = -(j / k) Σ (2n + 1) jₙ'(ka) / hₙ'(ka) Pₙ(cos Θ)``. The time factor is ``exp(jωt)``, so the spherical Hankel
     functions are of the second kind (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, section 8.2). The echo of
-    the mirror is ``(a / 2) exp(2 j k a sin(Θ / 2))``, relative to the sphere's centre. For small k a the ratio falls
-    as (k a)² (Rayleigh scattering); near k a = 1 the creeping wave around the sphere makes it oscillate.
+    the mirror is ``(a / 2) exp(2 j k a sin(Θ / 2))``, relative to the sphere's centre. For small k a the ratio falls as
+    (k a)² (Rayleigh scattering); near k a = 1 the creeping wave around the sphere makes it oscillate.
 
-    Parameters
-    ----------
-    radius_m : (path,) float64
-    wave : (frequency,) float64
-        Wave numbers.
-    cos_turn : (path, mic) float64
-        Cosine of the scattering angle Θ; -1 is backscatter.
+    - ``radius_m`` (path,)
+    - ``wave`` (frequency,): wave numbers.
+    - ``cos_turn`` (path, mic): cosine of the scattering angle Θ; -1 is backscatter.
     """
     found = np.empty((*cos_turn.shape, len(wave)), dtype=np.complex128)
     for radius in np.unique(radius_m):
