@@ -21,17 +21,8 @@ _TURN = 2 * math.pi
 def reach_rad(gaps_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the angle from either end of each gap in which the value of that direction applies: (gap,) float64.
 
-    A gap as wide as a neighbouring one is a coarser part of the grid, as in grids that are finer ahead.
-
-    Parameters
-    ----------
-    gaps_rad : (gap,) float64
-        Angles from each direction to the next.
-
-    Returns
-    -------
-    (gap,) float64
-        Angles in radians.
+    A gap as wide as a neighbouring one is a coarser part of the grid, as in grids that are finer ahead. ``gaps_rad``
+    (gap,): angles from each direction to the next.
     """
     if len(gaps_rad) < 2:
         return np.full(len(gaps_rad), ALONE_RAD)
@@ -43,17 +34,8 @@ def reach_rad(gaps_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 def unrolled_rad(azimuth_rad: NDArray[np.float64], closed_rad: float = 0.0) -> NDArray[np.float64]:
     """Return azimuths shifted by whole turns so that the widest gap lies outside of their interval.
 
-    Parameters
-    ----------
-    azimuth_rad : (direction,) float64
-        Azimuths in any order.
-    closed_rad : float
-        Gaps up to this width do not count, because directions of other elevations lie in them.
-
-    Returns
-    -------
-    (direction,) float64
-        Azimuths within one turn; the middle between the first and the last is from −π to π.
+    The azimuths may be in any order. The results lie within one turn; the middle between the first and the last is from
+    −π to π. ``closed_rad``: gaps up to this width do not count, because directions of other elevations lie in them.
     """
     turns = np.floor((azimuth_rad + math.pi) / _TURN)
     within = np.where(np.abs(azimuth_rad) > math.pi + 1e-9, azimuth_rad - _TURN * turns, azimuth_rad)
@@ -68,11 +50,6 @@ def unrolled_rad(azimuth_rad: NDArray[np.float64], closed_rad: float = 0.0) -> N
 
 def is_closed(azimuth_rad: NDArray[np.float64]) -> bool:
     """Return True if increasing azimuths form a closed circle, without a wider gap between the last and the first.
-
-    Parameters
-    ----------
-    azimuth_rad : (direction,) float64
-        Azimuths in increasing order.
 
     Examples
     --------

@@ -23,23 +23,8 @@ def delay_matrix(settings: Settings, *, n_directions: int) -> NDArray[np.float64
     """Return the delays that ``processing.delay_matrix`` lists or names; None without it.
 
     Only the differences between microphones matter: the mean over the layout's microphones is subtracted from each
-    direction. Ranges then count from the centre of the array, as they do with plane waves.
-
-    Parameters
-    ----------
-    n_directions : int
-        Number of directions of the image.
-
-    Returns
-    -------
-    (direction, mic) float64, or None
-        Delays of the enabled microphones in seconds; positive for later sound.
-
-    Raises
-    ------
-    ArgumentError
-        The file cannot be read, a delay is not finite or too large, or the matrix does not have one row per direction
-        and one column per channel.
+    direction. Ranges then count from the centre of the array, as they do with plane waves. The result has the delays of
+    the enabled microphones in seconds, (direction, mic), positive for later sound.
 
     Examples
     --------
@@ -80,22 +65,8 @@ def delay_matrix(settings: Settings, *, n_directions: int) -> NDArray[np.float64
 def plane_delays(settings: Settings, grid: Grid, *, sound_speed_m_s: float) -> NDArray[np.float64]:
     """Return the delays of each direction, the given ones or else those of plane waves.
 
-    Parameters
-    ----------
-    grid : Grid
-        Directions of the image.
-    sound_speed_m_s : float
-        Speed of sound in metres per second.
-
-    Returns
-    -------
-    (direction, mic) float64
-        Delays of the enabled microphones in seconds; positive for later sound.
-
-    Raises
-    ------
-    ArgumentError
-        As for `delay_matrix`.
+    The result is (direction, mic), in seconds, for the enabled microphones; positive for later sound. Raise
+    ArgumentError as `delay_matrix` does.
     """
     given_s = delay_matrix(settings, n_directions=len(grid))
     if given_s is not None:

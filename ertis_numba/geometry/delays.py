@@ -7,16 +7,7 @@ __all__ = ["far_field_delays", "spherical_delays", "unit_vectors"]
 
 
 def unit_vectors(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return directions as unit vectors in the sensor frame.
-
-    Parameters
-    ----------
-    azimuth_rad, elevation_rad : (direction,) float64
-        Angles in radians.
-
-    Returns
-    -------
-    (direction, axis) float64
+    """Return directions as unit vectors in the sensor frame: (direction, axis).
 
     Examples
     --------
@@ -32,21 +23,10 @@ def unit_vectors(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.flo
 def far_field_delays(
     positions_m: NDArray[np.float64], directions: NDArray[np.float64], *, sound_speed_m_s: float
 ) -> NDArray[np.float64]:
-    """Return the delays of plane waves at each microphone, relative to the centroid.
+    """Return the delays of plane waves at each microphone, ``−p·u / c``, relative to the centroid: (direction, mic).
 
-    Parameters
-    ----------
-    positions_m : (mic, axis) float64
-        Positions relative to the centroid, in metres.
-    directions : (direction, axis) float64
-        Unit vectors towards the source.
-    sound_speed_m_s : float
-        Speed of sound in metres per second.
-
-    Returns
-    -------
-    (direction, mic) float64
-        ``−p·u / c`` in seconds.
+    The result is in seconds. Positions p (mic, axis) are relative to the centroid; u (direction, axis) are unit vectors
+    towards the source.
 
     Examples
     --------
@@ -65,23 +45,10 @@ def spherical_delays(
     range_m: float,
     sound_speed_m_s: float,
 ) -> NDArray[np.float64]:
-    """Return the delays of the echoes of points at each microphone, relative to the centroid.
+    """Return the delays of the echoes of points, ``(‖r u − p‖ − r) / c``, relative to the centroid: (direction, mic).
 
-    Parameters
-    ----------
-    positions_m : (mic, axis) float64
-        Positions relative to the centroid, in metres.
-    directions : (direction, axis) float64
-        Unit vectors towards the points.
-    range_m : float
-        Distance of the points from the centroid, in metres.
-    sound_speed_m_s : float
-        Speed of sound in metres per second.
-
-    Returns
-    -------
-    (direction, mic) float64
-        ``(‖r u − p‖ − r) / c`` in seconds.
+    The result is in seconds. Positions p (mic, axis) and the range r are relative to the centroid; u (direction, axis)
+    are unit vectors towards the points.
 
     Examples
     --------

@@ -31,10 +31,7 @@ PAPER_GRIDS = {
 class Grid(DegreesFromRadians):
     """Directions of an image; ``azimuth_deg`` and ``elevation_deg`` are the same angles in degrees.
 
-    Attributes
-    ----------
-    azimuth_rad, elevation_rad : (direction,) float64
-        Angles in radians.
+    ``azimuth_rad``, ``elevation_rad`` (direction,): angles in radians.
     """
 
     azimuth_rad: NDArray[np.float64]
@@ -47,19 +44,7 @@ class Grid(DegreesFromRadians):
 def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
     """Return the number of directions of a named grid or of a list; None if the name is the path of a file.
 
-    Parameters
-    ----------
-    name : str or tuple of (azimuth, elevation)
-        Same as `Processing.directions`.
-
-    Returns
-    -------
-    int or None
-
-    Raises
-    ------
-    ArgumentError
-        The count is missing or out of range.
+    ``name`` is that of `Processing.directions`.
     """
     if not isinstance(name, str):
         return len(name)
@@ -98,16 +83,8 @@ def direction_grid(processing: Processing) -> Grid:
 
     ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths at one elevation, including both limits.
     ``3d:N`` is N cells of equal area between the limits, in rows of equal elevation. Any other name is the path of a
-    CSV file of azimuth, elevation in degrees.
-
-    Returns
-    -------
-    Grid
-
-    Raises
-    ------
-    ArgumentError
-        The name is neither a grid nor a readable file, or the grid is empty.
+    CSV file of azimuth, elevation in degrees. Raise ArgumentError if the name is neither a grid nor a readable file, or
+    the grid is empty.
 
     Examples
     --------

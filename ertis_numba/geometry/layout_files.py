@@ -85,13 +85,7 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
         return tables
 
     def rows(self, source: str) -> tuple[list[list[float]], str]:
-        """Return the positions and their unit; ``source`` is the name of the file in errors.
-
-        Raises
-        ------
-        ArgumentError
-            There are no positions, twofold ones, or their unit is missing or contradictory.
-        """
+        """Return the positions and their unit, each stated once; ``source`` is the name of the file in errors."""
         if self.positions is not None and self.positions_mm is not None:
             raise ArgumentError(f"{source}: both positions and positions_mm; remove one")
         if self.unit is not None:
@@ -117,12 +111,8 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
 class ReadLayout:
     """Array of a layout file.
 
-    Attributes
-    ----------
-    notes : tuple of str
-        Remarks for the user; none by default.
-    unit_is_stated : bool
-        False if the file states no unit; True by default.
+    ``notes``: remarks for the user; none by default. ``unit_is_stated``: False if the file states no unit; True by
+    default.
     """
 
     array: Array
@@ -131,22 +121,9 @@ class ReadLayout:
 
 
 def read_layout(path: str | Path) -> ReadLayout:
-    """Read a layout file.
+    """Read a layout file with one of the endings in `ertis_numba.settings.LAYOUT_SUFFIXES`.
 
-    Parameters
-    ----------
-    path : str or Path
-        File with one of the endings in `ertis_numba.settings.LAYOUT_SUFFIXES`.
-
-    Raises
-    ------
-    ArgumentError
-        The file cannot be read or used, or its unit or axes are unclear.
-
-    Warns
-    -----
-    LayoutUnitWarning
-        The file states no unit, and its numbers may be metres as well as millimetres.
+    Raise ArgumentError if the file cannot be read or used, or its unit or axes are unclear.
     """
     content = layout_bytes(path)
     if Path(path).suffix.lower() == ".toml":
@@ -175,13 +152,7 @@ def read_layout(path: str | Path) -> ReadLayout:
 
 
 def parse_layout(path: str, text: str) -> ReadLayout:
-    """Return the array in the TOML text of a layout; ``path`` is the name of its file.
-
-    Raises
-    ------
-    ArgumentError
-        The text is no layout, or a value cannot be used.
-    """
+    """Return the array in the TOML text of a layout; ``path`` is the name of its file."""
     source = f"layout {path}"
     try:
         file = LayoutFile.from_toml(text, source)
@@ -295,14 +266,8 @@ def _spacing(positions: NDArray[np.float64]) -> float:
 def unclear_unit(source: str, span: float, reason: str = "") -> str:
     """Return the question for the unit of a file whose array has an implausible extent in millimetres.
 
-    Parameters
-    ----------
-    source : str
-        Name of the file.
-    span : float
-        Extent of the array in the unit of the file.
-    reason : str
-        Clause that says why the extent is implausible; empty by default.
+    ``span``: extent of the array in the unit of the file. ``reason``: clause that says why the extent is implausible;
+    empty by default.
     """
     sizes = {unit: factor_m * span for unit, factor_m in LENGTH_UNITS_M.items()}
     likely = [

@@ -107,13 +107,6 @@ class Layout:
 def layout_file(layout: Layout, *, name: str, source: str = "") -> LayoutFile:
     """Return the content of a layout file with the microphones of a layout, to 0.1 µm, 1 ps and six digits of gain.
 
-    Parameters
-    ----------
-    name : str
-        Name of the layout.
-    source : str
-        Origin of the numbers; empty by default.
-
     Examples
     --------
     >>> from ertis_numba.geometry import layout_file, load_layout
@@ -196,16 +189,7 @@ def _shipped_array(name: str) -> Array:
 def microphones(array: Array) -> Layout:
     """Return the microphones that array settings describe, by position or by name.
 
-    Returns
-    -------
-    Layout
-        Positions are relative to the centroid of the layout's microphones, including those in ``array.disabled``.
-
-    Raises
-    ------
-    ArgumentError
-        The named layout is unknown or cannot be used, ``array.disabled`` names a channel that it does not have, or no
-        microphone remains.
+    Positions are relative to the centroid of the layout's microphones, including those in ``array.disabled``.
 
     Examples
     --------
@@ -253,10 +237,7 @@ def _fitted(array: Array) -> Layout:
 def written_out(array: Array) -> Array:
     """Return array settings with the positions of the microphones, so that they depend on no layout file.
 
-    Raises
-    ------
-    ArgumentError
-        The layout is unknown, or its file cannot be read or used.
+    Raise ArgumentError if the layout is unknown, or its file cannot be read or used.
     """
     if array.positions_m is not None:
         return array
@@ -266,10 +247,7 @@ def written_out(array: Array) -> Array:
 def self_contained(settings: Settings) -> Settings:
     """Return settings with the positions of the microphones, so that they depend on no layout file.
 
-    Raises
-    ------
-    ArgumentError
-        The layout is unknown, its file cannot be read or used, or its size does not suit the sound.
+    Raise ArgumentError if the layout is unknown, its file cannot be read or used, or its size does not suit the sound.
 
     Examples
     --------
@@ -286,11 +264,8 @@ def self_contained(settings: Settings) -> Settings:
 def require_plausible_size(settings: Settings) -> None:
     """Ask for the unit of an array whose size does not suit the sound that it receives.
 
-    Raises
-    ------
-    ArgumentError
-        The layout file states no unit, and the array would be smaller than a third of the shortest wavelength; or the
-        array is larger than 1 m and than the way that sound travels during a record.
+    Raise ArgumentError if the layout file states no unit, and the array would be smaller than a third of the shortest
+    wavelength; or the array is larger than 1 m and than the way that sound travels during a record.
     """
     layout, recording = microphones(settings.array), settings.recording
     speed_m_s = sound_speed_m_s(settings.air)
@@ -311,17 +286,7 @@ def require_plausible_size(settings: Settings) -> None:
 
 
 def storable(settings: Settings) -> Settings:
-    """Return settings in the form that recordings contain, which depends on no file.
-
-    Returns
-    -------
-    Settings
-
-    Raises
-    ------
-    ArgumentError
-        Directions or delays are in a file, or the layout cannot be used.
-    """
+    """Return settings in the form that recordings contain, which depends on no file."""
     if grid_count(settings.processing.directions) is None:
         raise ArgumentError(
             f"processing.directions is the file {settings.processing.directions}, but a recording cannot contain "

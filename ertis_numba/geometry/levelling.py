@@ -20,27 +20,11 @@ def levelled_grid(grid: Grid, attitude_xyzw: ArrayLike) -> tuple[Grid, NDArray[n
     The level frame has the origin and the heading of the sensor, and its z axis points up. With the rotation matrix R
     of the sensor in the world and the heading ψ of its x axis, a direction d of the level frame is ``Rᵀ Rz(ψ) d`` in
     the sensor frame. Jansen, Laurijssen and Steckel (arXiv 2406.06255) thus compensate the pitch of a vehicle; this
-    function also compensates roll.
-
-    Parameters
-    ----------
-    grid : Grid
-        Directions in the level frame.
-    attitude_xyzw : (4,) array_like of float
-        Unit quaternion that rotates the sensor frame into the world frame.
-
-    Returns
-    -------
-    turned : Grid
-        The same directions in the sensor frame.
-    is_behind : (direction,) bool
-        True for directions with x ≥ 0 in the level frame that lie behind the sensor. A planar array cannot distinguish
-        them from directions in front.
-
-    Raises
-    ------
-    ArgumentError
-        The quaternion is invalid, or the sensor looks straight up or down, so that it has no heading.
+    function also compensates roll. ``grid``: directions in the level frame. ``attitude_xyzw`` (4,) array_like of float:
+    unit quaternion that rotates the sensor frame into the world frame. ``turned``: the same directions in the sensor
+    frame. ``is_behind`` (direction,) bool: True for directions with x ≥ 0 in the level frame that lie behind the
+    sensor. A planar array cannot distinguish them from directions in front. Raise ArgumentError if the quaternion is
+    invalid, or the sensor looks straight up or down, so that it has no heading.
 
     Examples
     --------

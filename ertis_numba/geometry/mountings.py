@@ -20,26 +20,8 @@ def mounting(
     """Return the validated mounting of a sensor; empty if it is unknown.
 
     If only the translation is given, the rotation is the identity. If only the rotation is given, the sensor is at the
-    origin.
-
-    Parameters
-    ----------
-    sensor : str
-        Name of the sensor in errors.
-    translation_m : sequence of 3 float, optional
-        Position x, y, z in metres.
-    rotation_xyzw : sequence of 4 float, optional
-        Unit quaternion of the rotation from the sensor frame to the frame of the platform.
-
-    Returns
-    -------
-    dict of str to NDArray
-        ``translation_m``: (3,) float64, and ``rotation_xyzw``: (4,) float64; empty if neither is given.
-
-    Raises
-    ------
-    ArgumentError
-        A number is missing or not finite, or the length of the quaternion is not 1.
+    origin. The result has ``translation_m`` (3,) and ``rotation_xyzw`` (4,), a unit quaternion from the sensor frame to
+    that of the platform.
 
     Examples
     --------
@@ -67,13 +49,7 @@ def mounting(
 
 
 def require_unit_quaternion(name: str, rotation_xyzw: NDArray[np.float64]) -> None:
-    """Raise an error if an array is not a unit quaternion.
-
-    Raises
-    ------
-    ArgumentError
-        It does not have four finite numbers, or its length is not 1.
-    """
+    """Raise an error if an array is not a unit quaternion."""
     checks.shape(name, rotation_xyzw.shape, (4,))
     checks.finite_array(name, rotation_xyzw)
     length = float(np.linalg.norm(rotation_xyzw))

@@ -21,16 +21,7 @@ _FINER = 4  # columns of a raster per spacing: a direction is displaced by at mo
 def spacing_rad(directions: NDArray[np.float64]) -> float:
     """Return the median angle from a direction to its nearest neighbour in radians; π for fewer than two.
 
-    Equal directions count once.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
-
-    Returns
-    -------
-    float
+    Equal directions count once. ``directions`` are unit vectors (direction, axis).
 
     Examples
     --------
@@ -58,10 +49,7 @@ def spacing_rad(directions: NDArray[np.float64]) -> float:
 class AzimuthColumns:
     """Azimuths, and the directions near each of them.
 
-    Attributes
-    ----------
-    azimuth_rad : (column,) float64
-        Azimuths in increasing order.
+    ``azimuth_rad`` (column,): azimuths in increasing order.
     """
 
     azimuth_rad: NDArray[np.float64]
@@ -78,15 +66,8 @@ def azimuth_columns(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.
     """Return columns of azimuths for display, each with the directions within half of their spacing.
 
     Directions at several elevations usually have different azimuths. If there are many, a raster with a quarter of
-    their spacing replaces them. Directions in a plane have one column each.
-
-    Parameters
-    ----------
-    azimuth_rad, elevation_rad : (direction,) float64
-
-    Returns
-    -------
-    AzimuthColumns
+    their spacing replaces them. Directions in a plane have one column each. ``azimuth_rad``, ``elevation_rad``
+    (direction,).
     """
     order = np.argsort(azimuth_rad, kind="stable")
     rising = azimuth_rad[order]

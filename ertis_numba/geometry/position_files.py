@@ -28,13 +28,7 @@ FLAT: Final = 1e-3
 
 
 def layout_bytes(path: str | Path) -> bytes:
-    """Return the content of a layout file.
-
-    Raises
-    ------
-    ArgumentError
-        The file cannot be read, is empty, or is too large for a layout.
-    """
+    """Return the content of a layout file, which is neither empty nor too large."""
     try:
         with Path(path).open("rb") as file:
             content = file.read(_MAX_BYTES + 1)
@@ -48,13 +42,7 @@ def layout_bytes(path: str | Path) -> bytes:
 
 
 def layout_file_text(path: str | Path, content: bytes) -> str:
-    """Return the text of a layout file in UTF-8, UTF-16 with a byte order mark, or Windows-1252.
-
-    Raises
-    ------
-    ArgumentError
-        The content is not text.
-    """
+    """Return the text of a layout file in UTF-8, UTF-16 with a byte order mark, or Windows-1252."""
     is_utf_16 = content[:2] in {b"\xff\xfe", b"\xfe\xff"}
     try:
         text = content.decode("utf-16" if is_utf_16 else "utf-8-sig")
@@ -74,17 +62,7 @@ def _remedy(wanted: str = "readable") -> str:
 def read_position_file(path: str | Path, content: bytes) -> PositionTable:
     """Return the positions in a file other than TOML, by its ending.
 
-    Parameters
-    ----------
-    path : str or Path
-        File with one of the endings in `ertis_numba.settings.LAYOUT_SUFFIXES`.
-    content : bytes
-        Content of the file.
-
-    Raises
-    ------
-    ArgumentError
-        The content has another format, or its axes or unit are unclear.
+    Raise ArgumentError if the content has another format, or its axes or unit are unclear.
     """
     source, suffix = f"layout {path}", Path(path).suffix.lower()
     if suffix == ".xml":

@@ -30,14 +30,8 @@ _UNIT_IN_COMMENT: Final = re.compile(r"\b(?:in|units?)\b[\s:=(\[]*([^\W\d_]+)", 
 class ColumnHeading:
     """Heading of a column.
 
-    Attributes
-    ----------
-    text : str
-        The heading itself.
-    axis : str
-        Axis of the positions in the column; empty for other columns.
-    unit : str
-        Unit in the heading, also one that is not accepted; empty if there is none.
+    - ``axis``: axis of the positions in the column; empty for other columns.
+    - ``unit``: unit in the heading, also one that is not accepted; empty if there is none.
     """
 
     text: str = ""

@@ -29,14 +29,9 @@ _Rows = Sequence[tuple[int, list[str]]]
 class PositionTable:
     """Positions as a file states them.
 
-    Attributes
-    ----------
-    positions : (channel, axis) float64
-        Coordinates x, y and z in the unit of the file; x is 0 if the file has none.
-    unit : str
-        Unit that the file states; empty if it states none.
-    notes : tuple of str
-        Remarks for the user; none by default.
+    - ``positions`` (channel, axis): coordinates x, y and z in the unit of the file; x is 0 if the file has none.
+    - ``unit``: unit that the file states; empty if it states none.
+    - ``notes``: remarks for the user; none by default.
     """
 
     positions: NDArray[np.float64]
@@ -48,19 +43,9 @@ def read_position_table(source: str, text: str) -> PositionTable:
     """Return the positions in a table with one row per channel, in the order of the bits.
 
     Cells are separated by commas, semicolons, tabs or spaces; a decimal comma is accepted unless commas separate. A
-    comment follows #, % or //. A header, or a comment above the positions, names the
-    axes in any order, and may state their unit, as in ``x_m``, ``y (mm)`` or ``Z [cm]``. Without a header, columns are
-    ``y, z`` or ``x, y, z``, after a column of names or numbers of the channels, if any.
-
-    Parameters
-    ----------
-    source : str
-        Name of the table in errors.
-
-    Raises
-    ------
-    ArgumentError
-        A cell is not a finite number, rows differ in length or order, or the axes or the unit are unclear.
+    comment follows #, % or //. A header, or a comment above the positions, names the axes in any order, and may state
+    their unit, as in ``x_m``, ``y (mm)`` or ``Z [cm]``. Without a header, columns are ``y, z`` or ``x, y, z``, after a
+    column of names or numbers of the channels, if any.
     """
     lines, comments = _without_comments(text)
     rows = list(_cells(lines))

@@ -35,11 +35,8 @@ def round_step(length: float, largest: int) -> float:
 class Fan:
     """Sector that an image covers; with several elevations, it shows their maximum.
 
-    Attributes
-    ----------
-    azimuth_rad : (azimuth,) float64
-        Rising. A thin image becomes two degrees wide, and a full circle ends with its first azimuth.
-    range_m : (first, last)
+    ``azimuth_rad`` (azimuth,): rising. A thin image becomes two degrees wide, and a full circle ends with its first
+    azimuth. ``range_m`` (first, last).
     """
 
     azimuth_rad: NDArray[np.float64]

@@ -26,17 +26,6 @@ def layout_names() -> tuple[str, ...]:
 
 
 def layout_text(name: str) -> str:
-    """Return the TOML text of a shipped layout.
-
-    Parameters
-    ----------
-    name : str
-        One of `layout_names`.
-
-    Raises
-    ------
-    ArgumentError
-        The name is unknown.
-    """
+    """Return the TOML text of a shipped layout, one of `layout_names`."""
     checks.choice("layout", name, layout_names())
     return _FOLDER.joinpath(f"{name}.toml").read_text("utf-8")

@@ -11,24 +11,8 @@ __all__ = ["received_settings"]
 def received_settings(text: bytes | str, source: str, *, are_applied: bool = False) -> Settings:
     """Parse settings from an untrusted source, and reject names of files on this machine.
 
-    Parameters
-    ----------
-    text : bytes or str
-        TOML in UTF-8.
-    source : str
-        Name of the settings in errors.
-    are_applied : bool
-        True to accept any name as ``processing.directions`` and ``delay_matrix``, because the directions themselves
-        accompany the settings, and their images exist.
-
-    Returns
-    -------
-    Settings
-
-    Raises
-    ------
-    SettingsError
-        The text is too long or is not TOML, a value cannot be used, or a name is the path of a file.
+    ``are_applied``: True to accept any name as ``processing.directions`` and ``delay_matrix``, because the directions
+    themselves accompany the settings, and their images exist.
     """
     if isinstance(text, bytes):
         if len(text) > Settings.max_bytes:  # before a copy of it is made

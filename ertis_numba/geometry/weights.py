@@ -22,19 +22,9 @@ def array_weights(settings: Settings) -> NDArray[np.float64]:
     aperture extends beyond the outermost microphone by half of the mean distance between neighbours, so that no
     microphone has the weight 0.
 
-    A mean of 1 preserves the level of an echo to which all microphones contribute in phase. The constraint
-    ``wᴴv = 1`` does the same for the response in the steered direction (H. L. Van Trees, Optimum Array Processing,
-    2002, sections 2.6 and 3.1).
-
-    Returns
-    -------
-    (mic,) float64
-
-    Raises
-    ------
-    ArgumentError
-        The length of the list ``processing.array_weights`` differs from the number of channels, or all enabled
-        microphones have the weight 0.
+    A mean of 1 preserves the level of an echo to which all microphones contribute in phase. The constraint ``wᴴv = 1``
+    does the same for the response in the steered direction (H. L. Van Trees, Optimum Array Processing, 2002, sections
+    2.6 and 3.1).
 
     Examples
     --------
@@ -60,16 +50,7 @@ def effective_count(weights: NDArray[np.float64]) -> float:
     """Return the number of equally weighted microphones with the same gain over uncorrelated noise, ``(Σw)² / Σw²``.
 
     It is the white noise gain of the array (Van Trees, section 2.6.2). With uniform weights it is the number of
-    microphones.
-
-    Parameters
-    ----------
-    weights : (mic,) float64
-        Weights with a mean of 1.
-
-    Returns
-    -------
-    float
+    microphones. ``weights`` are (mic,) with a mean of 1.
 
     Examples
     --------
