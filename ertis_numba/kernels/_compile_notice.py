@@ -8,18 +8,7 @@ _callbacks: list[Callable[[], None]] = []
 
 
 def on_compiling(callback: Callable[[], None]) -> Callable[[], None]:
-    """Register a function to be called once, when a kernel is compiled.
-
-    Parameters
-    ----------
-    callback : callable
-        Called without arguments.
-
-    Returns
-    -------
-    callable
-        Function that unregisters ``callback``.
-    """
+    """Register a function to be called once, when a kernel is compiled; return a function that unregisters it."""
     _callbacks.append(callback)
 
     def withdraw() -> None:

@@ -53,13 +53,7 @@ class Lane(Protocol):
 
 
 class Memory(Protocol):
-    """Memory of one pipeline on the device.
-
-    Raises
-    ------
-    DeviceError
-        From any of its methods: the device has too little memory.
-    """
+    """Memory of one pipeline on the device; any method raises DeviceError if the device has too little."""
 
     n_lanes: int
     """Number of lanes that keep the device busy; 1 if more are not faster."""
@@ -89,24 +83,13 @@ class NewMemory(Protocol):
     """Creates the memory of a pipeline.
 
     With ``graphs``, `Lane.run` records its steps as a CUDA graph and replays it. This is the default on devices that
-    support graphs.
-
-    Raises
-    ------
-    ArgumentError
-        ``graphs`` is True, but the device does not support graphs.
+    support graphs. Raise ArgumentError if ``graphs`` is True, but the device does not support graphs.
     """
 
     def __call__(self, *, graphs: bool | None = None) -> Memory: ...
 
 
 class Threads(Protocol):
-    """Run the enclosed kernels of this Python thread on ``count`` threads.
-
-    Raises
-    ------
-    ArgumentError
-        ``count`` exceeds the number of threads.
-    """
+    """Run the enclosed kernels of this Python thread on ``count`` threads, at most `KernelSet.max_threads`."""
 
     def __call__(self, count: int) -> AbstractContextManager[None]: ...

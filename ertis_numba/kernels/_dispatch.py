@@ -32,22 +32,10 @@ DEVICES: Final = {
 def load(device: str = "auto") -> KernelSet:
     """Return the kernels of a device.
 
-    Parameters
-    ----------
-    device : {"auto", "cpu", "cuda", "numpy"}
-        ``cpu`` is Numba on all cores, ``cuda`` is Numba on an NVIDIA GPU, and ``numpy`` is plain NumPy for comparison.
-        ``auto``, the default, is ``cuda`` if a GPU and its libraries are available, otherwise ``cpu``.
-
-    Returns
-    -------
-    KernelSet
-
-    Raises
-    ------
-    ArgumentError
-        The device is unknown.
-    DeviceError
-        The device is known but cannot be used on this machine.
+    ``device`` {"auto", "cpu", "cuda", "numpy"}: ``cpu`` is Numba on all cores, ``cuda`` is Numba on an NVIDIA GPU, and
+    ``numpy`` is plain NumPy for comparison. ``auto``, the default, is ``cuda`` if a GPU and its libraries are
+    available, otherwise ``cpu``. Raise ArgumentError if the device is unknown. Raise DeviceError if the device is known
+    but cannot be used on this machine.
 
     Examples
     --------
@@ -80,10 +68,6 @@ def load(device: str = "auto") -> KernelSet:
 def load_fusion() -> FusionKernels:
     """Return the kernels of fusion: compiled ones, or those of NumPy if none can be compiled on this machine.
 
-    Returns
-    -------
-    FusionKernels
-
     Examples
     --------
     >>> from ertis_numba import kernels
@@ -97,10 +81,6 @@ def load_fusion() -> FusionKernels:
 @functools.cache
 def load_mapping() -> MappingKernels:
     """Return the kernels of occupancy maps: compiled ones, or those of NumPy if none can be compiled on this machine.
-
-    Returns
-    -------
-    MappingKernels
 
     Examples
     --------
@@ -116,10 +96,6 @@ def load_mapping() -> MappingKernels:
 def load_points() -> PointKernels:
     """Return the kernels of points: compiled ones, or those of NumPy if none can be compiled on this machine.
 
-    Returns
-    -------
-    PointKernels
-
     Examples
     --------
     >>> from ertis_numba import kernels
@@ -134,15 +110,8 @@ def load_points() -> PointKernels:
 def load_steering(device: str = "auto") -> SteeringKernels:
     """Return the kernels of steering, which compute tables on the host, also for a GPU.
 
-    Parameters
-    ----------
-    device : {"auto", "numpy"}
-        ``auto``, the default, selects compiled kernels, or those of NumPy if none can be compiled on this machine.
-        ``numpy`` always selects those of NumPy.
-
-    Returns
-    -------
-    SteeringKernels
+    ``device`` {"auto", "numpy"}: ``auto``, the default, selects compiled kernels, or those of NumPy if none can be
+    compiled on this machine. ``numpy`` always selects those of NumPy.
 
     Examples
     --------
@@ -173,13 +142,7 @@ def _in_numpy(name: str) -> Any:
 
 
 def usable() -> tuple[str, ...]:
-    """Return the devices that `load` can load on this machine.
-
-    Returns
-    -------
-    tuple of str
-        Names as accepted by `load`; reasons for missing devices are logged at level INFO.
-    """
+    """Return the names of devices that `load` can load on this machine; log reasons for missing ones at level INFO."""
     found = []
     for device in DEVICES:
         try:

@@ -26,13 +26,7 @@ class _Lease:
 
 
 class ImagePool:
-    """Pool of the images of one pipeline.
-
-    Parameters
-    ----------
-    make : callable
-        Returns a new array of a given shape.
-    """
+    """Pool of the images of one pipeline; ``make`` returns a new array of a given shape."""
 
     def __init__(self, make: Callable[[tuple[int, ...]], NDArray[np.float32]]) -> None:
         self._make = make

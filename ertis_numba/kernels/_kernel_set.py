@@ -18,26 +18,15 @@ class KernelSet(AdaptiveKernels):
 
     Every attribute that is not listed below is a kernel; its contract documents it.
 
-    Attributes
-    ----------
-    device : str
-        Name of the device, as accepted by `load`.
-    hardware : str
-        Name of the GPU; empty for the CPU.
-    transforms : {"scipy", "cufft"}
-        Library of the Fourier transforms, see `fft`.
-    max_threads : int
-        Maximum number of threads.
-    tile_ranges : int
-        Ranges in a tile of the 16-bit kernels.
-    instruction_set : str
-        Vector instructions of the CPU's kernels, such as "AVX2"; empty for other devices.
-    simulated : bool
-        True if the CPU simulates the device, which is fast enough only for tests.
-    memory : callable
-        Returns a `Memory`. See `NewMemory`.
-    threads : callable
-        Context manager that limits the number of threads, see `Threads`.
+    - ``device``: name of the device, as accepted by `load`.
+    - ``hardware``: name of the GPU; empty for the CPU.
+    - ``transforms`` {"scipy", "cufft"}: library of the Fourier transforms, see `fft`.
+    - ``max_threads``: maximum number of threads.
+    - ``tile_ranges``: ranges in a tile of the 16-bit kernels.
+    - ``instruction_set``: vector instructions of the CPU's kernels, such as "AVX2"; empty for other devices.
+    - ``simulated``: True if the CPU simulates the device, which is fast enough only for tests.
+    - ``memory``: returns a `Memory`. See `NewMemory`.
+    - ``threads``: context manager that limits the number of threads, see `Threads`.
     """
 
     device: str

@@ -30,10 +30,7 @@ _POOLS: Final = {
 def prepare() -> None:
     """Import Numba, and ensure that it can start threads and store compiled kernels.
 
-    Raises
-    ------
-    DeviceError
-        Numba refuses an environment variable, or no folder for compiled kernels is writable.
+    Raise DeviceError if Numba refuses an environment variable, or no folder for compiled kernels is writable.
     """
     config = _imported().config
     layer = str(config.THREADING_LAYER).lower()

@@ -36,12 +36,8 @@ def add_products(builder, total, x, weight):
 class Dot16:
     """Emits the instructions of one tile.
 
-    As many ranges as registers can hold the sums of are summed in one pass.
-
-    Parameters
-    ----------
-    n_beams : int
-        BeamErrors that are summed at a time.
+    As many ranges as registers can hold the sums of are summed in one pass. ``n_beams`` is the number of beams that are
+    summed at a time.
     """
 
     def __init__(self, builder, n_beams=1):

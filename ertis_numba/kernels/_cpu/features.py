@@ -37,17 +37,11 @@ def host() -> tuple[str, dict[str, bool]]:
 class InstructionSet:
     """Vector instructions of a processor.
 
-    Attributes
-    ----------
-    lanes : int
-        Numbers of 32 bits in a vector register.
-    sums : int
-        Vectors of sums that stay in registers; the other registers hold weights and samples.
-    multiply_pairs : str
-        LLVM's name of the instruction that multiplies 16-bit numbers and adds the products of each pair. If it is
-        empty, each product has a sum of its own. LLVM then emits ``smlal`` for NEON.
-    has_masks : bool
-        True if registers of one bit per lane select lanes.
+    - ``lanes``: numbers of 32 bits in a vector register.
+    - ``sums``: vectors of sums that stay in registers; the other registers hold weights and samples.
+    - ``multiply_pairs``: LLVM's name of the instruction that multiplies 16-bit numbers and adds the products of each
+      pair. If it is empty, each product has a sum of its own. LLVM then emits ``smlal`` for NEON.
+    - ``has_masks``: True if registers of one bit per lane select lanes.
     """
 
     name: str

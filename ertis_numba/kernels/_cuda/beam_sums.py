@@ -42,13 +42,7 @@ def complexes(array):
 
 
 def indexed(array):
-    """Return a flat array unchanged after checking that 32-bit indices suffice, as kernels assume.
-
-    Raises
-    ------
-    DeviceError
-        The array is too large for 32-bit indices.
-    """
+    """Return a flat array unchanged after checking that 32-bit indices suffice, as kernels assume."""
     if array.size > _MAX_INDEXED:
         raise DeviceError(
             f"device 'cuda' would have to index {array.size:,} numbers; the limit is {_MAX_INDEXED:,}. "

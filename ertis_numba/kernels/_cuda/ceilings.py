@@ -93,19 +93,9 @@ def ceilings(
 ) -> dict[str, float]:
     """Return the best result of several runs, because a ceiling is not an average.
 
-    Parameters
-    ----------
-    runs : int
-        Number of runs.
-    turns, copy_bytes, threads : int
-        Amount of work; enough to fill a GPU by default.
-
-    Returns
-    -------
-    dict
-        ``copy_gb_s`` counts bytes read and bytes written. ``float32_gop_s`` counts a multiply-add as two operations.
-        ``load_gb_s`` is from the L1 cache with warps aligned to cache lines; ``load_unaligned_gb_s`` is for an offset
-        of one sample.
+    The result has ``copy_gb_s`` (bytes read and written), ``float32_gop_s`` (a multiply-add is two operations),
+    ``load_gb_s`` (L1 cache, warps aligned to cache lines) and ``load_unaligned_gb_s`` (an offset of one sample).
+    ``turns``, ``copy_bytes``, ``threads``: amount of work; enough to fill a GPU by default.
     """
     threads = threads or _BLOCK * _BLOCKS_PER_MULTIPROCESSOR * properties()["multiprocessors"]
     source, target = (cuda.to_device(np.ones(copy_bytes // 4, np.float32)) for _ in range(2))

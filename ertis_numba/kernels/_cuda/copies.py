@@ -12,13 +12,7 @@ __all__ = ["Copies"]
 
 
 class Copies:
-    """Copies of contiguous arrays on one stream.
-
-    Parameters
-    ----------
-    stream : numba.cuda.Stream
-        Any stream other than the default one.
-    """
+    """Copies of contiguous arrays on one stream, which must not be the default one."""
 
     def __init__(self, stream: Any) -> None:
         from cupy.cuda import Stream, runtime  # noqa: PLC0415 - the import takes half a second; the simulator has none

@@ -18,13 +18,7 @@ _REMEDY = (
 
 
 def _hardware() -> str:
-    """Return the name of the GPU.
-
-    Raises
-    ------
-    DeviceError
-        There is no GPU, or a library that it needs is missing.
-    """
+    """Return the name of the GPU; raise DeviceError if it or a library that it needs is missing."""
     if SIMULATED:
         return "Numba's CUDA simulator"
     # Checked first, because the target that Numba itself still ships crashes on newer drivers.

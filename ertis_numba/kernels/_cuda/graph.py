@@ -13,10 +13,7 @@ __all__ = ["Graph"]
 class Graph:
     """Replayable graph of steps that launch the same kernels on the same arrays at each call.
 
-    Parameters
-    ----------
-    stream : numba.cuda.Stream
-        Any stream other than the default one, which cannot be recorded.
+    ``stream`` is not the default stream, which cannot be recorded.
     """
 
     def __init__(self, stream: Any) -> None:

@@ -33,15 +33,11 @@ class Lane:
     A kernel requests workspace for intermediate results from `workspace`, under a unique name. Launches on one stream
     run in order, so the next measurement can reuse the workspace.
 
-    Parameters
-    ----------
-    stream : numba.cuda.Stream or 0
-        0 is the default stream, which synchronises with all others.
-    allocate, pin : callable
-        Return a new array of a given shape and type: of the device, and of pinned memory of the host.
-    graphs : bool
-        True if `run` records its steps as a CUDA graph. Without graphs, a launch takes the CPU about 50
-        microseconds per kernel.
+    - ``stream``: 0 is the default stream, which synchronises with all others.
+    - ``allocate``, ``pin``: return a new array of a given shape and type: of the device, and of pinned memory of the
+      host.
+    - ``graphs``: True if `run` records its steps as a CUDA graph. Without graphs, a launch takes the CPU about 50
+      microseconds per kernel.
     """
 
     def __init__(
@@ -142,13 +138,7 @@ def current() -> Lane:
 
 
 def launch(kernel: Any, grid: tuple[int, ...], block: tuple[int, ...], *arguments: Any) -> None:
-    """Launch ``kernel`` with ``grid`` blocks of ``block`` threads, after all earlier launches on this lane.
-
-    Raises
-    ------
-    DeviceError
-        The grid exceeds the limit of blocks.
-    """
+    """Launch ``kernel`` with ``grid`` blocks of ``block`` threads, after all earlier launches on this lane."""
     if max(grid[1:], default=0) > _MAX_BLOCKS:
         raise DeviceError(
             f"device 'cuda' would need a grid of {max(grid[1:]):,} blocks; the limit is {_MAX_BLOCKS:,}. "

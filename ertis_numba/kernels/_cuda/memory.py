@@ -60,13 +60,7 @@ class CudaMemory:
         return self._made(_bytes_of(shape, dtype), lambda: cuda.device_array(shape, dtype))
 
     def _pinned(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """Return an array of pinned host memory.
-
-        Raises
-        ------
-        DeviceError
-            The array does not fit.
-        """
+        """Return an array of pinned host memory; raise DeviceError if it does not fit."""
         try:
             array: NDArray[Any] = cuda.pinned_array(shape, dtype)
         except CudaAPIError as error:
@@ -79,13 +73,7 @@ class CudaMemory:
         return array
 
     def _made(self, n_bytes: int, make: Callable[[], Any]) -> Any:
-        """Return the array that ``make`` allocates, and count its bytes.
-
-        Raises
-        ------
-        DeviceError
-            The array does not fit.
-        """
+        """Return the array that ``make`` allocates, and count its bytes; raise DeviceError if it does not fit."""
         try:
             made = make()
         except CudaAPIError as error:
