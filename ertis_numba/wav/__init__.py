@@ -27,18 +27,12 @@ _ORDERS: Final = {b"RIFF": "<", b"RF64": "<", b"BW64": "<", b"RIFX": ">"}
 class WavFile:
     """Content of a WAV file.
 
-    Attributes
-    ----------
-    samples : Samples
-        (sample, channel); slices along the first axis are arrays. The file is mapped into memory. Integers have the
-        full scale of their type, and bytes are unsigned.
-    valid_bits : int
-        Bits of a sample that the header states to be used; the samples may have more.
-    notes : tuple of str
-        Contradictions in the file, and how they were resolved.
-    chunks : dict of str to bytes
-        Contents of the other chunks up to 1 MiB by name, such as ``bext``, ``iXML`` and ``guan``; of a ``LIST``, by the
-        name of the list, such as ``INFO``. Of several with one name, the first.
+    - ``samples``: (sample, channel); slices along the first axis are arrays. The file is mapped into memory. Integers
+      have the full scale of their type, and bytes are unsigned.
+    - ``valid_bits``: bits of a sample that the header states to be used; the samples may have more.
+    - ``notes``: contradictions in the file, and how they were resolved.
+    - ``chunks``: contents of the other chunks up to 1 MiB by name, such as ``bext``, ``iXML`` and ``guan``; of a
+      ``LIST``, by the name of the list, such as ``INFO``. Of several with one name, the first.
     """
 
     rate_hz: float
@@ -51,11 +45,8 @@ class WavFile:
 def read_wav(path: Path) -> WavFile:
     """Return the content of a WAV, RF64, BW64 or big-endian RIFX file.
 
-    Raises
-    ------
-    DataError
-        The file is not WAV, has no samples, contains compressed samples, is truncated, or states lengths of which none
-        fits.
+    Raise DataError if the file is not WAV, has no samples, contains compressed samples, is truncated, or states lengths
+    of which none fits.
     """
     content = _opened(path)
     chunks, form = read_chunks(content)
@@ -83,14 +74,7 @@ def _alignment_notes(samples: Samples, form: Form) -> list[str]:
 
 
 def wav_bytes(rate_hz: float, samples: NDArray[np.float32]) -> bytes:
-    """Return a WAV file of one channel of 32-bit floating-point samples, in bytes.
-
-    Parameters
-    ----------
-    rate_hz : float
-        Sample rate, which the file holds in whole hertz.
-    samples : (sample,) float32
-    """
+    """Return the bytes of a WAV file of one channel of 32-bit floating-point samples; its rate is in whole hertz."""
     rate, data = round(rate_hz), samples.astype("<f4").tobytes()
     header = struct.pack("<HHIIHHH", _FLOAT, 1, rate, 4 * rate, 4, 32, 0)
     fact = struct.pack("<I", len(samples))

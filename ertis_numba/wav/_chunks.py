@@ -49,10 +49,7 @@ class Chunks:
 def read_chunks(content: Content) -> tuple[Chunks, Form]:
     """Return the chunks of a WAV file, and the encoding of its samples.
 
-    Raises
-    ------
-    DataError
-        A chunk is missing, incomplete or in the file twice, or the samples are not PCM.
+    Raise DataError if a chunk is missing, incomplete or in the file twice, or the samples are not PCM.
     """
     chunks = Chunks()
     place: int | None = _FIRST

@@ -65,19 +65,7 @@ class Form:
 def read_form(content: bytes, order: str, place: int, path: Path) -> Form:
     """Return the encoding that a fmt chunk describes.
 
-    Parameters
-    ----------
-    order : str
-        ``<`` or ``>``.
-    place : int
-        Byte of the file where the chunk begins, for errors.
-    path : Path
-        File, for errors.
-
-    Raises
-    ------
-    DataError
-        Sizes contradict each other, or the samples are compressed.
+    ``order`` is ``<`` or ``>``; ``place`` is the byte where the chunk begins, for errors.
     """
     where = f"{path}: the fmt chunk at byte {place}"
     if len(content) < _MIN_BYTES:

@@ -108,19 +108,8 @@ def chain_fits(content: Content, place: int) -> bool:
 def sample_bytes(content: Content, place: int, wide: int | None, frame_bytes: int) -> Length:
     """Return the length of the samples.
 
-    Parameters
-    ----------
-    place : int
-        Where the data chunk begins.
-    wide : int, optional
-        Length of the chunk as a ds64 chunk states it.
-    frame_bytes : int
-        Bytes of a sample of all channels; 1 if unknown.
-
-    Raises
-    ------
-    DataError
-        The file is shorter than stated, or ends neither where it should nor where a chunk does.
+    The data chunk begins at byte ``place``; a ds64 chunk states its length as ``wide``. ``frame_bytes`` is 1 if
+    unknown. Raise DataError if the file is shorter than stated, or ends neither where it should nor where a chunk does.
     """
     _, narrow = content.header(place)
     start = place + HEADER_BYTES
