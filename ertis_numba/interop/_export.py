@@ -32,14 +32,8 @@ _POINT_OPTIONS = ("mounting", "top", "min_level_db")
 class ExportFormat:
     """Export format.
 
-    Attributes
-    ----------
-    suffix : str
-        Suffix of the file.
-    fields : tuple of str
-        Names of the fields in the file.
-    options : tuple of str
-        Options of `export` that apply to this format, but not to all formats. None by default.
+    - ``fields``: names of the fields in the file.
+    - ``options``: options of `export` that apply to this format, but not to all formats. None by default.
     """
 
     suffix: str
@@ -83,10 +77,7 @@ FORMATS: Final = {
 def choose_format(path: str | Path, name: str | None = None) -> str:
     """Return the name of the format to write: the given name, or that of the file's suffix.
 
-    Raises
-    ------
-    ArgumentError
-        The name or suffix is unknown.
+    Raise ArgumentError if the name or suffix is unknown.
     """
     if name is None:
         endings = {each.suffix: known for known, each in FORMATS.items()}
@@ -96,13 +87,7 @@ def choose_format(path: str | Path, name: str | None = None) -> str:
 
 
 def output_files(path: str | Path, name: str) -> tuple[Path, ...]:
-    """Return the files of an export: for ``acoular`` also that of the array, with the suffix ``.xml``.
-
-    Raises
-    ------
-    ArgumentError
-        Both files would have the same name.
-    """
+    """Return the files of an export: for ``acoular`` also that of the array, with the suffix ``.xml``."""
     if name != "acoular":
         return (Path(path),)
     files = Path(path), Path(path).with_suffix(".xml")

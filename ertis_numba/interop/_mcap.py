@@ -49,11 +49,8 @@ def write_mcap(
 ) -> None:
     """Write the messages of images as they arrive.
 
-    Raises
-    ------
-    ArgumentError
-        The packages for MCAP are not installed, the name of a sensor is invalid, or a
-        time is outside the range of ROS 2, or directions are levelled.
+    Raise ArgumentError if the packages for MCAP are not installed, the name of a sensor is invalid, or a time is
+    outside the range of ROS 2, or directions are levelled.
     """
     with path.open("wb") as file, _started(file) as writer:
         _McapWriter(writer, find, mountings, topics).write(images)
@@ -62,12 +59,8 @@ def write_mcap(
 def map_mcap(occupancy: OccupancyMap, *, probabilities: bool = False) -> bytes:
     """Return a file that holds a map as one latched message of type nav_msgs/msg/OccupancyGrid on the topic /map.
 
-    `occupancy_values` describes the cells.
-
-    Raises
-    ------
-    ArgumentError
-        The packages for MCAP are not installed, or the time is outside the range of ROS 2.
+    `occupancy_values` describes the cells. Raise ArgumentError if the packages for MCAP are not installed, or the time
+    is outside the range of ROS 2.
     """
     file = io.BytesIO()
     with _started(file) as writer:
@@ -77,13 +70,7 @@ def map_mcap(occupancy: OccupancyMap, *, probabilities: bool = False) -> bytes:
 
 
 def require_mcap() -> None:
-    """Refuse a missing package.
-
-    Raises
-    ------
-    ArgumentError
-        The packages for MCAP are not installed.
-    """
+    """Raise ArgumentError if the packages for MCAP are not installed."""
     with extra("ros", "format 'mcap' needs mcap and mcap-ros2-support"):
         import mcap.writer  # noqa: F401, PLC0415  an extra
         from mcap_ros2 import _dynamic  # noqa: F401, PLC0415  an extra

@@ -16,13 +16,7 @@ PLATFORM: Final = "base_link"
 
 
 def validated(given: Mapping[str, tuple[Sequence[float], Sequence[float]]] | None) -> Mountings:
-    """Return mountings as tuples of floats.
-
-    Raises
-    ------
-    ArgumentError
-        A mounting is invalid.
-    """
+    """Return mountings as tuples of floats, all valid."""
     made = {}
     for sensor, (translation_m, rotation_xyzw) in (given or {}).items():
         (x, y, z), (i, j, k, w) = (each.tolist() for each in mounting(sensor, translation_m, rotation_xyzw).values())

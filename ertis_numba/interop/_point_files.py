@@ -50,10 +50,7 @@ _HEADING = "Point cloud of ertis-numba"
 def write_ply(path: Path, table: PointTable, *, text: bool) -> None:
     """Write points as PLY, little-endian or as text.
 
-    Raises
-    ------
-    ArgumentError
-        A number exceeds its type, or the name of a sensor is invalid.
+    Raise ArgumentError if a number exceeds its type, or the name of a sensor is invalid.
     """
     properties = [f"property {_PLY_TYPES[dtype]} {name}" for name, dtype in POINT_FIELDS.items()]
     head = [
@@ -70,12 +67,8 @@ def write_ply(path: Path, table: PointTable, *, text: bool) -> None:
 def write_pcd(path: Path, table: PointTable, *, text: bool) -> None:
     """Write points as PCD 0.7, little-endian or as text.
 
-    PCL reads positions in float32 only. They are float64 if float32 would round one by more than 10 µm.
-
-    Raises
-    ------
-    ArgumentError
-        A number exceeds its type, or the name of a sensor is invalid.
+    PCL reads positions in float32 only. They are float64 if float32 would round one by more than 10 µm. Raise
+    ArgumentError if a number exceeds its type, or the name of a sensor is invalid.
     """
     fields = POINT_FIELDS | dict.fromkeys("xyz", "<f4" if table.fits_float32 else "<f8")
     kinds = [np.dtype(dtype) for dtype in fields.values()]

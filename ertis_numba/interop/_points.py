@@ -33,14 +33,11 @@ _MAX_SEC = 2**31 - 1
 class PointTable:
     """Points of several measurements, one row each.
 
-    Attributes
-    ----------
-    rows : (point,) structured
-        Position and uncertainty in metres, intensity, number of the sensor, and stamp of the measurement.
-    sensors : tuple of str
-        Names by number.
-    frame : str
-        Frame of the positions: the platform frame if mountings are known, otherwise the frame of the only sensor.
+    - ``rows`` (point,) structured: position and uncertainty in metres, intensity, number of the sensor, and stamp of
+      the measurement.
+    - ``sensors``: names by number.
+    - ``frame``: frame of the positions: the platform frame if mountings are known, otherwise the frame of the only
+      sensor.
     """
 
     rows: NDArray[np.void]
@@ -57,13 +54,7 @@ class PointTable:
 
     @classmethod
     def from_images(cls, images: Iterable[Energyscape], find: FindPoints, mountings: Mountings) -> "PointTable":
-        """Collect the points of images.
-
-        Raises
-        ------
-        ArgumentError
-            There are several sensors, and the mounting of one of them is unknown.
-        """
+        """Collect the points of images; with several sensors, all mountings must be known."""
         numbers: dict[str, int] = {}
         parts = [np.empty(0, _POINT)]
         for image in images:
@@ -82,12 +73,8 @@ class PointTable:
     def columns(self, dtypes: dict[str, str]) -> NDArray[np.void]:
         """Return some columns, packed, in the types of a format.
 
-        ``sec`` and ``nanosec`` are the time of the measurement in the form of ROS 2.
-
-        Raises
-        ------
-        ArgumentError
-            A number exceeds its type, or a time is outside the range of ROS 2.
+        ``sec`` and ``nanosec`` are the time of the measurement in the form of ROS 2. Raise ArgumentError if a number
+        exceeds its type, or a time is outside the range of ROS 2.
         """
         made = np.empty(len(self.rows), np.dtype(list(dtypes.items())))
         times = self._ros_times() if {"sec", "nanosec"} & dtypes.keys() else {}
@@ -129,13 +116,7 @@ def _rows(cloud: PointCloud, number: int, mountings: Mountings) -> NDArray[np.vo
 
 
 def ros_time(stamp: Stamp) -> tuple[int, int]:
-    """Return the time of a measurement in the form of ROS 2 (builtin_interfaces/msg/Time): seconds and nanoseconds.
-
-    Raises
-    ------
-    ArgumentError
-        The time is before 1970 or after 2038.
-    """
+    """Return the time of a measurement, from 1970 to 2038, as seconds and nanoseconds (builtin_interfaces/msg/Time)."""
     sec, nanosec = divmod(stamp.timestamp_ns, _NS)
     if not 0 <= sec <= _MAX_SEC:
         raise _no_ros_time(stamp.sequence, stamp.timestamp_ns)

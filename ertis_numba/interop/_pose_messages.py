@@ -45,12 +45,8 @@ class _StampedPose(NamedTuple):
 def read_messages(path: Path, topic: str | None) -> PoseRows:
     """Return the poses of a topic.
 
-    Raises
-    ------
-    ArgumentError
-        The topic does not exist, several topics have poses, or the packages for MCAP are not installed.
-    DataError
-        The file is damaged, or its poses are in several frames.
+    Raise ArgumentError if the topic does not exist, several topics have poses, or the packages for MCAP are not
+    installed. Raise DataError if the file is damaged, or its poses are in several frames.
     """
     with extra("ros", "trajectories in .mcap files need mcap and mcap-ros2-support"):
         from mcap.exceptions import DecoderNotFoundError, McapError, UnsupportedCompressionError  # noqa: PLC0415  an extra
@@ -84,13 +80,7 @@ def read_messages(path: Path, topic: str | None) -> PoseRows:
 
 
 def _check_summary(file: BinaryIO) -> None:
-    """Compare the summary with its checksum, which the library ignores.
-
-    Raises
-    ------
-    DataError
-        They differ.
-    """
+    """Raise DataError if the checksum of the summary, which the library ignores, does not match."""
     size = file.seek(0, io.SEEK_END)
     file.seek(max(0, size - _FOOTER.size))
     footer = file.read()

@@ -28,20 +28,12 @@ _MAX_POSITION_M: Final = 1e8  # As for Trajectory.
 class PoseRows:
     """Poses of a file, as its rows state them.
 
-    Attributes
-    ----------
-    kind : str
-        Name of a row in messages: "line" or "message".
-    numbers : (row,) int64
-        Numbers of the rows in the file, from 1.
-    time_ns : (row,) int64
-    position_m : (row, 3) float64
-        NaN where the file has no number.
-    rotation_xyzw : (row, 4) float64
-        As for ``position_m``.
-    covariance : (row, 6, 6) float64, or None
-    notes : tuple of str
-        Findings so far.
+    - ``kind``: name of a row in messages: "line" or "message".
+    - ``numbers`` (row,) int64: numbers of the rows in the file, from 1.
+    - ``time_ns`` (row,) int64
+    - ``position_m`` (row, 3): NaN where the file has no number.
+    - ``rotation_xyzw`` (row, 4): as for ``position_m``.
+    - ``covariance`` (row, 6, 6), or None
     """
 
     kind: str
@@ -79,15 +71,7 @@ class PoseRows:
 def trajectory_of(rows: PoseRows, pose_axes: PoseAxes = "platform") -> Trajectory:
     """Return the trajectory that rows form, with notes on the rows that were left out or changed.
 
-    Parameters
-    ----------
-    pose_axes : {"platform", "camera", "camera-world", "ned"}
-        Axes of the rows.
-
-    Raises
-    ------
-    DataError
-        There is no pose, a number is impossible, or the times do not increase.
+    Raise DataError if there is no pose, a number is impossible, or the times do not increase.
     """
     rows = _complete(rows)
     if not len(rows):

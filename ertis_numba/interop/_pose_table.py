@@ -82,19 +82,11 @@ _ORDER_OF_TUM: Final = _Columns(0, None, {"x": 1, "y": 2, "z": 3}, {"x": 4, "y":
 def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: str | None = None) -> PoseRows:
     """Return the poses of a text.
 
-    Parameters
-    ----------
-    needs_header : bool
-        Refuse rows without a line that names the columns, instead of reading them as TUM or KITTI.
-    time_unit : {"s", "ms", "us", "ns"} or None
-        Unit of times whose column states none; by their magnitude if None.
-    times : str, optional
-        Text with one time per pose, for poses of KITTI.
+    - ``needs_header``: refuse rows without a line that names the columns, instead of reading them as TUM or KITTI.
+    - ``time_unit`` {"s", "ms", "us", "ns"} or None: unit of times whose column states none; by their magnitude if None.
+    - ``times``: text with one time per pose, for poses of KITTI.
 
-    Raises
-    ------
-    DataError
-        The text contains no poses, or a line is not understood.
+    Raise DataError if the text contains no poses, or a line is not understood.
     """
     columns, rows = _header(text, needs_header=needs_header)
     if not rows:
@@ -327,13 +319,7 @@ def _rotations(rows: list[Row], columns: _Columns) -> Floats:
 
 
 def _half_turns(rows: list[Row], columns: _Columns, name: str) -> NDArray[np.complex128]:
-    """Return the cosines and sines of half an angle, as complex numbers; an angle without a column is 0.
-
-    Raises
-    ------
-    DataError
-        Angles in radians are so large that they are degrees.
-    """
+    """Return the cosines and sines of half an angle in radians, as complex numbers; an angle without a column is 0."""
     if name not in columns.angles:
         return np.ones(len(rows), np.complex128)
     place, degrees = columns.angles[name]

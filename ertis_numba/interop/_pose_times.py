@@ -29,16 +29,9 @@ _DATE: Final = re.compile(
 def times_of(cells: Sequence[tuple[int, str]], unit: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
     """Return times in nanoseconds, and notes on their unit.
 
-    Parameters
-    ----------
-    cells : sequence of (line, text)
-    unit : {"s", "ms", "us", "ns"} or None
-        None chooses the unit in which the times lie between 1973 and 2116, and seconds for smaller ones.
-
-    Raises
-    ------
-    DataError
-        A time is no number and no date, has no plausible unit, or is beyond the year 2116.
+    ``cells`` are (line, text). Without a unit, it is the one in which the times lie between 1973 and 2116, and seconds
+    for smaller ones. Raise DataError if a time is no number and no date, has no plausible unit, or is beyond the year
+    2116.
     """
     dates = [_DATE.fullmatch(text.strip()) for _, text in cells]
     if cells and dates[0] is not None:

@@ -30,9 +30,7 @@ _MIN_BASELINE_M: Final = 1e-4
 class BinauralSignals(NamedTuple):
     """Signals of both ears, with a full scale of 1.
 
-    Attributes
-    ----------
-    left, right : (sample,) float64
+    ``left``, ``right`` (sample,).
     """
 
     left: Floats
@@ -51,30 +49,16 @@ class _HalfArray:
 class VirtualEars:
     """Beamformer of both ears.
 
-    Parameters
-    ----------
-    settings : Settings
-        Settings of the measurements. The range ends at ``processing.range_m``, or at the end of the record.
-    azimuth_deg : float
-        Azimuth of the left ear in degrees; the right ear is steered to its negative. 0 steers both to the front.
+    - ``settings``: settings of the measurements. The range ends at ``processing.range_m``, or at the end of the record.
+    - ``azimuth_deg``: azimuth of the left ear in degrees; the right ear is steered to its negative. 0 steers both to
+      the front.
+    - ``rate_hz``: sample rate of the signals.
+    - ``max_range_m``: range of the last echo that the signals hold completely.
+    - ``n_samples``: samples per ear. Sample n is n / rate_hz after the start of the call.
+    - ``baseline_m``: lateral distance between the centroids of both halves.
+    - ``call`` (sample,): emitted call at the same rate.
 
-    Attributes
-    ----------
-    rate_hz : float
-        Sample rate of the signals.
-    max_range_m : float
-        Range of the last echo that the signals hold completely.
-    n_samples : int
-        Samples per ear. Sample n is n / rate_hz after the start of the call.
-    baseline_m : float
-        Lateral distance between the centroids of both halves.
-    call : (sample,) float64
-        Emitted call at the same rate.
-
-    Raises
-    ------
-    ArgumentError
-        The array has fewer than 2 microphones, or all of them lie on one vertical line.
+    Raise ArgumentError if the array has fewer than 2 microphones, or all of them lie on one vertical line.
     """
 
     def __init__(self, settings: Settings, azimuth_deg: float) -> None:

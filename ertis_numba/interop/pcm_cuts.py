@@ -26,16 +26,9 @@ _NEARLY: Final = 0.8  # Minimum length of the last measurement of a file, relati
 class Cuts:
     """Measurements of equal length in files.
 
-    Attributes
-    ----------
-    n_samples : int
-        Length of a measurement.
-    samples : list of (measurement,) int64
-        First sample of each measurement of each file.
-    times_s : list of (measurement,) float64
-        Time of each emission since the start of its file, in seconds.
-    notes : tuple of str
-        Assumption about the emission, or where it was found.
+    - ``samples`` list of (measurement,) int64: first sample of each measurement of each file.
+    - ``times_s`` list of (measurement,): time of each emission since the start of its file, in seconds.
+    - ``notes``: assumption about the emission, or where it was found.
     """
 
     n_samples: int
@@ -55,12 +48,7 @@ class Cuts:
 def cut_regularly(files: Sequence[PcmFile], *, skip_s: float, length_s: float | None) -> Cuts:
     """Return one measurement per file, with the length of the shortest file, or several of ``length_s``.
 
-    Raises
-    ------
-    ArgumentError
-        A time is invalid.
-    DataError
-        A file is too short.
+    Raise ArgumentError if a time is invalid.
     """
     rate_hz = files[0].rate_hz
     skipped = round(checks.between("skip_s", skip_s, 0.0, _MAX_DURATION_S) * rate_hz)
@@ -93,12 +81,8 @@ def cut_at_emissions(
 ) -> Cuts:
     """Return a measurement for each emission in a channel, which lasts until the next one or for ``length_s``.
 
-    Raises
-    ------
-    ArgumentError
-        The length is invalid.
-    DataError
-        A file contains no emission, or the next emission follows before the length.
+    Raise ArgumentError if the length is invalid. Raise DataError if a file contains no emission, or the next emission
+    follows before the length.
     """
     rate_hz = files[0].rate_hz
     found = [

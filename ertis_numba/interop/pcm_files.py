@@ -39,20 +39,12 @@ _MAX_FLOAT32: Final = float(np.finfo(np.float32).max)
 class PcmFile:
     """Properties of a PCM file, or of several whose channels are joined.
 
-    Attributes
-    ----------
-    paths : tuple of Path
-        Files in the order of their channels.
-    rate_hz : float
-        Rate at which the sound was recorded.
-    counts : tuple of int
-        Number of channels of each file.
-    kind : dtype
-        Type of the samples in the file.
-    is_wide : bool
-        True for integers of 32 or 64 bits, all of which are used according to the file.
-    settings : Settings or None
-        Settings in the file.
+    - ``paths``: files in the order of their channels.
+    - ``rate_hz``: rate at which the sound was recorded.
+    - ``counts``: number of channels of each file.
+    - ``kind``: type of the samples in the file.
+    - ``is_wide``: True for integers of 32 or 64 bits, all of which are used according to the file.
+    - ``settings``: settings in the file.
     """
 
     paths: tuple[Path, ...]
@@ -101,10 +93,7 @@ class PcmSamples:
     def block(self, samples: slice, enabled: NDArray[np.bool_] | None = None) -> NDArray[Any]:
         """Return samples, (sample, channel); non-finite samples of disabled channels become 0.
 
-        Raises
-        ------
-        DataError
-            A sample of an enabled channel is not finite, or exceeds float32.
+        Raise DataError if a sample of an enabled channel is not finite, or exceeds float32.
         """
         numbers = self._numbers(samples)
         if self._without is not None:
@@ -112,13 +101,7 @@ class PcmSamples:
         return _converted(self._file, numbers, samples.start, enabled)
 
     def channel(self, channel: int, samples: slice) -> NDArray[np.float64]:
-        """Return samples of one channel, in units of the file.
-
-        Raises
-        ------
-        DataError
-            A sample is not finite.
-        """
+        """Return samples of one channel, in units of the file; raise DataError if one is not finite."""
         numbers = self.channel_or_nan(channel, samples)
         if not np.isfinite(numbers).all():
             raise DataError(f"channel {channel} of {self._file.path} contains NaN or infinity; replace these numbers")
@@ -134,13 +117,7 @@ class PcmSamples:
 
 
 def inspect(path: Path, expansion: float | None = None) -> PcmFile:
-    """Return the properties of a file.
-
-    Raises
-    ------
-    DataError
-        The file cannot be read, or its rate is unknown or out of range.
-    """
+    """Return the properties of a file."""
     read = _read(path)
     try:
         Recording(sample_rate_hz=read.rate_hz)
@@ -166,10 +143,8 @@ def inspect(path: Path, expansion: float | None = None) -> PcmFile:
 def joined(files: Sequence[PcmFile]) -> PcmFile:
     """Return one file with the channels of all, cut to the shortest.
 
-    Raises
-    ------
-    DataError
-        The files differ in rate, type of numbers or time, or are in the order of the alphabet but not of numbers.
+    Raise DataError if the files differ in rate, type of numbers or time, or are in the order of the alphabet but not of
+    numbers.
     """
     require_alike(files, joined=True)
     _require_one_measurement(files)

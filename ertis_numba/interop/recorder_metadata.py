@@ -29,16 +29,10 @@ _BEXT_DATE: Final = slice(320, 338)
 class RecorderMetadata:
     """Statements of a recorder about a file.
 
-    Attributes
-    ----------
-    stated_times : list of StatedTime
-        Time of the first sample, from each source that states it; the most reliable source comes first.
-    expansion : float or None
-        Factor by which the header's rate is too low, as stated.
-    rate_hz : float or None
-        True sample rate, as stated.
-    notes : list of str
-        Statements that cannot be read.
+    - ``stated_times``: time of the first sample, from each source that states it; the most reliable source comes first.
+    - ``expansion``: factor by which the header's rate is too low, as stated.
+    - ``rate_hz``: true sample rate, as stated.
+    - ``notes``: statements that cannot be read.
     """
 
     stated_times: list[StatedTime] = field(default_factory=list)
@@ -48,15 +42,7 @@ class RecorderMetadata:
 
 
 def read_metadata(chunks: Mapping[str, bytes], rate_hz: float) -> RecorderMetadata:
-    """Return time and time expansion in the chunks of a WAV file.
-
-    Parameters
-    ----------
-    chunks : mapping of str to bytes
-        See `ertis_numba.wav.WavFile`.
-    rate_hz : float
-        Sample rate in the header, in hertz.
-    """
+    """Return time and time expansion in the chunks of a WAV file (`ertis_numba.wav.WavFile`) with a stated rate."""
     found = RecorderMetadata()
     _read_guano(chunks.get("guan", b""), found)
     _read_wamd(chunks.get("wamd", b""), found)

@@ -31,16 +31,10 @@ _HEX_S: Final = range(round(datetime(2014, 1, 1, tzinfo=UTC).timestamp()), 2**31
 class StatedTime(NamedTuple):
     """Time at which a file begins, as its source states it.
 
-    Attributes
-    ----------
-    clock : datetime
-        Reading of the clock, without a zone.
-    offset : timedelta or None
-        Offset of the clock from UTC; None if the source states none. UTC is then assumed.
-    source : str
-        Words for the source, such as ``GUANO``.
-    resolution_s : float
-        Step of the clock, in seconds.
+    - ``clock``: reading of the clock, without a zone.
+    - ``offset``: offset of the clock from UTC; None if the source states none. UTC is then assumed.
+    - ``source``: words for the source, such as ``GUANO``.
+    - ``resolution_s``: step of the clock, in seconds.
     """
 
     clock: datetime

@@ -29,21 +29,9 @@ def file_times(
 ) -> tuple[list[int], list[str]]:
     """Return the time of the first measurement of each file, in nanoseconds since 1970, and notes about the times.
 
-    Parameters
-    ----------
-    files : sequence of PcmFile
-        Files in the order of their times.
-    starts_ns : sequence of int
-        Times of the first measurements as given by the user: none, that of the first file, or one for each file.
-    first_s : sequence of float
-        Time of the first measurement of each file, relative to the start of the file.
-
-    Raises
-    ------
-    ArgumentError
-        The number of times is neither 0, 1 nor the number of files.
-    DataError
-        The files are not in the order of their times, or only some of them state a time.
+    ``files`` are in the order of their times. ``starts_ns`` are times of first measurements as given by the user: none,
+    that of the first file, or one per file. ``first_s`` are the times of the first measurements relative to the starts
+    of their files.
     """
     if len(starts_ns) not in {0, 1, len(files)}:
         raise ArgumentError(

@@ -72,12 +72,7 @@ class TopicNames(dict[str, str]):
     """Name of each sensor in topics, by sensor. Characters that ROS does not allow become ``_``.
 
     The topics of fused images, whose sensor is ``base_link``, lie in ``fused``. If another sensor has the same name in
-    topics, the later one gets a number, such as ``a_b_2``.
-
-    Raises
-    ------
-    ArgumentError
-        The name of a sensor is invalid.
+    topics, the later one gets a number, such as ``a_b_2``. Raise ArgumentError if the name of a sensor is invalid.
     """
 
     def __missing__(self, sensor: str) -> str:
@@ -93,10 +88,7 @@ class TopicNames(dict[str, str]):
 def header(stamp: Stamp, *, frame: str | None = None) -> dict[str, Any]:
     """Return the header of a message: the time of the emission, and the frame of the sensor or another one.
 
-    Raises
-    ------
-    ArgumentError
-        The time is before 1970 or after 2038.
+    Raise ArgumentError if the time is before 1970 or after 2038.
     """
     sec, nanosec = ros_time(stamp)
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame or stamp.sensor}

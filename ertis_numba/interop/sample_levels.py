@@ -19,14 +19,8 @@ _MAX_PASCALS: Final = 200.0  # 140 dB
 class SampleLevels:
     """Peak and number of samples at full scale of the samples of a file.
 
-    Parameters
-    ----------
-    full_scale : float
-        Full scale of the samples.
-    kind : dtype
-        Type of the samples in the file.
-    is_wide : bool
-        Whether they are integers of 32 or 64 bits, all of which are used according to the file.
+    ``kind`` is the type of the samples in the file; ``is_wide`` states that all bits of integers of 32 or 64 bits are
+    used.
     """
 
     def __init__(self, full_scale: float, kind: np.dtype[Any], *, is_wide: bool) -> None:

@@ -93,14 +93,8 @@ def _half_lobe_rad(settings: Settings) -> float:
 def reflectors_ahead(cloud: PointCloud, image: Energyscape, mounting: Mounting) -> PointCloud:
     """Return the reflectors of a platform that are certain, and in front of one of its sensors, in its frame.
 
-    Parameters
-    ----------
-    cloud : PointCloud
-        Fused reflectors in the frame of the platform.
-    image : Energyscape
-        Image of the sensor at the same SYNC pulse.
-    mounting : (translation_m, rotation_xyzw)
-        Pose of the sensor on the platform.
+    ``cloud`` is in the frame of the platform, ``image`` is that of the sensor at the same SYNC pulse, and ``mounting``
+    its pose on the platform.
     """
     translation_m, rotation_xyzw = mounting
     rotation = Rotation.from_quat(rotation_xyzw)

@@ -38,10 +38,7 @@ Reader = Callable[[slice], NDArray[np.float64]]
 class Emissions:
     """Emissions in a file.
 
-    Attributes
-    ----------
-    times : (emission,) float64
-        Times of the emissions since the first sample, in samples; range 0 of the call.
+    ``times`` (emission,): times of the emissions since the first sample, in samples; range 0 of the call.
     """
 
     times: NDArray[np.float64]
@@ -52,21 +49,8 @@ def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, 
     """Return the emissions in a loopback channel.
 
     The matched filter of the call finds them. If no part of the channel resembles the call, its pulses are found by
-    their onsets, as those of a trigger.
-
-    Parameters
-    ----------
-    read : callable
-        Function that returns consecutive samples of the channel.
-    n_samples : int
-        Number of samples of the channel.
-    path, channel : Path, int
-        Names in messages.
-
-    Raises
-    ------
-    DataError
-        There is no complete emission, or a sample is not finite.
+    their onsets, as those of a trigger. ``read`` returns consecutive samples of the channel. Raise DataError if there
+    is no complete emission, or a sample is not finite.
     """
     times, match = _of_call(read, n_samples, call_samples(call, rate_hz=rate_hz), call.start_s * rate_hz)
     notes = []
@@ -109,14 +93,8 @@ def louder_and_earlier(
 ) -> str:
     """Return a note if another channel contains the call more loudly and up to half an interval earlier.
 
-    Nothing contains a call before the loopback does, so ``channel`` may be that of a microphone.
-
-    Parameters
-    ----------
-    read : callable
-        Function that returns samples of a channel.
-    emissions : Emissions
-        Those in ``channel``.
+    Nothing contains a call before the loopback does, so ``channel`` may be that of a microphone. ``emissions`` are
+    those in ``channel``.
     """
     at = float(emissions.times[0])
     interval = float(np.diff(emissions.times).min()) if len(emissions.times) > 1 else math.inf

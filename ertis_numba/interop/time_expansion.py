@@ -16,17 +16,8 @@ def true_rate_hz(
 ) -> tuple[float, list[str]]:
     """Return the rate at which the sound was recorded, in hertz, and notes if it is not that of the header.
 
-    Parameters
-    ----------
-    header_hz : float
-        Rate in the header, in hertz.
-    expansion : float or None
-        Factor given by the user, which overrides the metadata.
-
-    Raises
-    ------
-    DataError
-        The metadata contradict the header, but not by a whole factor.
+    ``expansion`` is the user's factor, which overrides the metadata. Raise DataError if the metadata contradict the
+    header, but not by a whole factor.
     """
     stated = metadata.expansion
     ratio = None if metadata.rate_hz is None else metadata.rate_hz / header_hz

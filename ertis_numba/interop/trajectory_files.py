@@ -197,18 +197,7 @@ def write_tum(path: str | Path, trajectory: Trajectory, *, overwrite: bool = Fal
 
 
 def check_tum_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
-    """Refuse a path to which `write_tum` could not write.
-
-    Parameters
-    ----------
-    sources : iterable of Path
-        Input files, which are never overwritten.
-
-    Raises
-    ------
-    ArgumentError
-        The file exists and ``overwrite`` is false, or its name has another ending.
-    """
+    """Refuse a path to which `write_tum` could not write; ``sources`` are never overwritten."""
     suffix = path.suffix.lower()
     if suffix in _OTHER_SUFFIXES:
         raise ArgumentError(
