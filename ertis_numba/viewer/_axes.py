@@ -36,16 +36,9 @@ _MIN_RATIO, _MAX_RATIO = 0.25, 1.0  # Height of the sector relative to its width
 class Place:
     """Position of the sector in the picture.
 
-    Attributes
-    ----------
-    sensor_px : (x, y)
-        Position of the sensor from the upper left corner of the picture; it may lie outside.
-    scale_px_m : float
-        Pixels per metre.
-    width_px, height_px : int
-        Size of the picture.
-    box_px : (left, top, right, bottom)
-        Bounds of the sector.
+    - ``sensor_px`` (x, y): position of the sensor from the upper left corner of the picture; it may lie outside.
+    - ``scale_px_m``: pixels per metre.
+    - ``box_px`` (left, top, right, bottom): bounds of the sector.
     """
 
     sensor_px: tuple[float, float]
@@ -110,13 +103,9 @@ class Place:
 class Ink:
     """Overlay of a picture.
 
-    Attributes
-    ----------
-    places : (drawn,) intp
-        Pixels of the flat picture.
-    colours : (drawn, 3) float32
-    cover : (drawn, 1) float32
-        Opacity of each pixel, 0 to 1.
+    - ``places`` (drawn,) intp: pixels of the flat picture.
+    - ``colours`` (drawn, 3) float32
+    - ``cover`` (drawn, 1) float32: opacity of each pixel, 0 to 1.
     """
 
     places: NDArray[np.intp]

@@ -25,13 +25,7 @@ def is_level(pose: Pose) -> bool:
 
 
 class FusedPlan:
-    """Renderer of the fused image, which it keeps while images and choices are unchanged.
-
-    Parameters
-    ----------
-    width_px : int
-        Width of the picture.
-    """
+    """Renderer of the fused image, which it keeps while images and choices are unchanged."""
 
     def __init__(self, width_px: int) -> None:
         self._width_px = width_px
@@ -45,10 +39,7 @@ class FusedPlan:
     def __call__(self, several: Mapping[str, ReceivedImage[Energyscape]], choices: Choices) -> Sector:
         """Return the image, in the frame of the platform.
 
-        Parameters
-        ----------
-        several : mapping of str to ReceivedImage
-            Latest image of each sensor; all poses are known.
+        All poses of ``several`` are known.
         """
         whole = self._image(several)
         made_for: list[object] = [whole, choices]

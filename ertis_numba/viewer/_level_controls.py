@@ -20,12 +20,7 @@ _BAR_PX: Final = 70
 class LevelControls:
     """Controls of acoustic maps on the page.
 
-    Parameters
-    ----------
-    choices : Choices
-        Initial choices.
-    choose : callable
-        Called with the name and the value of a choice.
+    ``choose``: called with the name and the value of a choice.
     """
 
     def __init__(self, gui: viser.GuiApi, choices: Choices, choose: Callable[[str, Any], None]) -> None:

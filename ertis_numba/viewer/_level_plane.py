@@ -35,13 +35,8 @@ class LevelPlane:
 
     Directions at several elevations have a plane of azimuth (positive to the left) and elevation, in which each point
     has the colour of the nearest direction. Directions in a horizontal plane have a polar plot, whose radius and colour
-    are the level.
-
-    Parameters
-    ----------
-    azimuth_rad, elevation_rad : (direction,) float64
-    width_px : int
-        Width of the pictures; the height follows from it.
+    are the level. ``azimuth_rad``, ``elevation_rad`` (direction,). ``width_px``: width of the pictures; the height
+    follows from it.
     """
 
     def __init__(
@@ -98,18 +93,9 @@ class LevelPlane:
         return x + float(right) * scale, y - float(ahead) * scale
 
     def picture(self, shades: NDArray[np.uint8], table: NDArray[np.uint8], scale: LevelScale) -> NDArray[np.uint8]:
-        """Return the picture with its axes, and a ring around the loudest direction.
+        """Return the picture with its axes, and a ring around the loudest direction: (row, column, 3) uint8.
 
-        Parameters
-        ----------
-        shades : (direction,) uint8
-            Result of `LevelScale.shade`.
-        table : (256, 3) uint8
-            Colours of levels.
-
-        Returns
-        -------
-        (row, column, 3) uint8
+        ``shades`` (direction,) uint8: result of `LevelScale.shade`. ``table`` (256, 3) uint8: colours of levels.
         """
         made = self._page.copy()
         flat = made.reshape(-1, 3)

@@ -14,10 +14,6 @@ class MapSequence:
 
     Every ``passive.averages`` measurements form a group, as in `AcousticCamera.process_many`. The map of a measurement
     is the mean of its group up to this measurement. Measurements in order are therefore processed once.
-
-    Parameters
-    ----------
-    device : {"auto", "cpu", "cuda", "numpy"}
     """
 
     def __init__(self, reader: RecordingReader, *, device: Literal["auto", "cpu", "cuda", "numpy"]) -> None:

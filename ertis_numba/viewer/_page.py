@@ -48,28 +48,14 @@ Orders: TypeAlias = "SimpleQueue[ControlRequest | None]"
 class ViewerPage:
     """Server of the page; choices made there go into a queue.
 
-    Parameters
-    ----------
-    port : int
-        0 selects a free one.
-    title : str
-        Name of the source.
-    choices : Choices
-        Initial choices.
-    n_time_steps : int, optional
-        Length of the time line; there is none by default.
-    shows_maps : bool
-        Controls of acoustic maps instead of those of images.
+    - ``port``: 0 selects a free one.
+    - ``title``: name of the source.
+    - ``choices``: initial choices.
+    - ``n_time_steps``: length of the time line; there is none by default.
+    - ``shows_maps``: controls of acoustic maps instead of those of images.
+    - ``is_seen``: True once a browser has connected.
 
-    Attributes
-    ----------
-    is_seen : bool
-        True once a browser has connected.
-
-    Raises
-    ------
-    NetworkError
-        The address cannot be used.
+    Raise NetworkError if the address cannot be used.
     """
 
     def __init__(

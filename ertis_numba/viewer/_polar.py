@@ -42,14 +42,9 @@ def cropped(image: Energyscape, range_m: tuple[float, float] | None) -> Energysc
 class PolarSampling:
     """Interpolation of levels at points of a plane; call it to get the levels.
 
-    Attributes
-    ----------
-    places : (shown,) intp
-        Points within the image.
-    first, second : (shown,) intp
-        Flat indices into the levels of `Polar.levels`, on either side of the point.
-    share : (shown,) uint16
-        Weight of the second, of 256.
+    - ``places`` (shown,) intp: points within the image.
+    - ``first``, ``second`` (shown,) intp: flat indices into the levels of `Polar.levels`, on either side of the point.
+    - ``share`` (shown,) uint16: weight of the second, of 256.
     """
 
     places: NDArray[np.intp]

@@ -34,20 +34,8 @@ class RecordingReceiver(Protocol):
 class ToFile:
     """File for a recording.
 
-    Parameters
-    ----------
-    sources : sequence of Path
-        Files on display, which are never overwritten.
-
-    Attributes
-    ----------
-    n_frames : int or None
-        Number of frames in the file; None until it is written.
-
-    Raises
-    ------
-    ArgumentError
-        The file cannot be written there.
+    ``sources``: files on display, which are never overwritten. ``n_frames``: number of frames in the file; None until
+    it is written. Raise ArgumentError if the file cannot be written there.
     """
 
     def __init__(
@@ -79,13 +67,7 @@ class ToFile:
 
 
 class ToBrowser:
-    """Browser that requested a recording.
-
-    Parameters
-    ----------
-    name : str
-        Name of the file.
-    """
+    """Browser that requested a recording."""
 
     def __init__(self, client: Any, name: str) -> None:
         self._client, self._name = client, name
@@ -147,14 +129,8 @@ class Recordings:
     All times are from one clock. Time starts when the first frame is drawn.
 
     A separate thread builds and delivers a page, because this takes seconds for a long recording and would stop a live
-    view.
-
-    Parameters
-    ----------
-    serializer : callable
-        Returns what viser keeps from now on.
-    finished : callable
-        Returns the function that completes a page whose recording ends now.
+    view. ``serializer``: returns what viser keeps from now on. ``finished``: returns the function that completes a page
+    whose recording ends now.
     """
 
     def __init__(

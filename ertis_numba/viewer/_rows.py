@@ -23,12 +23,7 @@ _NONE: Final = "–"
 class FrameCounts:
     """Counts of frames.
 
-    Attributes
-    ----------
-    shown : int
-        Frames with a new image.
-    latency_s : float or None
-        Time from the emission to the display.
+    ``latency_s`` is the time from the emission to the display; ``shown`` counts frames with a new image.
     """
 
     def __init__(self) -> None:

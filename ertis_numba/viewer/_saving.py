@@ -52,19 +52,9 @@ def picture_png(frame: DrawnFrame) -> bytes:
 
 
 def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> bytes:
-    """Return the points of images on the platform as PLY.
+    """Return the points of images on the platform as PLY, from tuples as `ViewedScene.latest` returns them.
 
-    Points of a sensor with unknown mounting are in its own frame.
-
-    Parameters
-    ----------
-    points : list of (Energyscape, PointCloud, Pose or None)
-        As `ViewedScene.latest` returns them.
-
-    Raises
-    ------
-    ArgumentError
-        There are several sensors, and the mounting of one is unknown.
+    Points of a sensor with unknown mounting are in its own frame. With several sensors, all mountings must be known.
     """
     mountings = validated(
         {image.stamp.sensor: (pose.translation_m, pose.rotation_xyzw) for image, _, pose in points if pose}
@@ -82,12 +72,8 @@ def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> byt
 def with_legend(page: str, title: str, frame: DrawnFrame | None) -> str:
     """Return a saved page with a legend in its upper right corner.
 
-    Parameters
-    ----------
-    page : str
-        HTML, with a head and a body.
-    frame : DrawnFrame or None
-        The pictures of its first four sensors are shown; they have colour bars.
+    ``page`` is HTML with a head and a body. Of ``frame``, the pictures of the first four sensors are shown; they have
+    colour bars.
     """
     unit = "" if frame is None else frame.unit
     sensors = [] if frame is None else [*frame.sensors.items()][:_MAX_PICTURES]

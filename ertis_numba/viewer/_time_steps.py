@@ -22,11 +22,8 @@ _TOGETHER_NS: Final = 10_000_000  # measurements of several sensors that are sho
 class TimeStep:
     """Measurements shown together: at most one per sensor.
 
-    Attributes
-    ----------
-    time_s : float
-        Time since the first time step.
-    measurements : tuple of (sensor, number)
+    ``measurements`` are (sensor, number). ``time_s``: time since the first time step. ``measurements`` tuple of
+    (sensor, number).
     """
 
     time_s: float
@@ -37,12 +34,8 @@ class TimeStep:
 class SensorTimeline:
     """Measurements of a sensor along the time steps.
 
-    Attributes
-    ----------
-    places, numbers : tuple of int
-        Rising indices of the time steps, and indices of the measurements in the file.
-    interval_s : float or None
-        Typical interval between measurements; None for a single one.
+    ``places``, ``numbers``: rising indices of the time steps, and indices of the measurements in the file.
+    ``interval_s``: typical interval between measurements; None for a single one.
     """
 
     places: tuple[int, ...]
