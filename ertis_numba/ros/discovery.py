@@ -16,12 +16,8 @@ _MAX_SAMPLES: Final = 1000
 class FoundSubscriber:
     """Subscriber of a ROS 2 topic.
 
-    Attributes
-    ----------
-    topic, message : str
-        ROS name, as in ``/front/points``, and type of the messages.
-    is_reliable : bool
-        It receives nothing from best-effort publishers.
+    - ``topic``, ``message``: ROS name, as in ``/front/points``, and type of the messages.
+    - ``is_reliable``: it receives nothing from best-effort publishers.
     """
 
     topic: str
@@ -32,12 +28,7 @@ class FoundSubscriber:
 def discover(participant: Participant, wait_s: float = 2.0) -> tuple[int, list[FoundSubscriber]]:
     """Return the number of other participants, and the subscribers of ROS 2 topics.
 
-    Parameters
-    ----------
-    participant : Participant
-        Open participant of the domain.
-    wait_s : float
-        Time in which the others announce themselves.
+    ``participant`` is open; others announce themselves within ``wait_s``.
     """
     from cyclonedds.builtin import (  # noqa: PLC0415  an extra
         BuiltinDataReader,

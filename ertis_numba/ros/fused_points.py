@@ -57,13 +57,8 @@ class FusedImages:
         """Add an image, and return the pulses that are complete now.
 
         Images that are planar, unlike the first one of their pulse, or the reverse, are left out. A pulse that cannot
-        be fused is left out with a note. The frame of the result is that of `joined`,
-        with an origin in whole metres.
-
-        Parameters
-        ----------
-        mountings : mapping of str to (translation_m, rotation_xyzw)
-            Poses of all sensors with a known mounting.
+        be fused is left out with a note. The frame of the result is that of `joined`, with an origin in whole metres.
+        ``mountings`` are those of all sensors with a known pose.
         """
         fused = []
         for group in self._groups.add(image):
@@ -122,12 +117,7 @@ def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:
     """Return the points of several sensors as one cloud in the frame of the platform, with the earliest time.
 
     If a sensor is more than 1 km from the origin of this frame, the points are in the frame ``base_link_local``, and
-    ``translation_m`` is its origin in whole kilometres.
-
-    Parameters
-    ----------
-    clouds : mapping of str to PointCloud
-        Points by sensor, with known mountings.
+    ``translation_m`` is its origin in whole kilometres. ``clouds`` have known mountings.
     """
     each = list(clouds.values())
     stamp = min((cloud.stamp for cloud in each), key=lambda stamp: stamp.timestamp_ns)

@@ -21,14 +21,10 @@ _Group = dict[str, _Item]
 class OdometryPublisher:
     """Publisher of nav_msgs/msg/Odometry and the transform from ``odom`` to ``base_link``.
 
-    Parameters
-    ----------
-    on_note : callable
-        Called by any thread with a line for each sensor without mounting, and for each pulse that cannot be used.
-    is_paused : callable
-        Returns True while nothing is to be published; the pose is still computed.
-    alone : bool, optional
-        True if no other sensor emits than those given, as for `Odometry`; False by default.
+    - ``on_note``: called by any thread with a line for each sensor without mounting, and for each pulse that cannot be
+      used.
+    - ``is_paused``: returns True while nothing is to be published; the pose is still computed.
+    - ``alone``: True if no other sensor emits than those given, as for `Odometry`; False by default.
     """
 
     def __init__(
@@ -71,10 +67,7 @@ class OdometryPublisher:
     def close(self) -> None:
         """Publish the poses of all waiting pulses, and end the thread.
 
-        Raises
-        ------
-        ErtisError
-            The computation has failed.
+        Raise ErtisError if the computation has failed.
         """
         while group := self._groups.close():
             self._put(group)

@@ -145,12 +145,8 @@ class Participant:
 class Topic:
     """Topic on which messages are published.
 
-    Attributes
-    ----------
-    name, message : str
-        ROS name, and type of the messages.
-    published, dropped : int
-        Number of published messages, and of those dropped because a reliable subscriber did not keep up.
+    ``name``, ``message``: ROS name, and type of the messages. ``published``, ``dropped``: number of published messages,
+    and of those dropped because a reliable subscriber did not keep up.
     """
 
     def __init__(self, name: str, message: str, kind: Any, writer: Any) -> None:
