@@ -16,13 +16,7 @@ Real = NDArray[np.float32]
 
 
 def as_array(name: str, given: ArrayLike, kinds: str = "iuf") -> NDArray[Any]:
-    """Return an array of numbers of the kinds ``kinds``, which are those of `numpy.dtype.kind`.
-
-    Raises
-    ------
-    ArgumentError
-        ``given`` is ragged, or its elements are of another kind.
-    """
+    """Return an array of numbers of the kinds ``kinds``, which are those of `numpy.dtype.kind`."""
     try:
         array = np.asarray(given)
     except (TypeError, ValueError) as error:

@@ -41,25 +41,11 @@ Real = NDArray[np.float32]
 class FastProcessor:
     """Processing of measurements by the fast chain. Several threads may call `process`.
 
-    Parameters
-    ----------
-    exact : Processor
-        Computes whatever the fast chain does not, and the images to compare with.
-    device : {"auto", "cpu", "cuda", "numpy"}
-
-    Attributes
-    ----------
-    difference_db : float
-        RMS of the difference of both images of a simulated measurement with loud echoes, relative to the exact image.
-    weak_difference_db : float
-        The same for echoes that are 60 dB weaker. Images of noise alone differ more.
-
-    Raises
-    ------
-    ArgumentError
-        The fast chain cannot do what the arguments say, or differs by more than -15 dB for loud or weak echoes.
-    DeviceError
-        The device does not exist.
+    ``exact`` computes whatever the fast chain does not, and the images to compare with. ``difference_db``: RMS of the
+    difference of both images of a simulated measurement with loud echoes, relative to the exact image.
+    ``weak_difference_db``: the same for echoes that are 60 dB weaker. Images of noise alone differ more. Raise
+    ArgumentError if the fast chain cannot do what the arguments say, or differs by more than -15 dB for loud or weak
+    echoes. Raise DeviceError if the device does not exist.
     """
 
     def __init__(self, exact: Processor, *, device: str = "auto") -> None:
@@ -99,10 +85,7 @@ class FastProcessor:
     def process(self, data: NDArray[Any], *, pdm: bool) -> Real:
         """Return the image, as `Processor.process` does.
 
-        Raises
-        ------
-        ArgumentError
-            The shape of ``data`` does not match the configuration.
+        Raise ArgumentError if the shape of ``data`` does not match the configuration.
         """
         if not pdm or self._exact.has_lost_gpu:
             return self._exact.process(data, pdm=pdm)

@@ -35,37 +35,23 @@ Combine = Callable[[NDArray[np.int32], Real], None]
 class Configuration:
     """Arguments of `rtiscuda.preload`; None for stages that are off.
 
-    Attributes
-    ----------
-    pdm_filter : (tap,) float32
-        Low pass for PDM demodulation.
-    pre_filter, post_filter : (tap,) float32 or None
-        Filters of the signals, and of the beams.
-    envelope_filter : (tap,) float32
-        Low pass of rectified beams.
-    matched_filter : (mic, bin) complex64 or None
-        Factors for the spectra of the signals, as `numpy.fft.rfft` returns them.
-    delays : (direction, mic) int32 or None
-        Delays in samples of the signals, at least 0.
-    n_samples : int
-        Number of PDM words.
-    pdm_factor, envelope_factor : int
-        Decimation of the PDM words to signals, and of the rectified beams to the image.
-    beamforming_drop : int
-        Number of samples at the end of signals without beams.
-    first_range, last_range : int
-        Range of the image in its samples; the last is not included.
-    clean_multipliers : (float, float) or None
-        Amplitudes of a range become 0 below the first number times the mean of the range, and below the second
-        number times its maximum.
-    has_envelope : bool
-        The envelope is computed.
-    disabled : tuple of int
-        Microphones to exclude.
-    dmas_order : int
-        1 for delay-and-sum; 2 to 5 for delay-multiply-and-sum.
-    coherent : bool
-        Multiply beams by the coherence factor.
+    - ``pdm_filter`` (tap,) float32: low pass for PDM demodulation.
+    - ``pre_filter``, ``post_filter`` (tap,) float32 or None: filters of the signals, and of the beams.
+    - ``envelope_filter`` (tap,) float32: low pass of rectified beams.
+    - ``matched_filter`` (mic, bin) complex64 or None: factors for the spectra of the signals, as `numpy.fft.rfft`
+      returns them.
+    - ``delays`` (direction, mic) int32 or None: delays in samples of the signals, at least 0.
+    - ``n_samples``: number of PDM words.
+    - ``pdm_factor``, ``envelope_factor``: decimation of the PDM words to signals, and of the rectified beams to the
+      image.
+    - ``beamforming_drop``: number of samples at the end of signals without beams.
+    - ``first_range``, ``last_range``: range of the image in its samples; the last is not included.
+    - ``clean_multipliers`` (float, float) or None: amplitudes of a range become 0 below the first number times the mean
+      of the range, and below the second number times its maximum.
+    - ``has_envelope``: the envelope is computed.
+    - ``disabled``: microphones to exclude.
+    - ``dmas_order``: 1 for delay-and-sum; 2 to 5 for delay-multiply-and-sum.
+    - ``coherent``: multiply beams by the coherence factor.
     """
 
     pdm_filter: Real
@@ -137,15 +123,8 @@ class Configuration:
 class Processor:
     """Processing of measurements with one configuration. Several threads may call `process`.
 
-    Parameters
-    ----------
-    device : {"auto", "cpu", "cuda", "numpy"}
-        Device of the PDM filter and of the beams; Fourier transforms and the other filters use the CPU.
-
-    Raises
-    ------
-    DeviceError
-        The device does not exist.
+    Fourier transforms and filters other than that of PDM use the CPU on any device. Raise DeviceError if the device
+    does not exist.
     """
 
     def __init__(self, configuration: Configuration, *, device: str = "auto") -> None:
@@ -181,10 +160,7 @@ class Processor:
     def process(self, data: NDArray[Any], *, pdm: bool) -> Real:
         """Return the result of the last stage that is on: signals, beams or an image, (row, sample) float32.
 
-        Raises
-        ------
-        ArgumentError
-            The shape of ``data`` does not match the configuration.
+        Raise ArgumentError if the shape of ``data`` does not match the configuration.
         """
         return cleaned(self.uncleaned(data, pdm=pdm), self._given.clean_multipliers)
 
@@ -227,13 +203,7 @@ class Processor:
         return beams
 
     def words(self, data: NDArray[Any]) -> NDArray[np.uint32]:
-        """Return the PDM words of a measurement: (sample, 1) uint32.
-
-        Raises
-        ------
-        ArgumentError
-            Their type or number does not match the configuration.
-        """
+        """Return the PDM words of a measurement, which must match the configuration: (sample, 1) uint32."""
         return arguments.words(data, self._given.n_samples)
 
     def _demodulated(self, data: NDArray[Any]) -> Real:

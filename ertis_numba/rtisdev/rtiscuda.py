@@ -56,14 +56,9 @@ def preload(  # noqa: PLR0913, PLR0917  as the original has it
 ) -> None:
     """Prepare a configuration for `processing`, and replace an earlier one of this name.
 
-    All arguments are those that ``rtisdev`` passes, in its order. `processor.Configuration` describes them.
-
-    Raises
-    ------
-    ArgumentError
-        A type, shape or value is wrong, or they do not fit together.
-    DeviceError
-        The device of ERTIS_RTISDEV_DEVICE does not exist.
+    All arguments are those that ``rtisdev`` passes, in its order. `processor.Configuration` describes them. Raise
+    ArgumentError if a type, shape or value is wrong, or they do not fit together. Raise DeviceError if the device of
+    ERTIS_RTISDEV_DEVICE does not exist.
     """
     with _errors_logged():
         name = arguments.text("name", name)
@@ -104,28 +99,10 @@ def preload(  # noqa: PLR0913, PLR0917  as the original has it
 
 
 def processing(data: NDArray[Any], pdm: int, dim1: int, dim2: int, name: str) -> NDArray[np.float32]:
-    """Process a measurement.
+    """Process a measurement with a preloaded configuration; return (dim1, dim2) float32.
 
-    Parameters
-    ----------
-    data : ndarray
-        With ``pdm``, the PDM words, (sample,) uint32. Otherwise the result of an earlier stage: signals, (mic, sample),
-        or, for a configuration without beamforming, beams, (direction, sample).
-    pdm : int
-        Not 0 for PDM words.
-    dim1, dim2 : int
-        Shape of the result.
-    name : str
-        Configuration that was preloaded.
-
-    Returns
-    -------
-    (dim1, dim2) float32
-
-    Raises
-    ------
-    ArgumentError
-        Nothing is preloaded under this name, a shape does not match the configuration, or data are NaN or infinite.
+    With a ``pdm`` other than 0, ``data`` are PDM words (sample,) uint32. Otherwise they are the finite result of an
+    earlier stage: signals (mic, sample), or, without beamforming, beams (direction, sample).
     """
     with _errors_logged():
         name = arguments.text("name", name)
@@ -146,10 +123,7 @@ def processing(data: NDArray[Any], pdm: int, dim1: int, dim2: int, name: str) ->
 def unloadone(name: str) -> None:
     """Free a configuration; a name that was never preloaded is only reported.
 
-    Raises
-    ------
-    ArgumentError
-        The name is not a text.
+    Raise ArgumentError if the name is not a text.
     """
     with _errors_logged():
         name = arguments.text("name", name)

@@ -36,23 +36,10 @@ _awaits_triggers = False  # after the command that switches external triggers on
 def connect(port: str, baud: int) -> None:  # noqa: ARG001  USB ignores the rate
     """Open a serial port, and close the one that was open.
 
-    Bytes that still arrive for a former program are dropped.
-
-    Parameters
-    ----------
-    port : str
-        Path, link, serial number, or name of an emulated device; the variable ERTIS_RTISDEV_PORT overrides it.
-    baud : int
-        Ignored, because USB has no rate.
-
-    Raises
-    ------
-    ArgumentError
-        The port is not a text.
-    ConnectionRefusedError
-        Another program uses the port.
-    ConnectionError
-        The port does not exist, or may not be used.
+    Bytes that still arrive for a former program are dropped. The variable ERTIS_RTISDEV_PORT overrides ``port``: a
+    path, link, serial number, or name of an emulated device. ``baud`` is ignored, because USB has no rate. Raise
+    ConnectionRefusedError if another program uses the port, and ConnectionError if it does not exist or may not be
+    used.
     """
     global _line  # noqa: PLW0603  one connection per process
     with _errors_translated():
@@ -85,16 +72,8 @@ def _quiet(path: str) -> Dialogue:
 def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as the original has it
     """Send a command, which ends with a new line, and return its answer, a number, or None if none is wanted.
 
-    Raises
-    ------
-    ArgumentError
-        The command is not a text.
-    ConnectionRefusedError
-        No port is open.
-    ConnectionError
-        The device was unplugged.
-    TimeoutError
-        No answer came.
+    Raise ConnectionRefusedError without an open port, ConnectionError if the device was unplugged, and TimeoutError
+    without an answer.
     """
     global _awaits_triggers  # noqa: PLW0603  one connection per process
     line = _connected()
@@ -112,18 +91,8 @@ def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as th
 def getdata(n_bytes: int) -> NDArray[np.uint8]:
     """Return ``n_bytes`` bytes as soon as they have arrived, (byte,) uint8.
 
-    There is no limit of time while external triggers are on.
-
-    Raises
-    ------
-    ArgumentError
-        The number is negative or not whole.
-    ConnectionRefusedError
-        No port is open.
-    ConnectionError
-        The device was unplugged.
-    TimeoutError
-        The measurement did not arrive.
+    There is no limit of time while external triggers are on. Raise ConnectionRefusedError without an open port,
+    ConnectionError if the device was unplugged, and TimeoutError if the measurement does not arrive.
     """
     with _errors_translated():
         n_bytes = arguments.whole("n_bytes", n_bytes, 0)
@@ -132,15 +101,7 @@ def getdata(n_bytes: int) -> NDArray[np.uint8]:
 
 
 def flush() -> None:
-    """Drop received bytes.
-
-    Raises
-    ------
-    ConnectionRefusedError
-        No port is open.
-    ConnectionError
-        The device was unplugged.
-    """
+    """Drop received bytes; raise ConnectionRefusedError or ConnectionError as `command` does."""
     line = _connected()
     with _errors_translated():
         while waiting := line.waiting:
@@ -148,13 +109,7 @@ def flush() -> None:
 
 
 def close() -> None:
-    """Close the port.
-
-    Raises
-    ------
-    ConnectionRefusedError
-        No port is open.
-    """
+    """Close the port; raise ConnectionRefusedError if none is open."""
     global _line  # noqa: PLW0603  one connection per process
     _connected().close()
     _line = None
