@@ -439,20 +439,9 @@ def calibration(
     """Draw the residuals of a calibration, and the beam pattern along azimuth, before and after.
 
     Patterns show plane waves that the calibrated array receives, with beams of the former and of the new layout.
-
-    Parameters
-    ----------
-    settings : Settings
-        Settings of the recordings, for the call and the air.
-    azimuth_deg, elevation_deg : float
-        Steering direction in degrees, -90 to 90.
-    dynamic_range_db, **look
-        Range of the colours in dB and the style, as for `plot`.
-
-    Raises
-    ------
-    ArgumentError
-        An argument is invalid.
+    Steering directions are -90 to 90 degrees; ``settings`` are those of the recordings, for the call and the air.
+    ``dynamic_range_db``, ``**look``: range of the colours in dB and the style, as for `plot`. Raise ArgumentError if an
+    argument is invalid.
     """
     checks.positive("dynamic_range_db", dynamic_range_db)
     checks.instance("made", made, Calibration, "calibrate returns")

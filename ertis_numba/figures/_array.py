@@ -135,13 +135,7 @@ def width_deg(angle_deg: NDArray[np.float64], level_db: NDArray[np.float64], at_
 
 
 def _lines(settings: Settings, frequencies_hz: Sequence[float] | None) -> list[Cut]:
-    """Return the lines to draw: the ends of the call's band and its mean, or the requested frequencies.
-
-    Raises
-    ------
-    ArgumentError
-        A frequency is not positive, there are too many, or they are not a list.
-    """
+    """Return the lines to draw: the ends of the call's band and its mean, or the requested frequencies."""
     if frequencies_hz is None:
         low_hz, high_hz = settings.call.low_frequency_hz, settings.call.high_frequency_hz
         band = f"{_captions.khz(low_hz)}–{_captions.khz(high_hz)} kHz"

@@ -31,14 +31,8 @@ def name_points(
 ) -> None:
     """Write labels beside points, the first ones nearest; omit those without room.
 
-    The limits of the axes must be final. Existing texts are not covered.
-
-    Parameters
-    ----------
-    points : sequence of (x, y)
-        Positions in the coordinates of the axes.
-    ring_pt : float
-        Radius around each point that names avoid.
+    The limits of the axes must be final. Existing texts are not covered. ``points`` sequence of (x, y): positions in
+    the coordinates of the axes. ``ring_pt``: radius around each point that names avoid.
     """
     px_per_pt, size_pt, page = axes.figure.dpi / 72, style.tick_pt, axes.figure.bbox
     taken = [text.get_window_extent() for text in axes.texts if text.get_text()]

@@ -23,14 +23,9 @@ _MAX_SAMPLES = 2**19  # of the record, 0.1 s of an eRTIS: what a picture can sho
 class MicrophoneTraces:
     """Values of each microphone over time or range.
 
-    Attributes
-    ----------
-    values : (mic, place) float32
-        Full scale 1.
-    axis : (place,) float64
-        Seconds from the start of the emission, or metres.
-    channels : (mic,) int64
-        Channel of each microphone.
+    - ``values`` (mic, place) float32: full scale 1.
+    - ``axis`` (place,): seconds from the start of the emission, or metres.
+    - ``channels`` (mic,) int64: channel of each microphone.
     """
 
     values: NDArray[np.float32]

@@ -31,18 +31,11 @@ _SHARE_ALONE = 0.8  # of its box that a colour bar takes which no list is under
 class Panel:
     """Picture that is drawn in two steps, because labels find their places only after the axes have theirs.
 
-    Attributes
-    ----------
-    paint : callable
-        Draws into axes and returns the raster that the colour bar explains, or None.
-    height : callable
-        Returns the height of the axes from their width, both in points.
-    finish : callable
-        Draws what depends on the final position of the axes.
-    title_ems : float
-        Distance of the title from the axes.
-    box_aspect : float, optional
-        Height of the axes relative to their width on a page.
+    - ``paint``: draws into axes and returns the raster that the colour bar explains, or None.
+    - ``height``: returns the height of the axes from their width, both in points.
+    - ``finish``: draws what depends on the final position of the axes.
+    - ``title_ems``: distance of the title from the axes.
+    - ``box_aspect``: height of the axes relative to their width on a page.
     """
 
     paint: Callable[[Axes], AxesImage | None]
@@ -66,14 +59,8 @@ def compose(
     """Return a page; Matplotlib's constrained layout places the pictures.
 
     On a wide page, the pictures are beside each other, with colour bar and list on their right. On a narrow one, all
-    parts are below each other.
-
-    Parameters
-    ----------
-    width_pt : float
-        Width of the page if the style has none.
-    stacked : bool
-        Place pictures below each other on a wide page, too.
+    parts are below each other. ``width_pt`` applies if the style has none; ``stacked`` places pictures below each other
+    on a wide page, too.
     """
     style, em_pt, rows = canvas.style, canvas.style.em_pt, canvas.rows()
     width_pt = width_pt if style.width_pt is None else style.width_pt

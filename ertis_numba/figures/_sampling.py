@@ -63,16 +63,8 @@ def polar_raster(
 ) -> NDArray[np.float32]:
     """Return levels at points of the horizontal plane: (row, column), NaN outside of the image.
 
-    Interpolation is bilinear between directions and ranges. The value is NaN if no direction is near.
-
-    Parameters
-    ----------
-    level_db : (azimuth, range) float32
-        Levels in dB for the azimuths of ``fan``.
-    range_m : (range,) float64
-        Rising.
-    right_m : (column,) float64
-    ahead_m : (row,) float64
+    Interpolation is bilinear between directions and ranges. The value is NaN if no direction is near. Levels in dB are
+    (azimuth, range) for the azimuths of ``fan``; ``range_m`` rises.
     """
     ahead_m = ahead_m[:, None]
     direction, near = fan.directions(right_m, ahead_m)
@@ -105,15 +97,7 @@ def sphere_raster(
     """Return levels over azimuth and elevation: (row, column), NaN where no direction is near.
 
     The value is the mean of the four nearest directions, weighted by their inverse square distance. Directions may be
-    in any arrangement.
-
-    Parameters
-    ----------
-    level_db : (direction,) float32
-    directions : (direction, axis) float64
-        Unit vectors.
-    azimuth_rad : (column,) float64
-    elevation_rad : (row,) float64
+    in any arrangement. Levels are (direction,), and ``directions`` unit vectors (direction, axis).
     """
     looks = unit_vectors(*(grid.ravel() for grid in np.meshgrid(azimuth_rad, elevation_rad)))
     return look_raster(level_db, directions, looks.reshape(len(elevation_rad), len(azimuth_rad), 3))
@@ -124,13 +108,7 @@ def look_raster(
 ) -> NDArray[np.float32]:
     """Return levels in the directions of pixels, interpolated as by `sphere_raster`: (row, column).
 
-    Parameters
-    ----------
-    level_db : (direction,) float32
-    directions : (direction, axis) float64
-        Unit vectors.
-    looks : (row, column, axis) float64
-        Unit vectors.
+    Levels are (direction,); ``directions`` (direction, axis) and ``looks`` (row, column, axis) are unit vectors.
     """
     place, weight = _around(directions, looks.reshape(-1, 3))
     return np.asarray(np.sum(weight * level_db[place], axis=1), np.float32).reshape(looks.shape[:2])
@@ -145,16 +123,9 @@ def volume_raster(
 ) -> NDArray[np.float32]:
     """Return levels at points of space: (row, column), NaN outside of the image.
 
-    Interpolation is linear between ranges, and that of `sphere_raster` between directions.
-
-    Parameters
-    ----------
-    level_db : (direction, range) float32
-    directions : (direction, axis) float64
-        Unit vectors.
-    range_m : (range,) float64
-        Rising.
-    points_m : (row, column, axis) float64
+    Interpolation is linear between ranges, and that of `sphere_raster` between directions. Levels are
+    (direction, range), ``directions`` unit vectors (direction, axis), and ``points_m`` (row, column, axis). ``range_m``
+    rises.
     """
     flat_m = points_m.reshape(-1, 3)
     radius_m = np.linalg.norm(flat_m, axis=1)

@@ -89,13 +89,7 @@ def draw_echoes(canvas: Canvas, measurement: Measurement, *, microphone: int | N
 
 
 def _chosen(heard: MicrophoneTraces, microphone: int | None) -> MicrophoneTraces:
-    """Return the traces of one microphone, or of all.
-
-    Raises
-    ------
-    ArgumentError
-        There is no such microphone, or it is disabled.
-    """
+    """Return the traces of one microphone, or of all."""
     if microphone is None:
         return heard
     place = np.flatnonzero(heard.channels == checks.integer("microphone", microphone, 0))

@@ -25,13 +25,7 @@ _MAX_RATIO = 1.1
 
 
 def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float | None) -> Figure:
-    """Draw the plane of a height and the upright one that runs forward at a distance to the left.
-
-    Raises
-    ------
-    ArgumentError
-        A section lies outside of the image, or a planar image has no vertical section.
-    """
+    """Draw the plane of a height and the upright one that runs forward at a distance to the left."""
     if image.is_planar and left_m is not None:
         raise ArgumentError(
             f"left_m is {left_m:g}, but a planar image has no upright plane; "
@@ -52,14 +46,10 @@ def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float |
 class _Cut:
     """A plane through an image.
 
-    Attributes
-    ----------
-    name : str
-        Name of the argument that sets its position.
-    across, up, normal : int
-        Axes of the sensor frame.
-    extent_m : (left, right, bottom, top)
-        Limits of the picture; the left limit is the larger one if y increases to the left.
+    - ``name``: name of the argument that sets its position.
+    - ``across``, ``up``, ``normal``: axes of the sensor frame.
+    - ``extent_m`` (left, right, bottom, top): limits of the picture; the left limit is the larger one if y increases to
+      the left.
     """
 
     name: str
@@ -71,13 +61,7 @@ class _Cut:
     extent_m: tuple[float, float, float, float]
 
     def sample(self, level_db: NDArray[np.float32], image: Energyscape) -> NDArray[np.float32]:
-        """Return the levels in the plane: (row, column), NaN where there are none.
-
-        Raises
-        ------
-        ArgumentError
-            The section lies outside of the image.
-        """
+        """Return the levels in the plane, which the image must contain: (row, column), NaN where there are none."""
         left, right, bottom, top = self.extent_m
         step_m = max(abs(right - left), top - bottom) / _PIXELS
         across_m = centres(left, right, step_m)

@@ -20,16 +20,9 @@ def draw_grid(
 ) -> None:
     """Draw rings and rays with their labels in the present font of Matplotlib.
 
-    Parameters
-    ----------
-    axes : Axes
-        Metres to the right of the sensor and ahead of it; limits must be final.
-    first_m : float
-        First range that a ring may have.
-    largest : int
-        Largest number of parts between rings.
-    spare_m : float
-        Distance from the image at which a ring is still drawn.
+    ``axes`` are in metres to the right of the sensor and ahead of it; their limits must be final. ``first_m`` is the
+    first range that a ring may have, and ``largest`` the largest number of parts between rings. ``spare_m``: distance
+    from the image at which a ring is still drawn.
     """
     line: dict[str, Any] = {"color": style.faint, "alpha": 0.35, "linewidth": 0.7 * style.line_pt}
     line |= {"clip_on": False, "scalex": False, "scaley": False}

@@ -63,16 +63,10 @@ class StyleOptions(TypedDict, total=False):
 class Style:
     """Colours, letters and sizes; ``colours`` is a perceptually uniform map of Matplotlib.
 
-    Attributes
-    ----------
-    title_pt, label_pt, tick_pt, list_pt : float
-        Font sizes.
-    margin_pt : float
-        Margin around the page.
-    side_pt : float
-        Minimum width beside the pictures for the scale and the list.
-    width_pt : float or None
-        Width of the page; None for the width of the kind of picture.
+    - ``title_pt``, ``label_pt``, ``tick_pt``, ``list_pt``: font sizes.
+    - ``margin_pt``: margin around the page.
+    - ``side_pt``: minimum width beside the pictures for the scale and the list.
+    - ``width_pt``: width of the page; None for the width of the kind of picture.
     """
 
     page: str
@@ -167,13 +161,7 @@ def style_of(
     columns: Literal[1, 2] | None = None,
     font: Literal["sans", "serif"] = "sans",
 ) -> Style:
-    """Return a style by its name.
-
-    Raises
-    ------
-    ArgumentError
-        A name is unknown, or columns are given for a screen.
-    """
+    """Return a style by its name; only the theme "paper" has columns."""
     checks.choice("theme", theme, THEMES)
     checks.choice("font", font, FONTS)
     style = replace(THEMES[theme], font=FONTS[font])
