@@ -160,15 +160,7 @@ def write_maps(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Write the acoustic maps of a recording.
-
-    Parameters
-    ----------
-    path, target : Path
-        Recording, and the file to write.
-    quiet, as_json : bool
-        As for the command.
-    """
+    """Write the acoustic maps of a recording."""
     _require_maps()
     with ExitStack() as stack:
         with options.note_when_slow(options.PREPARING, quiet=quiet):

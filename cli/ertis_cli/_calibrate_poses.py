@@ -37,25 +37,13 @@ def write_poses(
 ) -> None:
     """Calibrate the poses of sensors from recordings of one or several runs, print them, and write a mounting file.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Recordings that contain all sensors, or some of them.
-    sensors : sequence of str or None
-        Names of the sensors in the order of the SYNC chain; those of the recordings by default.
-    target : Path or None
-        Mounting file (TOML) to write, for ``--mounting``.
-    reference : str or None
-        Sensor whose frame the poses refer to; the first by default.
-    force, quiet, as_json : bool
-        As for the command.
+    - ``paths``: recordings that contain all sensors, or some of them.
+    - ``sensors``: names of the sensors in the order of the SYNC chain; those of the recordings by default.
+    - ``target``: mounting file (TOML) to write, for ``--mounting``.
+    - ``reference``: sensor whose frame the poses refer to; the first by default.
 
-    Raises
-    ------
-    ArgumentError
-        The target cannot be written, or no recording contains a sensor.
-    DataError
-        The recordings do not determine the poses; nothing is written.
+    Raise ArgumentError if the target cannot be written, or no recording contains a sensor. Raise DataError if the
+    recordings do not determine the poses; nothing is written.
     """
     from ertis_numba.atomic_files import atomic_write, check_target
     from ertis_numba.calibration.poses import calibrate_poses

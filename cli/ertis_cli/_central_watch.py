@@ -87,15 +87,7 @@ def require_use(*, stores: bool, as_json: bool) -> None:
 class CentralWatch:
     """Reporter of a central node: JSON lines on stdout, log lines and, on a terminal, a progress line on stderr.
 
-    Parameters
-    ----------
-    life : Life
-        This process.
-
-    Attributes
-    ----------
-    recordings : list of str
-        Sealed recordings.
+    ``recordings``: sealed recordings.
     """
 
     def __init__(self, life: "Life", *, quiet: bool, as_json: bool) -> None:
@@ -169,13 +161,7 @@ class CentralWatch:
 
 
 def archive(folder: Path, name: str, rotate_mb: float, rotate_s: float) -> "Archive":
-    """Return an archive that stores measurements according to the options.
-
-    Raises
-    ------
-    ArgumentError
-        An option has an invalid value.
-    """
+    """Return an archive that stores measurements according to the options."""
     from ertis_numba import checks
     from ertis_numba.errors import ArgumentError
     from ertis_numba.network.central_node import Archive
@@ -199,15 +185,8 @@ def run(
 ) -> None:
     """Run a central node until it is asked to end.
 
-    Parameters
-    ----------
-    made : list of Path
-        New folders, as yielded by `ertis_cli._saving.withdrawn`; cleared once the node runs.
-
-    Raises
-    ------
-    ErtisError
-        The node cannot start.
+    ``made`` lists new folders, as yielded by `ertis_cli._saving.withdrawn`; it is cleared once the node runs. Raise
+    ErtisError if the node cannot start.
     """
     with stopped_by_signals() as signals, ExitStack() as stack:
         stack.callback(watch.close)
@@ -226,13 +205,7 @@ def size(n_bytes: float) -> str:
 
 
 def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
-    """Report the results of a central node; exit with code 1 if unsealed journals remain.
-
-    Parameters
-    ----------
-    event : str
-        Name of the JSON event.
-    """
+    """Report the results of a central node; exit with code 1 if unsealed journals remain."""
     import msgspec
 
     quiet = watch.quiet

@@ -42,10 +42,7 @@ def variable(path: Iterable[str], option: str) -> str:
 def add_variables(command: click.Command, path: tuple[str, ...]) -> None:
     """Let environment variables set the options of a command and its subcommands.
 
-    Parameters
-    ----------
-    path : tuple of str
-        Names of the groups that contain the command, then its own name.
+    ``path``: names of the groups that contain the command, then its own name.
     """
     for option, parameter in _options(command).items():
         if parameter.envvar is None:

@@ -58,16 +58,7 @@ _INSTRUCTION_SETS: Final = {
 class InstallationFinding:
     """Finding about one part of an installation.
 
-    Attributes
-    ----------
-    check : str
-        Part that was checked.
-    state : {"good", "note", "bad"}
-        ``bad`` if something does not work.
-    text : str
-        Description of the state.
-    remedy : str
-        Action that fixes the problem; empty by default.
+    - ``state`` {"good", "note", "bad"}: ``bad`` if something does not work.
     """
 
     check: str

@@ -46,13 +46,7 @@ def examples() -> dict[str, Traversable]:
 
 
 def named(name: str) -> dict[str, Traversable]:
-    """Return the source of the example with this name, or without a suffix of all examples of that name.
-
-    Raises
-    ------
-    ArgumentError
-        No example has this name.
-    """
+    """Return the source of the example with this name, or without a suffix of all examples of that name."""
     from ertis_numba.errors import ArgumentError
 
     every = examples()

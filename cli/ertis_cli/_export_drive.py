@@ -102,25 +102,9 @@ def drive_of(
 ) -> "Drive":
     """Return the poses, the odometry and the scene of a drive.
 
-    Parameters
-    ----------
-    readers : sequence of RecordingReader
-        Recordings of all sensors of the platform.
-    ears : RecordingReader
-        Recording of the sensor whose microphones act as ears.
-    chosen : sequence of int
-        Indices of its measurements with a call.
-    known : mapping of str to Mounting
-        Mountings of sensors, as far as they are known.
-    poses, odometry, scene : Path or None
-        Files given as options.
-
-    Raises
-    ------
-    ArgumentError
-        There are no true poses, or a mounting is needed but unknown.
-    DataError
-        A file cannot be read, or no motion could be measured.
+    ``readers`` are of all sensors, and the microphones of ``ears`` act as ears; ``chosen`` are its measurements with a
+    call. ``known`` has the mountings that are known. Raise ArgumentError if there are no true poses, or a mounting is
+    needed but unknown. Raise DataError if a file cannot be read, or no motion could be measured.
     """
     from ertis_numba import load_scene
     from ertis_numba.errors import ArgumentError

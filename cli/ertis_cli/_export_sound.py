@@ -33,13 +33,7 @@ _PEAK = 10 ** (-1 / 20)  # of the file
 
 
 class SoundOptions(NamedTuple):
-    """Options of format wav.
-
-    Attributes
-    ----------
-    direction : (azimuth, elevation), optional
-        Direction in degrees.
-    """
+    """Options of format wav; ``direction`` is (azimuth, elevation) in degrees."""
 
     direction: tuple[float, float] | None
     heterodyne_hz: float | None

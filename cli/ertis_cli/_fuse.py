@@ -39,24 +39,9 @@ def write_fused(
 ) -> None:
     """Write the fused image of each SYNC pulse.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        Recordings of sensors of one platform.
-    target : Path
-        Energyscape file to write.
-    changed : callable
-        Function that returns the settings to use from those of the recording.
-    without : ExcludedChannels
-        Channels to exclude.
-    mounting : Path or None
-        File with the mountings of all sensors, instead of those of the recordings.
-    emitter_diameter_m : float or None
-        Diameter of the emitters instead of that of the recordings.
-    force, quiet, as_json : bool
-        As for the command.
-    **device
-        Device, threads and plan, as for `options.pipeline`.
+    ``paths`` are recordings of sensors of one platform, and ``target`` is an energyscape file. ``changed`` returns the
+    settings to use from those of the recording. A file with the mountings of all sensors, and an emitter diameter,
+    replace those of the recordings. ``device`` has device, threads and plan, as for `options.pipeline`.
     """
     from ertis_numba.fusion import PLATFORM, Fuser
     from ertis_numba.storage import EnergyscapeWriter, check_target

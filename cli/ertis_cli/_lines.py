@@ -15,17 +15,7 @@ class JsonLines:
     """Stream whose writer never waits for the reader, because a thread writes the texts in order.
 
     If too many texts are waiting, new ones are dropped and counted. A stream without a file descriptor, as in tests, is
-    written directly.
-
-    Parameters
-    ----------
-    largest : int
-        Largest number of waiting texts; 65,536 by default.
-
-    Attributes
-    ----------
-    lost : int
-        Number of dropped texts.
+    written directly. ``largest``: largest number of waiting texts; 65,536 by default.
     """
 
     def __init__(self, stream: IO[str], *, largest: int = _MAX) -> None:

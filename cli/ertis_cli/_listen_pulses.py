@@ -56,20 +56,12 @@ def listen_pulses(
 ) -> None:
     """Show each pulse until a signal, a count or a duration ends the command.
 
-    Parameters
-    ----------
-    sensors : sequence of str
-        Requested sensors; empty for all.
-    show : callable
-        Prints what arrived of a pulse.
-    head : str
-        Line above the lines of pulses; omitted with ``as_json``.
-    of : (str, str)
-        What is shown, in the singular, and what the central node may drop, in the plural.
-    product : str
-        Product that the subscriber receives.
-    at_end : callable
-        Called with the subscriber at the end, also after an error.
+    - ``sensors``: requested sensors; empty for all.
+    - ``show``: prints what arrived of a pulse.
+    - ``head``: line above the lines of pulses; omitted with ``as_json``.
+    - ``of`` (str, str): what is shown, in the singular, and what the central node may drop, in the plural.
+    - ``product``: product that the subscriber receives.
+    - ``at_end``: called with the subscriber at the end, also after an error.
     """
     notes: deque[str] = deque()
     heard = MicrophoneTable(as_json=as_json, quiet=quiet)

@@ -25,13 +25,7 @@ mounting: "Decorator" = click.option(
 
 
 def mountings(path: Path | None, sensors: Iterable[str] | None) -> dict[str, Mounting] | None:
-    """Return the mountings of some or all sensors, at the start of a scene; return None without a file.
-
-    Raises
-    ------
-    ArgumentError
-        The file does not contain the mounting of a sensor.
-    """
+    """Return the mountings of some or all sensors, at the start of a scene; return None without a file."""
     if path is None:
         return None
     from ertis_numba.errors import ArgumentError

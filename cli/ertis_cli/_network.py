@@ -46,10 +46,7 @@ allow: Decorator = click.option(
 def server_keys(key: str | None, allow: Path | None) -> "ServerKeys | None":
     """Return the keys of a central node, or None if no keys were given.
 
-    Raises
-    ------
-    SettingsError
-        A key file or the list cannot be used.
+    Raise SettingsError if a key file or the list cannot be used.
     """
     from ertis_numba.network.allow_list import ALLOW_LIST
     from ertis_numba.network.keys import KeyPair, ServerKeys, default_folder
@@ -62,13 +59,7 @@ def server_keys(key: str | None, allow: Path | None) -> "ServerKeys | None":
 
 
 def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
-    """Return the keys of a sensor node or an application, or None if no keys were given.
-
-    Raises
-    ------
-    SettingsError
-        A key cannot be used.
-    """
+    """Return the keys of a sensor node or an application, or None if no keys were given."""
     from ertis_numba.errors import SettingsError
     from ertis_numba.network.keys import ClientKeys, KeyPair, public_key
 
@@ -87,13 +78,7 @@ def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
 
 
 def metrics(given: str | None, latest: "Callable[[], Status]") -> "Metrics | None":
-    """Return a metrics server that has not started, or None without an address.
-
-    Raises
-    ------
-    ArgumentError
-        The address is invalid.
-    """
+    """Return a metrics server that has not started, or None without an address."""
     from ertis_numba.errors import ArgumentError
     from ertis_numba.network.addresses import endpoint
     from ertis_numba.network.metrics import Metrics
@@ -108,13 +93,7 @@ def metrics(given: str | None, latest: "Callable[[], Status]") -> "Metrics | Non
 
 
 def require_address(option: str, given: str | None) -> None:
-    """Check the address of an option before anything is opened.
-
-    Raises
-    ------
-    ArgumentError
-        The text is not an address.
-    """
+    """Raise ArgumentError if the text of an option is not an address, before anything is opened."""
     from ertis_numba.network.addresses import endpoint
 
     if given is not None:
@@ -122,13 +101,7 @@ def require_address(option: str, given: str | None) -> None:
 
 
 def require_duration(given: float | None) -> None:
-    """Check a duration before anything is opened.
-
-    Raises
-    ------
-    ArgumentError
-        The duration is not above zero.
-    """
+    """Raise ArgumentError if a duration is not above zero, before anything is opened."""
     from ertis_numba import checks
 
     if given is not None:

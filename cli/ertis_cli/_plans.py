@@ -36,14 +36,9 @@ def report_lines(sensor: str, reported: dict[str, Any]) -> Iterator[str]:
 
 
 def wavefront_note(whose: str, error_db: float, range_m: float) -> str:
-    """Return a line on the error of plane wavefronts.
+    """Return a line on the largest error of plane wavefronts, and its range.
 
-    Parameters
-    ----------
-    whose : str
-        Sensor, or number of recordings.
-    error_db, range_m : float
-        Largest error, and the range of it.
+    ``whose`` is a sensor, or a number of recordings.
     """
     return (
         f"{whose}: the error of plane wavefronts is up to {error_db:.1f} dB at {range_m:g} m, in addition to the error "

@@ -160,13 +160,7 @@ class _Report:
             options.print_json(_object(event) | ({"error": error} if error else {}))
 
     def close(self) -> None:
-        """Report the totals.
-
-        Raises
-        ------
-        ClickException
-            Some recordings failed.
-        """
+        """Report the totals; raise ClickException if some recordings failed."""
         took_s = time.monotonic() - self._begun_s
         if not self._quiet:
             self._print_wavefronts()

@@ -72,10 +72,7 @@ def note_without_own_echo(counts: "Mapping[str, int]", n_pulses: int, *, quiet: 
 def open_sensors(paths: "Sequence[Path]", stack: ExitStack, *, images: bool = False) -> "list[Any]":
     """Open the recordings of all sensors until a stack closes, and with ``images`` also energyscape files.
 
-    Raises
-    ------
-    UsageError
-        A sensor occurs twice, or images are fused already.
+    Raise UsageError if a sensor occurs twice, or images are fused already.
     """
     from ertis_numba.fusion import PLATFORM
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording, sensor_names
@@ -102,10 +99,7 @@ def open_sensors(paths: "Sequence[Path]", stack: ExitStack, *, images: bool = Fa
 def mountings_of(readers: "Sequence[RecordingReader]", file: "Path | None") -> "dict[str, Mounting]":
     """Return the mountings of sensors from the file given with --mounting, or else from their recordings.
 
-    Raises
-    ------
-    ArgumentError
-        A mounting is unknown.
+    Raise ArgumentError if a mounting is unknown.
     """
     given = _mountings.mountings(file, [reader.sensor for reader in readers])
     return {reader.sensor: _mounting(reader) for reader in readers} if given is None else given
@@ -168,13 +162,7 @@ class StampedIndex:
 
 
 def pulse_groups(readers: "Sequence[RecordingReader]") -> "list[dict[str, StampedIndex]]":
-    """Return the measurements of each pulse, by sensor.
-
-    Raises
-    ------
-    DataError
-        The stamps belong to different SYNC chains.
-    """
+    """Return the measurements of each pulse, by sensor; raise DataError if stamps belong to different SYNC chains."""
     from ertis_numba.fusion.pulses import PulseGroups
 
     places = [StampedIndex(index, stamp) for reader in readers for index, stamp in enumerate(reader.stamps())]
@@ -226,19 +214,9 @@ def active_groups(
     """Return the measurements of each pulse in which a sensor emitted its call, by sensor.
 
     A sensor that was silent in such a pulse hears the echoes of the others, so its measurement belongs to the pulse. A
-    note states the number of other pulses.
-
-    Parameters
-    ----------
-    readers : sequence of RecordingReader
-        Recordings of all sensors of the platform.
-    changed : callable
-        Function that returns the settings to use; with their ``processing.mode``, `is_passive` decides.
-
-    Raises
-    ------
-    DataError
-        No sensor emitted in any pulse, or the stamps belong to different SYNC chains.
+    note states the number of other pulses. With the ``processing.mode`` of the settings that ``changed`` returns,
+    `is_passive` decides. Raise DataError if no sensor emitted in any pulse, or the stamps belong to different SYNC
+    chains.
     """
     from ertis_numba.errors import DataError
     from ertis_numba.frames import is_passive
@@ -270,13 +248,7 @@ def image_settings(settings_file: "Path | None", preset: str | None) -> "Callabl
 
 
 class PipelinesBySensor:
-    """Pipelines by sensor, for the air of each measurement.
-
-    Attributes
-    ----------
-    warnings : list of str
-        Printed warnings about the images.
-    """
+    """Pipelines by sensor, for the air of each measurement; ``warnings`` are those printed about the images."""
 
     def __init__(
         self,
@@ -300,10 +272,7 @@ class PipelinesBySensor:
     def image(self, measurement: "Measurement | Energyscape") -> "Energyscape":
         """Return the image of a measurement, or the given image, and warn once if its directions are too far apart.
 
-        Raises
-        ------
-        UsageError
-            Settings are given for an image of a file.
+        Raise UsageError if settings are given for an image of a file.
         """
         from ertis_numba.analysis.direction_spacing import spacing_warning
 

@@ -51,20 +51,8 @@ def write_results(
 ) -> None:
     """Write the results of the last stage for all measurements of one sensor.
 
-    Parameters
-    ----------
-    path, target : Path
-        Recording, and the file to write.
-    changed : callable
-        Function that returns the settings to use from those of the recording.
-    without : ExcludedChannels
-        Channels to exclude.
-    sensor : str or None
-        Name of the sensor; None if there is only one.
-    force, quiet, as_json : bool
-        As for the command.
-    **device
-        Device, threads and plan, as for `options.pipeline`.
+    ``changed`` returns the settings to use from those of the recording. ``device`` has device, threads and plan, as for
+    `options.pipeline`. ``sensor``: name of the sensor; None if there is only one.
     """
     from ertis_numba.interop import export
     from ertis_numba.storage import check_target, open_recording

@@ -192,10 +192,7 @@ def publish_ports(
 class _ImageSink:
     """Destination of measurements that publishes their images, of each sensor the newest.
 
-    Attributes
-    ----------
-    superseded : int
-        Number of measurements without an image, because newer ones had arrived.
+    ``superseded``: number of measurements without an image, because newer ones had arrived.
     """
 
     def __init__(

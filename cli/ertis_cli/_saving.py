@@ -46,12 +46,8 @@ def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
 def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Write]:
     """Yield a function that saves a product; the file appears when the block ends without an error.
 
-    Raises
-    ------
-    ArgumentError
-        The file cannot be written, or a product does not match earlier ones.
-    DataError
-        There is no product to save.
+    Raise ArgumentError if the file cannot be written, or a product does not match earlier ones. Raise DataError if
+    there is no product to save.
     """
     from ertis_numba.errors import DataError
 

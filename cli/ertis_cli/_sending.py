@@ -58,24 +58,13 @@ class _Watch(Watch):
 class Sending:
     """A capture whose measurements go to a central node.
 
-    Parameters
-    ----------
-    limits_mb : tuple of (float or None)
-        Limits of the spool and of the memory, in MB; None for the defaults of `SensorNode`.
-    is_fixed : bool
-        True to refuse new settings from admins.
+    - ``limits_mb`` tuple of (float or None): limits of the spool and of the memory, in MB; None for the defaults of
+      `SensorNode`.
+    - ``is_fixed``: True to refuse new settings from admins.
+    - ``report``: summary for JSON output, complete once `run` has returned.
+    - ``n_lost``: number of captured measurements that are lost.
 
-    Attributes
-    ----------
-    report : dict
-        Summary for JSON output, complete once `run` has returned.
-    n_lost : int
-        Number of captured measurements that are lost.
-
-    Raises
-    ------
-    ArgumentError
-        The spool or the ring is too small for one measurement.
+    Raise ArgumentError if the spool or the ring is too small for one measurement.
     """
 
     def __init__(

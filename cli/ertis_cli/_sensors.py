@@ -96,10 +96,7 @@ def named_sensors(
 class ConfiguredSensors:
     """Sensors of a capture, which can be configured again.
 
-    Attributes
-    ----------
-    checks : dict of str to BitCheck
-        Check of each sensor's bits; empty if they are not checked.
+    ``checks``: check of each sensor's bits; empty if they are not checked.
     """
 
     def __init__(

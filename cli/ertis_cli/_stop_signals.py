@@ -37,12 +37,8 @@ class Interruption:
     and sends the signal again otherwise.
 
     The handler raises nothing in Python's own code for imports, which would keep its locks, so that an import in
-    another thread would wait forever. The signal is sent again a moment later.
-
-    Attributes
-    ----------
-    asked : bool
-        A signal has requested the command to end.
+    another thread would wait forever. The signal is sent again a moment later. ``asked``: a signal has requested the
+    command to end.
     """
 
     def __init__(self) -> None:
@@ -172,13 +168,7 @@ class Signals:
         self._stop()
 
     def obey(self, stop: Callable[[], None]) -> None:
-        """End the program if a signal has arrived; call ``stop`` at each later signal.
-
-        Raises
-        ------
-        KeyboardInterrupt, SystemExit
-            A signal has arrived.
-        """
+        """Raise KeyboardInterrupt or SystemExit if a signal has arrived; call ``stop`` at each later signal."""
         self._stop = stop
         if self.came:
             self.end()

@@ -35,18 +35,11 @@ _allowed = False
 class Life(NamedTuple):
     """One process of a central node.
 
-    Attributes
-    ----------
-    restarts : int
-        Processes before it.
-    reason : str
-        End of the process before it, such as SIGABRT.
-    addresses : mapping of str to str
-        Addresses of the former process: ``address`` for sensors, and ``publish`` for applications.
-    elapsed_s : float
-        Seconds since the first process was started.
-    report_fd : int
-        Descriptor to the supervisor; -1 if there is none.
+    - ``restarts``: processes before it.
+    - ``reason``: end of the process before it, such as SIGABRT.
+    - ``addresses``: addresses of the former process: ``address`` for sensors, and ``publish`` for applications.
+    - ``elapsed_s``: seconds since the first process was started.
+    - ``report_fd``: descriptor to the supervisor; -1 if there is none.
     """
 
     restarts: int = 0

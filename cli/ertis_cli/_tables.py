@@ -25,12 +25,8 @@ _FOLDED = 16  # minimum width of a text column in a narrow terminal
 class TextTable:
     """Rows of cells under headings, which rich can draw.
 
-    Parameters
-    ----------
-    columns : mapping of str
-        Headings and the alignment of their cells; numbers are aligned right.
-    styles : mapping of str, optional
-        Styles of cells by their text, as in ``{"failed": "red"}``; empty by default.
+    ``columns``: headings and the alignment of their cells; numbers are aligned right. ``styles``: styles of cells by
+    their text, as in ``{"failed": "red"}``; empty by default.
     """
 
     columns: Mapping[str, Side]

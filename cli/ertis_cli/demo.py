@@ -102,13 +102,7 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
 
 
 def _make(folder: Path, *, force: bool) -> None:
-    """Make the folder, and remove the files of an earlier demo.
-
-    Raises
-    ------
-    ArgumentError
-        Files of an earlier demo exist and may not be replaced.
-    """
+    """Make the folder, and remove the files of an earlier demo."""
     from ertis_numba.errors import ArgumentError
 
     there = [folder / name for name in _WRITTEN if (folder / name).exists() or (folder / name).is_symlink()]
@@ -145,13 +139,7 @@ class _DemoRun:
         self._bind = ends if sys.platform == "linux" else None
 
     def __call__(self, *words: object, allowed: Sequence[int] = ()) -> None:
-        """Run a command to its end.
-
-        Raises
-        ------
-        ClickException
-            The command has failed.
-        """
+        """Run a command to its end; raise ClickException if it fails."""
         typed = self._printed(words)
         command = [*_NODE, *map(str, words)]
         done = subprocess.run(command, env=self._environment, preexec_fn=self._bind, check=False)  # noqa: S603
@@ -162,10 +150,7 @@ class _DemoRun:
     def node(self, *words: object, output: Path) -> Iterator[dict[str, Any]]:
         """Run a command until the block ends; yield the first object that it prints.
 
-        Raises
-        ------
-        ClickException
-            The command has ended before it was ready.
+        Raise ClickException if the command has ended before it was ready.
         """
         typed = self._printed(words)
         with output.open("wb") as file:

@@ -194,13 +194,7 @@ def emulate(
 
 
 def _require_log(path: Path | None) -> None:
-    """Refuse to append lines to a file of another kind, such as a recording.
-
-    Raises
-    ------
-    ArgumentError
-        The file exists and does not contain JSON.
-    """
+    """Refuse to append lines to a file of another kind, such as a recording."""
     from ertis_numba.errors import ArgumentError
 
     if path is not None and path.is_file():
@@ -272,14 +266,9 @@ def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: boo
 class _Estimate:
     """Estimate of the time and the memory of a long task, derived from its first steps and reported once.
 
-    Parameters
-    ----------
-    n_steps : int
-        Number of all steps.
-    n_first : int
-        Number of first steps whose time does not count, because they also prepare the following ones.
-    clock : callable
-        Clock in seconds; a monotonic one by default.
+    - ``n_steps``: number of all steps.
+    - ``n_first``: number of first steps whose time does not count, because they also prepare the following ones.
+    - ``clock``: clock in seconds; a monotonic one by default.
     """
 
     def __init__(self, n_steps: int, *, n_first: int, clock: "Callable[[], float]" = time.monotonic) -> None:

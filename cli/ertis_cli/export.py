@@ -279,13 +279,7 @@ class _Items:
 
 
 def _with_call(reader: "RecordingReader | EnergyscapeReader", chosen: range) -> "Sequence[int]":
-    """Return the chosen measurements of a recording that have echoes of a call.
-
-    Raises
-    ------
-    DataError
-        All are passive.
-    """
+    """Return the chosen measurements of a recording that have echoes of a call."""
     from ertis_numba.errors import DataError
     from ertis_numba.frames import is_passive
 

@@ -118,22 +118,8 @@ def odometry_of(
     """Return the odometry of pulses, under a progress bar.
 
     A sensor without a call hears the echoes of others, whose paths begin elsewhere. Its images are left out.
-
-    Parameters
-    ----------
-    readers : sequence of RecordingReader
-        Recordings of all sensors of the platform.
-    groups : sequence of mapping of str to StampedIndex
-        Measurements of each pulse, by sensor.
-    mountings : mapping of str to Mounting
-        Mountings of all sensors.
-    alone : bool, optional
-        As for `Odometry`.
-
-    Raises
-    ------
-    DataError
-        Clocks of the recordings cannot be used, or no motion could be measured.
+    ``groups``: measurements of each pulse, by sensor. ``alone``: as for `Odometry`. Raise DataError if clocks of the
+    recordings cannot be used, or no motion could be measured.
     """
     from ertis_numba.errors import DataError
     from ertis_numba.frames import is_passive
