@@ -10,7 +10,7 @@ from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recordi
 LINE_8 = tuple((0.0, 0.004 * channel, 0.0) for channel in range(8))
 SHORT = Settings(
     recording=Recording(n_samples=40_960),
-    processing=Processing(directions="2d:7", range_m=(0.4, 0.9)),
+    processing=Processing(directions="2d:7", range_m=(0.4, 0.9), wavefront="plane"),
     accuracy=Accuracy(max_error_db=-45.0),
 )
 CASES = {

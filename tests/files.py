@@ -5,7 +5,10 @@ import numpy as np
 from ertis_numba.frames import Energyscape, Measurement, Stamp
 from ertis_numba.settings import Array, Processing, Recording, Settings
 
-SMALL = Settings(recording=Recording(n_samples=40_960), processing=Processing(directions="2d:7", range_m=(0.4, 0.9)))
+SMALL = Settings(
+    recording=Recording(n_samples=40_960),
+    processing=Processing(directions="2d:7", range_m=(0.4, 0.9), wavefront="plane"),
+)
 
 
 def line(n_channels, word_bits):

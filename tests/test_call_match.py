@@ -20,7 +20,7 @@ from ertis_numba.waveform import call_at
 
 SETTINGS = Settings(
     recording=Recording(sample_rate_hz=450e3, n_samples=8100, encoding="float32"),
-    processing=Processing(directions="2d:9", range_m=(0.5, 1.4), range_decimation=10),
+    processing=Processing(directions="2d:9", range_m=(0.5, 1.4), range_decimation=10, wavefront="plane"),
 )
 CALL = SETTINGS.call
 REVERSED = CALL.replace(start_frequency_hz=CALL.stop_frequency_hz, stop_frequency_hz=CALL.start_frequency_hz)

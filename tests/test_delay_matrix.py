@@ -156,8 +156,8 @@ def test_delays_are_read_from_a_file_beside_the_settings(tmp_path, suffix):
         ({"delay_matrix": np.zeros((1000, 32))}, "lists 1000 × 32 numbers; the limit is 20000, so give the name of a"),
         ({"delay_matrix": ((1.0,),), "beamformer": "dmas"}, "is given, which processing.beamformer 'dmas' does not"),
         (
-            {"delay_matrix": ((1.0,),), "wavefront": "auto"},
-            "is given, which processing.wavefront 'auto' does not support",
+            {"delay_matrix": ((1.0,),), "wavefront": "spherical"},
+            "is given, which processing.wavefront 'spherical' does not support",
         ),
         ({"delay_rate_hz": 0.0}, "processing.delay_rate_hz is 0; use a number from 1"),
     ],

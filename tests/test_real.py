@@ -33,7 +33,20 @@ def processed(request, tmp_path_factory):
     recording, image = folder / "recording.h5", folder / "image.h5"
     run("import", RAW, "-o", recording, "--layout", request.param, "--preset", "default_25_50")
     # One of the ten peaks is barely a maximum, and errors of -35 dB may remove it.
-    run("process", recording, "-o", image, "--directions", "2d:181", "--range", "0.8:5", "--max-error", "fine")
+    run(
+        "process",
+        recording,
+        "-o",
+        image,
+        "--directions",
+        "2d:181",
+        "--range",
+        "0.8:5",
+        "--max-error",
+        "fine",
+        "--wavefront",
+        "plane",
+    )
     with ertis.open_energyscapes(image) as images:
         return request.param, image, images[0]
 

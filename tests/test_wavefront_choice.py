@@ -1,5 +1,6 @@
 """Wavefronts: their error is predicted and reported, and ``auto`` chooses by the nearest range."""
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
@@ -7,7 +8,7 @@ from ertis_cli.main import cli
 from ertis_numba import kernels, verification
 from ertis_numba.errors import ArgumentError
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Accuracy
+from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.stages.planner import Planner, complete
 from ertis_numba.stages.wavefronts import plane_wave_error_db
 from ertis_numba.storage import open_energyscapes, write_recording
@@ -40,6 +41,24 @@ def test_auto_chooses_plane_wavefronts_if_the_settings_exclude_streams():
     settings = settings.replace(accuracy=Accuracy(max_error_db=-25.0, precision="float32"))
     with pytest.raises(ArgumentError, match="needs 16-bit streams"):
         complete(settings.replace("processing.wavefront", "spherical"), CPU, threads=1)
+    assert complete(settings, CPU, threads=1).processing.wavefront == "plane"
+
+
+def test_default_chooses_spherical_wavefronts_near_the_array():
+    """At 0.5 m, plane wavefronts have an error of -23 dB, for a budget of -35 dB."""
+    near, far = (Settings().replace("processing.range_m", range_m) for range_m in ((0.5, 5.0), (4.0, 5.0)))
+    assert Settings().processing.wavefront == "auto"
+    assert complete(near, CPU, threads=1).processing.wavefront == "spherical"
+    assert complete(far, CPU, threads=1).processing.wavefront == "plane"
+    pinned = far.replace("processing.wavefront", "plane")
+    assert complete(far, CPU, threads=1) == complete(pinned, CPU, threads=1)  # and so the same bits
+
+
+@pytest.mark.parametrize(
+    "changes", [{"method": "paper"}, {"beamformer": "capon"}, {"delay_matrix": tuple(map(tuple, np.zeros((181, 32))))}]
+)
+def test_default_is_plane_where_spherical_wavefronts_are_not_supported(changes):
+    settings = Settings().replace(processing=Settings().processing.replace(directions="2d:181", **changes))
     assert complete(settings, CPU, threads=1).processing.wavefront == "plane"
 
 

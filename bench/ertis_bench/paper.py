@@ -148,7 +148,9 @@ def _of_directions(
 
 def _pipeline(measurement: Measurement, n_directions: int, *, method: str, device: str) -> Pipeline:
     settings = measurement.settings
-    processing = settings.processing.replace(directions=str(n_directions), range_m=RANGE_M, method=method)
+    processing = settings.processing.replace(
+        directions=str(n_directions), range_m=RANGE_M, method=method, wavefront="plane"
+    )
     return Pipeline(settings.replace(processing=processing), device=device, predict=False)
 
 

@@ -42,7 +42,7 @@ def wavefront_note(whose: str, error_db: float, range_m: float) -> str:
     """
     return (
         f"{whose}: the error of plane wavefronts is up to {error_db:.1f} dB at {range_m:g} m, in addition to the error "
-        "budget; --wavefront auto corrects it, except for capon"
+        "budget; use --wavefront auto (capon supports only plane wavefronts), or a larger first range"
     )
 
 

@@ -58,11 +58,11 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     decimation : int, optional, default None
         Samples of the record per signal sample, 1 to 1000, a divisor of ``range_decimation``. By default the largest
         divisor that suits the method and the call's band; see `Settings.decimation`.
-    wavefront : {"plane", "spherical", "auto"}, default "plane"
+    wavefront : {"plane", "spherical", "auto"}, default "auto"
         Shape of an echo's wavefront. ``plane`` is that of the paper. ``spherical`` focuses on each range, which matters
         at ranges below some ten apertures. ``auto`` chooses ``spherical`` if plane wavefronts exceed the error budget
-        at the first range, and ``plane`` otherwise, for capon, and if no plan of an adaptive beamformer suits the rest
-        of the settings.
+        at the first range, and ``plane`` otherwise. For the paper's method, capon, own delays, and settings or memory
+        that exclude a plan for spherical wavefronts, it also chooses ``plane``.
     beamformer : str, default "delay_and_sum"
         Combination of the delayed signals, one of `BEAMFORMERS`; ``docs/explanation/beamformers.md`` compares them. All
         except delay_and_sum need the fast method, and capon also plane wavefronts.
@@ -118,7 +118,7 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     range_decimation: int = 100
     band_edges_hz: tuple[float, float] | None = None
     decimation: int | None = None
-    wavefront: Literal["plane", "spherical", "auto"] = "plane"
+    wavefront: Literal["plane", "spherical", "auto"] = "auto"
     beamformer: BeamformerName = "delay_and_sum"
     weighting: WeightingName = "none"
     dmas_order: int = 2
@@ -213,10 +213,10 @@ class Processing(TomlTable, frozen=True, kw_only=True):
                     f"({self.range_decimation})"
                 )
         checks.choice("processing.wavefront", self.wavefront, ("plane", "spherical", "auto"))
-        if self.wavefront != "plane" and self.method == "paper":
+        if self.wavefront == "spherical" and self.method == "paper":
             raise ArgumentError(
-                f"processing.wavefront is {self.wavefront!r}, but processing.method 'paper' supports only plane "
-                "wavefronts; use 'plane', or method 'fast'"
+                "processing.wavefront is 'spherical', but processing.method 'paper' supports only plane wavefronts; "
+                "use 'plane', or method 'fast'"
             )
         self._check_beamformer()
         self._check_array_weights()
@@ -320,8 +320,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             )
         if not isinstance(given, str):
             check_delays(given)
-        if self.is_adaptive or self.wavefront != "plane":
-            part = self._adaptive_part if self.is_adaptive else f"processing.wavefront {self.wavefront!r}"
+        if self.is_adaptive or self.wavefront == "spherical":
+            part = self._adaptive_part if self.is_adaptive else "processing.wavefront 'spherical'"
             raise ArgumentError(
                 f"processing.delay_matrix is given, which {part} does not support; leave it out, or use beamformer "
                 "'delay_and_sum', weighting 'none' and wavefront 'plane'"

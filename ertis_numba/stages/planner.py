@@ -78,7 +78,7 @@ def complete(
         No plan keeps the budget, or the given plan does not keep it.
     """
     if settings.processing.method == "paper":
-        return settings
+        return settings.replace(processing=settings.processing.replace(wavefront="plane"))
     if settings.processing.delay_matrix:  # Only exact delays need no model of the distribution of delays.
         settings = settings.replace(accuracy=settings.accuracy.replace(delay_taps=0))
 
@@ -92,8 +92,8 @@ def complete(
     try:
         return chosen(wanted)
     except ArgumentError:
-        # Spherical wavefronts of adaptive beamformers need streams, which cannot keep every plan and budget.
-        if wanted == plane or not plane.processing.is_adaptive:
+        # Spherical wavefronts need more memory, and those of adaptive beamformers streams, which exclude some plans.
+        if wanted == plane:
             raise
         return chosen(plane)
 

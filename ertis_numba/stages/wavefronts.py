@@ -21,12 +21,13 @@ def plane_wave_error_db(model: ErrorModel, settings: Settings, range_m: float) -
 def with_wavefront(settings: Settings, model: ErrorModel) -> Settings:
     """Return settings with spherical wavefronts if plane ones exceed the error budget at the nearest range.
 
-    Beamformers without streams and the paper's method support only plane wavefronts.
+    Beamformers without streams, own delays and the paper's method support only plane wavefronts.
     """
     processing = settings.processing
     beamformer = BEAMFORMERS[processing.beamformer]
     spherical = (
         processing.method == "fast"
+        and not processing.delay_matrix
         and bool(beamformer.streams(*beamformer.values(processing)))
         and plane_wave_error_db(model, settings, processing.range_m[0]) > settings.accuracy.max_error_db
     )

@@ -13,7 +13,7 @@ from tests.scenes import SENSOR, line_array, only
 EIGHT = SENSOR.replace(
     array=line_array(8, 0.004),
     recording=Recording(n_samples=32_768),
-    processing=Processing(directions="2d:91", range_m=(0.0, 0.8)),
+    processing=Processing(directions="2d:91", range_m=(0.0, 0.8), wavefront="plane"),
 )
 ALL_OF_IT = Electronics(
     noise_dbfs=-70,

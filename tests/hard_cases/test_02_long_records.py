@@ -21,7 +21,9 @@ N_SAMPLES = 2**24
 N_NOISE = 40_960
 PAIR = Array(layout="pair", positions_m=((0.0, -0.02, 0.0), (0.0, 0.02, 0.0)), word_bits=8)
 LONG = Settings(
-    array=PAIR, recording=Recording(n_samples=N_SAMPLES), processing=Processing(directions="2d:5", range_m=(0.4, 0.9))
+    array=PAIR,
+    recording=Recording(n_samples=N_SAMPLES),
+    processing=Processing(directions="2d:5", range_m=(0.4, 0.9), wavefront="plane"),
 )
 RATE_HZ = LONG.recording.sample_rate_hz
 LATER = (N_SAMPLES - N_NOISE - 2000) // 100 * 100  # a multiple of range_decimation, to shift ranges by whole steps

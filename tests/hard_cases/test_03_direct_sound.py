@@ -20,7 +20,10 @@ from tests.scenes import only, scene_of
 
 LOUDEST_DB = -6.0  # level of the direct sound in the microphone nearest to the emitter
 DIRECT_DB = -46.0  # reaches LOUDEST_DB at that microphone's distance of 1 cm
-SHORT = Settings(recording=Recording(n_samples=65_536), processing=Processing(directions="2d:91", range_m=(0.0, 2.0)))
+SHORT = Settings(
+    recording=Recording(n_samples=65_536),
+    processing=Processing(directions="2d:91", range_m=(0.0, 2.0), wavefront="plane"),
+)
 
 
 def echo(azimuth_deg, range_m, level_db):

@@ -50,7 +50,9 @@ def run(*, count: int, say: Callable[[str], None], directions: str = DIRECTIONS)
         The error of an image exceeds -20 dB, or its budget without a warning.
     """
     measurement, source = input_measurements.real() or input_measurements.measurement()
-    settings = measurement.settings.replace("processing.directions", directions)
+    settings = measurement.settings.replace("processing.directions", directions).replace(
+        "processing.wavefront", "plane"
+    )
     budget_db = settings.accuracy.max_error_db
     kernel_set = kernels.load("cpu")
     rows: list[dict[str, Any]] = []

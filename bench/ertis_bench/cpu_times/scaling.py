@@ -112,7 +112,7 @@ def _settings(plan: str, *, directions: float, last_range_m: float, microphones:
     positions_m = np.stack([np.zeros(n_mics), radius_m * np.cos(angle_rad), radius_m * np.sin(angle_rad)], axis=1)
     array = Array(layout=f"disc of {n_mics}", positions_m=tuple(map(tuple, positions_m.tolist())), word_bits=32)
     processing = settings.processing.replace(
-        directions=f"3d:{int(directions)}", range_m=(_FIRST_RANGE_M, float(last_range_m))
+        directions=f"3d:{int(directions)}", range_m=(_FIRST_RANGE_M, float(last_range_m)), wavefront="plane"
     )
     accuracy = settings.accuracy
     if plan != _DEFAULT:

@@ -57,7 +57,11 @@ class Trials:
             range_decimation=_RANGE_DECIMATION,
         )
         recording = Recording(sample_rate_hz=_RATE_HZ, n_samples=_N_SAMPLES, encoding="float32")
-        settings = Settings(recording=recording, processing=processing, accuracy=Accuracy(max_error_db=max_error_db))
+        settings = Settings(
+            recording=recording,
+            processing=processing.replace(wavefront="plane"),
+            accuracy=Accuracy(max_error_db=max_error_db),
+        )
         device = kernels.load("cpu")
         self._settings = planner.complete(settings, device, threads=1)
         self._chain = FastChain(self._settings, device, threads=1)
