@@ -14,7 +14,10 @@ __all__ = ["Checked"]
 class Checked(TomlDocument, frozen=True, kw_only=True):
     """TOML document with an optional CRC-32 of its content.
 
-    ``check`` is the CRC-32 in the file; empty for a document in memory.
+    Attributes
+    ----------
+    check : str
+        CRC-32 in the file; empty for a document in memory.
     """
 
     check: str = ""
