@@ -19,8 +19,8 @@ _UNTURNED = (0.0, 0.0, 0.0, 1.0)
 class Attitudes:
     """Rotations from the frame of a sensor to the world frame.
 
-    The recording has poses of the platform. ``rotation_xyzw`` is the rotation of the sensor on its platform; that of
-    the recording by default. ``note`` describes poses that are hardly those of a platform, such as those that tilt it.
+    ``rotation_xyzw`` of the sensor on its platform is that of the recording by default. ``note`` describes poses that
+    are hardly those of a platform, such as those that tilt it.
     """
 
     def __init__(

@@ -25,9 +25,8 @@ class DaskWorkerPool:
 
     The workers need the same versions of this package and its dependencies, and access to the files under the same
     paths. Dask repeats the task of a lost worker on another worker, a few times. Every program that reaches a scheduler
-    can run code on its workers: keep it in a trusted network, or use TLS with dask. Raises DeviceError if
-    dask.distributed is not installed; or NetworkError if no scheduler answers, or it has no workers. `wait` also raises
-    NetworkError if the connection is lost.
+    can run code on its workers: keep it in a trusted network, or use TLS with dask. `wait` raises NetworkError if the
+    connection is lost.
     """
 
     def __init__(self, address: str) -> None:

@@ -45,7 +45,7 @@ class EchoMeasurements(Sequence[Measurement]):
         return (self.recording[place] for place in self._places)
 
     def attitudes(self, mountings: Mapping[str, Mounting] | None = None) -> Attitudes:
-        """Return the attitudes of the sensor at its measurements; raises the errors of `Attitudes`.
+        """Return the attitudes of the sensor at its measurements.
 
         ``mountings``, (translation_m, rotation_xyzw) by sensor, replace those of the recording.
         """

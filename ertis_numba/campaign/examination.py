@@ -31,9 +31,8 @@ def examine(
     """Yield the examination of a sensor's plan for JSON: ``plan``, then ``verified``.
 
     ``first`` is the measurement with which the plan is examined; all ``threads`` are used by default. ``explain``
-    yields the plan, its predicted error and its predicted time; ``verify`` yields the true error of the image of
-    ``first``, with the predicted errors. ``heard`` is a planner from `planner_of`, if it exists already. Raises
-    ArgumentError if the method has no plan; or DataError if the true error exceeds the budget, after it is yielded.
+    yields the plan with its predicted error and time; ``verify`` yields the true error of the image of ``first``.
+    Raises DataError if the true error exceeds the budget, after it is yielded.
     """
     settings = pipeline.settings
     if settings.processing.method == "paper":

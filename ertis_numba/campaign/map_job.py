@@ -79,7 +79,7 @@ class _MapsOfSensor:
     def write(self, writer: AcousticMapWriter) -> Generator[None]:
         """Process the recording and write its maps; yield after each measurement.
 
-        Raises DataError if the air of a measurement differs from that of the recording, and no settings replace it.
+        All measurements need the air of the recording, unless settings replace it.
         """
         recording, camera = self._recording, self._camera
         settings, n_left, elapsed_s = camera.settings, len(recording), 0.0
@@ -155,9 +155,8 @@ def prepare_maps(
 
     Options of images have no effect. By default, ``options.settings`` derives ``settings`` from the recorded ones.
     ``warn`` is called with a line for each sensor that has faulty microphones, bands of noise only or coarse
-    directions, and after the processing of a sensor that emitted its call. Yields the recording, ready to be processed.
-    Raises DataError if microphones are faulty and ``options.strict`` is set; or ErtisError if the recording, its
-    settings or the target is invalid.
+    directions, and after the processing of a sensor that emitted its call. Raises DataError if microphones are faulty
+    and ``options.strict`` is set.
     """
     with ExitStack() as stack:
         if settings is None:
@@ -192,8 +191,7 @@ def check_maps(
 ) -> None:
     """Check every sensor of a recording as `prepare_maps` does; write nothing.
 
-    ``settings`` are those with which its maps were made, by sensor; ``warn`` is as for `prepare_maps`. Raises its
-    DataError.
+    ``settings`` are those with which its maps were made, by sensor; ``warn`` is as for `prepare_maps`.
     """
     for name, each in settings.items():
         with open_recording(path, sensor=name) as recording:

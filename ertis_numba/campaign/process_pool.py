@@ -28,8 +28,8 @@ class _WorkerProcess:
 class ProcessPool:
     """`WorkerPool` of processes on this machine.
 
-    A process that dies costs its recording, and is replaced. Raises DeviceError if processes end before they are ready;
-    `wait` raises this error.
+    A process that dies costs its recording, and is replaced. `wait` raises DeviceError if processes end before they are
+    ready.
     """
 
     def __init__(self, size: int) -> None:

@@ -89,14 +89,12 @@ def prepare_recording(
     """Open a recording and check every sensor, so that errors are reported before any processing.
 
     ``target`` is the energyscape file. By default, ``options.settings`` derives ``settings`` from the recorded ones.
-    ``pipelines`` takes a sequence of settings, and returns a context manager with one pipeline for each. ``max_bytes``
-    limits the images that wait to be written; see `SensorProcessing`. ``warn`` is called with a line for each sensor
-    that has faulty microphones, whose echoes do not match the call or the layout, or whose images may exceed the error
-    budget, and for each sensor with passive measurements, which are left out, or with level directions from poses that
-    tilt the platform by more than 30°. ``show`` is called with the name of a sensor and each result about its plan.
-    Yields the recording, ready to be processed. Raises DataError if microphones are faulty and ``options.strict`` is
-    set, the error of an image exceeds its budget and ``options.verify`` is set, or all measurements are passive; or
-    ErtisError if the recording, its settings or the target is invalid.
+    ``max_bytes`` limits the images that wait to be written; see `SensorProcessing`. ``warn`` is called with a line for
+    each sensor that has faulty microphones, whose echoes do not match the call or the layout, or whose images may
+    exceed the error budget, and for each sensor with passive measurements, which are left out, or with level directions
+    from poses that tilt the platform by more than 30°. Raises DataError if microphones are faulty and
+    ``options.strict`` is set, the error of an image exceeds its budget and ``options.verify`` is set, or all
+    measurements are passive.
     """
     with ExitStack() as stack:
         if settings is None:

@@ -55,10 +55,9 @@ class SensorProcessing:
 
     ``batch`` is the number of measurements per batch; fewer if the images that wait to be written exceed ``max_bytes``,
     `MAX_WAITING_BYTES` by default. ``attitudes`` of the sensor are required if ``processing.level_directions`` is true.
-    ``times_ms`` has the processing time of each measurement, and ``reported`` the results about the plan.
-    ``prediction`` is the predicted error of the first measurement's image; None before it is computed, and for the
-    paper's method. ``call_warning``, ``start_warning`` and ``layout_warning`` warn that the sound does not match the
-    call, the start of the record or the layout, or that the call could not be checked; otherwise they are empty.
+    ``times_ms`` are those of measurements, and ``reported`` has results about the plan. ``prediction`` is the predicted
+    error of the first image; None before it is computed, and for the paper's method. The warnings are that the sound
+    does not match the call, the start of the record or the layout, or that the call could not be checked.
     """
 
     def __init__(
@@ -85,7 +84,7 @@ class SensorProcessing:
     def write(self, recording: EchoMeasurements, writer: EnergyscapeWriter) -> Iterator[None]:
         """Process a recording and write its images; yield after each.
 
-        Raises DataError if the air of a measurement differs from that of the recording, and no settings replace it.
+        All measurements need the air of the recording, unless settings replace it.
         """
         settings = self.pipeline.settings
         as_recorded = settings.air == recording.settings.air

@@ -139,8 +139,8 @@ class Task:
 class TaskUpdate:
     """Message of a worker about a task.
 
-    ``done`` is the number of processed measurements, in a progress report. ``result`` comes at the end of a task:
-    ``error`` is the reason of a failure, and ``by_chance`` marks a failure that may be temporary.
+    ``done`` measurements are processed. ``result`` comes at the end of a task: ``error`` is the reason of a failure,
+    and ``by_chance`` marks a failure that may be temporary.
     """
 
     number: int

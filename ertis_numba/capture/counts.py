@@ -13,8 +13,7 @@ _RECENT_S = 3.0  # Interval of the reported rate.
 class CaptureCounts:
     """Counts of one sensor's measurements.
 
-    ``missing`` counts measurements by reason, ``unplugged`` the times that the sensor was unplugged, and ``skipped``
-    the commands that were skipped because the sensor was still busy.
+    ``missing`` counts by reason, and ``skipped`` the commands that were skipped because the sensor was still busy.
     """
 
     stored: int = 0

@@ -27,10 +27,10 @@ __all__ = [
 class BlockArrived:
     """A received measurement.
 
-    ``count`` is the number of the measurement among those of this sensor: the number of the command, or else the
-    sensor's own counter, without wrap-around. ``tick`` is the number of the command, which all sensors share; None with
-    SYNC pulses. Since the previous block, the sensor counted ``skipped`` measurements that did not arrive, blocks were
-    rejected if ``damaged``, and the reader waited ``waited_s`` for the disk.
+    ``count`` is the number of the command, or else the sensor's own counter, without wrap-around. ``tick`` is the
+    number of the command, which all sensors share; None with SYNC pulses. Since the previous block, the sensor counted
+    ``skipped`` measurements that did not arrive, blocks were rejected if ``damaged``, and the reader waited
+    ``waited_s`` for the disk.
     """
 
     sensor: str

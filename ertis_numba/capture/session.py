@@ -67,16 +67,15 @@ class CaptureSession:
     Sequence numbers are those of the commands to a sensor, or of the SYNC pulses since its first one. They start at 0,
     and a missing number is a missing measurement.
 
-    ``sonars`` are configured drivers by their names in the recording, armed one after the other in this order, except
-    passive ones. ``trigger`` is ``command`` for commands of this computer, or ``sync`` for pulses of the SYNC chain.
-    ``n`` is the number of measurements of each sensor, or of pulses; like ``duration_s``, it is unlimited by default.
-    ``patience_s`` is the timeout for a silent or unplugged sensor. ``mounting`` has (translation_m, rotation_xyzw) by
-    sensor, as in `ertis_numba.journal.Journal.add_sensor`; unknown by default. ``session_id`` distinguishes the
-    sequence numbers of sessions; it is random by default. ``on_stored`` is called with the entries of each commit, once
-    they are durable; ``on_note`` with a sensor's name and a message about it; ``on_back`` with its name and the seconds
-    that it was unplugged; ``on_tick`` about ten times a second. ``configure`` configures the driver of a named sensor
-    with new settings, and is required by `change`. ``complete`` and ``incomplete`` count the pulses with measurements
-    of all sensors, and of some sensors only.
+    ``sonars`` are configured drivers by their names in the recording; active ones are armed in this order. ``trigger``
+    is ``command`` for commands of this computer, or ``sync`` for pulses of the SYNC chain. ``n`` is the number of
+    measurements of each sensor, or of pulses; like ``duration_s``, it is unlimited by default. ``patience_s`` is the
+    timeout for a silent or unplugged sensor. ``mounting`` has (translation_m, rotation_xyzw) by sensor, as in
+    `ertis_numba.journal.Journal.add_sensor`; unknown by default. ``session_id`` is random by default. ``on_stored`` is
+    called with the entries of each commit, once they are durable; ``on_note`` with a sensor's name and a message about
+    it; ``on_back`` with its name and the seconds that it was unplugged; ``on_tick`` about ten times a second.
+    ``configure`` configures the driver of a named sensor with new settings, and is required by `change`. ``complete``
+    and ``incomplete`` count the pulses with measurements of all sensors, and of some sensors only.
     """
 
     def __init__(  # noqa: PLR0913  trigger, limits and callbacks
@@ -153,8 +152,8 @@ class CaptureSession:
     def run(self, sink: MeasurementSink) -> None:
         """Capture until the session ends.
 
-        Raises SonarError if sensors have failed permanently (the measurements of the others are stored), or DataError
-        if further measurements cannot be stored (reported ones are durable).
+        Raises SonarError if sensors have failed permanently, or DataError if further measurements cannot be stored; all
+        reported ones are durable.
         """
         end_s = None if self._duration_s is None else time.monotonic() + self._duration_s
         for sensor in self._sonars:

@@ -39,8 +39,8 @@ class PulseAligner(Generic[Item]):
     The offset then stays, until the times of five successive blocks contradict it.
 
     ``sensors`` are in the order in which they are armed: the first receives every pulse that any other receives.
-    ``shortest_s`` is the minimum interval between pulses. ``realigned`` counts the offsets that were changed.
-    ``interval_ns`` is the interval between pulses; the minimum while it is unknown.
+    ``shortest_s`` is the minimum interval between pulses. ``realigned`` counts changed offsets. ``interval_ns`` is the
+    interval between pulses; the minimum while it is unknown.
     """
 
     def __init__(self, sensors: list[str], *, shortest_s: float) -> None:

@@ -41,12 +41,11 @@ _AS_EVER = (0.3, 0.7)  # Share of differing bits there; near overload, which com
 class BitCheck:
     """Detector of blocks that microphones cannot have sent.
 
-    ``n_samples`` is the number of words of a block. At the slower clock of 1.125 MHz, neither splices nor stretches of
-    noise can be distinguished from sound. ``enabled`` has shape (channel,) and is true for channels with a microphone,
-    all by default. ``splices`` also detects missing and misplaced words, nearly all of them; false alarms were tested
-    with simulated sensors and with the only public measurement of a real one. ``density`` has shape (channel,): the
-    share of ones in the last checked block; 0 or 1 is a stuck microphone, which is no reason for rejection. Raises
-    ArgumentError if a number is out of range, or ``enabled`` does not have 32 channels.
+    At the slower clock of 1.125 MHz, neither splices nor stretches of noise can be distinguished from sound.
+    ``enabled``, (channel,), is true for channels with a microphone; all by default. ``splices`` also detects nearly all
+    missing and misplaced words; false alarms were tested with simulated sensors and with the only public measurement of
+    a real one. ``density``, (channel,), is the share of ones in the last checked block; 0 or 1 is a stuck microphone,
+    which is no reason for rejection.
     """
 
     def __init__(

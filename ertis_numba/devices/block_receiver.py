@@ -26,11 +26,10 @@ class BlockParser:
     behind that header, so that damage costs only its own block. Two damaged blocks may have the correct length together
     by chance; the header of the second one reveals this, because it arrived later and its number is still to come.
 
-    ``bytes fed = n_bytes · blocks returned + rejected.total() + pending`` at any time. ``n_samples`` is the number of
-    words of a block. Bytes that come ``apart_s`` after the first byte of a block may belong to another one; never by
-    default. ``n_bytes`` is the size of a whole block. ``rejected`` counts bytes by reason (``no header``, ``footer``,
-    ``cut short``), each once, with the header that led to it; ``rejected_blocks`` counts headers by the reason for
-    which no block was found behind them.
+    ``bytes fed = n_bytes · blocks returned + rejected.total() + pending`` at any time. Bytes that come ``apart_s``
+    after the first byte of a block may belong to another one; never by default. ``n_bytes`` is the size of a whole
+    block. ``rejected`` counts bytes by reason (``no header``, ``footer``, ``cut short``), each once, with the header
+    that led to it; ``rejected_blocks`` counts headers by the reason for which no block was found behind them.
     """
 
     def __init__(self, n_samples: int, *, apart_s: float = math.inf) -> None:
@@ -159,13 +158,12 @@ class BlockReceiver:
     A block with an uncertain number is held until others decide (see `CounterCheck`), so that `feed` may return several
     at once, in order. `expect` sets the next number; call it before each commanded measurement, and no block is held.
 
-    ``bytes fed = n_bytes · (blocks returned + held) + rejected.total() + pending`` at any time. ``n_samples`` is the
-    number of words of a block, ``n_bytes`` the size of a whole one. ``expected`` is the number of the first block; it
-    or the one after is taken, any by default. ``shortest_s`` is the minimum time from one measurement to the next.
-    ``bits`` returns for words, (sample,) uint32, the reason why they cannot come from microphones, or None.
-    ``on_words`` is called with words of an incomplete block as they arrive, after the number of the first of them,
-    which is 0 for a new block. The last words of a block are left out, and the block may still be rejected. `feed`
-    raises its exceptions, which lose no block.
+    ``bytes fed = n_bytes · (blocks returned + held) + rejected.total() + pending`` at any time. ``n_samples`` counts
+    the words of a block. The first block has the number ``expected`` or the one after; any by default. ``shortest_s``
+    is the minimum time between measurements. ``bits`` returns the reason why words, (sample,) uint32, cannot come from
+    microphones, or None. ``on_words`` is called with words of an incomplete block as they arrive, after the number of
+    the first of them, which is 0 for a new block. The last words of a block are left out, and the block may still be
+    rejected. `feed` raises its exceptions, which lose no block.
     """
 
     def __init__(

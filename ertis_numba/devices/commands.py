@@ -60,10 +60,7 @@ _LINE: Final = re.compile(rb"!([A-Z]),(\d{1,10}),(\d{1,10}),(\d{1,10})\n?")
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One command to a sensor: one of `CODES`, and three numbers from 0 to 2³² − 1; unused ones are 0.
-
-    Raises ArgumentError if the command does not exist, or a number does not fit into 32 bits.
-    """
+    """One command to a sensor: one of `CODES`, and three numbers from 0 to 2³² − 1; unused ones are 0."""
 
     code: str
     first: int = 0
@@ -156,10 +153,7 @@ class CustomCommand:
 
 
 def encode_answer(value: int) -> bytes:
-    """Return a sensor's answer: four bytes, least significant first.
-
-    Raises ArgumentError if the number does not fit into 32 bits.
-    """
+    """Return a sensor's answer: four bytes, least significant first."""
     return checks.integer("answer", value, 0, MAX_NUMBER).to_bytes(4, "little")
 
 

@@ -23,8 +23,8 @@ _log = logging.getLogger("ertis_numba")
 class Dialogue(SerialLine):
     """Serial line with commands and answers.
 
-    An answer differs from four bytes of a measurement only in that nothing follows it. ``timeout_s`` is that of an
-    answer, and ``stop`` that of `SerialLine`. ``dropped`` counts bytes without a request.
+    An answer differs from four bytes of a measurement only in that nothing follows it. ``dropped`` counts bytes without
+    a request.
     """
 
     def __init__(self, path: str, *, timeout_s: float, stop: Callable[[], bool]) -> None:
@@ -36,7 +36,6 @@ class Dialogue(SerialLine):
         """Drop bytes until none arrive, and return their number without the answers to ``repeat``.
 
         ``repeat`` is sent again and again while bytes keep coming: the first may have followed half of another command.
-        Raises SonarError if they do not end.
         """
         count = n_answers = 0
         began = last = reported = time.monotonic()
@@ -66,8 +65,7 @@ class Dialogue(SerialLine):
         """Send a command and return its answer.
 
         Earlier bytes are dropped. If more than an answer arrives, it belonged to something else, and the command is
-        sent again afterwards. ``alone`` is false where measurements may follow the answer. Raises SonarError if no
-        answer came, or none by itself.
+        sent again afterwards. ``alone`` is false where measurements may follow the answer.
         """
         deadline = time.monotonic() + self._timeout_s
         while True:
@@ -88,10 +86,7 @@ class Dialogue(SerialLine):
                 )
 
     def ask_twice(self, command: Command) -> int:
-        """Return an answer that arrived twice: four other bytes may look like an answer once, but not twice.
-
-        Raises SonarError if the second answer is another one, or as `ask` does.
-        """
+        """Return an answer that arrived twice: four other bytes may look like an answer once, but not twice."""
         first, second = self.ask(command), self.ask(command)
         if first != second:
             raise sonar_error(
@@ -101,10 +96,7 @@ class Dialogue(SerialLine):
         return first
 
     def ask_all(self, commands: Sequence[Command]) -> None:
-        """Send many commands, a few at a time, and receive their answers.
-
-        Raises SonarError if answers are missing.
-        """
+        """Send many commands, a few at a time, and receive their answers."""
         for start in range(0, len(commands), _GROUP):
             group = commands[start : start + _GROUP]
             self.send(b"".join(command.encode() for command in group))

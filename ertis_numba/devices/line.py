@@ -83,8 +83,8 @@ class SerialLine:
         """Return bytes that arrive within some milliseconds, perhaps none, and the time of the first.
 
         ``missing`` is the number of bytes still missing of a block or answer. With 0, a new one may begin: its first
-        byte is returned alone as soon as it arrives, unless it has arrived before. Raises SonarDisconnectedError if the
-        device was unplugged; or SonarError if ``stop`` returned True, or the line is closed.
+        byte is returned alone as soon as it arrives, unless it has arrived before. Raises SonarDisconnectedError, or
+        SonarError if ``stop`` returned True or the line is closed.
         """
         with self._lock:
             self._check()
@@ -105,8 +105,7 @@ class SerialLine:
     def send(self, data: bytes) -> None:
         """Write all of ``data``.
 
-        Raises SonarDisconnectedError if the device was unplugged; or SonarError if it reads nothing, ``stop`` returned
-        True, or the line is closed.
+        Raises SonarDisconnectedError, or SonarError if it reads nothing, ``stop`` returned True, or the line is closed.
         """
         with self._lock:
             self._check()

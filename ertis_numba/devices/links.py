@@ -50,8 +50,7 @@ class HeldLink:
 
     A link left by a killed device is replaced. A lock on a hidden file beside the link shows if the device is alive.
     The existence of the port does not, because the system reuses its number. The folder of ``path`` is made, for this
-    user only, if it is missing. Raises ArgumentError if the link belongs to a device that runs, or there is something
-    else of this name; or SonarError if this system has no pseudo terminals.
+    user only, if it is missing.
     """
 
     def __init__(self, path: Path) -> None:

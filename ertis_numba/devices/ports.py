@@ -21,9 +21,9 @@ _CDC_ACM = ("ttyACM", "cu.usbmodem", "tty.usbmodem", "COM")
 class Port:
     """A serial port.
 
-    ``path`` is the path to open, such as ``/dev/ttyACM0``; it may change when the device is plugged in again. ``link``
-    is a stable name, such as one in ``/dev/serial/by-id``; empty if there is none. ``serial_number`` is that of the USB
-    device, or the name of an emulated one; empty if unknown.
+    ``path``, such as ``/dev/ttyACM0``, may change when the device is plugged in again. ``link`` is a stable name, such
+    as one in ``/dev/serial/by-id``; empty if there is none. ``serial_number`` is that of the USB device, or the name of
+    an emulated one; empty if unknown.
     """
 
     path: str

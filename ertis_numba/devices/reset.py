@@ -22,10 +22,8 @@ def reset_sensor(
 ) -> Iterator[tuple[SonarDriver, bool]]:
     """Reset a sensor, whether it answers or not; use it in a ``with`` statement.
 
-    ``port`` is as for `SonarDriver.open`, and may be missing until the sensor is reset. ``pulse`` resets the hardware,
-    and ``within_s`` is the longest time until the sensor answers. Yields the open driver, which is not configured, and
-    the result of `SonarDriver.reset`. Raises SonarError if the port cannot be used, ``pulse`` cannot reset the
-    hardware, or the sensor does not answer in time.
+    ``port`` is as for `SonarDriver.open`, and may be missing until the sensor is reset. The sensor must answer in
+    ``within_s``. Yields the open driver, which is not configured, and the result of `SonarDriver.reset`.
     """
     try:
         sonar = SonarDriver.open(port)

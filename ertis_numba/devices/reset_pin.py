@@ -17,7 +17,7 @@ _PULSE_S: Final = 1.0
 def pulse_reset_pin(pin: int = RESET_PIN) -> None:
     """Set a pin to 0 for a second, and to 1 again.
 
-    ``pin`` is the number on the board. Raises SonarError if this computer is no Jetson, or its pins cannot be used.
+    ``pin`` is the number on the board.
     """
     try:
         pins = importlib.import_module("Jetson.GPIO")

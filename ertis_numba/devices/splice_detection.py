@@ -75,10 +75,7 @@ class _Filter:
 
 
 class Splices:
-    """Detector of impulses in all channels at once, in a band with little sound and noise.
-
-    ``n_samples`` is the number of words of a block.
-    """
+    """Detector of impulses in all channels at once, in a band with little sound and noise."""
 
     def __init__(self, n_samples: int, pdm_rate_hz: float) -> None:
         band = _analytic(_BAND_HZ, pdm_rate_hz, _TAPS)

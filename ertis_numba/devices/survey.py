@@ -34,8 +34,7 @@ class Answer:
 def survey(ports: Iterable[Port], *, timeout_s: float = 0.3) -> list[Answer]:
     """Probe ports for sensors, in less than a second.
 
-    This stops a measurement for a host that has ended; ports in use are skipped. ``timeout_s`` is the timeout of an
-    answer.
+    This stops a measurement for a host that has ended; ports in use are skipped.
     """
 
     def ask(port: Port) -> Answer:

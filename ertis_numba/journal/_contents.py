@@ -26,8 +26,8 @@ _SELECTION: Final = select_statement("measurements", "WHERE id = ?")
 def _recording_name(journal: str, target: str) -> str:
     """Return the name of the recording to be made from a journal, in the folder of the journal.
 
-    A journal may come from an untrusted source. The path that it stores is used only if the journal's own name lacks
-    the suffix, and then only the last part of that path.
+    The path stored in a journal may be malicious: it is used only if the journal's own name lacks the suffix, and then
+    only its last part.
     """
     if journal.endswith(SUFFIX) and journal != SUFFIX:
         return journal.removesuffix(SUFFIX)
@@ -130,10 +130,7 @@ class ReadableJournal:
         )
 
     def read_poses(self) -> tuple[list[JournalPose], int]:
-        """Return the undamaged poses of platforms in order of arrival, and the number of damaged ones.
-
-        Raises DamagedError if the table of poses is damaged.
-        """
+        """Return the undamaged poses of platforms in order of arrival, and the number of damaged ones."""
         with self._lock:
             return read_poses(self._database, self.path)
 
@@ -148,10 +145,7 @@ class ReadableJournal:
             yield block
 
     def times_ns(self, sensor: str) -> list[int]:
-        """Return the times of the measurements of a sensor in any order, without checking them.
-
-        Raises DamagedError if the table of measurements is damaged.
-        """
+        """Return the times of the measurements of a sensor in any order, without checking them."""
         number = self._ids[self._sensor(sensor).name]
         with self._lock:
             rows = self._database.execute("SELECT timestamp_ns FROM measurements WHERE sensor = ?", (number,))
@@ -193,10 +187,7 @@ class ReadableJournal:
         return JournalKey(rows[0][0], sensor, session_id, sequence)
 
     def entry(self, key: JournalKey) -> JournalEntry:
-        """Return a measurement with read-only data.
-
-        Raises DataError if the measurement cannot be read.
-        """
+        """Return a measurement with read-only data."""
         with self._lock:
             rows = self._database.execute(_SELECTION, (key.place,))
         if len(rows) != 1 or tuple(rows[0][1:4]) != (self._ids[key.sensor], key.session_id, key.sequence):

@@ -54,8 +54,8 @@ _MESSAGES: Final = {
 class Database:
     """SQLite file with the tables of a journal, locked against other processes.
 
-    The lock belongs to the operating system. It ends with the process, even after a crash. ``path`` exists; with
-    ``empty``, an empty file is accepted and becomes a new journal, and ``is_new`` is then true.
+    The system releases the lock when the process ends, even after a crash. With ``empty``, an empty file becomes a new
+    journal, and ``is_new`` is true.
     """
 
     def __init__(self, path: Path, *, empty: bool) -> None:
@@ -147,8 +147,7 @@ class Database:
 
         Until then, a commit writes to the log with one sync, and a full log is moved to the main file. If each commit
         fills the log, all data is written twice. A rollback journal stores only the old content of changed pages. New
-        rows use new pages without old content. A commit then needs four syncs. Raises DataError if the disk is full or
-        fails; nothing has changed.
+        rows use new pages without old content. A commit then needs four syncs. After a DataError, nothing has changed.
         """
         if not self._uses_rollback_journal:
             self._set_rollback_mode("DELETE")
@@ -166,10 +165,7 @@ class Database:
             raise DataError(f"{self._path} cannot switch from its log; close it, and try again")
 
     def require_file(self) -> None:
-        """Refuse to continue if the path no longer leads to the open file, because new data would be lost.
-
-        Raises JournalInUseError if the file was removed or replaced.
-        """
+        """Refuse to continue if the path no longer leads to the open file, because new data would be lost."""
         self._require_same_file(self._file)
 
     @property
@@ -194,8 +190,7 @@ class Database:
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Run a statement and return its rows.
 
-        Raises JournalInUseError if another process has the journal open; DamagedError if the file is damaged; or
-        DataError if the disk is full, fails or is not writable, or the file is closed.
+        Raises JournalInUseError, DamagedError, or DataError (disk full, failing or not writable; file closed).
         """
         with self._translate_errors():
             return self._connection.execute(statement, values).fetchall()
@@ -229,10 +224,7 @@ class Database:
             raise
 
     def max_ids(self) -> dict[str, int]:
-        """Return the highest row number of each table, 0 if it has no rows.
-
-        Raises DataError if the file is damaged or cannot be read.
-        """
+        """Return the highest row number of each table, 0 if it has no rows."""
         tables = [table for table in TABLES if self.has_table(table)]
         ends = (self.execute(f"SELECT ifnull(max(id), 0) FROM {table}")[0][0] for table in tables)  # noqa: S608  our own
         return dict(zip(tables, ends, strict=True))
@@ -257,8 +249,7 @@ class Database:
     def copy_to(self, path: Path) -> None:
         """Copy the current pages of the file.
 
-        The open connection makes the copy. A second descriptor would release the lock when it is closed (POSIX). Raises
-        DataError if the disk is full or fails.
+        The open connection makes the copy. A second descriptor would release the lock when it is closed (POSIX).
         """
         with self._translate_errors():
             copy = sqlite3.connect(path, isolation_level=None)
@@ -270,8 +261,8 @@ class Database:
     def checkpoint_and_remove_log(self) -> None:
         """Move everything to the main file and remove the log, so that closing touches no file by name.
 
-        Only `close` may follow, because an interrupted commit could no longer be rolled back. Raises DataError if the
-        disk is full or fails; the log stays.
+        Only `close` may follow, because an interrupted commit could no longer be rolled back. After a DataError, the
+        log stays.
         """
         for statement in ("BEGIN IMMEDIATE", "COMMIT"):  # They roll back a commit that a disk error has interrupted.
             self.execute(statement)

@@ -130,10 +130,7 @@ class JournalSensor:
         return (*numbered, row_crc32(numbered), words)
 
     def entry_values(self, entry: JournalEntry) -> tuple[Any, ...]:
-        """Return the values of a measurement and its data, and fill in its CRC-32.
-
-        Raises ArgumentError if a number is out of range, or the data does not match this sensor.
-        """
+        """Return the values of a measurement and its data, and fill in its CRC-32."""
         stamp, air = entry.measurement.stamp, entry.measurement.settings.air
         words = self._sample_data(entry.measurement.data)
         checks.choice("behaviour", stamp.behaviour, BEHAVIOURS)

@@ -33,7 +33,7 @@ def unused_path(path: Path, end: str) -> Path:
 def keep_damaged_log(path: Path, content: bytes) -> Path | None:
     """Keep a copy of a damaged log; return its path, or None if a copy with the same content exists.
 
-    Earlier copies stay, because they may contain the only data of other measurements. ``path`` is that of the journal.
+    Earlier copies stay: they may contain the only data of other measurements.
     """
     log = companion(path, "-wal")
     for kept in log.parent.iterdir():

@@ -28,9 +28,9 @@ def require_free_space(path: Path, target: Path, *, sizes_bytes: Sequence[int], 
     """Refuse measurements or poses after which a journal could not be sealed any more.
 
     The disk of ``target`` needs space for the recording of the whole journal, and a reserve. The disk of the journal
-    needs space to move the log to the main file. It also needs space for the new content, once in the log and once in
-    the main file. Without a log, it needs space for it and the changed pages. ``sizes_bytes`` has the size of each new
-    measurement, or of all new poses; ``seals_bytes`` is the size of the recording with the new content.
+    needs space to move the log to the main file, and for the new content in both; without a log, for the new content
+    and the changed pages. ``sizes_bytes`` has the size of each new measurement, or of all new poses; ``seals_bytes`` is
+    the size of the recording with the new content.
     """
     log = path.with_name(f"{path.name}-wal")
     grows_bytes = sum((size // PAGE_BYTES + 2) * PAGE_BYTES for size in sizes_bytes)

@@ -26,9 +26,8 @@ class Journal(WritableJournal):
     """Durable measurements until they are sealed into a recording.
 
     Create it with `create` or `open`, and close it after use, or use it in a ``with`` statement. No other process can
-    open it meanwhile. Threads may share it. ``target`` is the path of the recording to be made from it, ``tally`` has
-    the highest stored numbers, and ``remark`` is a line about files that `create` has renamed, empty if there were
-    none.
+    open it meanwhile. Threads may share it. ``target`` is the recording to be made from it, and ``remark`` a line about
+    files that `create` has renamed.
     """
 
     def __init__(self, path: Path, database: Database) -> None:
@@ -45,8 +44,7 @@ class Journal(WritableJournal):
         """Create a journal.
 
         By convention, ``path`` is that of the recording ``target`` followed by `SUFFIX`. A relative ``target`` starts
-        at the folder of the journal. ``source`` is the origin of the measurements. Raises ArgumentError if the path
-        exists already, and DataError if the journal cannot be written.
+        at the folder of the journal.
         """
         path = Path(path)
         try:
@@ -75,8 +73,8 @@ class Journal(WritableJournal):
     def open(cls, path: str | Path) -> Self:
         """Open a journal, regardless of how the process that wrote it ended.
 
-        Raises JournalInUseError if another process has the journal open; DataError if the journal does not exist, is
-        damaged, or is not writable; or FormatVersionError if a newer version of this package wrote the journal.
+        Raises JournalInUseError if another process has it open; DataError if it is missing, damaged, or not writable;
+        or FormatVersionError if a newer version wrote it.
         """
         path = Path(path)
         log = read_log(path)
@@ -112,8 +110,8 @@ class Journal(WritableJournal):
         After a failed sync, a journal may show rows that never reach the disk. Close the journal, abandon it, and store
         the rows that were not acknowledged in another journal. The next process that opens this journal deletes those
         rows first, so that none is stored twice. A journal without acknowledged measurements is removed. ``acked`` has
-        the highest acknowledged number of each (sensor, session_id) that has one. If this raises OSError or DataError
-        because the disk is full or fails, call it again.
+        the highest acknowledged number of each (sensor, session_id) that has one. After an OSError or DataError, call
+        this again.
         """
         path = Path(path)
         if acked:
@@ -152,8 +150,7 @@ class Journal(WritableJournal):
     def restore_header(self, header: Sequence[Any]) -> None:
         """Restore the header of the journal from before its log was damaged.
 
-        ``header`` has the columns of the table ``journal``, except the first and the last. Raises DataError if the
-        journal cannot be written.
+        ``header`` has the columns of the table ``journal``, except the first and the last.
         """
         identity = row_crc32(header)
         with self._lock:
@@ -167,7 +164,7 @@ class Journal(WritableJournal):
     def free_log(self) -> None:
         """Move the content of the log to the main file and truncate the log, which frees its disk space.
 
-        Raises DataError if the disk fails; the stored measurements are safe.
+        After a DataError, the stored measurements are safe.
         """
         with self._lock:
             self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -188,8 +185,7 @@ class Journal(WritableJournal):
     def set_aside(self, end: str = "damaged") -> Path:
         """Close the journal, rename it so that it is never sealed again, and return its new path.
 
-        ``end`` is the new suffix without its dot. If this raises DataError because the disk is full or fails, the
-        journal keeps its name.
+        ``end`` is the new suffix without its dot. After a DataError, the journal keeps its name.
         """
         with self._lock:
             try:

@@ -23,7 +23,7 @@ def write_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
     """Write the limit of a journal durably.
 
     ``acked`` has the highest acknowledged number of each (sensor, session_id); no number of other sessions was
-    acknowledged. Raises OSError or DataError if the file cannot be written.
+    acknowledged.
     """
     runs: list[list[str | int]] = [[sensor, session_id, last] for (sensor, session_id), last in acked.items()]
     text = json.dumps({"runs": runs, "crc32": _check(runs)})

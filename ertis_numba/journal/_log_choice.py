@@ -33,8 +33,8 @@ def choose_log(path: Path, log: WriteAheadLog) -> None:
 
     The log stays if the journal is intact with the part that SQLite reads. Otherwise it is replaced by a repaired log,
     which SQLite reads completely, or removed, whichever gives an intact journal. A journal that another process has
-    open is not changed. Nothing has changed if this raises DamagedError because the journal is intact with none of
-    these logs, or DataError because the disk is full or fails.
+    open is not changed. Raises DamagedError if the journal is intact with none of these logs. After an error, nothing
+    has changed.
     """
     with _locked(path) as is_unused:
         if not is_unused:

@@ -29,7 +29,6 @@ class JournalPose:
 
     ``timestamp_ns`` counts from 1970-01-01 UTC, and the unit quaternion ``rotation_xyzw`` rotates the platform frame
     into the world frame. ``covariance`` has 6 by 6 little-endian doubles, as in `Trajectory`; it is empty if unknown.
-    ``source`` is the origin of the pose.
     """
 
     sensors: tuple[str, ...]
@@ -92,7 +91,7 @@ def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Tra
 
     The covariance is None if that of any pose is unknown. The source lists the sources of the poses. ``poses`` are
     those of one platform in any order, at least one; ``max_gap_s`` is the longest interval of the trajectory between
-    poses. Raises ArgumentError or ValueError if a number or a covariance cannot be that of a pose.
+    poses. Raises ArgumentError or ValueError for an impossible pose.
     """
     time_ns, first = np.unique([pose.timestamp_ns for pose in poses], return_index=True)
     kept = [poses[index] for index in first]
@@ -126,7 +125,7 @@ class PosesAround:
     def add(self, poses: Sequence[JournalPose]) -> None:
         """Add poses in any order; the first of several poses at one time counts.
 
-        Raises ArgumentError or ValueError if a number or a covariance cannot be that of a pose.
+        Raises ArgumentError or ValueError for an impossible pose.
         """
         if not poses:
             return

@@ -54,8 +54,8 @@ class _RecoveredRows:
 def recover_rows(journal: "Journal", database: Database, log: WriteAheadLog | None) -> str:
     """Recover rows of a damaged log that SQLite does not read, and note lost numbers as gaps.
 
-    ``log`` is that from before the journal was opened. The result describes losses that no gap of the journal covers;
-    it is empty if there are none.
+    ``log`` is that from before the journal was opened. Returns losses that no gap of the journal covers, or an empty
+    text.
     """
     n_commits = log.n_lost_commits if log is not None else 0
     try:
@@ -128,8 +128,7 @@ def _missing_parts(journal: "Journal", gap: SequenceGap) -> Iterator[SequenceGap
 def _read_copy(journal: "Journal", database: Database, log: WriteAheadLog) -> _RecoveredRows:
     """Read the rows that the journal lacks from a copy of it with the repaired log.
 
-    Each row has its own checksum, so a wrong repair cannot give wrong rows. Raises DataError or OSError if the disk has
-    no space for a copy, or SQLite cannot read it.
+    Each row has its own checksum, so a wrong repair cannot give wrong rows.
     """
     n_bytes = journal.path.stat().st_size + 2 * len(log.content)
     if shutil.disk_usage(journal.path.parent).free < 2 * n_bytes:

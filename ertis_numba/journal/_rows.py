@@ -23,10 +23,7 @@ _INSERTION: Final = insert_statement("measurements")
 
 
 class WritableJournal(ReadableJournal):
-    """An open journal for changes.
-
-    ``tally`` has the highest stored numbers.
-    """
+    """An open journal for changes."""
 
     def __init__(self, path: Path, database: Database) -> None:
         super().__init__(path, database)
@@ -45,9 +42,8 @@ class WritableJournal(ReadableJournal):
         """Register a sensor at any time before its first measurement.
 
         The air of its measurements may differ from ``settings``; the content of layout files is stored in the journal.
-        ``translation_m`` is the position x, y, z on the platform, and the unit quaternion ``rotation_xyzw`` rotates the
-        sensor frame into the platform frame; without both, the mounting is unknown. Raises ArgumentError if the sensor
-        is registered already, or a recording cannot contain it; or DataError if the journal is not writable.
+        The mounting is as in `JournalSensor`, and unknown without both parts. Raises ArgumentError if the sensor exists
+        already, or a recording cannot contain it.
         """
         made = JournalSensor.from_settings(
             name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
@@ -64,9 +60,9 @@ class WritableJournal(ReadableJournal):
 
         Sensors may be in any order; the sequence numbers of a sensor rise within a session. ``crc32`` is filled in if
         it is None. Raises ArgumentError if a measurement does not match its sensor, or its number does not rise;
-        DiskFullError if the disk is full or nearly full, and nothing was written (free some space, and append again);
-        DataError if the disk is full or fails (earlier measurements are safe); or JournalInUseError if another process
-        has removed or replaced the journal.
+        DiskFullError if the disk is nearly full and nothing was written, so that a later call may succeed; DataError if
+        the disk fails (earlier measurements are safe); or JournalInUseError if another process removed or replaced the
+        journal.
         """
         with self._lock:
             last = dict(self._last)
@@ -110,16 +106,12 @@ class WritableJournal(ReadableJournal):
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
         """Store durably why numbers of a sensor's session are missing, ``first`` and ``last`` included.
 
-        Raises ArgumentError if the sensor or session is unknown, ``last`` comes before ``first``, or the reason is not
-        a line of at most 64 bytes; or DataError if the journal is not writable.
+        Raises ArgumentError if the sensor or session is unknown, or the reason is not a line of at most 64 bytes.
         """
         self.note_gaps([SequenceGap(sensor, first, last, reason, session_id)])
 
     def note_gaps(self, gaps: Sequence[SequenceGap]) -> None:
-        """Store gaps durably, all or none.
-
-        Raises ArgumentError if the sensor is unknown, or DataError if the journal is not writable.
-        """
+        """Store gaps durably, all or none."""
         with self._lock:
             rows = [
                 (self._ids[self._sensor(gap.sensor).name], gap.session_id, gap.first, gap.last, gap.reason)
@@ -134,8 +126,7 @@ class WritableJournal(ReadableJournal):
     def append_poses(self, poses: Sequence[JournalPose]) -> None:
         """Store poses of platforms durably, all or none.
 
-        Raises DiskFullError if the disk is full or nearly full, and nothing was written; DataError if the disk is full
-        or fails; or JournalInUseError if another process has removed or replaced the journal.
+        Raises DiskFullError, DataError and JournalInUseError as `append` does.
         """
         with self._lock:
             sizes_bytes = [sum(pose.n_bytes for pose in poses)]
@@ -153,8 +144,7 @@ class WritableJournal(ReadableJournal):
 
         After the first call, row numbers have holes, because rows of several sensors are interleaved. The journal then
         has version `VERSION`, and readers count rows instead. ``up_to`` is the last sequence number to delete; a gap
-        that extends beyond it is kept unchanged. Returns the number of deleted measurements. Raises ArgumentError if
-        the sensor is unknown, or DataError if the journal is not writable.
+        that extends beyond it is kept unchanged. Returns the number of deleted measurements.
         """
         known = self._sensor(sensor)
         which = self._ids[known.name], session_id, up_to
@@ -183,10 +173,7 @@ class WritableJournal(ReadableJournal):
         self._database.execute(insert_statement(table), (*values, row_crc32(values)))
 
     def appendable_bytes(self) -> int:
-        """Return the approximate number of bytes of samples that can be appended while sealing stays possible.
-
-        Raises DataError if the folder of the recording does not exist.
-        """
+        """Return the approximate number of bytes of samples that can be appended while sealing stays possible."""
         with self._lock:
             return _free_space.appendable_bytes(self.path, self.target, seals_bytes=self._recording_bytes())
 

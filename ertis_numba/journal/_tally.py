@@ -42,7 +42,7 @@ _FIELDS: Final = tuple(field.name for field in fields(SequenceRange))
 class Tally:
     """File with one block for each session, updated after each commit.
 
-    ``damage`` describes known losses that no gap of the journal covers; it is empty if there are none.
+    ``damage`` describes known losses that no gap of the journal covers.
     """
 
     def __init__(self, journal: Path) -> None:
@@ -93,10 +93,7 @@ class Tally:
             self._begin()
 
     def discard(self, sensor: str, session_id: int, up_to: int) -> None:
-        """Register durably that numbers may be deleted.
-
-        Raises OSError if the file cannot be written.
-        """
+        """Register durably that numbers may be deleted."""
         mark = self.ranges.get((sensor, session_id))
         if mark is not None and up_to > mark.discarded:
             mark.discarded = up_to
@@ -106,8 +103,7 @@ class Tally:
     def limit(self, acked: Mapping[tuple[str, int], int]) -> None:
         """Remove numbers above the acknowledged ones, because a failed journal does not contain them reliably.
 
-        ``acked`` has the highest acknowledged number of each (sensor, session_id) that has one. Raises OSError if the
-        file cannot be written.
+        ``acked`` has the highest acknowledged number of each (sensor, session_id) that has one.
         """
         for run, mark in self.ranges.items():
             last = max(acked.get(run, -1), mark.first - 1)

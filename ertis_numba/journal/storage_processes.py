@@ -32,14 +32,13 @@ Progress = Callable[[int, int], None]
 class SealingResult:
     """Result of sealing a journal.
 
-    ``recording`` is None if the journal had no measurement. ``missing`` counts the missing measurements of the
-    recording, ``damaged`` those of them that were damaged in the journal, and ``lost`` those that the journal had noted
-    before its log was damaged: each number belongs to a stored measurement or a gap, or was skipped by the sensor.
-    ``set_aside`` is the new path of a journal that has damaged poses, or damaged or refused measurements; otherwise it
-    is None, and the journal was removed. ``damage`` describes losses from a damaged log that no gap of the recording
-    covers. ``refused`` has the reason why a recording cannot contain the measurements of a sensor, by sensor.
-    ``without_pose`` counts the measurements without a pose, of sensors that have poses. ``pose_damage`` is the number
-    of damaged poses, or the reason why all poses were left out; empty if there was no damage.
+    ``recording`` is None if the journal had no measurement. Of the ``missing`` measurements, ``damaged`` ones were
+    damaged in the journal, and ``lost`` ones noted before its log was damaged: each number belongs to a stored
+    measurement or a gap, or was skipped by the sensor. ``set_aside`` is the new path of a journal with damaged poses,
+    or damaged or refused measurements; without any, the journal was removed. ``damage`` describes losses from a damaged
+    log that no gap of the recording covers. ``refused`` has by sensor the reason why a recording cannot contain its
+    measurements. ``without_pose`` counts measurements of sensors with poses. ``pose_damage`` is the number of damaged
+    poses, or the reason why all were left out.
     """
 
     journal: Path
@@ -137,11 +136,9 @@ def seal_in_subprocess(
     Ctrl-C in a terminal does not reach that process. However it ends, the measurements are in the journal or in the
     recording, and sealing can be repeated.
 
-    ``overwrite`` replaces an existing file, even if it has other content. With ``rests``, the process runs at low
-    priority, and pauses after each step for this multiple of its duration. ``progress`` is called about a hundred times
-    with the number of written measurements and of all measurements. Raises JournalInUseError if another process has the
-    journal open, DataError if sealing failed (the journal is still there), OSError if no process can be started, and
-    KeyboardInterrupt if it was interrupted; its message states where the measurements are.
+    With ``rests``, the process runs at low priority, and pauses after each step for this multiple of its duration.
+    ``progress`` is called about a hundred times. Raises also OSError if no process can be started, and
+    KeyboardInterrupt, whose message states where the measurements are.
     """
     replies: list[Sealed | StorageFailed] = []
     try:

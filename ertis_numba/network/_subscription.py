@@ -47,9 +47,9 @@ _AT_ONCE: Final = 64
 class SubscriberCounts:
     """Counts of an application's products.
 
-    ``received`` counts products that the application has taken, and ``dropped`` those that the publisher dropped
-    because the application was slow. ``missed`` counts numbers that never arrived: it equals ``dropped`` except for
-    those still on their way. ``damaged`` counts invalid messages; each ends a connection.
+    The application has taken ``received`` products; the publisher ``dropped`` others because the application was slow.
+    ``missed`` numbers never arrived: those dropped, except for any still on their way. ``damaged`` messages were
+    invalid; each ends a connection.
     """
 
     received: int = 0
@@ -71,10 +71,7 @@ class _Numbers:
 
 
 class Subscription:
-    """Client that requests products and reads them in one thread; another thread may call only `taken`.
-
-    ``deliver`` gets each `Arrival`.
-    """
+    """Client that requests products and reads them in one thread; another thread may call only `taken`."""
 
     def __init__(
         self,
@@ -125,7 +122,7 @@ class Subscription:
     def turn(self, woken: WakeupSocket, now_s: float) -> None:
         """Do pending work, or wait up to a tenth of a second.
 
-        Raises RefusedError if the publisher refuses this application, and has never accepted it.
+        Raises RefusedError if the publisher has never accepted this application.
         """
         connection = self._connection
         if connection is None:

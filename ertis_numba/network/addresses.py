@@ -30,8 +30,7 @@ def endpoint(text: str, *, name: str = "address") -> str:
     """Return an address in the form of ZeroMQ.
 
     ``text`` is ``tcp://HOST:PORT``. A node that listens may give port 0 or ``*`` for a free port, and host ``*`` for
-    all interfaces. ``name`` is that of the address in errors, such as the option by which users give it. Raises
-    ArgumentError if the text is not an address.
+    all interfaces. ``name`` is used in errors, such as the option by which users give it.
     """
     found = _ADDRESS.fullmatch(text) if isinstance(text, str) else None
     if found is None or (found[2] != "*" and int(found[2]) > 65535):
@@ -71,7 +70,7 @@ def is_loopback(endpoint: str) -> bool:
 def is_own_host(given: str, host: str) -> bool:
     """Return True if the Host of an HTTP request is a loopback name or address, or the server's own host.
 
-    ``given`` is the Host of the request, with or without a port; ``host`` is that of the server, without brackets.
+    ``given`` may have a port; ``host`` is that of the server, without brackets.
     """
     found = _HTTP_HOST.fullmatch(given)
     if found is None:

@@ -21,11 +21,10 @@ class Connection:
     ZeroMQ connects and reconnects in the background. A client that has been refused, or hears nothing, closes its
     connection and makes a new one.
 
-    Without ``keys``, it connects on loopback only. ``max_bytes`` is the size of the longest frame. ``sent_s`` is the
-    time of the first message that was sent, which requires a peer; None before. ``heard_s`` is the time of the last
-    valid message; its reader sets it. ``is_blocked`` is true if there was no room for a message; `wait` ends when there
-    is room again. Raises ArgumentError if the address cannot be used, or requires keys; or NetworkError if the address
-    can never be connected to.
+    Without ``keys``, it connects on loopback only. ``max_bytes`` limits a frame. ``sent_s`` is the time of the first
+    message sent, which requires a peer; None before. ``heard_s`` is the time of the last valid message; its reader sets
+    it. ``is_blocked`` is true if there was no room for a message; `wait` ends when there is room again. Raises
+    NetworkError if the address can never be connected to.
     """
 
     def __init__(

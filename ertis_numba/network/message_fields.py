@@ -52,8 +52,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """Header of a message. Its class declares the message once: tables, checks of roles and handlers derive from it.
 
     ``routes`` are (sender, receiver): nodes that send and receive the message. ``payload`` describes its payload
-    frames, for the documentation; empty without payload. ``product`` is the product that the message brings to
-    applications; empty for other messages.
+    frames, for the documentation, and ``product`` is what the message brings to applications; both may be empty.
     """
 
     routes: ClassVar[tuple[tuple[Party, Party], ...]] = ()

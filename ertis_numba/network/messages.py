@@ -94,8 +94,7 @@ class Hello(Message, frozen=True, kw_only=True):
     """A sensor node has measurements of a sensor. Payload: the sensor's settings as TOML.
 
     ``session_id`` and its sequence numbers are the identity of a measurement. ``next_sequence`` is the oldest number
-    that the node still has, or the next one. ``settings_crc32`` is the CRC-32 of the payload. ``translation_m`` and
-    ``rotation_xyzw`` are the mounting of the sensor on its platform; None if it is unknown.
+    that the node still has, or the next one. The mounting of the sensor on its platform is None if unknown.
     """
 
     routes = (("sensor", "central"),)
@@ -131,8 +130,7 @@ class Welcome(Message, frozen=True, kw_only=True):
 class Data(OfMeasurement, frozen=True, kw_only=True):
     """A measurement. Payload: its samples, little-endian.
 
-    ``temperature_c``, ``humidity_percent`` and ``pressure_pa`` are the state of the air; ``crc32`` is that of the
-    payload.
+    ``crc32`` is that of the payload.
     """
 
     routes = (("sensor", "central"),)
@@ -166,9 +164,8 @@ class Gap(Message, frozen=True, kw_only=True):
 class Ack(Message, frozen=True, kw_only=True):
     """Cumulative acknowledgement of a sensor's session; a repeated or late one is harmless.
 
-    ``acked_through`` is as in `Welcome`. ``status`` is the place of the acknowledged measurements: ``stored`` on disk,
-    or ``accepted`` in memory. ``dropped`` are the measurements that the node has discarded since the previous ack, as
-    (sequence, reason).
+    ``acked_through`` and ``status`` are as ``acked_through`` and ``acks`` of `Welcome`. ``dropped`` has the (sequence,
+    reason) of measurements discarded since the previous ack.
     """
 
     routes = (("central", "sensor"),)
@@ -186,7 +183,7 @@ class PlatformPose(Message, frozen=True, kw_only=True):
     The key must be allowed to send for each of ``sensors``, those on the platform. ``session_id`` is that of the
     sender, which remains when it connects again. ``timestamp_ns`` counts from 1970-01-01 UTC. ``position_m`` and
     ``rotation_xyzw`` are as in `ertis_numba.frames.Trajectory`. ``covariance`` has the rows of its covariance; None if
-    it is unknown. ``source`` is the origin of the pose.
+    it is unknown.
     """
 
     routes = (("sensor", "central"),)
@@ -237,7 +234,7 @@ class Refused(Message, frozen=True, kw_only=True):
 
     ``code`` is the reason for programs. ``hello``: the session is unknown; the node should send `Hello` again.
     ``sensor``: no sensor node sends the sensor that the message is for. ``reason`` is for people: what was got, what is
-    accepted, the remedy. ``sensor`` is the one that the message was about, if any.
+    accepted, the remedy.
     """
 
     routes = (("central", "sensor"), ("central", "application"), ("publisher", "application"))
@@ -251,8 +248,8 @@ class Refused(Message, frozen=True, kw_only=True):
 class Configure(Message, frozen=True, kw_only=True):
     """Request for new settings of a sensor, which the central node forwards. Payload: the settings as TOML.
 
-    The answer is recognised by ``request_id``, a random number. The central node fills in ``max_bytes``, the size of
-    the largest measurement that it accepts; it is 0 from an admin.
+    The answer is recognised by ``request_id``, a random number. The central node fills in ``max_bytes``, its limit on a
+    measurement; it is 0 from an admin.
     """
 
     routes = (("admin", "central"), ("central", "sensor"))
@@ -266,9 +263,8 @@ class Configure(Message, frozen=True, kw_only=True):
 class Configured(Message, frozen=True, kw_only=True):
     """Answer to a `Configure`.
 
-    ``sensor`` and ``request_id`` are as in the request. ``sensors`` are those with the new settings, which are those of
-    the sensor node, at most 32; empty if there are none. ``error`` is the reason why the former settings are still in
-    use; otherwise empty.
+    ``sensors`` are those of the sensor node, at most 32, if they have the new settings. ``error`` is the reason why the
+    former ones are still in use; otherwise empty.
     """
 
     routes = (("sensor", "central"), ("central", "admin"))
@@ -304,8 +300,7 @@ def encode(message: Message) -> bytes:
 def decode(header: "bytes | memoryview", wanted: Sequence[type[Message]] | None = None) -> Any:
     """Return the message of a header frame.
 
-    ``wanted`` are the accepted messages; any by default. Raises FormatVersionError if another version sent the message;
-    or DataError if the frame is not a header of this protocol, or not an accepted message.
+    ``wanted`` are the accepted messages; any by default.
     """
     if len(header) > HEADER_BYTES:
         raise DataError(f"a header has {len(header)} bytes; the limit is {HEADER_BYTES}")

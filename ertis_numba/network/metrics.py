@@ -41,8 +41,7 @@ class Metrics:
     """Server of a central node's status as metrics, over HTTP and on this machine only.
 
     Requests whose Host is not a loopback name or address are refused with 421. ``address`` is ``HOST:PORT``; port 0
-    selects a free one, and the attribute has the actual port once the server has started. ``latest`` returns the
-    status; other threads call it.
+    selects a free one, which the attribute shows after the start. Other threads call ``latest``.
 
     ::
 

@@ -8,10 +8,7 @@ __all__ = ["Owner"]
 
 
 class Owner:
-    """Process that has opened an object. Its sockets and threads do not work in a fork, which would wait for ever.
-
-    ``name`` is that of the object in errors.
-    """
+    """Process that has opened an object. Its sockets and threads do not work in a fork, which would wait for ever."""
 
     def __init__(self, name: str) -> None:
         self._name, self._process_id = name, os.getpid()

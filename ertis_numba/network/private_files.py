@@ -46,8 +46,8 @@ def require_own(path: Path, about: str = "is an allow list of keys") -> None:
     """Refuse a file that other users of this machine may change or replace.
 
     Other users are all except this user and root. The function follows each link of the path and checks each folder, as
-    StrictModes of OpenSSH does for the folders above ``authorized_keys``. ``about`` describes the file in errors.
-    Raises SettingsError if other users may change or replace the file, and OSError if it does not exist.
+    StrictModes of OpenSSH does for the folders above ``authorized_keys``. Raises SettingsError, or OSError if the file
+    does not exist.
     """
     if os.name != "posix":
         return

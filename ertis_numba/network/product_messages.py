@@ -112,11 +112,10 @@ class Raw(_Product, frozen=True, kw_only=True):
 class Group(Message, frozen=True, kw_only=True):
     """Simultaneous measurements, once all have arrived or no more are expected.
 
-    ``number`` and ``dropped`` are as in `Image`. ``group`` is the pulse of the SYNC chain, as all sensors count it.
-    ``members`` are the measurements that have arrived, as (sensor, session_id, sequence), and ``missing`` the sensors
-    without one. ``spread_ns`` is the time between the first and the last timestamp. ``flags`` are faults:
-    ``incomplete``, sensors are missing; ``clock``, timestamps disagree although counters agree; ``pulse``, a sensor has
-    lost a pulse or seen one twice.
+    ``group`` is the pulse of the SYNC chain, as all sensors count it. ``members`` are the measurements that have
+    arrived, as (sensor, session_id, sequence), and ``missing`` the sensors without one. ``spread_ns`` is the time
+    between the first and the last timestamp. ``flags`` are faults: ``incomplete``, sensors are missing; ``clock``,
+    timestamps disagree although counters agree; ``pulse``, a sensor has lost a pulse or seen one twice.
     """
 
     routes = (("publisher", "application"),)
@@ -139,7 +138,7 @@ class Group(Message, frozen=True, kw_only=True):
 class Report(Message, frozen=True, kw_only=True):
     """Status of the central node. Payload: `ertis_numba.network.status.Status` as MessagePack.
 
-    ``number`` and ``dropped`` are as in `Image`; 0 in the answer to `AskStatus`.
+    ``number`` and ``dropped`` are 0 in the answer to `AskStatus`.
     """
 
     routes = (("central", "application"), ("publisher", "application"))

@@ -37,8 +37,8 @@ class Arrival:
     ``item`` is an Energyscape, PointCloud, Measurement, Group or Status, and ``header`` its message in
     `ertis_numba.network.messages`. ``arrived_ns`` is the complete arrival by the monotonic clock (`time.monotonic_ns`),
     which a sensor node on this machine also uses for ``header.monotonic_ns``; ``arrived_utc_ns`` is the same by the
-    system clock. ``connection`` is the number of the connection; product numbers count from 0 in each.
-    ``translation_m`` and ``rotation_xyzw`` are the mounting of the sensor on its platform; None if it is unknown.
+    system clock. ``connection`` is the number of the connection; product numbers count from 0 in each. The mounting of
+    the sensor on its platform is None if unknown.
     """
 
     item: Item
@@ -106,10 +106,7 @@ class ProductReader:
         return number in self._described
 
     def describe(self, header: Description, payload: Payload) -> None:
-        """Store a description for later products.
-
-        Raises DataError if the description cannot be used.
-        """
+        """Store a description for later products."""
         # Each change of settings brings a description. A connection that lasts for months must not keep them all.
         of_sensor = [number for number, kept in self._described.items() if kept.header.sensor == header.sensor]
         stale = of_sensor[: max(0, len(of_sensor) - _MAX_OF_SENSOR)]
@@ -122,10 +119,7 @@ class ProductReader:
         return self.described(number).header
 
     def read(self, header: Header, payload: Payload) -> Item:
-        """Return the frame of a message.
-
-        Raises DataError if the payload contradicts its header, or has no description.
-        """
+        """Return the frame of a message."""
         return _DECODERS[type(header)](self, header, payload)
 
     def described(self, number: int) -> _Described:

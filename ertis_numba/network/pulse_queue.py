@@ -20,10 +20,7 @@ Pulse = TypeVar("Pulse")
 
 
 class PulseQueue(Generic[Pulse]):
-    """Queue that keeps the latest pulses, or all of them while the application prepares; thread-safe.
-
-    ``n_skipped`` counts pulses that were discarded.
-    """
+    """Queue that keeps the latest pulses, or all of them while the application prepares; thread-safe."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -43,10 +40,7 @@ class PulseQueue(Generic[Pulse]):
             self._changed.notify_all()
 
     def take(self, timeout_s: float | None = None) -> Pulse | None:
-        """Return the next pulse; None after ``timeout_s``, once the queue is closed, or after the last one.
-
-        Raises the error of `fail`.
-        """
+        """Return the next pulse; None after ``timeout_s``, once the queue is closed, or after the last one."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._failure or self._closed or self._ended, timeout_s)
             if self._failure is not None:

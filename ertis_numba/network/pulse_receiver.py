@@ -62,12 +62,10 @@ class PulseReceiver:
     until up to three later pulses have begun, or until no image has come for 0.25 s. An application that is too slow
     gets the latest pulses. A sensor without a mounting, and one that sends images with NaN, is left out with a note.
 
-    ``address`` is that at which the central node publishes, ``tcp://HOST:PORT``. ``mountings``, (translation_m,
-    rotation_xyzw) by sensor, replace those that the central node sends. ``sensors`` are all by default; ``keys`` are
-    None on loopback only. A thread calls ``on_note`` with a line for each change of the connection, and ``on_image``
-    with each image that awaits others of its pulse, unless a pulse waits for `receive`. ``counts`` are those of the
-    images; ``queue`` has pulses that wait for `receive`. Raises ArgumentError if the address or a sensor cannot be
-    used, or the address requires keys.
+    The central node publishes at ``address``, ``tcp://HOST:PORT``. ``mountings``, (translation_m, rotation_xyzw) by
+    sensor, replace those that the central node sends. ``sensors`` are all by default; ``keys`` are None on loopback
+    only. A thread calls ``on_note`` with a line for each change of the connection, and ``on_image`` with each image
+    that awaits others of its pulse, unless a pulse waits for `receive`.
     """
 
     def __init__(
@@ -110,8 +108,8 @@ class PulseReceiver:
     def receive(self, timeout_s: float | None = None) -> ReceivedPulse | None:
         """Return the images of the next pulse; None after ``timeout_s``, or once the receiver is closed.
 
-        ``timeout_s`` is unlimited by default. Raises RefusedError if the central node has refused this application from
-        the start.
+        ``timeout_s`` is unlimited by default. Raises RefusedError if the central node has never accepted this
+        application.
         """
         self._owner.require_this_process()
         group = self.queue.take(timeout_s)

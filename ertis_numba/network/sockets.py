@@ -77,8 +77,8 @@ def server(
 
     With keys, its context needs a `ertis_numba.network.zap_authenticator.ZapAuthenticator` made before. Without
     ``keys``, it listens on loopback only. ``max_bytes``, the longest frame, also bounds the memory that an
-    unauthenticated peer can occupy, so give no more than necessary. ``option`` is that by which users give the address.
-    Raises ArgumentError if the address cannot be used, or requires keys; or NetworkError if another program uses it.
+    unauthenticated peer can occupy, so set no more than necessary. Users set the address by ``option``. Raises
+    NetworkError if another program uses it.
     """
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)
@@ -120,8 +120,7 @@ def client(
     """Return a DEALER that connects and reconnects; a `Monitor` of it reports failures.
 
     It does not reconnect after a refusal: create a new one to try again. Without ``keys``, it connects on loopback
-    only. ``max_bytes`` is the longest frame. Raises ArgumentError if the address cannot be used, or requires keys; or
-    NetworkError if it can never be connected to.
+    only. ``max_bytes`` is the longest frame. Raises NetworkError if the address can never be connected to.
     """
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)
@@ -188,8 +187,8 @@ class _Events:
 class Monitor(_Events):
     """Monitor of a client's failed and interrupted connections.
 
-    Poll ``socket``, and call `read` when it is readable. ``n_disconnections`` counts connections that have ended, as
-    far as read. ``final`` is true if the client has given up: only a new socket tries again.
+    Poll ``socket``, and call `read` when it is readable. ``final`` is true if the client has given up: only a new
+    socket tries again.
     """
 
     def __init__(self, client: "zmq.Socket[bytes]") -> None:

@@ -32,10 +32,7 @@ class Percentiles(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Latencies:
-    """Collector of recent durations.
-
-    ``size`` is the number of durations to keep.
-    """
+    """Collector of recent durations."""
 
     def __init__(self, size: int = 1024) -> None:
         self._times_ms: deque[float] = deque(maxlen=size)

@@ -177,8 +177,7 @@ class ZapAuthenticator:
     def self_test(self, endpoint: str) -> None:
         """Verify that connections with an unknown key, and without a key, are refused.
 
-        ``endpoint`` is the address of a server in this context. Raises NetworkError if a connection was accepted, or
-        nothing answered.
+        ``endpoint`` is that of a server in this context. Raises NetworkError if one was accepted, or nothing answered.
         """
         if self._keys is None:
             return

@@ -14,9 +14,8 @@ Kind = TypeVar("Kind")
 class SupervisedProcess(Generic[Kind]):
     """Child that is killed when it misses a deadline, and that is replaced when it has ended.
 
-    No method blocks, except `close`: the owner polls `fds`, and calls `check` several times a second. ``module``,
-    ``kinds`` and ``environment`` are as for `Child`. ``delays_s`` are the delays before it is replaced, by the number
-    of earlier ends since the last `succeeded`; the last one repeats. ``child`` is None while there is no process;
+    No method blocks, except `close`: the owner polls `fds`, and calls `check` several times a second. ``delays_s`` are
+    the delays before it is replaced, by the number of earlier ends since the last `succeeded`; the last one repeats.
     ``restarts`` counts the processes that have ended.
     """
 

@@ -22,7 +22,7 @@ def find_damage(path: Path) -> str:
     """Return the first damaged object of a file and its damage, as one line; empty if there is none.
 
     HDF5 stores checksums of everything except the references from variables to their axes. The check therefore compares
-    them with the expected names of the axes. Raises ForeignDataError if a dataset is stored in another file.
+    them with the expected names of the axes.
     """
     place = "/"
     try:

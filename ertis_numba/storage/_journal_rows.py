@@ -30,8 +30,7 @@ def damaged_poses(count: int) -> str:
 class JournalRows:
     """Measurements of one sensor of a journal, without damaged ones.
 
-    The attributes are valid once all measurements have been read. ``keys`` are those of all measurements, ``damaged``
-    ones included.
+    The attributes are valid once all measurements have been read; ``keys`` include ``damaged`` ones.
     """
 
     def __init__(self, journal: Journal, sensor: str) -> None:

@@ -55,8 +55,7 @@ def write_points(group: h5py.Group, clouds: Sequence[PointCloud]) -> None:
 class PointReader:
     """Points of the images of a sensor.
 
-    ``group`` is that of the sensor, which has points; ``path`` is used in errors. Raises DamagedError if a part of the
-    points is missing, or the counts do not match the points.
+    ``group`` is that of the sensor, which has points.
     """
 
     def __init__(self, group: h5py.Group, path: Path, settings: Settings) -> None:

@@ -84,8 +84,7 @@ def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
     """Store the pose at each measurement of a sensor; the group has its rows, but no poses.
 
     A sensor without measurements has no poses. If the trajectory has a `max_gap_s`, measurements that it does not cover
-    have NaN. Raises ArgumentError if the trajectory does not cover all measurements, or ForeignDataError if the axes of
-    the group are links.
+    have NaN.
     """
     time_ns = np.asarray(group["time"][:], np.int64)
     require_times(trajectory, time_ns, group.name.rpartition("/")[2])

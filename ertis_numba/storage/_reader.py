@@ -34,10 +34,7 @@ _KIND_NAMES = {
 
 
 def file_kind(path: str | Path, wanted: str = RESULT_OR_RECORDING) -> str:
-    """Return ``recording``, ``energyscape`` or ``acoustic_map``; errors name the kinds of file that are wanted.
-
-    Raises DataError if the file cannot be read, or is none of them.
-    """
+    """Return ``recording``, ``energyscape`` or ``acoustic_map``; errors name the kinds of file that are wanted."""
     with open_file(Path(path), wanted) as file:
         return _kind(file, Path(path), wanted)
 

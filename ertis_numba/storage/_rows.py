@@ -40,8 +40,8 @@ _LIMITS = {
 class RowWriter:
     """Writer of measurements to the variables of a sensor.
 
-    ``data`` is the name of the variable with one array per measurement. ``numbered`` requires sequence numbers to be
-    unique within a session.
+    ``data`` is the variable with one array per measurement. ``numbered`` requires sequence numbers to be unique within
+    a session.
     """
 
     def __init__(self, group: h5py.Group, data: str, *, numbered: bool) -> None:
@@ -102,7 +102,7 @@ class RowWriter:
 class RowReader:
     """Reader of measurements, which checks each against its CRC-32.
 
-    ``data`` is the name of the variable with one array per row; ``name`` is that of a row in errors.
+    ``data`` is the variable with one array per row; ``name`` is that of a row in errors.
     """
 
     def __init__(self, group: h5py.Group, data: str, name: str = "measurement") -> None:

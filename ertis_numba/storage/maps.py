@@ -43,8 +43,7 @@ def write_map_file(
 ) -> Path:
     """Write an occupancy map as HDF5, and return the path.
 
-    ``truth`` is the ground truth of each pulse in the frame of the map, from `PlacedTruth`. Raises ArgumentError if the
-    file exists and ``overwrite`` is false; or DataError if the disk is full or cannot be written.
+    ``truth`` is the ground truth of each pulse in the frame of the map, from `PlacedTruth`.
     """
     checks.instance("occupancy", occupancy, OccupancyMap, "Mapper.map returns")
     axes, table = _AXES[: occupancy.n_dimensions], _table(occupancy.n_dimensions)
@@ -147,10 +146,7 @@ def read_map(path: str | Path) -> OccupancyMap:
 
 
 def read_map_truth(path: str | Path) -> GroundTruth | None:
-    """Read the ground truth of an occupancy map, one row per pulse; None if its recordings were not simulated.
-
-    The file is one that `read_map` accepts.
-    """
+    """Read the ground truth of an occupancy map, one row per pulse; None if its recordings were not simulated."""
     path = Path(path)
     with open_file(path, _NAME) as file, reading(file, path):
         return read_truth(file)

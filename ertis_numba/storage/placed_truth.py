@@ -30,7 +30,7 @@ _DIFFERS_DEG: Final = 0.1
 def surfaces_at(truth: GroundTruth, row: int, time_ns: int) -> Surfaces:
     """Return the surfaces of the scene at a time, in the frame of a row of the ground truth of fused images or maps.
 
-    Raises SettingsError if another version of this package wrote the scene, with other keys.
+    Raises SettingsError if another version wrote the scene, with other keys.
     """
     position_m, rotation_xyzw = truth.frames[row]
     surfaces = surfaces_of(_scene_of(truth.scene), time_ns / _NS_PER_S)
@@ -52,8 +52,8 @@ class PlacedTruth:
     ``readers`` are the recordings or images of all sensors. ``mountings``, (translation_m, rotation_xyzw) by sensor,
     define the frame of the platform. ``trajectory`` has the poses of the platform in the frame of a map; none for fused
     images. If they are not those of the scene, such as poses of an odometry that begins at the origin, the scene is
-    moved to fit them best. ``missing`` is the reason for which there is no ground truth; empty if there is one.
-    ``is_partial`` is true if there is none although some recordings are simulated.
+    moved to fit them best. ``missing`` is the reason why there is none. ``is_partial`` is true if it is missing
+    although some recordings are simulated.
     """
 
     def __init__(

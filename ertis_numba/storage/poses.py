@@ -125,9 +125,7 @@ def add_poses(
 def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: bool = False) -> int:
     """Refuse a recording to which poses cannot be added, and return the number of its measurements.
 
-    ``replace`` accepts a recording that has poses already. The measurements of all sensors count. Raises ArgumentError
-    if the trajectory does not cover the recording, or the recording has poses already; or DataError if the recording
-    cannot be read.
+    ``replace`` accepts a recording that has poses already. The measurements of all sensors count.
     """
     n_measurements = 0
     for sensor in sensor_names(path, "a recording"):

@@ -229,8 +229,7 @@ def create_sensor_variables(
     """Create all variables of a sensor, without rows.
 
     The name of ``group`` is that of the sensor. ``settings`` come from `ertis_numba.geometry.storable`, and
-    ``mounting`` from `ertis_numba.geometry.mounting`; it is empty if unknown. Raises ArgumentError if a row exceeds the
-    limit of HDF5.
+    ``mounting`` from `ertis_numba.geometry.mounting`; it is empty if unknown.
     """
     layout, words, samples = microphones(settings.array), sample_format(settings), call_samples(settings.call)
     data, table = _data_and_table(pdm=settings.recording.is_pdm)

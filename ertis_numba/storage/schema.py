@@ -456,10 +456,7 @@ def _joined(contents: Mapping[str, str]) -> str:
 
 
 def sensor_path(name: str) -> str:
-    """Return the group of a sensor.
-
-    Raises ArgumentError if the name cannot be the name of a group.
-    """
+    """Return the group of a sensor."""
     return f"/sensors/{checks.sensor_name(name)}"
 
 

@@ -62,9 +62,8 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
     sensors are sealed. Measurements that were sealed before are not written again.
 
     ``overwrite`` replaces an existing file, even if it has other content. ``progress`` is called with the number of
-    written measurements and of all measurements. Raises JournalInUseError if another process has the journal open;
-    DataError if the journal cannot be read, the recording cannot be written, or its name is taken by other content (the
-    journal stays); or ArgumentError if the recording cannot have this name.
+    written measurements and of all. Raises JournalInUseError if another process has the journal open; or DataError if
+    the journal cannot be read, or the recording cannot be written or has other content (the journal stays).
     """
     path = Path(path)
     before = path.with_name(path.name.removesuffix(SUFFIX))

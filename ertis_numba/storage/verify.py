@@ -21,10 +21,9 @@ _SQLITE = b"SQLite format 3\0"
 class SensorReport:
     """Result for one sensor.
 
-    ``measurements`` counts damaged ones too, ``gaps`` are missing sequence numbers with their reasons, and
-    ``out_of_order`` has the indices of measurements whose sequence number is not above the previous one of the session.
-    ``fault`` is the reason why nothing of this sensor can be read; otherwise empty. ``remark`` is damage to the file or
-    to poses, and losses from its journal that no gap covers, for all sensors; empty if there are none.
+    ``measurements`` counts damaged ones too, and ``out_of_order`` has the indices of measurements whose sequence number
+    is not above the previous one of the session. ``fault`` is the reason why nothing of this sensor can be read. For
+    all sensors, ``remark`` describes damage to the file or to poses, and losses from its journal that no gap covers.
     """
 
     sensor: str

@@ -78,8 +78,7 @@ class Faults:
     drawn independently, so that a block may have several.
 
     ``kinds`` has the probability per block of each of `KINDS`, 0 by default. Its ``short_reads`` is true for pieces of
-    1 to 4,095 bytes by chance, which is no fault; else pieces are as long as can be. Raises ArgumentError if there is
-    no such kind, or a probability is not within 0 and 1.
+    1 to 4,095 bytes by chance, which is no fault; else pieces are as long as can be.
     """
 
     def __init__(

@@ -27,9 +27,9 @@ _BUFFERED = 2  # Limit on measurements that wait for a reader.
 class Quirks:
     """Faulty behaviour of a device apart from its data.
 
-    ``silent`` obeys commands but answers nothing; ``wrong_hash`` reports a wrong hash of the call, however often it is
-    loaded. ``answer_delay_s`` delays each answer. ``bytes_per_s`` is the data rate; as fast as the host reads by
-    default. The device returns ``away_s`` after a fault has unplugged it.
+    If ``silent``, it obeys but answers nothing; with ``wrong_hash``, it reports a wrong hash of the call, however often
+    it is loaded. ``bytes_per_s`` is the data rate; as fast as the host reads by default. The device returns ``away_s``
+    after a fault has unplugged it.
     """
 
     silent: bool = False

@@ -57,10 +57,7 @@ class DeviceConfig:
         return self.dac_rate_hz == call.sample_rate_hz and np.array_equal(self.codes, call_codes(call))
 
     def call(self) -> Call:
-        """Return the loaded call as a custom waveform.
-
-        Raises ArgumentError if the samples are too many, or have no usable band.
-        """
+        """Return the loaded call as a custom waveform."""
         return call_from_codes(self.codes, float(self.dac_rate_hz))
 
 

@@ -25,7 +25,6 @@ class SyncChain:
     Pulses are numbered from the first that a device accepted. All devices send the samples of the same number.
     ``devices`` are in the order of the chain. ``before`` is called with the number of each pulse before the pulse; if
     it takes longer than a period, the pulses meanwhile are left out. ``pulses`` counts those that some device took.
-    Raises ArgumentError if the rate is not within 0.001 and 1000 Hz.
     """
 
     def __init__(

@@ -80,7 +80,7 @@ class Unwanted(Exception):  # noqa: N818  it is an answer
 class ReceivedMessage:
     """Sender and frames of a message.
 
-    ``frames`` are sender, header and payload; ``arrived_ns`` is the time of arrival by `time.monotonic_ns`.
+    ``frames`` are sender, header and payload; ``arrived_ns`` is by `time.monotonic_ns`.
     """
 
     frames: list[zmq.Frame]

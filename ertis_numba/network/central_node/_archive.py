@@ -45,8 +45,7 @@ class Archive:
 
     Only one archive can use ``folder`` at a time; it is created if it is missing. ``name`` is the prefix of recording
     names, before the time. A recording is full after ``rotate_bytes`` of data and poses, or after ``rotate_s``. Without
-    ``seal``, journals are left to ``ertis recover``. Raises ArgumentError if the name cannot be a file name, or a
-    number is invalid.
+    ``seal``, journals are left to ``ertis recover``.
     """
 
     def __init__(
@@ -83,8 +82,7 @@ class Archive:
     def open(self) -> int:
         """Open the folder, recover journals left by a crash, and return a descriptor to poll.
 
-        Call `read` when it is readable. Raises JournalInUseError if another process uses the folder, or a journal in it
-        that this archive needs.
+        Call `read` when it is readable.
         """
         try:
             make_folder(self.folder)

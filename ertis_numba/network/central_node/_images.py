@@ -20,10 +20,7 @@ _Result = TypeVar("_Result")
 
 
 class Guarded:
-    """Image processing whose errors are reported and cost measurements at most.
-
-    ``on_error`` is called with the exception.
-    """
+    """Image processing whose errors are reported and cost measurements at most."""
 
     def __init__(self, images: "ImageProcessing", on_error: Callable[[Exception], None]) -> None:
         self._images, self._on_error = images, on_error

@@ -30,9 +30,7 @@ _NEVER: Final = "never reached the central node"
 class Intake:
     """Receiver of measurements from greeted nodes, each number once and in order.
 
-    Without a ``store``, accepted measurements are acknowledged at once. ``send`` is called with a peer and a message to
-    it, ``notify`` with the name of an event and its fields, and ``on_stored`` with stored items. ``max_bytes`` is the
-    size of the largest accepted measurement. ``tracks`` are by sensor, ``peers`` by peer.
+    Without a ``store``, accepted measurements are acknowledged at once.
     """
 
     def __init__(
@@ -61,17 +59,14 @@ class Intake:
     # Messages from nodes
 
     def read(self, hello: Hello, payload: list[bytes]) -> JournalSensor:
-        """Return the sensor of a hello; any thread may call this.
-
-        Raises Unwanted if the greeting cannot be accepted.
-        """
+        """Return the sensor of a hello; any thread may call this."""
         return source_in(hello, payload, max_bytes=self._max_bytes)
 
     def greet(self, peer_id: bytes, hello: Hello, source: JournalSensor, key: str = "") -> Stream:
         """Accept a hello, and return the session.
 
         ``source`` is the sensor from `read`. The number of peers per ``key`` is limited more strictly than the number
-        of peers. Raises Unwanted if the hello cannot be accepted.
+        of peers.
         """
         run = SensorSession(hello.sensor, hello.session_id)
         peer = self.peers.get(peer_id)
@@ -128,10 +123,7 @@ class Intake:
         return stream
 
     def measure(self, peer_id: bytes, data: Data, payload: list[memoryview], arrived_ns: int) -> None:
-        """Accept a measurement.
-
-        Raises Unwanted if the measurement cannot be accepted.
-        """
+        """Accept a measurement."""
         stream = self._stream(peer_id, data)
         mark("arrived", data.sensor, data.sequence)
         entry, source = entry_in(stream, data, payload), stream.source

@@ -30,11 +30,9 @@ _MAX_DUPLICATES: Final = 4096
 class JournalStore:
     """Journals that store each item once and in order.
 
-    An item is stored only if it follows the acknowledged ones. The folder is locked, and ``ledger`` is its ledger.
-    ``name`` is the prefix of recording names; ``notify`` is called with events. ``acked_through`` is the number up to
-    which a session is stored or known to be missing; ``volume`` is the journal in use, and ``to_hand_on`` lists
-    journals to seal. Raises JournalInUseError if another process uses a journal whose content is needed, or DataError
-    if the content of the folder cannot be read.
+    An item is stored only if it follows the acknowledged ones. The folder is locked. ``name`` is the prefix of
+    recording names. Up to ``acked_through``, a session is stored or known to be missing; ``volume`` is the journal in
+    use, and ``to_hand_on`` lists journals to seal.
     """
 
     def __init__(self, folder: Path, name: str, ledger: Ledger, notify: Callable[[Event], None]) -> None:
@@ -99,7 +97,7 @@ class JournalStore:
     def store(self, items: list[ReceivedItem]) -> None:
         """Store items durably and report them; after an error, call it again with the same ones.
 
-        Raises an error if the disk fails; reported items are durable, and the other items are not lost.
+        If the disk fails, reported items are durable, and the others are not lost.
         """
         try:
             self._abandon_failed()
@@ -245,8 +243,7 @@ class JournalStore:
     def store_poses(self) -> None:
         """Store poses durably in the journal in use.
 
-        Raises DiskFullError if the disk is full or nearly full; the next call tries again. Raises another error if the
-        disk fails; the poses are stored in the next journal.
+        After a DiskFullError, the next call tries again; after another error, the poses are stored in the next journal.
         """
         if self.volume is not None:
             try:
@@ -261,7 +258,7 @@ class JournalStore:
     def rotate(self) -> None:
         """Begin new recordings with the next item.
 
-        Raises an error if a failed journal still fails; the next start recovers it.
+        If a failed journal still fails, the next start recovers it.
         """
         self._abandon_failed()
         volumes, self.volume, self._duplicates = (self.volume, self._duplicates), None, None
@@ -285,7 +282,7 @@ class JournalStore:
     def hand_on(self) -> list[Path]:
         """Return journals that can be sealed, once the ledger durably contains their content.
 
-        If this raises DataError or OSError because the ledger cannot be written, call it again.
+        After a DataError or OSError, call this again.
         """
         if not self._is_saved:
             self._save(open_=self._open)
@@ -325,7 +322,7 @@ class JournalStore:
     def _abandon_failed(self) -> None:
         """Limit failed journals durably to their acknowledged measurements, and queue them for sealing.
 
-        If this raises an error because the disk still fails, call it again.
+        After an error, call this again.
         """
         while self._failed:
             volume = self._failed[0]

@@ -86,11 +86,10 @@ class Ledger:
     The file has a line for each entry: its CRC-32 in hexadecimal, and the entry as a JSON array. The reader omits
     entries with a wrong CRC-32. The file keeps only the newest 64 sessions of each sensor.
 
-    ``is_new`` is true if the file did not exist; ``damage`` describes omitted entries and the consequence, and is empty
-    if the file is sound. In ``acked_through``, the session that grew last comes last. ``open`` and ``unsealed`` are
-    names of journals that may contain more than ``acked_through``, and of those to seal. ``gaps`` are missing numbers
-    that no recording contains yet. ``tails`` has the CRC-32 of the newest measurements of sessions, by number. Raises
-    DataError if the file cannot be read, or FormatVersionError if a newer version wrote it.
+    ``is_new`` is true if the file did not exist; ``damage`` describes omitted entries and the consequence. In
+    ``acked_through``, the session that grew last comes last. ``open`` and ``unsealed`` are names of journals that may
+    contain more than ``acked_through``, and of those to seal. ``gaps`` are missing numbers that no recording contains
+    yet. ``tails`` has the CRC-32 of the newest measurements of sessions, by number.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -273,10 +272,7 @@ class Lock:
 
 
 def read_acked_through(recordings: Iterable[Path]) -> dict[SensorSession, int]:
-    """Return the highest acknowledged number of each session in recordings, read by a separate process.
-
-    Raises DataError if a recording cannot be read.
-    """
+    """Return the highest acknowledged number of each session in recordings, read by a separate process."""
     paths = list(recordings)
     acked_through: dict[SensorSession, int] = {}
     for sensor, session_id, last in sessions_in_recordings(paths) if paths else ():

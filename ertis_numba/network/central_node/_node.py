@@ -70,12 +70,12 @@ class CentralNode:
 
     ``listen`` is the address for sensor nodes, ``tcp://HOST:PORT``; addresses that other machines can reach require
     ``keys``. With an ``archive``, acks confirm storage; with ``processing``, measurements become images. ``max_bytes``
-    is the size of the largest accepted measurement, and ``window`` limits the unacknowledged measurements of a session.
-    ``on_event`` is called with each event, a dict with the key ``event``: listening, joined, left, fault, resumed,
-    sealed, unsealed, conflict, configure (an admin changes settings), refused, shared (two nodes send one sensor), keys
-    (state of the allow list), internal (an internal error). ``on_stored`` is called with sensor, session_id, sequence
-    and CRC-32 of each stored measurement. ``address`` is the actual address, in the form that nodes on this machine
-    use; ``latest`` is a recent status, for threads other than that of `run`.
+    limits a measurement, and ``window`` the unacknowledged measurements of a session. ``on_event`` gets dicts with the
+    key ``event``: listening, joined, left, fault, resumed, sealed, unsealed, conflict, configure (an admin changes
+    settings), refused, shared (two nodes send one sensor), keys (state of the allow list), internal (an internal
+    error). ``on_stored`` gets sensor, session_id, sequence and CRC-32 of each stored measurement. ``address`` is the
+    actual address, in the form that nodes on this machine use; ``latest`` is a recent status, for threads other than
+    that of `run`.
     """
 
     def __init__(
@@ -180,11 +180,7 @@ class CentralNode:
         self._stopping.set()
 
     def run(self, duration_s: float | None = None) -> None:
-        """Receive measurements until `stop` is called, and then wait until they are on disk.
-
-        ``duration_s`` is the longest time. Raises ArgumentError if the central node is not open, or the time is not
-        above zero.
-        """
+        """Receive measurements until `stop` is called, and then wait until they are on disk."""
         if not self._server.is_open and not self._stopping.is_set():
             raise ArgumentError("the central node is not open; use it in a with statement")
         end_s = None if duration_s is None else time.monotonic() + checks.positive("duration", duration_s)

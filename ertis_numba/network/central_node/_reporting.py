@@ -29,8 +29,8 @@ _LOG_INTERVAL_S: Final = 1.0  # Interval between events about internal errors.
 class Condition:
     """State and status of a central node.
 
-    ``listen`` is the requested address, and ``keys`` is true if the node has keys. ``begun_s`` is the time of opening
-    by `time.monotonic`. ``fault`` is the latest error of the archive; empty while it can store.
+    ``listen`` is the requested address, and ``begun_s`` the time of opening by `time.monotonic`. ``fault`` is the
+    latest error of the archive; empty while it can store.
     """
 
     def __init__(
@@ -113,8 +113,7 @@ def _memory_bytes() -> int:
 class EventReporter:
     """Reporter of changes as events.
 
-    ``on_event`` is called with each event, and ``on_stored`` with sensor, session_id, sequence and CRC-32 of stored
-    measurements.
+    The functions are those of `CentralNode`.
     """
 
     def __init__(

@@ -35,8 +35,7 @@ _SHARE: Final = 0.25
 class Sealing:
     """Thread that seals one journal after the other, each in a separate process.
 
-    Both functions are called in the thread, ``on_failed`` with a line on the reason. ``sealed``, ``failed`` and
-    ``set_aside`` are counts so far.
+    Both functions are called in the thread, ``on_failed`` with a line on the reason.
     """
 
     def __init__(self, on_sealed: Callable[[SealingResult], None], on_failed: Callable[[str], None]) -> None:

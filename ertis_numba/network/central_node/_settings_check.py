@@ -18,7 +18,7 @@ _PREFIX: Final = "no image could be computed from measurements with them: "
 class SettingsCheck:
     """Checker of the settings in requests, in the order of the requests.
 
-    ``require`` is called in the thread with settings; it raises an ArgumentError if they cannot be used.
+    ``require`` is called in the thread; it raises an ArgumentError if settings cannot be used.
     """
 
     def __init__(self, require: Callable[[Settings], None]) -> None:

@@ -33,9 +33,8 @@ class _OpenRequest:
 class SettingsRequests:
     """Checks and forwards requests, and forwards their answers.
 
-    ``send`` is called with a peer, a message to it and its payload, and returns False if the peer is gone. ``nodes_of``
-    returns the sensor nodes that send a sensor. ``max_bytes`` is the size of the largest accepted measurement.
-    ``require`` is called with requested settings in another thread; it raises an ArgumentError if they cannot be used.
+    ``send``, with a peer, a message to it and its payload, returns False if the peer is gone. ``nodes_of`` returns the
+    sensor nodes that send a sensor. ``require`` is as for `SettingsCheck`.
     """
 
     def __init__(
@@ -62,8 +61,8 @@ class SettingsRequests:
     def forward(self, admin_id: bytes, request: Configure, payload: list[bytes]) -> None:
         """Forward a request to the sensor node, once it is checked.
 
-        Raises Unwanted if no node, or several, send the sensor; the settings are missing or too long; or there are too
-        many requests, or an equal one is open.
+        Refuses it if no node or several send the sensor, the settings are missing or too long, too many requests are
+        open, or an equal one is.
         """
         self._forget_old()
         if len(payload) != 1 or len(payload[0]) > Settings.max_bytes:
@@ -109,8 +108,8 @@ class SettingsRequests:
     def tick(self, nodes: Container[bytes], sign_of_life: Pong) -> None:
         """Answer requests whose sensor node is gone.
 
-        ``nodes`` are the registered sensor nodes. ``sign_of_life`` is sent to sensor nodes with a request: it shows
-        that a connection has ended before the node is missed.
+        Sensor nodes with a request get ``sign_of_life``: it shows that a connection has ended before the node is
+        missed.
         """
         for request_id, request in list(self._open.items()):
             if request.node_id not in nodes or not self._send(request.node_id, sign_of_life):

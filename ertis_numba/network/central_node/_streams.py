@@ -32,8 +32,7 @@ _DROPS: Final = 32  # Limit on the drops in one ack.
 def source_of(hello: Hello, text: bytes, *, max_bytes: int) -> JournalSensor:
     """Return the sensor of a hello.
 
-    ``text`` has the settings as TOML; ``max_bytes`` is the size of the largest accepted measurement. Raises
-    ArgumentError if the settings cannot be used.
+    ``text`` has the settings as TOML; ``max_bytes`` limits a measurement.
     """
     return _source(hello.sensor, text, hello.firmware, hello.translation_m, hello.rotation_xyzw, max_bytes)
 
@@ -141,8 +140,8 @@ class Stream:
     Everything is acknowledged up to ``acked_through``, and will be up to ``taken`` once the waiting items are stored.
     ``begins`` is the oldest number that the node has, and ``owner`` the peer that sent the latest hello. Measurements
     up to ``shown`` were counted and shown; repeated ones are not shown again. ``turn`` is the number of the current
-    transmission; see `ReceivedItem`. ``dropped`` has the latest measurements discarded by processing and not yet
-    reported to the node, as (sequence, reason).
+    transmission; see `ReceivedItem`. ``dropped`` has the latest (sequence, reason) discarded by processing and not yet
+    reported to the node.
     """
 
     run: SensorSession
@@ -165,10 +164,7 @@ class Stream:
             self.recent.popitem(last=False)
 
     def settings(self, data: Data) -> Settings:
-        """Return the settings of a measurement.
-
-        Raises ArgumentError if the air is impossible.
-        """
+        """Return the settings of a measurement."""
         air = (data.temperature_c, data.humidity_percent, data.pressure_pa)
         if self._air is None or self._air[0] != air:
             temperature_c, humidity_percent, pressure_pa = air
@@ -191,8 +187,7 @@ class Stream:
 class PeerConnection:
     """Connection of a sensor node.
 
-    ``heard_s`` is the time of its last message, by `time.monotonic`; ``waiting_bytes`` from it wait for the disk.
-    ``key`` is empty without keys.
+    Its last message came at ``heard_s``, by `time.monotonic`; ``waiting_bytes`` from it wait for the disk.
     """
 
     streams: dict[SensorSession, Stream] = field(default_factory=dict)
@@ -204,8 +199,7 @@ class PeerConnection:
 class Acks:
     """Pending acks, one per session for any number of measurements.
 
-    ``send`` is called with a peer and a message to it. ``status`` is the place of acknowledged measurements: ``stored``
-    on disk, or ``accepted`` in memory. ``latencies`` are times from the arrival of a measurement to its ack.
+    ``status`` is that of `Ack`. ``latencies`` are times from the arrival of a measurement to its ack.
     """
 
     def __init__(self, send: Callable[[bytes, Message], object], status: Literal["stored", "accepted"]) -> None:
@@ -250,10 +244,7 @@ class Acks:
 
 
 class Sharing:
-    """Detector of sensors that several nodes send; reports each once.
-
-    ``notify`` is called with the name of an event and its fields.
-    """
+    """Detector of sensors that several nodes send; reports each once."""
 
     def __init__(self, notify: Callable[..., None]) -> None:
         self._emit_event = notify

@@ -47,7 +47,7 @@ class Greeting:
 class Greetings:
     """Reader of the settings in Hello messages, one at a time; peers take turns.
 
-    ``read`` is called in the thread with the message and its payload; it returns the sensor or raises an error.
+    ``read`` is called in the thread; it returns the sensor of a message and its payload, or raises an error.
     """
 
     def __init__(self, read: Callable[[Hello, list[bytes]], JournalSensor]) -> None:

@@ -31,8 +31,8 @@ _chains: "OrderedDict[tuple[str, str, str], SharedPipeline]" = OrderedDict()
 class ClusterResult:
     """Result of processing a measurement.
 
-    ``image`` is (direction, range) float32 or float16. ``points`` is (point, 4) float32, empty unless points were
-    requested. ``worker`` is the address of the worker.
+    ``image`` is (direction, range) float32 or float16; ``points`` is (point, 4), empty unless requested. ``worker`` is
+    an address.
     """
 
     image: NDArray[Any]

@@ -62,15 +62,13 @@ class _Attempt:
 class Cluster:
     """`Runner` whose jobs run on the workers of a dask scheduler.
 
-    The scheduler lists the workers; measurements and images go directly to and from each worker. Pipelines stay in the
-    processes of these workers, which need the same version of this package. Each worker has as many jobs under way as
-    threads. With more jobs, which would overlap transfer and processing, each took 30 ms instead of 23 ms at the same
-    throughput. A worker that misses the deadline, or whose connection breaks, gets no jobs until it is reached again.
-    Anyone who reaches a scheduler can run code on its workers: keep it among trusted machines, or use dask's TLS.
+    Measurements and images go directly to and from each worker. Workers keep their pipelines, and need the same version
+    of this package. Each worker has as many jobs under way as threads. With more jobs, which would overlap transfer and
+    processing, each took 30 ms instead of 23 ms at the same throughput. A worker that misses the deadline, or whose
+    connection breaks, gets no jobs until it is reached again. Anyone who reaches a scheduler can run code on its
+    workers: keep it among trusted machines, or use dask's TLS.
 
-    ``options`` has deadlines, device, type of images, and the scheduler's address ``cluster``. ``log`` is called with a
-    line for each event. ``respawned`` counts workers that have left, or did not answer. Raises DeviceError if
-    dask.distributed is not installed, or NetworkError if no scheduler answers.
+    ``options.cluster`` is the scheduler's address. ``respawned`` counts workers that have left, or did not answer.
     """
 
     def __init__(self, options: ProcessingOptions, log: Callable[[str], None]) -> None:

@@ -26,7 +26,7 @@ _CLOSED_S: Final = 2.0
 class DeadLetterQueue:
     """Writer of measurements into a journal, in a separate thread, so that a slow disk delays nothing.
 
-    ``ertis recover`` makes a recording of the journal. ``log`` gets failures.
+    ``ertis recover`` makes a recording of the journal.
     """
 
     def __init__(self, folder: Path, log: EventLog) -> None:

@@ -19,16 +19,15 @@ __all__ = ["ProcessingOptions"]
 class ProcessingOptions:
     """Options of image processing.
 
-    ``publish`` is the address for applications; ``keys`` are None on loopback only. ``processing`` has fields of
+    ``publish`` is the address for applications; without ``keys``, only on loopback. ``processing`` has fields of
     `ertis_numba.settings.Processing` that override a sensor's own. ``max_error_db`` is the error budget of images; the
-    sensor's own by default. ``without`` excludes channels, of all sensors or of some. ``plan`` selects the costs by
-    which plans are chosen, as for `ertis_numba.Pipeline`. ``workers`` is the number of processes: by default one for
-    each core, or one for a GPU; ``threads`` is that of all workers together, all cores by default. ``deadline_s`` is
-    the timeout of a measurement, after which its worker is killed; ``prepare_s`` is that of preparing for a sensor, the
-    compilation of kernels included. ``dtype`` is the type of published images. ``quarantine`` is the folder of the
-    dead-letter queue, for measurements that made two workers fail. Workers prepare in advance for ``expected``, the
-    settings of a likely sensor. ``cluster`` is the address of a dask scheduler whose workers replace local ones. Raises
-    ArgumentError if an option cannot be used, or the file of the directions cannot be read.
+    sensor's own by default. ``without`` excludes channels, of all sensors or of some. ``plan`` is as for
+    `ertis_numba.Pipeline`. ``workers`` are processes: by default one for each core, or one for a GPU; ``threads`` are
+    those of all together, by default all cores. ``deadline_s`` is the timeout of a measurement, after which its worker
+    is killed; ``prepare_s`` includes the compilation of kernels for a sensor. ``dtype`` is that of published images.
+    ``quarantine`` is the folder of the dead-letter queue, for measurements that made two workers fail. Workers prepare
+    in advance for ``expected``, the settings of a likely sensor. ``cluster`` is the address of a dask scheduler whose
+    workers replace local ones.
     """
 
     publish: str = DEFAULT_PUBLISH
@@ -63,10 +62,7 @@ class ProcessingOptions:
             direction_grid(applied.processing)
 
     def applied(self, settings: Settings, sensor: str = "") -> Settings:
-        """Return a sensor's settings with these options applied.
-
-        Raises ArgumentError if the result cannot be used.
-        """
+        """Return a sensor's settings with these options applied."""
         settings = self.without.applied(settings, sensor)
         if self.processing:
             settings = settings.replace(processing=settings.processing.replace(**self.processing))

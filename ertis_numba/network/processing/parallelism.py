@@ -66,8 +66,8 @@ class Choice:
 
     One measurement on all cores is done soonest. Several at once, with a share of the cores each, have a higher
     throughput, and wait less for each other if they arrive in bursts, as from sensors on a common SYNC line.
-    ``threads`` are those of all workers together. ``modes`` are one at a time, then 2, 4, 8 and so on at once, up to
-    the number of workers. ``why`` is the reason for ``mode`` in one line.
+    ``threads`` are those of all workers. ``modes`` are one at a time, then 2, 4, 8 and so on at once, up to the number
+    of workers.
     """
 
     def __init__(self, workers: int, threads: int) -> None:

@@ -57,8 +57,7 @@ class ImageProcessing:
 
     It runs in the event loop of the intake: poll `fds`, call `ready` for each readable one, and `tick` at least ten
     times a second. These calls wait for no other process and no disk. They take the time of copying a measurement, or
-    some milliseconds to start a process. ``log`` gets failures; it is the package's own by default. ``address`` is that
-    for applications.
+    some milliseconds to start a process.
     """
 
     def __init__(self, options: ProcessingOptions, log: EventLog | None = None) -> None:
@@ -95,7 +94,7 @@ class ImageProcessing:
         """Start the processes; applications can subscribe when this returns.
 
         ``stopping`` is polled five times a second; once it returns True, this returns without waiting for the
-        processes. Raises NetworkError if the address cannot be listened at.
+        processes.
         """
         try:
             self._runner = _runner(self._options, self._log)
@@ -111,8 +110,7 @@ class ImageProcessing:
     def require_usable(self, settings: Settings) -> None:
         """Refuse settings from which no image can be computed; any thread may call this.
 
-        Raises ArgumentError if the image would be too large, the ranges lie outside the record, or the last stage
-        yields no image.
+        Refuses images that are too large, ranges outside the record, and a last stage without images.
         """
         applied = self._options.applied(settings)
         if applied.processing.mode != "passive":
@@ -126,7 +124,7 @@ class ImageProcessing:
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
         """Accept a measurement, and count it until it is published or dropped.
 
-        ``words`` are samples as bytes; they are not copied, and must not change. ``arrived_ns`` is a time of
+        ``words`` are samples as bytes; they are not copied, and must not change. ``arrived_ns`` is by
         `time.monotonic_ns`.
         """
         kind = self._sensors.kind_of(data)

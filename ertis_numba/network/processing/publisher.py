@@ -37,8 +37,8 @@ _CLOSED_S: Final = 2.0
 class Publisher:
     """Process that sends products to applications.
 
-    ``log`` gets failures. ``address`` is that for applications; it stays the same after a restart. ``refused`` counts
-    messages and keys by reason.
+    ``address`` is that for applications; it stays the same after a restart. ``refused`` counts messages and keys by
+    reason.
     """
 
     def __init__(self, options: ProcessingOptions, log: EventLog) -> None:

@@ -43,8 +43,7 @@ class ProcessingCounts:
 class Queues:
     """Waiting measurements, at most two per sensor, served in turn.
 
-    ``counts`` are by sensor. ``dropped`` has the latest drops as (sensor, session_id, sequence, reason), removed when
-    they are reported.
+    ``dropped`` has the latest drops as (sensor, session_id, sequence, reason), removed when they are reported.
     """
 
     def __init__(self) -> None:

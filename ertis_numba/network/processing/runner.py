@@ -20,7 +20,7 @@ __all__ = ["Event", "FinishedJob", "Job", "JobKind", "KindFailed", "KindReady", 
 class JobKind:
     """Measurements that one pipeline can process, or measurements of which no image is made.
 
-    ``settings`` are those of the pipeline as TOML; empty without one. ``words_bytes`` is the size of a measurement.
+    ``settings`` are those of the pipeline as TOML; empty without one.
     """
 
     number: int
@@ -33,7 +33,7 @@ class Job:
     """A measurement to process.
 
     ``words`` are contiguous bytes, kept until the image is done for a second try. ``arrived_ns`` is by a monotonic
-    clock. ``points`` is true if an application subscribes to the points, and ``tries`` counts failed tries. ``predict``
+    clock. ``points`` are made if an application subscribes to them, and ``tries`` counts failed tries. ``predict``
     predicts the error of the image, and logs a warning if images may exceed the budget; ``check_sound`` compares the
     sound with the settings, and logs a warning if it contradicts them. ``slot`` has samples and image once it is
     `FinishedJob`; release it afterwards.

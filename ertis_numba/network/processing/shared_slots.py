@@ -53,10 +53,7 @@ class SlotView:
 
 
 class Slot:
-    """Memory for one measurement and its products.
-
-    Processes refer to it by ``number``, and use it by ``descriptor``.
-    """
+    """Memory for one measurement and its products."""
 
     def __init__(self, number: int, words_bytes: int, image_bytes: int) -> None:
         self.number, self.words_bytes, self.image_bytes = number, words_bytes, image_bytes

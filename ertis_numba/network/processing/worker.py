@@ -23,9 +23,8 @@ _DELAYS_S: Final = (0.0, 0.1, 0.2, 0.5, 1.0)
 class Worker(SupervisedProcess[FromWorker]):
     """Supervised worker process.
 
-    ``ready`` is true once it has reported that it is ready. ``slots`` are all slots, ``free`` the empty ones, and
-    ``slot`` that of the ``job``. ``kinds`` are those with a pipeline, and ``preparing`` is the one that it prepares
-    for. ``mode`` is that of the job, and ``done`` counts finished jobs.
+    It reports when it is ``ready``. Of its ``slots``, ``free`` ones are empty, and ``slot`` is that of the ``job``,
+    like ``mode``. ``kinds`` have a pipeline, it prepares for ``preparing``, and ``done`` counts finished jobs.
     """
 
     def __init__(self, number: int) -> None:

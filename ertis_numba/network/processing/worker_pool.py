@@ -47,7 +47,7 @@ class LocalWorkerPool:
     """`Runner` whose jobs run in processes of this machine.
 
     Each worker has its own pipe and two slots, so that its death at any time costs only its job. A worker that misses
-    its deadline is killed. ``log`` gets failures.
+    its deadline is killed.
     """
 
     def __init__(self, options: ProcessingOptions, log: EventLog) -> None:

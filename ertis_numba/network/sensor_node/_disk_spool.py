@@ -31,7 +31,7 @@ class DiskSpool(Spool):
     """Measurements in journals of a folder, and also in memory while there is room.
 
     ``folder`` is created if it does not exist. ``ring_bytes`` limits the data in memory, and ``max_bytes`` the data in
-    the journals. ``on_note`` is called with a line, from any thread.
+    the journals. Any thread may call ``on_note``.
     """
 
     def __init__(self, folder: Path, ring_bytes: int, max_bytes: int | None, *, on_note: Callable[[str], None]) -> None:

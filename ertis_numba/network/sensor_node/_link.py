@@ -39,8 +39,7 @@ class Link(threading.Thread):
     """Sender of a spool's items, which reconnects until it is stopped.
 
     The functions are called from this thread and must not raise; without ``on_settings``, requests for new settings are
-    refused. ``central`` is the last reported state of the central node. ``reconnects`` counts reconnections after the
-    central node was away.
+    refused. ``central`` is its last reported state, and ``reconnects`` counts reconnections after it was away.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ class UnackedItem:
     """Measurement or gap that waits for its acknowledgement.
 
     ``first`` and ``last`` are its numbers, equal for a measurement. ``reason`` is that of a gap; empty for a
-    measurement. ``n_bytes`` is the size of its data. ``entry`` is the measurement, if it is in memory.
+    measurement. ``entry`` is the measurement, if it is in memory.
     """
 
     first: int
@@ -41,10 +41,9 @@ class OutgoingSession:
     Positions are kept as numbers, so that items may be moved or replaced meanwhile. Callers ensure that only one thread
     uses a session at a time.
 
-    ``following`` is the number after the last item; None before the first. Up to ``acked_through``, the central node
-    has everything; up to ``sent``, everything was sent; up to ``reached``, anything was ever sent: an ack beyond it
-    belongs to other items. ``stage`` is that of the handshake with the central node; it began at ``since_s``, or for
-    "waiting" ends then.
+    ``following`` is the number after the last item. Up to ``acked_through``, the central node has everything; up to
+    ``sent``, everything was sent; up to ``reached``, anything was ever sent: an ack beyond it belongs to other items.
+    The ``stage`` of the handshake began at ``since_s``; "waiting" ends then.
     """
 
     sensor: JournalSensor

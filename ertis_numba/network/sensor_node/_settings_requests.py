@@ -40,8 +40,7 @@ class SettingsRequest:
 class RequestQueue:
     """Reader of requests, and queue of their answers.
 
-    ``on_request`` is called with each valid request; None if the node does not accept any. ``wake`` is called when
-    there is an answer to send.
+    Without ``on_request``, the node accepts no requests. ``wake`` is called when there is an answer to send.
     """
 
     def __init__(self, on_request: Callable[[SettingsRequest], None] | None, wake: Callable[[], None]) -> None:

@@ -22,9 +22,8 @@ _FIRMWARE_CHARACTERS = 64
 class Acknowledged:
     """Acknowledgement by the central node.
 
-    Up to ``acked_through``, everything is stored or accepted, or known to be missing. ``status`` is the place of the
-    acknowledged measurements: ``stored`` on the central node's disk, or ``accepted`` in its memory. ``dropped`` are
-    measurements discarded since the previous acknowledgement, as (sequence, reason).
+    Up to ``acked_through``, everything is stored or accepted, or known to be missing. The other fields are those of
+    `ertis_numba.network.messages.Ack`.
     """
 
     sensor: str
