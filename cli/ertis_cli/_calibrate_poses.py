@@ -37,7 +37,6 @@ def write_poses(
 ) -> None:
     """Calibrate the poses of sensors from recordings of one or several runs, print them, and write a mounting file.
 
-    - ``paths``: recordings that contain all sensors, or some of them.
     - ``sensors``: names of the sensors in the order of the SYNC chain; those of the recordings by default.
     - ``target``: mounting file (TOML) to write, for ``--mounting``.
     - ``reference``: sensor whose frame the poses refer to; the first by default.

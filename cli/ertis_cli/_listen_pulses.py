@@ -57,10 +57,8 @@ def listen_pulses(
     """Show each pulse until a signal, a count or a duration ends the command.
 
     - ``sensors``: requested sensors; empty for all.
-    - ``show``: prints what arrived of a pulse.
     - ``head``: line above the lines of pulses; omitted with ``as_json``.
     - ``of`` (str, str): what is shown, in the singular, and what the central node may drop, in the plural.
-    - ``product``: product that the subscriber receives.
     - ``at_end``: called with the subscriber at the end, also after an error.
     """
     notes: deque[str] = deque()

@@ -44,10 +44,7 @@ allow: Decorator = click.option(
 
 
 def server_keys(key: str | None, allow: Path | None) -> "ServerKeys | None":
-    """Return the keys of a central node, or None if no keys were given.
-
-    Raise SettingsError if a key file or the list cannot be used.
-    """
+    """Return the keys of a central node, or None if no keys were given."""
     from ertis_numba.network.allow_list import ALLOW_LIST
     from ertis_numba.network.keys import KeyPair, ServerKeys, default_folder
 

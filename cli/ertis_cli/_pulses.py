@@ -97,10 +97,7 @@ def open_sensors(paths: "Sequence[Path]", stack: ExitStack, *, images: bool = Fa
 
 
 def mountings_of(readers: "Sequence[RecordingReader]", file: "Path | None") -> "dict[str, Mounting]":
-    """Return the mountings of sensors from the file given with --mounting, or else from their recordings.
-
-    Raise ArgumentError if a mounting is unknown.
-    """
+    """Return the mountings of sensors from the file given with --mounting, or else from their recordings."""
     given = _mountings.mountings(file, [reader.sensor for reader in readers])
     return {reader.sensor: _mounting(reader) for reader in readers} if given is None else given
 
@@ -215,8 +212,7 @@ def active_groups(
 
     A sensor that was silent in such a pulse hears the echoes of the others, so its measurement belongs to the pulse. A
     note states the number of other pulses. With the ``processing.mode`` of the settings that ``changed`` returns,
-    `is_passive` decides. Raise DataError if no sensor emitted in any pulse, or the stamps belong to different SYNC
-    chains.
+    `is_passive` decides.
     """
     from ertis_numba.errors import DataError
     from ertis_numba.frames import is_passive

@@ -44,11 +44,7 @@ def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
 
 @contextmanager
 def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Write]:
-    """Yield a function that saves a product; the file appears when the block ends without an error.
-
-    Raise ArgumentError if the file cannot be written, or a product does not match earlier ones. Raise DataError if
-    there is no product to save.
-    """
+    """Yield a function that saves a product; the file appears when the block ends without an error."""
     from ertis_numba.errors import DataError
 
     if target is None:

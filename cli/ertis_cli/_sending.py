@@ -62,9 +62,6 @@ class Sending:
       `SensorNode`.
     - ``is_fixed``: True to refuse new settings from admins.
     - ``report``: summary for JSON output, complete once `run` has returned.
-    - ``n_lost``: number of captured measurements that are lost.
-
-    Raise ArgumentError if the spool or the ring is too small for one measurement.
     """
 
     def __init__(

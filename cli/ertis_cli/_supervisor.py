@@ -38,7 +38,6 @@ class Life(NamedTuple):
     - ``restarts``: processes before it.
     - ``reason``: end of the process before it, such as SIGABRT.
     - ``addresses``: addresses of the former process: ``address`` for sensors, and ``publish`` for applications.
-    - ``elapsed_s``: seconds since the first process was started.
     - ``report_fd``: descriptor to the supervisor; -1 if there is none.
     """
 

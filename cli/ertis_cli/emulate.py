@@ -266,9 +266,7 @@ def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: boo
 class _Estimate:
     """Estimate of the time and the memory of a long task, derived from its first steps and reported once.
 
-    - ``n_steps``: number of all steps.
-    - ``n_first``: number of first steps whose time does not count, because they also prepare the following ones.
-    - ``clock``: clock in seconds; a monotonic one by default.
+    ``n_first``: number of first steps whose time does not count, because they also prepare the following ones.
     """
 
     def __init__(self, n_steps: int, *, n_first: int, clock: "Callable[[], float]" = time.monotonic) -> None:

@@ -440,8 +440,7 @@ def calibration(
 
     Patterns show plane waves that the calibrated array receives, with beams of the former and of the new layout.
     Steering directions are -90 to 90 degrees; ``settings`` are those of the recordings, for the call and the air.
-    ``dynamic_range_db``, ``**look``: range of the colours in dB and the style, as for `plot`. Raise ArgumentError if an
-    argument is invalid.
+    ``dynamic_range_db``, ``**look``: range of the colours in dB and the style, as for `plot`.
     """
     checks.positive("dynamic_range_db", dynamic_range_db)
     checks.instance("made", made, Calibration, "calibrate returns")

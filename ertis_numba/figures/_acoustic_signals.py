@@ -77,8 +77,7 @@ def power_spectra(
 
     Bins are narrower at sample rates below 90 kHz. The window is Hann's, and spectra overlap by three quarters (P. D.
     Welch, 1967). Sums over all bins are the mean square of the signals, of which the mean is taken. In a long record, a
-    column is the mean of several spectra. ``values`` (channel, sample) float32. Raise ArgumentError if the record is
-    shorter than a window.
+    column is the mean of several spectra. ``values`` (channel, sample) float32.
     """
     size = scipy.fft.next_fast_len(round(rate_hz / min(_SPACING_HZ, rate_hz / _LEAST_SIZE)), real=True)
     size += size % 2

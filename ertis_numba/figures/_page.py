@@ -35,7 +35,6 @@ class Panel:
     - ``height``: returns the height of the axes from their width, both in points.
     - ``finish``: draws what depends on the final position of the axes.
     - ``title_ems``: distance of the title from the axes.
-    - ``box_aspect``: height of the axes relative to their width on a page.
     """
 
     paint: Callable[[Axes], AxesImage | None]

@@ -63,10 +63,8 @@ class StyleOptions(TypedDict, total=False):
 class Style:
     """Colours, letters and sizes; ``colours`` is a perceptually uniform map of Matplotlib.
 
-    - ``title_pt``, ``label_pt``, ``tick_pt``, ``list_pt``: font sizes.
-    - ``margin_pt``: margin around the page.
-    - ``side_pt``: minimum width beside the pictures for the scale and the list.
-    - ``width_pt``: width of the page; None for the width of the kind of picture.
+    ``side_pt``: minimum width beside the pictures for the scale and the list. ``width_pt``: width of the page; None for
+    the width of the kind of picture.
     """
 
     page: str

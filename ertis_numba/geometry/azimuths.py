@@ -49,15 +49,7 @@ def unrolled_rad(azimuth_rad: NDArray[np.float64], closed_rad: float = 0.0) -> N
 
 
 def is_closed(azimuth_rad: NDArray[np.float64]) -> bool:
-    """Return True if increasing azimuths form a closed circle, without a wider gap between the last and the first.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ertis_numba.geometry import is_closed
-    >>> is_closed(np.radians(np.arange(0.0, 360.0, 30.0)))
-    True
-    """
+    """Return True if increasing azimuths form a closed circle, without a wider gap between the last and the first."""
     if len(azimuth_rad) < 3:
         return False
     open_rad = _TURN - float(azimuth_rad[-1] - azimuth_rad[0])

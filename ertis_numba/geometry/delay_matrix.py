@@ -65,8 +65,7 @@ def delay_matrix(settings: Settings, *, n_directions: int) -> NDArray[np.float64
 def plane_delays(settings: Settings, grid: Grid, *, sound_speed_m_s: float) -> NDArray[np.float64]:
     """Return the delays of each direction, the given ones or else those of plane waves.
 
-    The result is (direction, mic), in seconds, for the enabled microphones; positive for later sound. Raise
-    ArgumentError as `delay_matrix` does.
+    The result is (direction, mic), in seconds, for the enabled microphones; positive for later sound.
     """
     given_s = delay_matrix(settings, n_directions=len(grid))
     if given_s is not None:

@@ -27,13 +27,6 @@ def far_field_delays(
 
     The result is in seconds. Positions p (mic, axis) are relative to the centroid; u (direction, axis) are unit vectors
     towards the source.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ertis_numba.geometry import far_field_delays
-    >>> far_field_delays(np.array([[0.0, 0.1, 0.0]]), np.array([[0.0, 1.0, 0.0]]), sound_speed_m_s=340.0).round(6)
-    array([[-0.000294]])
     """
     return -(directions @ positions_m.T) / sound_speed_m_s
 
@@ -49,14 +42,6 @@ def spherical_delays(
 
     The result is in seconds. Positions p (mic, axis) and the range r are relative to the centroid; u (direction, axis)
     are unit vectors towards the points.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ertis_numba.geometry import spherical_delays
-    >>> ahead = np.array([[1.0, 0.0, 0.0]])
-    >>> spherical_delays(np.array([[0.0, 0.1, 0.0]]), ahead, range_m=1.0, sound_speed_m_s=340.0).round(7)
-    array([[1.47e-05]])
     """
     points_m = range_m * directions[:, None, :] - positions_m[None, :, :]
     return np.asarray((np.linalg.norm(points_m, axis=-1) - range_m) / sound_speed_m_s)

@@ -31,7 +31,7 @@ PAPER_GRIDS = {
 class Grid(DegreesFromRadians):
     """Directions of an image; ``azimuth_deg`` and ``elevation_deg`` are the same angles in degrees.
 
-    ``azimuth_rad``, ``elevation_rad`` (direction,): angles in radians.
+    All are (direction,).
     """
 
     azimuth_rad: NDArray[np.float64]
@@ -83,15 +83,7 @@ def direction_grid(processing: Processing) -> Grid:
 
     ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths at one elevation, including both limits.
     ``3d:N`` is N cells of equal area between the limits, in rows of equal elevation. Any other name is the path of a
-    CSV file of azimuth, elevation in degrees. Raise ArgumentError if the name is neither a grid nor a readable file, or
-    the grid is empty.
-
-    Examples
-    --------
-    >>> from ertis_numba.settings import Processing
-    >>> from ertis_numba.geometry import direction_grid
-    >>> len(direction_grid(Processing(directions="2d:181")))
-    181
+    CSV file of azimuth, elevation in degrees.
     """
     name = processing.directions
     if not isinstance(name, str):

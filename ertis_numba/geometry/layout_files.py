@@ -111,8 +111,7 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
 class ReadLayout:
     """Array of a layout file.
 
-    ``notes``: remarks for the user; none by default. ``unit_is_stated``: False if the file states no unit; True by
-    default.
+    ``notes`` are for the user; ``unit_is_stated`` is False if the file states no unit.
     """
 
     array: Array
@@ -121,10 +120,7 @@ class ReadLayout:
 
 
 def read_layout(path: str | Path) -> ReadLayout:
-    """Read a layout file with one of the endings in `ertis_numba.settings.LAYOUT_SUFFIXES`.
-
-    Raise ArgumentError if the file cannot be read or used, or its unit or axes are unclear.
-    """
+    """Read a layout file with one of the endings in `ertis_numba.settings.LAYOUT_SUFFIXES`."""
     content = layout_bytes(path)
     if Path(path).suffix.lower() == ".toml":
         return parse_layout(str(path), layout_file_text(path, content))
@@ -266,8 +262,7 @@ def _spacing(positions: NDArray[np.float64]) -> float:
 def unclear_unit(source: str, span: float, reason: str = "") -> str:
     """Return the question for the unit of a file whose array has an implausible extent in millimetres.
 
-    ``span``: extent of the array in the unit of the file. ``reason``: clause that says why the extent is implausible;
-    empty by default.
+    ``span`` is the extent in the unit of the file; ``reason`` is a clause that explains why it is implausible.
     """
     sizes = {unit: factor_m * span for unit, factor_m in LENGTH_UNITS_M.items()}
     likely = [

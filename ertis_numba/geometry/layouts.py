@@ -105,15 +105,7 @@ class Layout:
 
 
 def layout_file(layout: Layout, *, name: str, source: str = "") -> LayoutFile:
-    """Return the content of a layout file with the microphones of a layout, to 0.1 µm, 1 ps and six digits of gain.
-
-    Examples
-    --------
-    >>> from ertis_numba.geometry import layout_file, load_layout
-    >>> text = layout_file(load_layout("eRTIS_v2"), name="mine").to_toml()
-    >>> text.splitlines()[1]
-    '    [0.0, 22.0556, -14.2258],'
-    """
+    """Return the content of a layout file with the microphones of a layout, to 0.1 µm, 1 ps and six digits of gain."""
     return LayoutFile(
         name=name,
         source=source,
@@ -190,13 +182,6 @@ def microphones(array: Array) -> Layout:
     """Return the microphones that array settings describe, by position or by name.
 
     Positions are relative to the centroid of the layout's microphones, including those in ``array.disabled``.
-
-    Examples
-    --------
-    >>> from ertis_numba.settings import Array
-    >>> from ertis_numba.geometry import microphones
-    >>> int(microphones(Array(disabled=(0, 1))).enabled.sum())
-    30
     """
     fitted = _fitted(array)
     if not array.disabled:
@@ -235,27 +220,14 @@ def _fitted(array: Array) -> Layout:
 
 
 def written_out(array: Array) -> Array:
-    """Return array settings with the positions of the microphones, so that they depend on no layout file.
-
-    Raise ArgumentError if the layout is unknown, or its file cannot be read or used.
-    """
+    """Return array settings with the positions of the microphones, so that they depend on no layout file."""
     if array.positions_m is not None:
         return array
     return _fitted(array).to_array().replace(disabled=array.disabled)
 
 
 def self_contained(settings: Settings) -> Settings:
-    """Return settings with the positions of the microphones, so that they depend on no layout file.
-
-    Raise ArgumentError if the layout is unknown, its file cannot be read or used, or its size does not suit the sound.
-
-    Examples
-    --------
-    >>> from ertis_numba import Settings
-    >>> from ertis_numba.geometry import self_contained
-    >>> len(self_contained(Settings()).array.positions_m)
-    32
-    """
+    """Return settings with the positions of the microphones, so that they depend on no layout file."""
     require_plausible_size(settings)
     array = written_out(settings.array)
     return settings if array is settings.array else settings.replace(array=array)

@@ -22,12 +22,6 @@ def mounting(
     If only the translation is given, the rotation is the identity. If only the rotation is given, the sensor is at the
     origin. The result has ``translation_m`` (3,) and ``rotation_xyzw`` (4,), a unit quaternion from the sensor frame to
     that of the platform.
-
-    Examples
-    --------
-    >>> from ertis_numba.geometry import mounting
-    >>> mounting("left", (0.0, 0.2, 0.0))["rotation_xyzw"].tolist()
-    [0.0, 0.0, 0.0, 1.0]
     """
     if translation_m is None and rotation_xyzw is None:
         return {}

@@ -22,14 +22,6 @@ def spacing_rad(directions: NDArray[np.float64]) -> float:
     """Return the median angle from a direction to its nearest neighbour in radians; π for fewer than two.
 
     Equal directions count once. ``directions`` are unit vectors (direction, axis).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ertis_numba.geometry import spacing_rad, unit_vectors
-    >>> azimuth_rad = np.radians([0.0, 2.0, 4.0])
-    >>> round(float(np.degrees(spacing_rad(unit_vectors(azimuth_rad, np.zeros(3))))), 6)
-    2.0
     """
     # Importing SciPy's trees takes a tenth of a second, and processing does not need them.
     from scipy.spatial import KDTree  # noqa: PLC0415

@@ -60,10 +60,7 @@ def _remedy(wanted: str = "readable") -> str:
 
 
 def read_position_file(path: str | Path, content: bytes) -> PositionTable:
-    """Return the positions in a file other than TOML, by its ending.
-
-    Raise ArgumentError if the content has another format, or its axes or unit are unclear.
-    """
+    """Return the positions in a file other than TOML, by its ending."""
     source, suffix = f"layout {path}", Path(path).suffix.lower()
     if suffix == ".xml":
         return _of_acoular(source, content)

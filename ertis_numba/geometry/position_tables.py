@@ -29,9 +29,8 @@ _Rows = Sequence[tuple[int, list[str]]]
 class PositionTable:
     """Positions as a file states them.
 
-    - ``positions`` (channel, axis): coordinates x, y and z in the unit of the file; x is 0 if the file has none.
-    - ``unit``: unit that the file states; empty if it states none.
-    - ``notes``: remarks for the user; none by default.
+    ``positions`` (channel, axis): coordinates x, y and z in the unit of the file; x is 0 if the file has none.
+    ``unit``: unit that the file states; empty if it states none.
     """
 
     positions: NDArray[np.float64]

@@ -25,13 +25,6 @@ def array_weights(settings: Settings) -> NDArray[np.float64]:
     A mean of 1 preserves the level of an echo to which all microphones contribute in phase. The constraint ``wᴴv = 1``
     does the same for the response in the steered direction (H. L. Van Trees, Optimum Array Processing, 2002, sections
     2.6 and 3.1).
-
-    Examples
-    --------
-    >>> from ertis_numba import Settings
-    >>> from ertis_numba.geometry import array_weights
-    >>> float(array_weights(Settings()).mean())
-    1.0
     """
     layout, given = microphones(settings.array), settings.processing.array_weights
     if given == "uniform":
@@ -51,13 +44,6 @@ def effective_count(weights: NDArray[np.float64]) -> float:
 
     It is the white noise gain of the array (Van Trees, section 2.6.2). With uniform weights it is the number of
     microphones. ``weights`` are (mic,) with a mean of 1.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ertis_numba.geometry import effective_count
-    >>> effective_count(np.ones(32))
-    32.0
     """
     return len(weights) / float(np.mean(weights**2))
 

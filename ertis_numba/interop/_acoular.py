@@ -56,7 +56,7 @@ def read_acoular(path: Path) -> tuple[float, Samples, Settings | None]:
 
     Signals are read from the file when they are sliced. The settings describe the file's content: only enabled
     microphones, without gains, because the signals are divided by them, and ranges counted in its samples. For other
-    files they are None. Raise DataError if the file is not an Acoular file, or its data has another type or shape.
+    files they are None.
     """
     with open_file(path, _WANTED) as file, reading(file, path):
         data = _time_data(file, path)

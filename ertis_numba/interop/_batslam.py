@@ -34,10 +34,7 @@ _UPRIGHT: Final = 0.7  # Largest vertical component of the normal of a wall in a
 def write_batslam(path: Path, measurements: Iterable[Measurement], drive: Drive, mountings: Mountings) -> None:
     """Write the measurements of one sensor, in order of time.
 
-    ``drive``: poses of the platform, and the scene. ``mountings`` mapping of str to (translation_m, rotation_xyzw):
-    mountings by sensor. The frame of a sensor without one is that of the platform. Raise ArgumentError if the
-    measurements are fewer than 2, of several sensors, not in order of time or too many, their settings differ, or a
-    trajectory does not cover them.
+    The frame of a sensor without one is that of the platform.
     """
     echoes = _EchoRows.of(measurements, drive.beam_azimuth_deg)
     true, measured = (

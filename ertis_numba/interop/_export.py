@@ -32,8 +32,7 @@ _POINT_OPTIONS = ("mounting", "top", "min_level_db")
 class ExportFormat:
     """Export format.
 
-    - ``fields``: names of the fields in the file.
-    - ``options``: options of `export` that apply to this format, but not to all formats. None by default.
+    ``options``: options of `export` that apply to this format, but not to all formats. None by default.
     """
 
     suffix: str
@@ -75,10 +74,7 @@ FORMATS: Final = {
 
 
 def choose_format(path: str | Path, name: str | None = None) -> str:
-    """Return the name of the format to write: the given name, or that of the file's suffix.
-
-    Raise ArgumentError if the name or suffix is unknown.
-    """
+    """Return the name of the format to write: the given name, or that of the file's suffix."""
     if name is None:
         endings = {each.suffix: known for known, each in FORMATS.items()}
         return endings[checks.file_ending("export", path, endings)]

@@ -32,11 +32,7 @@ is unknown for the threshold 0.196 only, and free for 0.25, the threshold in new
 
 
 def map_files(path: str | Path, *, n_dimensions: int = 2, probabilities: bool = False) -> tuple[Path, ...]:
-    """Return the files of a map: for ``.pgm`` also that of its description, with the suffix ``.yaml``.
-
-    Raise ArgumentError if the suffix is unknown, its format does not support the dimensions of the map or the option
-    ``probabilities``, or the packages for MCAP are not installed.
-    """
+    """Return the files of a map: for ``.pgm`` also that of its description, with the suffix ``.yaml``."""
     path = Path(path)
     checks.file_ending("map", path, MAP_SUFFIXES)
     if n_dimensions == 3 and path.suffix.lower() in _PLANAR_SUFFIXES:

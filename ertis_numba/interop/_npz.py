@@ -31,8 +31,6 @@ def write_npz(path: Path, results: Iterable[Result], count: int | None) -> None:
 
     The samples have the shape (time, direction, range) or (time, microphone, sample), and the fields of the stamps
     (time,). The axes, and sensor and settings as texts, follow. Angles are NaN if the array observes no directions.
-    Raise ArgumentError if type, sensor, axes or settings of a result differ from those of the first, or their number
-    differs from ``count``.
     """
     if count is None:
         gathered = list(results)

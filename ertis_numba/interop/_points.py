@@ -73,8 +73,7 @@ class PointTable:
     def columns(self, dtypes: dict[str, str]) -> NDArray[np.void]:
         """Return some columns, packed, in the types of a format.
 
-        ``sec`` and ``nanosec`` are the time of the measurement in the form of ROS 2. Raise ArgumentError if a number
-        exceeds its type, or a time is outside the range of ROS 2.
+        ``sec`` and ``nanosec`` are the time of the measurement in the form of ROS 2.
         """
         made = np.empty(len(self.rows), np.dtype(list(dtypes.items())))
         times = self._ros_times() if {"sec", "nanosec"} & dtypes.keys() else {}

@@ -43,11 +43,7 @@ class _StampedPose(NamedTuple):
 
 
 def read_messages(path: Path, topic: str | None) -> PoseRows:
-    """Return the poses of a topic.
-
-    Raise ArgumentError if the topic does not exist, several topics have poses, or the packages for MCAP are not
-    installed. Raise DataError if the file is damaged, or its poses are in several frames.
-    """
+    """Return the poses of a topic."""
     with extra("ros", "trajectories in .mcap files need mcap and mcap-ros2-support"):
         from mcap.exceptions import DecoderNotFoundError, McapError, UnsupportedCompressionError  # noqa: PLC0415  an extra
         from mcap.reader import make_reader  # noqa: PLC0415  an extra

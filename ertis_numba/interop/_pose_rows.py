@@ -69,10 +69,7 @@ class PoseRows:
 
 
 def trajectory_of(rows: PoseRows, pose_axes: PoseAxes = "platform") -> Trajectory:
-    """Return the trajectory that rows form, with notes on the rows that were left out or changed.
-
-    Raise DataError if there is no pose, a number is impossible, or the times do not increase.
-    """
+    """Return the trajectory that rows form, with notes on the rows that were left out or changed."""
     rows = _complete(rows)
     if not len(rows):
         raise DataError("; ".join(("the file contains no complete pose", *rows.notes, "choose a file with poses")))

@@ -85,8 +85,6 @@ def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: s
     - ``needs_header``: refuse rows without a line that names the columns, instead of reading them as TUM or KITTI.
     - ``time_unit`` {"s", "ms", "us", "ns"} or None: unit of times whose column states none; by their magnitude if None.
     - ``times``: text with one time per pose, for poses of KITTI.
-
-    Raise DataError if the text contains no poses, or a line is not understood.
     """
     columns, rows = _header(text, needs_header=needs_header)
     if not rows:

@@ -30,8 +30,7 @@ def times_of(cells: Sequence[tuple[int, str]], unit: str | None) -> tuple[NDArra
     """Return times in nanoseconds, and notes on their unit.
 
     ``cells`` are (line, text). Without a unit, it is the one in which the times lie between 1973 and 2116, and seconds
-    for smaller ones. Raise DataError if a time is no number and no date, has no plausible unit, or is beyond the year
-    2116.
+    for smaller ones.
     """
     dates = [_DATE.fullmatch(text.strip()) for _, text in cells]
     if cells and dates[0] is not None:

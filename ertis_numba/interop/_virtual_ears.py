@@ -52,13 +52,10 @@ class VirtualEars:
     - ``settings``: settings of the measurements. The range ends at ``processing.range_m``, or at the end of the record.
     - ``azimuth_deg``: azimuth of the left ear in degrees; the right ear is steered to its negative. 0 steers both to
       the front.
-    - ``rate_hz``: sample rate of the signals.
     - ``max_range_m``: range of the last echo that the signals hold completely.
     - ``n_samples``: samples per ear. Sample n is n / rate_hz after the start of the call.
     - ``baseline_m``: lateral distance between the centroids of both halves.
     - ``call`` (sample,): emitted call at the same rate.
-
-    Raise ArgumentError if the array has fewer than 2 microphones, or all of them lie on one vertical line.
     """
 
     def __init__(self, settings: Settings, azimuth_deg: float) -> None:

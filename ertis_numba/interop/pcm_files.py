@@ -42,9 +42,7 @@ class PcmFile:
     - ``paths``: files in the order of their channels.
     - ``rate_hz``: rate at which the sound was recorded.
     - ``counts``: number of channels of each file.
-    - ``kind``: type of the samples in the file.
     - ``is_wide``: True for integers of 32 or 64 bits, all of which are used according to the file.
-    - ``settings``: settings in the file.
     """
 
     paths: tuple[Path, ...]

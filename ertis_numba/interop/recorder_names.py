@@ -34,7 +34,6 @@ class StatedTime(NamedTuple):
     - ``clock``: reading of the clock, without a zone.
     - ``offset``: offset of the clock from UTC; None if the source states none. UTC is then assumed.
     - ``source``: words for the source, such as ``GUANO``.
-    - ``resolution_s``: step of the clock, in seconds.
     """
 
     clock: datetime

@@ -49,8 +49,7 @@ def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, 
     """Return the emissions in a loopback channel.
 
     The matched filter of the call finds them. If no part of the channel resembles the call, its pulses are found by
-    their onsets, as those of a trigger. ``read`` returns consecutive samples of the channel. Raise DataError if there
-    is no complete emission, or a sample is not finite.
+    their onsets, as those of a trigger. ``read`` returns consecutive samples of the channel.
     """
     times, match = _of_call(read, n_samples, call_samples(call, rate_hz=rate_hz), call.start_s * rate_hz)
     notes = []

@@ -16,8 +16,7 @@ def true_rate_hz(
 ) -> tuple[float, list[str]]:
     """Return the rate at which the sound was recorded, in hertz, and notes if it is not that of the header.
 
-    ``expansion`` is the user's factor, which overrides the metadata. Raise DataError if the metadata contradict the
-    header, but not by a whole factor.
+    ``expansion`` is the user's factor, which overrides the metadata.
     """
     stated = metadata.expansion
     ratio = None if metadata.rate_hz is None else metadata.rate_hz / header_hz

@@ -36,12 +36,6 @@ def load(device: str = "auto") -> KernelSet:
     ``numpy`` is plain NumPy for comparison. ``auto``, the default, is ``cuda`` if a GPU and its libraries are
     available, otherwise ``cpu``. Raise ArgumentError if the device is unknown. Raise DeviceError if the device is known
     but cannot be used on this machine.
-
-    Examples
-    --------
-    >>> from ertis_numba import kernels
-    >>> kernels.load("numpy").device
-    'numpy'
     """
     checks.choice("device", device, ("auto", *DEVICES))
     if device == "auto":
@@ -66,42 +60,21 @@ def load(device: str = "auto") -> KernelSet:
 
 @functools.cache
 def load_fusion() -> FusionKernels:
-    """Return the kernels of fusion: compiled ones, or those of NumPy if none can be compiled on this machine.
-
-    Examples
-    --------
-    >>> from ertis_numba import kernels
-    >>> kernels.load_fusion().spread_cells.__name__
-    'spread_cells'
-    """
+    """Return the kernels of fusion: compiled ones, or those of NumPy if none can be compiled on this machine."""
     kernels: FusionKernels = _compiled("fusion")
     return kernels
 
 
 @functools.cache
 def load_mapping() -> MappingKernels:
-    """Return the kernels of occupancy maps: compiled ones, or those of NumPy if none can be compiled on this machine.
-
-    Examples
-    --------
-    >>> from ertis_numba import kernels
-    >>> kernels.load_mapping().find_walls.__name__
-    'find_walls'
-    """
+    """Return the kernels of occupancy maps: compiled ones, or those of NumPy if none can be compiled here."""
     kernels: MappingKernels = _compiled("mapping")
     return kernels
 
 
 @functools.cache
 def load_points() -> PointKernels:
-    """Return the kernels of points: compiled ones, or those of NumPy if none can be compiled on this machine.
-
-    Examples
-    --------
-    >>> from ertis_numba import kernels
-    >>> kernels.load_points().find_tops.__name__
-    'find_tops'
-    """
+    """Return the kernels of points: compiled ones, or those of NumPy if none can be compiled on this machine."""
     kernels: PointKernels = _compiled("points")
     return kernels
 
@@ -112,12 +85,6 @@ def load_steering(device: str = "auto") -> SteeringKernels:
 
     ``device`` {"auto", "numpy"}: ``auto``, the default, selects compiled kernels, or those of NumPy if none can be
     compiled on this machine. ``numpy`` always selects those of NumPy.
-
-    Examples
-    --------
-    >>> from ertis_numba import kernels
-    >>> kernels.load_steering().sum_polynomials.__name__
-    'sum_polynomials'
     """
     checks.choice("device", device, ("auto", "numpy"))
     kernels: SteeringKernels = _compiled("steering") if device == "auto" else _in_numpy("steering")

@@ -28,10 +28,7 @@ _POOLS: Final = {
 
 
 def prepare() -> None:
-    """Import Numba, and ensure that it can start threads and store compiled kernels.
-
-    Raise DeviceError if Numba refuses an environment variable, or no folder for compiled kernels is writable.
-    """
+    """Import Numba, and ensure that it can start threads and store compiled kernels."""
     config = _imported().config
     layer = str(config.THREADING_LAYER).lower()
     if layer not in _POOLS:

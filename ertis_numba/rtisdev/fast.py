@@ -83,10 +83,7 @@ class FastProcessor:
         return self._given
 
     def process(self, data: NDArray[Any], *, pdm: bool) -> Real:
-        """Return the image, as `Processor.process` does.
-
-        Raise ArgumentError if the shape of ``data`` does not match the configuration.
-        """
+        """Return the image, as `Processor.process` does."""
         if not pdm or self._exact.has_lost_gpu:
             return self._exact.process(data, pdm=pdm)
         return cleaned(self._image(data), self._given.clean_multipliers)

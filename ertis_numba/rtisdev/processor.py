@@ -48,10 +48,7 @@ class Configuration:
     - ``first_range``, ``last_range``: range of the image in its samples; the last is not included.
     - ``clean_multipliers`` (float, float) or None: amplitudes of a range become 0 below the first number times the mean
       of the range, and below the second number times its maximum.
-    - ``has_envelope``: the envelope is computed.
-    - ``disabled``: microphones to exclude.
     - ``dmas_order``: 1 for delay-and-sum; 2 to 5 for delay-multiply-and-sum.
-    - ``coherent``: multiply beams by the coherence factor.
     """
 
     pdm_filter: Real
@@ -158,10 +155,7 @@ class Processor:
         return self._loaded.device == "cuda" and self._process_id != os.getpid()
 
     def process(self, data: NDArray[Any], *, pdm: bool) -> Real:
-        """Return the result of the last stage that is on: signals, beams or an image, (row, sample) float32.
-
-        Raise ArgumentError if the shape of ``data`` does not match the configuration.
-        """
+        """Return the result of the last stage that is on: signals, beams or an image, (row, sample) float32."""
         return cleaned(self.uncleaned(data, pdm=pdm), self._given.clean_multipliers)
 
     def uncleaned(self, data: NDArray[Any], *, pdm: bool) -> Real:

@@ -121,10 +121,7 @@ def processing(data: NDArray[Any], pdm: int, dim1: int, dim2: int, name: str) ->
 
 
 def unloadone(name: str) -> None:
-    """Free a configuration; a name that was never preloaded is only reported.
-
-    Raise ArgumentError if the name is not a text.
-    """
+    """Free a configuration; a name that was never preloaded is only reported."""
     with _errors_logged():
         name = arguments.text("name", name)
     with _turn:

@@ -111,7 +111,6 @@ def image_change_db(
     lobes of a stronger echo therefore hardly counts.
 
     - ``before``, ``after`` (direction, range) float32
-    - ``spacing_m``: spacing of the ranges.
     - ``floor``: amplitude of the weakest reflector to be preserved.
     - ``noise`` float or (range,) float32: difference that noise alone causes; it is subtracted.
     """

@@ -63,7 +63,6 @@ class Arrivals:
       including the microphone's sensitivity.
     - ``stretch`` (path, mic) or None: received duration relative to the emitted duration; None if nothing moves and
       clocks agree.
-    - ``filters``: filters of the call by its emitter.
     """
 
     call: Call | NoiseFrame
@@ -148,8 +147,7 @@ def echoes(
     """Return the paths of an emitter's call over targets and walls.
 
     The direct path is included only for the emitter of another sensor. ``number`` is the index of the emitting sensor.
-    Amplitudes will be computed at ``n_frequencies`` frequencies. Raise ArgumentError if there are too many paths or
-    amplitudes.
+    Raise ArgumentError if there are too many paths or amplitudes.
     """
     firsts, seconds, specular = views_of(shot, active, number, transmitter_of(shot, active, number), clock)
     over = by_targets
@@ -174,7 +172,7 @@ def views_of(
 ) -> Views:
     """Return the emitter and the microphones as seen from the targets, and the emitter from the microphones.
 
-    The emitter is without mirror images; ``number`` distinguishes the emitters of the snapshot.
+    The emitter is without mirror images; ``number`` is unique within the snapshot.
     """
     views: Views = (
         images(transmitter, shot.targets.positions_m, shot.mirrors, 0),

@@ -17,8 +17,7 @@ _KEY_BYTES = 1000  # of a key, which contains a set of effects
 class Cache:
     """Results by key; the least recently used are discarded if all exceed ``max_bytes``.
 
-    ``max_bytes``: largest total size of the results and keys in bytes; 128 MiB by default. A larger result is kept
-    alone.
+    Sizes are those of results and keys. A larger result is kept alone.
     """
 
     def __init__(self, max_bytes: int = _MAX_BYTES) -> None:

@@ -88,13 +88,6 @@ def make_plan(scene: Scene) -> EffectPlan:
     the greatest estimates, with and without the effect. They also use the loudest measurement, because estimates do not
     model converters. Raise ArgumentError if a surface touches or encloses a microphone or an emitter, or the scene
     exceeds a limit.
-
-    Examples
-    --------
-    >>> from ertis_numba.simulation import Point, Scene
-    >>> from ertis_numba.simulation.effect_plan import make_plan
-    >>> "spreading" in make_plan(Scene(points=(Point(range_m=2.0),))).active
-    True
     """
     indices = _indices(scene)
     cache = Cache()

@@ -31,11 +31,10 @@ _CHANNELS = 128  # rendered at a time, so that memory does not grow with the arr
 
 
 class Engine:
-    """Renders the measurements of one sensor with given effects.
+    """Renders the measurements of one sensor with given effects; the bits do not depend on ``threads``.
 
-    - ``threads``: number of threads; all cores by default. The bits do not depend on it.
-    - ``loudest``: highest amplitude at a modulator or converter so far, full scale 1. Modulators are linear up to about
-      0.6, converters up to 1.
+    ``loudest``: highest amplitude at a modulator or converter so far, full scale 1. Modulators are linear up to about
+    0.6, converters up to 1.
     """
 
     def __init__(self, scene: Scene, sensor: Sensor, active: frozenset[str], *, threads: int | None = None) -> None:

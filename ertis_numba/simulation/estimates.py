@@ -19,8 +19,7 @@ Floats = NDArray[np.float64]
 class Estimate:
     """Estimated change of an image by an effect.
 
-    ``change_db``: greatest change of the image in decibels. ``sure``: factor by which the estimate may be wrong; 20 by
-    default.
+    ``change_db`` is the greatest change of the image; it may be wrong by the factor ``sure``.
     """
 
     change_db: float

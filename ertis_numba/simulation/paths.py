@@ -86,8 +86,8 @@ def pairs(
 def by_targets(first: Seen[Transmitters], second: Seen[Receivers], targets: Targets) -> Paths:
     """Return the paths over some targets, at least one.
 
-    ``targets`` are all of the scene. ``first``, ``second``: ways from the emitter to the targets, and from the
-    microphones to the same targets; one per path.
+    The arguments have one way per path, from the emitter and from the microphones to the same target of all
+    ``targets``.
     """
     return turning(first, second, targets, targets.positions_m[first.place, None, :], surface=False)
 
@@ -122,8 +122,8 @@ def without_target(
 ) -> Paths:
     """Return the direct paths from an emitter or its mirror images to the microphones.
 
-    ``transmitter`` has one image per path, ``receiver`` none; ``targets`` are all of the scene. ``corners_m``
-    (wall, path): distances of the mirror points from the emitter, along the path.
+    ``transmitter`` has one image per path, ``receiver`` none. ``corners_m`` (wall, path): distances of the mirror
+    points from the emitter, along the path.
     """
     n_paths = len(transmitter.position_m)
     none = np.zeros((0, n_paths))

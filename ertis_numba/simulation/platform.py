@@ -122,8 +122,8 @@ class Platform(TomlTable, frozen=True, kw_only=True):
     def trajectory(self, time_s: Floats, time_ns: NDArray[np.int64] | None = None) -> Trajectory:
         """Return the poses at times of the scene.
 
-        The source of the trajectory is "scene". ``time_s`` (pose,): times of the scene in seconds. ``time_ns`` (pose,)
-        int64: times of the poses in the result; those of the scene by default.
+        The source of the trajectory is "scene". Its times are ``time_ns``, and those of the scene, ``time_s``, by
+        default; both are (pose,).
         """
         times_s = np.asarray(time_s, np.float64)
         x, y, z, yaw_deg = (np.interp(times_s, *pair) for pair in self._axes())

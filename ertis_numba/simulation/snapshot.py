@@ -52,15 +52,12 @@ class Transmitters:
 class Receivers:
     """Poses of the microphones of a sensor and of their mirror images in walls.
 
-    - ``positions_m`` (image, mic, axis)
+    - ``positions_m`` (image, mic, axis); ``sways_m_s``, ``walls`` and ``reflection`` are as for `Transmitters`,
+      starting at the microphones.
     - ``centre_m``, ``velocity_m_s`` (image, axis): centre of the microphones, and its velocity.
     - ``spin_rad_s`` (image, axis): angular velocity about the centre.
     - ``axes`` (image, 3, axis): the sensor's x, y and z as unit vectors. An odd number of reflections makes them
       left-handed.
-    - ``sways_m_s`` (wall, image, axis): velocity that the motion of each wall adds to the image, starting at the
-      microphones; 0 beyond an image's last wall.
-    - ``walls``: names of each image's walls in the order in which the sound meets them.
-    - ``reflection`` (image,): amplitude reflection factor of these walls.
     """
 
     positions_m: Floats
@@ -135,7 +132,6 @@ class Snapshot:
     - ``receiver``: the microphones, without mirror images.
     - ``transmitters``: emitters without mirror images, one per sensor of the scene.
     - ``token``: identity of the snapshot in the cache.
-    - ``cache``: intermediate results, which snapshots may share.
     """
 
     scene: Scene

@@ -29,8 +29,8 @@ _CALL_NODES = 17  # frequencies at which the response to a call is averaged
 class SourceInScene(Generic[Kind]):
     """Source of sound, as one sensor receives it under given effects.
 
-    Its sound travels directly and over walls. It moves with a constant velocity during a measurement. ``name`` is that
-    in the scene, such as ``tones[0]``; ``number`` counts the sources of its kind.
+    Its sound travels directly and over walls. It moves with a constant velocity during a measurement. Its ``name`` is
+    like ``tones[0]``; ``number`` counts the sources of its kind.
     """
 
     name: str

@@ -36,9 +36,8 @@ _MIN_RATIO, _MAX_RATIO = 0.25, 1.0  # Height of the sector relative to its width
 class Place:
     """Position of the sector in the picture.
 
-    - ``sensor_px`` (x, y): position of the sensor from the upper left corner of the picture; it may lie outside.
-    - ``scale_px_m``: pixels per metre.
-    - ``box_px`` (left, top, right, bottom): bounds of the sector.
+    ``sensor_px`` (x, y): position of the sensor from the upper left corner of the picture; it may lie outside.
+    ``box_px`` (left, top, right, bottom): bounds of the sector.
     """
 
     sensor_px: tuple[float, float]

@@ -37,10 +37,7 @@ class FusedPlan:
         self._polar: tuple[list[object], Polar] | None = None
 
     def __call__(self, several: Mapping[str, ReceivedImage[Energyscape]], choices: Choices) -> Sector:
-        """Return the image, in the frame of the platform.
-
-        All poses of ``several`` are known.
-        """
+        """Return the image, in the frame of the platform; all poses are known."""
         whole = self._image(several)
         made_for: list[object] = [whole, choices]
         if self._sector is None or self._sector[0] != made_for:

@@ -49,8 +49,6 @@ class ViewerPage:
     """Server of the page; choices made there go into a queue.
 
     - ``port``: 0 selects a free one.
-    - ``title``: name of the source.
-    - ``choices``: initial choices.
     - ``n_time_steps``: length of the time line; there is none by default.
     - ``shows_maps``: controls of acoustic maps instead of those of images.
     - ``is_seen``: True once a browser has connected.

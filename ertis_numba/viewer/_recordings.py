@@ -129,8 +129,7 @@ class Recordings:
     All times are from one clock. Time starts when the first frame is drawn.
 
     A separate thread builds and delivers a page, because this takes seconds for a long recording and would stop a live
-    view. ``serializer``: returns what viser keeps from now on. ``finished``: returns the function that completes a page
-    whose recording ends now.
+    view. ``serializer`` returns what viser keeps from now on, and ``finished`` the function that completes a page.
     """
 
     def __init__(

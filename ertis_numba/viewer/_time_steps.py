@@ -22,8 +22,7 @@ _TOGETHER_NS: Final = 10_000_000  # measurements of several sensors that are sho
 class TimeStep:
     """Measurements shown together: at most one per sensor.
 
-    ``measurements`` are (sensor, number). ``time_s``: time since the first time step. ``measurements`` tuple of
-    (sensor, number).
+    ``time_s`` counts from the first time step; ``measurements`` are (sensor, number).
     """
 
     time_s: float

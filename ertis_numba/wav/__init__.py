@@ -43,11 +43,7 @@ class WavFile:
 
 
 def read_wav(path: Path) -> WavFile:
-    """Return the content of a WAV, RF64, BW64 or big-endian RIFX file.
-
-    Raise DataError if the file is not WAV, has no samples, contains compressed samples, is truncated, or states lengths
-    of which none fits.
-    """
+    """Return the content of a WAV, RF64, BW64 or big-endian RIFX file."""
     content = _opened(path)
     chunks, form = read_chunks(content)
     view = content.view[chunks.start : chunks.start + chunks.n_bytes]

@@ -47,10 +47,7 @@ class Chunks:
 
 
 def read_chunks(content: Content) -> tuple[Chunks, Form]:
-    """Return the chunks of a WAV file, and the encoding of its samples.
-
-    Raise DataError if a chunk is missing, incomplete or in the file twice, or the samples are not PCM.
-    """
+    """Return the chunks of a WAV file, and the encoding of its samples."""
     chunks = Chunks()
     place: int | None = _FIRST
     last = (b"RIFF", 0)

@@ -109,7 +109,7 @@ def sample_bytes(content: Content, place: int, wide: int | None, frame_bytes: in
     """Return the length of the samples.
 
     The data chunk begins at byte ``place``; a ds64 chunk states its length as ``wide``. ``frame_bytes`` is 1 if
-    unknown. Raise DataError if the file is shorter than stated, or ends neither where it should nor where a chunk does.
+    unknown.
     """
     _, narrow = content.header(place)
     start = place + HEADER_BYTES

@@ -65,7 +65,6 @@ Place = Literal[
 class Effect:
     """Entry of an effect in the registry.
 
-    - ``summary``: description for the user.
     - ``example``: small scene that the effect changes at each of its places, as TOML.
     - ``places``: functions of the module that the rendering calls.
     - ``keys``: keys of a scene without which the effect applies to nothing; ``*`` stands for every key. Empty if the
