@@ -185,8 +185,8 @@ def run(
 ) -> None:
     """Run a central node until it is asked to end.
 
-    ``made`` lists new folders, as yielded by `ertis_cli._saving.withdrawn`; it is cleared once the node runs. Raise
-    ErtisError if the node cannot start.
+    ``made``, from `ertis_cli._saving.withdrawn`, is cleared once the node runs. Raise ErtisError if the node cannot
+    start.
     """
     with stopped_by_signals() as signals, ExitStack() as stack:
         stack.callback(watch.close)

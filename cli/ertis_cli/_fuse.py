@@ -41,7 +41,7 @@ def write_fused(
 
     ``paths`` are recordings of sensors of one platform, and ``target`` is an energyscape file. ``changed`` returns the
     settings to use from those of the recording. A file with the mountings of all sensors, and an emitter diameter,
-    replace those of the recordings. ``device`` has device, threads and plan, as for `options.pipeline`.
+    replace those of the recordings. ``device`` is as for `options.pipeline`.
     """
     from ertis_numba.fusion import PLATFORM, Fuser
     from ertis_numba.storage import EnergyscapeWriter, check_target

@@ -14,8 +14,8 @@ _CLOSED_S = 5.0
 class JsonLines:
     """Stream whose writer never waits for the reader, because a thread writes the texts in order.
 
-    If too many texts are waiting, new ones are dropped and counted. A stream without a file descriptor, as in tests, is
-    written directly. ``largest``: largest number of waiting texts; 65,536 by default.
+    At most ``largest`` texts wait; further ones are dropped and counted. A stream without a file descriptor, as in
+    tests, is written directly.
     """
 
     def __init__(self, stream: IO[str], *, largest: int = _MAX) -> None:

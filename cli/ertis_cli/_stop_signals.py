@@ -37,8 +37,7 @@ class Interruption:
     and sends the signal again otherwise.
 
     The handler raises nothing in Python's own code for imports, which would keep its locks, so that an import in
-    another thread would wait forever. The signal is sent again a moment later. ``asked``: a signal has requested the
-    command to end.
+    another thread would wait forever. The signal is sent again a moment later.
     """
 
     def __init__(self) -> None:

@@ -34,7 +34,6 @@ class Panel:
     - ``paint``: draws into axes and returns the raster that the colour bar explains, or None.
     - ``height``: returns the height of the axes from their width, both in points.
     - ``finish``: draws what depends on the final position of the axes.
-    - ``title_ems``: distance of the title from the axes.
     """
 
     paint: Callable[[Axes], AxesImage | None]

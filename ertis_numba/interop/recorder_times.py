@@ -29,9 +29,8 @@ def file_times(
 ) -> tuple[list[int], list[str]]:
     """Return the time of the first measurement of each file, in nanoseconds since 1970, and notes about the times.
 
-    ``files`` are in the order of their times. ``starts_ns`` are times of first measurements as given by the user: none,
-    that of the first file, or one per file. ``first_s`` are the times of the first measurements relative to the starts
-    of their files.
+    ``files`` are in the order of their times. ``starts_ns`` are given by the user: none, that of the first file, or one
+    per file. ``first_s`` are relative to the starts of the files.
     """
     if len(starts_ns) not in {0, 1, len(files)}:
         raise ArgumentError(

@@ -41,7 +41,6 @@ class Configuration:
     - ``matched_filter`` (mic, bin) complex64 or None: factors for the spectra of the signals, as `numpy.fft.rfft`
       returns them.
     - ``delays`` (direction, mic) int32 or None: delays in samples of the signals, at least 0.
-    - ``n_samples``: number of PDM words.
     - ``pdm_factor``, ``envelope_factor``: decimation of the PDM words to signals, and of the rectified beams to the
       image.
     - ``beamforming_drop``: number of samples at the end of signals without beams.

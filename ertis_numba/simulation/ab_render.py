@@ -48,8 +48,7 @@ class ABRender:
     def change_db(self, index: int, name: str, others: frozenset[str], effect: str) -> float | None:
         """Return the greatest change of a sensor's image by an effect, in decibels.
 
-        The result is None if the sensor's settings yield no image, for example because its range window is beyond the
-        end of its records. ``others`` are the other effects that are simulated.
+        The result is None if the sensor's settings yield no image. ``others`` are the other simulated effects.
         """
         sensor, both = self._scene.sensor(name), (others, others | {effect})
         try:

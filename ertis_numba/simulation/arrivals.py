@@ -86,9 +86,8 @@ class Arrivals:
 def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clock: CostStopwatch) -> list[Arrivals]:
     """Return all copies of calls that arrive at the microphones.
 
-    Delays are rounded to picoseconds. This is far finer than a measurement can resolve. It is coarse enough to hide the
-    last digits of sines and roots, which differ between processors. Filters are evaluated at ``frequency_hz``
-    (frequency,).
+    Delays are rounded to picoseconds, which hides the last digits of sines and roots. These differ between processors.
+    Filters are evaluated at ``frequency_hz`` (frequency,).
     """
     gain, _ = gains(shot, active, clock)
     found: list[Arrivals] = []
@@ -259,7 +258,7 @@ def arrived(
 ) -> Arrivals:
     """Return copies of the call of sensor ``number``, timed by the clock of the receiving sensor.
 
-    Copies that end before the record begins are left out. Clocks that differ can cause such copies.
+    Copies that end before the record begins are left out; clocks that differ can cause them.
 
     - ``delay_s`` (path, mic): delay of the sound.
     - ``amplitude`` (path, mic, frequency) float64 or complex128: amplitude, including the microphone's sensitivity.

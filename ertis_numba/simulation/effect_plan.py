@@ -39,8 +39,7 @@ class Verdict:
     - ``forced``: True if the scene overrides the estimate: by ``effects``, by a key that requests the effect, or by a
       tolerance of 0.
     - ``ab_rendered``: True if an A/B render measured the change, because the estimate was too close to the tolerance.
-    - ``coupled``: True if the decision about this effect depends on another effect and vice versa. Both are then on, to
-      be safe.
+    - ``coupled``: True if the decisions about this and another effect depend on each other. Both are then on.
     """
 
     name: str
@@ -84,10 +83,10 @@ def make_plan(scene: Scene) -> EffectPlan:
     filters of echoes, then additional sound. Estimation repeats, given all other effects, until no decision changes. An
     effect that changes the recorded sound of a source by more than the tolerance is on, even if no image shows it.
 
-    If an estimate is not certain enough, A/B renders measure the change. They render and process the measurements with
-    the greatest estimates, with and without the effect. They also use the loudest measurement, because estimates do not
-    model converters. Raise ArgumentError if a surface touches or encloses a microphone or an emitter, or the scene
-    exceeds a limit.
+    If an estimate is not certain enough, A/B renders measure the change. They process the measurements with the
+    greatest estimates with and without the effect. They also process the loudest one, because estimates do not model
+    converters. Raise ArgumentError if a surface touches or encloses a microphone or an emitter, or the scene exceeds a
+    limit.
     """
     indices = _indices(scene)
     cache = Cache()

@@ -44,8 +44,7 @@ _MODULATOR_DBFS, _MAX_NOISE_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}, -10
 class Sight:
     """Estimated image of one sensor at one time, with given effects.
 
-    ``frequency_hz``, ``power`` (frequency,): frequencies of the matched call, and the fraction of its power at each;
-    the powers add up to 1.
+    ``power`` has the fraction of the matched call's power at each ``frequency_hz``; both are (frequency,). It adds up to 1.
     """
 
     def __init__(self, shot: Snapshot, active: frozenset[str]) -> None:
@@ -270,8 +269,8 @@ class Sight:
     def near_field(self, amplitude: Floats, delay_s: Floats) -> tuple[Floats, Floats]:
         """Return the highest amplitude in any beam of a sound from within the array, after the image begins.
 
-        ``amplitude``, ``delay_s`` (mic,): amplitude and delay at each microphone. ``time_s``, ``level`` (time,): times
-        after the start of the record, and the highest amplitude at each.
+        ``amplitude`` and ``delay_s`` are (mic,). The result has times after the start of the record, and the highest
+        amplitude at each: both (time,).
         """
         begin_s = 2 * self.settings.processing.range_m[0] / self.shot.speed_m_s
         time_s = begin_s + np.linspace(0.0, self.settings.call.duration_s, _LAGS)

@@ -56,7 +56,7 @@ def frames_between(begin_s: float, end_s: float) -> range:
 def frame_of(noise: Noise, seed: tuple[int, ...], number: int) -> NoiseFrame:
     """Return a frame of a source's noise by its number.
 
-    It does not depend on the sensor, the measurement or the sample rate: all sensors receive the same noise.
+    It depends on neither sensor, measurement nor sample rate: all sensors receive the same noise.
     """
     return NoiseFrame(noise, (*seed, number + _EARLIEST))
 

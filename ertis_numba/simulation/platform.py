@@ -37,9 +37,8 @@ class MovingPose(NamedTuple):
     def at(self, offset_m: Floats, rotation: Floats) -> "MovingPose":
         """Return the pose of an object that is fixed to this one.
 
-        ``p' = p + R o`` and ``v' = v + ω × R o`` for an offset o. ``offset_m`` (axis,): position of the other object in
-        the frame of this one. ``rotation`` (3, 3): rotation from the frame of the other object to the frame of this
-        one.
+        ``p' = p + R o`` and ``v' = v + ω × R o`` for an offset o. ``offset_m`` (axis,) and ``rotation`` (3, 3) are the
+        pose of the object in the frame of this one.
         """
         arm_m = self.rotation @ offset_m
         return MovingPose(

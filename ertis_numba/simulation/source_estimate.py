@@ -24,8 +24,8 @@ def change_of_sources(name: str, shot: Snapshot, active: frozenset[str]) -> Esti
 
     The change is ``20 log10(1 + |after - before| / level)``, where the level is the higher of both. Amplitudes of paths
     are compared one by one; a delay that changes during the record turns their phases. Sound below the resolution of
-    recordings does not count. ``active`` are the other effects that are simulated. The result is None if the effect
-    changes the sound of no source.
+    recordings does not count. ``active`` are the other simulated effects. The result is None if the effect changes no
+    source.
     """
     scene = shot.scene
     if name not in _ON_SOURCES or scene.effects.get("interference") is False or not EFFECTS[name].may_apply(scene):

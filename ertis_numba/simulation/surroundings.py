@@ -54,8 +54,8 @@ def change_db(part: Floats, beside: Floats) -> float:
 def greatest(bounds: Floats, exact: Callable[[NDArray[np.intp]], Floats]) -> tuple[int, float]:
     """Return the index of the greatest of some numbers, and the number; 0 and 0 if none is positive.
 
-    Numbers are computed only while their upper bounds exceed the greatest number so far. ``bounds`` (path,): upper
-    bounds on the numbers. ``exact``: returns the numbers at some indices.
+    Numbers are computed only while their upper bounds exceed the greatest number so far. ``bounds`` are (path,);
+    ``exact`` returns the numbers at some indices.
     """
     order = np.argsort(-bounds, kind="stable")
     bounds = bounds[order] * _ROUNDED

@@ -65,17 +65,6 @@ def signals(
 
     The remainder of a call that extends beyond its block is added to the next blocks. Yielded arrays are reused, and
     they may extend beyond the `BLOCK` samples of the block.
-
-    Parameters
-    ----------
-    arrived : sequence of Arrivals
-    n_samples : int
-        Length of the record.
-    rate_hz : float
-        Sample rate of the record.
-    n_mics, threads : int
-    clock : CostStopwatch
-        Accumulates the time spent on each effect.
     """
     delay_samples = [entry.delay_s * rate_hz for entry in arrived]
     # Sound that begins before the record wraps to the end of the first transform, which is never read.

@@ -42,7 +42,7 @@ class ResultNotes:
     def of(self, item: Energyscape | AcousticMap, band_note: str | None = None) -> Iterator[str]:
         """Yield the new notes on an image or a map.
 
-        ``band_note`` is on sound that the bands of the map do not show.
+        ``band_note`` is on sound outside of the bands of the map.
         """
         sensor = item.stamp.sensor
         if band_note and sensor not in self._with_band_note:

@@ -23,7 +23,7 @@ _NONE: Final = "–"
 class FrameCounts:
     """Counts of frames.
 
-    ``latency_s`` is the time from the emission to the display; ``shown`` counts frames with a new image.
+    ``latency_s`` is from the emission to the display; ``shown`` counts frames with a new image.
     """
 
     def __init__(self) -> None:

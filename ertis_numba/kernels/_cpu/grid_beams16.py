@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""BeamErrors at beam-grid points in 16 bits, stored as pairs of neighbours for the CPU's 16-bit dot product."""
+"""Beams at beam-grid points in 16 bits, stored as pairs of neighbours for the CPU's 16-bit dot product."""
 
 import numpy as np
 from llvmlite import ir

@@ -1,4 +1,4 @@
-"""BeamErrors on a coarse grid by delay-and-sum, interpolated to all directions, in single precision.
+"""Beams on a coarse grid by delay-and-sum, interpolated to all directions, in single precision.
 
 The grid beams of a tile stay in the L2 cache between the two steps.
 """

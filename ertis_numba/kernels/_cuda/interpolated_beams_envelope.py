@@ -1,4 +1,4 @@
-"""BeamErrors on a coarse grid by delay-and-sum, interpolated to all directions, in single precision."""
+"""Beams on a coarse grid by delay-and-sum, interpolated to all directions, in single precision."""
 
 import numpy as np
 from numba import cuda

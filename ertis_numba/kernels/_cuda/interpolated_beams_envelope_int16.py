@@ -1,4 +1,4 @@
-"""BeamErrors on a coarse grid by delay-and-sum, interpolated to all directions, on 16-bit samples."""
+"""Beams on a coarse grid by delay-and-sum, interpolated to all directions, on 16-bit samples."""
 
 import numpy as np
 from numba import cuda

@@ -21,8 +21,8 @@ def clock_times(shot: Snapshot, number: int, delay_s: Floats, stretch: Floats | 
     Both clocks start with the SYNC, a time T before the measurement. A clock with drift d counts ``(1 + d)`` seconds
     per second. An emitter with drift e emits when its own clock reads T. The call arrives
     ``T (d - e) / (1 + e) + (1 + d) τ`` after the receiver's clock reads T, and lasts ``(1 + d) / (1 + e)`` times as
-    long. A sensor therefore measures each delay of its own echoes as ``(1 + d)`` times the true delay. ``delay_s``
-    (path, mic). ``stretch`` (path, mic) or None.
+    long. A sensor therefore measures each delay of its own echoes as ``(1 + d)`` times the true delay. Arguments
+    and results are (path, mic).
     """
     sensors = shot.sensor, shot.scene.sensors[number]
     listener, emitter = (1e-6 * sensor.electronics.clock_drift_ppm for sensor in sensors)

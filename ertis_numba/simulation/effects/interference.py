@@ -39,7 +39,7 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, fou
 def frames(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats) -> list[Arrivals]:
     """Return the frames of all noises that arrive during the record.
 
-    A frame travels like a call, with the velocities at its centre. All sensors receive the same frames.
+    A frame travels like a call, with the velocities at its centre.
     """
     found = []
     for noise in sources_of(shot, active, Noise):
