@@ -44,7 +44,7 @@ _MODULATOR_DBFS, _MAX_NOISE_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}, -10
 class Sight:
     """Estimated image of one sensor at one time, with given effects.
 
-    ``power`` has the fraction of the matched call's power at each ``frequency_hz``; both are (frequency,). It adds up to 1.
+    ``power`` has the fraction of the matched call's power at each ``frequency_hz``: both (frequency,), the sum is 1.
     """
 
     def __init__(self, shot: Snapshot, active: frozenset[str]) -> None:
