@@ -30,9 +30,9 @@ def examine(
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the examination of a sensor's plan for JSON: ``plan``, then ``verified``.
 
-    ``first`` is the measurement with which the plan is examined; all ``threads`` are used by default. ``explain``
-    yields the plan with its predicted error and time; ``verify`` yields the true error of the image of ``first``.
-    Raises DataError if the true error exceeds the budget, after it is yielded.
+    ``first`` is the measurement to use; all ``threads`` are used by default. ``explain`` yields the plan with its
+    predicted error and time; ``verify`` yields the true error of the image of ``first``. Raises DataError if the true
+    error exceeds the budget, after it is yielded.
     """
     settings = pipeline.settings
     if settings.processing.method == "paper":

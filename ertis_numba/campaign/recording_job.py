@@ -149,23 +149,7 @@ def check_recording(
 ) -> dict[str, Any]:
     """Check every sensor of a recording as `prepare_recording` does, and return the results about plans; write nothing.
 
-    Parameters
-    ----------
-    path : Path
-        Recording.
-    options : CampaignOptions
-        Options for processing.
-    settings : mapping of str to Settings
-        Settings with which its energyscapes were made, by sensor.
-    pipelines, warn : callable
-        Source of pipelines, and receiver of warnings, as for `prepare_recording`.
-
-    Raises
-    ------
-    DataError
-        As for `prepare_recording`.
-    ErtisError
-        The recording is invalid.
+    ``settings`` are those with which its energyscapes were made, by sensor.
     """
     with ExitStack() as stack:
         recordings = [

@@ -106,9 +106,9 @@ class TriggerClock:
 class SensorReader(threading.Thread):
     """Thread that receives the blocks of one sensor, and reconnects after it was unplugged.
 
-    Nothing else may use the sensor meanwhile. The driver is configured, and armed if pulses trigger it. ``pace`` has
-    the times of commands; None with SYNC pulses. ``patience_s`` is the timeout for a silent or unplugged sensor. While
-    the queue of all ``events`` is full, the sensor waits.
+    Nothing else may use the sensor meanwhile. The driver is configured, and armed with SYNC pulses, which need no
+    ``pace``. ``patience_s`` is the timeout for a silent or unplugged sensor. While ``events`` is full, the sensor
+    waits.
     """
 
     def __init__(

@@ -70,12 +70,12 @@ class CaptureSession:
     ``sonars`` are configured drivers by their names in the recording; active ones are armed in this order. ``trigger``
     is ``command`` for commands of this computer, or ``sync`` for pulses of the SYNC chain. ``n`` is the number of
     measurements of each sensor, or of pulses; like ``duration_s``, it is unlimited by default. ``patience_s`` is the
-    timeout for a silent or unplugged sensor. ``mounting`` has (translation_m, rotation_xyzw) by sensor, as in
-    `ertis_numba.journal.Journal.add_sensor`; unknown by default. ``session_id`` is random by default. ``on_stored`` is
-    called with the entries of each commit, once they are durable; ``on_note`` with a sensor's name and a message about
-    it; ``on_back`` with its name and the seconds that it was unplugged; ``on_tick`` about ten times a second.
-    ``configure`` configures the driver of a named sensor with new settings, and is required by `change`. ``complete``
-    and ``incomplete`` count the pulses with measurements of all sensors, and of some sensors only.
+    timeout for a silent or unplugged sensor. ``mounting`` has (translation_m, rotation_xyzw) by sensor; unknown by
+    default. ``session_id`` is random by default. ``on_stored`` gets the entries of each commit, once they are durable;
+    ``on_note`` a sensor's name and a message about it; ``on_back`` its name and the seconds that it was unplugged.
+    ``on_tick`` is called about ten times a second. `change` requires ``configure``, which configures the driver of a
+    named sensor. ``complete`` and ``incomplete`` count the pulses with measurements of all sensors, and of some sensors
+    only.
     """
 
     def __init__(  # noqa: PLR0913  trigger, limits and callbacks

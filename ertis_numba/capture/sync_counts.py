@@ -38,9 +38,9 @@ class PulseAligner(Generic[Item]):
     microseconds, and pulses are at least 50 ms apart. A block may arrive late, so the majority of three blocks decides.
     The offset then stays, until the times of five successive blocks contradict it.
 
-    ``sensors`` are in the order in which they are armed: the first receives every pulse that any other receives.
-    ``shortest_s`` is the minimum interval between pulses. ``realigned`` counts changed offsets. ``interval_ns`` is the
-    interval between pulses; the minimum while it is unknown.
+    The first of ``sensors`` is armed first, and receives every pulse that any other receives. ``shortest_s`` is the
+    minimum interval between pulses. ``realigned`` counts changed offsets. ``interval_ns`` is the interval between
+    pulses; the minimum while it is unknown.
     """
 
     def __init__(self, sensors: list[str], *, shortest_s: float) -> None:

@@ -43,9 +43,9 @@ class BitCheck:
 
     At the slower clock of 1.125 MHz, neither splices nor stretches of noise can be distinguished from sound.
     ``enabled``, (channel,), is true for channels with a microphone; all by default. ``splices`` also detects nearly all
-    missing and misplaced words; false alarms were tested with simulated sensors and with the only public measurement of
-    a real one. ``density``, (channel,), is the share of ones in the last checked block; 0 or 1 is a stuck microphone,
-    which is no reason for rejection.
+    missing and misplaced words; false alarms were tested with simulated sensors and the only public measurement.
+    ``density``, (channel,), is the share of ones in the last checked block; 0 or 1 is a stuck microphone, which is no
+    reason for rejection.
     """
 
     def __init__(

@@ -23,13 +23,13 @@ class BlockParser:
     """Parser of blocks in a stream of bytes, for any division into pieces: framing only.
 
     A block is header, counter, words, footer. After a header without a footer, the parser searches again directly
-    behind that header, so that damage costs only its own block. Two damaged blocks may have the correct length together
-    by chance; the header of the second one reveals this, because it arrived later and its number is still to come.
+    behind that header, so that damage costs only its own block. Two damaged blocks may have the correct length
+    together; the later arrival of the second header reveals this.
 
     ``bytes fed = n_bytes · blocks returned + rejected.total() + pending`` at any time. Bytes that come ``apart_s``
     after the first byte of a block may belong to another one; never by default. ``n_bytes`` is the size of a whole
     block. ``rejected`` counts bytes by reason (``no header``, ``footer``, ``cut short``), each once, with the header
-    that led to it; ``rejected_blocks`` counts headers by the reason for which no block was found behind them.
+    that led to it; ``rejected_blocks`` counts headers without a block.
     """
 
     def __init__(self, n_samples: int, *, apart_s: float = math.inf) -> None:
@@ -161,9 +161,8 @@ class BlockReceiver:
     ``bytes fed = n_bytes · (blocks returned + held) + rejected.total() + pending`` at any time. ``n_samples`` counts
     the words of a block. The first block has the number ``expected`` or the one after; any by default. ``shortest_s``
     is the minimum time between measurements. ``bits`` returns the reason why words, (sample,) uint32, cannot come from
-    microphones, or None. ``on_words`` is called with words of an incomplete block as they arrive, after the number of
-    the first of them, which is 0 for a new block. The last words of a block are left out, and the block may still be
-    rejected. `feed` raises its exceptions, which lose no block.
+    microphones, or None. ``on_words`` gets words of an incomplete block as they arrive, except the last, and the number
+    of the first, 0 for a new block; the block may still be rejected. `feed` raises its exceptions, which lose no block.
     """
 
     def __init__(

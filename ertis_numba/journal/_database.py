@@ -145,9 +145,9 @@ class Database:
     def use_rollback_journal(self) -> None:
         """Switch to a rollback journal permanently, so that commits write to the main file at once.
 
-        Until then, a commit writes to the log with one sync, and a full log is moved to the main file. If each commit
-        fills the log, all data is written twice. A rollback journal stores only the old content of changed pages. New
-        rows use new pages without old content. A commit then needs four syncs. After a DataError, nothing has changed.
+        Until then, a commit needs one sync, and a full log is moved to the main file: if each commit fills it, all data
+        is written twice. A rollback journal stores only the old content of changed pages, of which new rows have none,
+        but a commit needs four syncs. After a DataError, nothing has changed.
         """
         if not self._uses_rollback_journal:
             self._set_rollback_mode("DELETE")

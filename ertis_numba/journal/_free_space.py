@@ -29,8 +29,8 @@ def require_free_space(path: Path, target: Path, *, sizes_bytes: Sequence[int], 
 
     The disk of ``target`` needs space for the recording of the whole journal, and a reserve. The disk of the journal
     needs space to move the log to the main file, and for the new content in both; without a log, for the new content
-    and the changed pages. ``sizes_bytes`` has the size of each new measurement, or of all new poses; ``seals_bytes`` is
-    the size of the recording with the new content.
+    and the changed pages. ``sizes_bytes`` are those of each new measurement, or of all new poses; ``seals_bytes`` is
+    that of the recording with them.
     """
     log = path.with_name(f"{path.name}-wal")
     grows_bytes = sum((size // PAGE_BYTES + 2) * PAGE_BYTES for size in sizes_bytes)

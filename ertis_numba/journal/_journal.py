@@ -107,11 +107,10 @@ class Journal(WritableJournal):
     def abandon(path: str | Path, acked: Mapping[tuple[str, int], int]) -> None:
         """Limit a closed journal durably to its acknowledged measurements.
 
-        After a failed sync, a journal may show rows that never reach the disk. Close the journal, abandon it, and store
-        the rows that were not acknowledged in another journal. The next process that opens this journal deletes those
-        rows first, so that none is stored twice. A journal without acknowledged measurements is removed. ``acked`` has
-        the highest acknowledged number of each (sensor, session_id) that has one. After an OSError or DataError, call
-        this again.
+        After a failed sync, a journal may show rows that never reach the disk. Store those that were not acknowledged
+        in another journal: the next process that opens this one deletes them first. A journal without acknowledged
+        measurements is removed. ``acked`` has the highest acknowledged number of each (sensor, session_id) that has
+        one. After an OSError or DataError, call this again.
         """
         path = Path(path)
         if acked:

@@ -89,9 +89,9 @@ def read_poses(database: Database, path: Path, *, after: int = 0) -> tuple[list[
 def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Trajectory:
     """Return the trajectory through poses; of several poses at one time, the first counts.
 
-    The covariance is None if that of any pose is unknown. The source lists the sources of the poses. ``poses`` are
-    those of one platform in any order, at least one; ``max_gap_s`` is the longest interval of the trajectory between
-    poses. Raises ArgumentError or ValueError for an impossible pose.
+    The covariance is None if that of any pose is unknown. The source lists the sources of the poses. ``poses`` of one
+    platform are in any order, at least one; ``max_gap_s`` is the longest interval of the trajectory between poses.
+    Raises ArgumentError or ValueError for an impossible pose.
     """
     time_ns, first = np.unique([pose.timestamp_ns for pose in poses], return_index=True)
     kept = [poses[index] for index in first]

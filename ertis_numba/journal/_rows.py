@@ -142,9 +142,9 @@ class WritableJournal(ReadableJournal):
     def discard(self, sensor: str, session_id: int, up_to: int) -> int:
         """Delete measurements of a sensor's session that another node has stored, and gaps; durably, all or none.
 
-        After the first call, row numbers have holes, because rows of several sensors are interleaved. The journal then
-        has version `VERSION`, and readers count rows instead. ``up_to`` is the last sequence number to delete; a gap
-        that extends beyond it is kept unchanged. Returns the number of deleted measurements.
+        As rows of several sensors are interleaved, row numbers then have holes; the journal has version `VERSION`, and
+        readers count rows. ``up_to`` is the last sequence number to delete; a gap that extends beyond it is kept
+        unchanged. Returns the number of deleted measurements.
         """
         known = self._sensor(sensor)
         which = self._ids[known.name], session_id, up_to

@@ -133,8 +133,8 @@ def seal_in_subprocess(
 ) -> SealingResult:
     """Make the recording of a journal in a separate process; see `ertis_numba.storage.sealing.seal`.
 
-    Ctrl-C in a terminal does not reach that process. However it ends, the measurements are in the journal or in the
-    recording, and sealing can be repeated.
+    Ctrl-C does not reach that process. However it ends, the measurements are in the journal or in the recording, and
+    sealing can be repeated.
 
     With ``rests``, the process runs at low priority, and pauses after each step for this multiple of its duration.
     ``progress`` is called about a hundred times. Raises also OSError if no process can be started, and

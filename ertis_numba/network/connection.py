@@ -18,13 +18,12 @@ _READ_OR_WRITE: Final = zmq.POLLIN | zmq.POLLOUT
 class Connection:
     """Socket of a client with its monitor: sends, receives, pings, and reports refusals. One thread uses it.
 
-    ZeroMQ connects and reconnects in the background. A client that has been refused, or hears nothing, closes its
-    connection and makes a new one.
+    ZeroMQ reconnects in the background. A client that has been refused, or hears nothing, makes a new connection.
 
-    Without ``keys``, it connects on loopback only. ``max_bytes`` limits a frame. ``sent_s`` is the time of the first
-    message sent, which requires a peer; None before. ``heard_s`` is the time of the last valid message; its reader sets
-    it. ``is_blocked`` is true if there was no room for a message; `wait` ends when there is room again. Raises
-    NetworkError if the address can never be connected to.
+    Without ``keys``, it connects on loopback only. ``max_bytes`` limits a frame. ``sent_s`` is that of the first
+    message sent, which requires a peer. The reader of valid messages sets ``heard_s``. If there was no room for a
+    message, it ``is_blocked``, and `wait` ends when there is room. Raises NetworkError if the address can never be
+    connected to.
     """
 
     def __init__(

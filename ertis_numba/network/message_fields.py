@@ -51,8 +51,8 @@ def as_line(text: str) -> str:
 class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower):
     """Header of a message. Its class declares the message once: tables, checks of roles and handlers derive from it.
 
-    ``routes`` are (sender, receiver): nodes that send and receive the message. ``payload`` describes its payload
-    frames, for the documentation, and ``product`` is what the message brings to applications; both may be empty.
+    ``routes`` are (sender, receiver). ``payload`` describes its payload frames, for the documentation, and ``product``
+    is what it brings to applications.
     """
 
     routes: ClassVar[tuple[tuple[Party, Party], ...]] = ()
@@ -74,8 +74,8 @@ class OfMeasurement(Message, frozen=True, kw_only=True):
     """Header fields of a message about a measurement.
 
     ``sensor``, ``session_id``, ``sequence``, ``sync_count`` and ``behaviour`` are as in `ertis_numba.frames.Stamp`. The
-    emission starts at ``timestamp_ns`` with ``uncertainty_ns``, since 1970-01-01 UTC by the sensor node's clock.
-    ``monotonic_ns`` is the complete arrival at the sensor node, by its monotonic clock.
+    emission starts at ``timestamp_ns`` ± ``uncertainty_ns`` since 1970-01-01 UTC, by the sensor node's clock; by its
+    monotonic clock, the measurement has arrived completely at ``monotonic_ns``.
     """
 
     sensor: Name

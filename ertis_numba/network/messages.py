@@ -180,10 +180,9 @@ class Ack(Message, frozen=True, kw_only=True):
 class PlatformPose(Message, frozen=True, kw_only=True):
     """Pose of a platform at a time, to be stored with the measurements of its sensors.
 
-    The key must be allowed to send for each of ``sensors``, those on the platform. ``session_id`` is that of the
-    sender, which remains when it connects again. ``timestamp_ns`` counts from 1970-01-01 UTC. ``position_m`` and
-    ``rotation_xyzw`` are as in `ertis_numba.frames.Trajectory`. ``covariance`` has the rows of its covariance; None if
-    it is unknown.
+    The key must be allowed to send for all ``sensors`` on the platform. The sender keeps ``session_id`` when it
+    connects again. ``timestamp_ns`` counts from 1970-01-01 UTC. ``position_m`` and ``rotation_xyzw`` are as in
+    `ertis_numba.frames.Trajectory`. ``covariance`` has the rows of its covariance; None if it is unknown.
     """
 
     routes = (("sensor", "central"),)

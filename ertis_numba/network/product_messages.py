@@ -112,10 +112,10 @@ class Raw(_Product, frozen=True, kw_only=True):
 class Group(Message, frozen=True, kw_only=True):
     """Simultaneous measurements, once all have arrived or no more are expected.
 
-    ``group`` is the pulse of the SYNC chain, as all sensors count it. ``members`` are the measurements that have
-    arrived, as (sensor, session_id, sequence), and ``missing`` the sensors without one. ``spread_ns`` is the time
-    between the first and the last timestamp. ``flags`` are faults: ``incomplete``, sensors are missing; ``clock``,
-    timestamps disagree although counters agree; ``pulse``, a sensor has lost a pulse or seen one twice.
+    ``group`` is the pulse of the SYNC chain, as all sensors count it. ``members`` are (sensor, session_id, sequence),
+    and ``missing`` sensors. ``spread_ns`` is the time between the first and the last timestamp. ``flags`` are faults:
+    ``incomplete``, sensors are missing; ``clock``, timestamps disagree although counters agree; ``pulse``, a sensor has
+    lost a pulse or seen one twice.
     """
 
     routes = (("publisher", "application"),)

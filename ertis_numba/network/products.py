@@ -34,11 +34,9 @@ _COLUMNS = 4  # Columns of a point: x, y, z and amplitude.
 class Arrival:
     """A received product.
 
-    ``item`` is an Energyscape, PointCloud, Measurement, Group or Status, and ``header`` its message in
-    `ertis_numba.network.messages`. ``arrived_ns`` is the complete arrival by the monotonic clock (`time.monotonic_ns`),
-    which a sensor node on this machine also uses for ``header.monotonic_ns``; ``arrived_utc_ns`` is the same by the
-    system clock. ``connection`` is the number of the connection; product numbers count from 0 in each. The mounting of
-    the sensor on its platform is None if unknown.
+    ``arrived_ns`` is the complete arrival by the monotonic clock (`time.monotonic_ns`), which a sensor node on this
+    machine also uses for ``header.monotonic_ns``; ``arrived_utc_ns`` is by the system clock. Product numbers count from
+    0 in each ``connection``. The mounting of the sensor on its platform is None if unknown.
     """
 
     item: Item

@@ -75,10 +75,9 @@ def server(
 ) -> "zmq.Socket[bytes]":
     """Return a ROUTER that listens.
 
-    With keys, its context needs a `ertis_numba.network.zap_authenticator.ZapAuthenticator` made before. Without
-    ``keys``, it listens on loopback only. ``max_bytes``, the longest frame, also bounds the memory that an
-    unauthenticated peer can occupy, so set no more than necessary. Users set the address by ``option``. Raises
-    NetworkError if another program uses it.
+    With keys, its context needs a `ZapAuthenticator` made before. Without ``keys``, it listens on loopback only.
+    ``max_bytes``, the longest frame, also bounds the memory that an unauthenticated peer can occupy, so set no more
+    than necessary. Users set the address by ``option``. Raises NetworkError if another program uses it.
     """
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)

@@ -42,9 +42,8 @@ _AUTH: Final = int(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
 class ZapAuthenticator:
     """Handler that accepts listed keys and identifies the sender of a message.
 
-    Without ``keys``, every peer has all permissions. Poll ``socket``. ``refused`` counts connections and messages by
-    reason; callers add refused messages. ``note`` is the error of the allow list, which keeps all nodes out; empty if
-    there is none.
+    Without ``keys``, every peer has all permissions. ``refused`` counts connections by reason, to which callers add
+    messages. ``note`` is the error of the allow list, which keeps all nodes out.
 
     ::
 

@@ -32,8 +32,7 @@ class Child(Generic[Kind]):
     It is a new interpreter rather than a fork, which OpenMP, HDF5 and ZeroMQ would not survive. Unlike a process of
     `multiprocessing`, it does not import the main program. It has a session of its own, so that Ctrl-C in a terminal
     does not reach it. The module calls `connect`, and sends messages of ``kinds``. ``environment`` has additional
-    variables. ``keep_stderr`` keeps the last line of its stderr for `wait`, instead of sharing the stderr of this
-    process.
+    variables. ``keep_stderr`` keeps the last line of its stderr for `wait`, instead of sharing that of this process.
     """
 
     def __init__(

@@ -49,11 +49,10 @@ class PlacedTruth:
     Its reflectors are those that the image of a sensor can show at the place of the reflector: echoes of its own call
     over a single surface. Those of several sensors are merged.
 
-    ``readers`` are the recordings or images of all sensors. ``mountings``, (translation_m, rotation_xyzw) by sensor,
-    define the frame of the platform. ``trajectory`` has the poses of the platform in the frame of a map; none for fused
-    images. If they are not those of the scene, such as poses of an odometry that begins at the origin, the scene is
-    moved to fit them best. ``missing`` is the reason why there is none. ``is_partial`` is true if it is missing
-    although some recordings are simulated.
+    ``mountings``, (translation_m, rotation_xyzw) by sensor, define the frame of the platform. ``trajectory`` has the
+    poses of the platform in the frame of a map; none for fused images. If they are not those of the scene, such as
+    poses of an odometry that begins at the origin, the scene is moved to fit them best. ``missing`` is the reason why
+    there is no ground truth; ``is_partial`` is then true if some recordings are simulated.
     """
 
     def __init__(

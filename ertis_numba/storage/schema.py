@@ -66,10 +66,9 @@ _UNLIMITED: Final = ("time", "gap")
 class Variable:
     """Array of a file.
 
-    ``dims`` are its axes; a variable with the name of its only axis is the coordinate of that axis. ``dtype`` is a
-    NumPy type, ``str`` for text, or empty if the settings determine it. ``description`` is stored as the attribute
-    ``long_name``. ``units`` are in the notation of UDUNITS; empty for numbers without a unit. ``optional`` is true if
-    older files lack it.
+    A variable with the name of its only axis, in ``dims``, is its coordinate. ``dtype`` is a NumPy type, ``str`` for
+    text, or empty if the settings determine it. ``description`` is stored as the attribute ``long_name``. ``units`` are
+    in the notation of UDUNITS; empty for numbers without a unit. ``optional`` is true if older files lack it.
     """
 
     name: str
@@ -319,8 +318,8 @@ def create_variables(
     """Create the variables of ``table`` in ``group``, with a named scale for each axis.
 
     ``sizes`` has the length of each axis. An axis without a length is omitted, unless it grows with the file. If the
-    rows along time are samples or images, each row is a chunk. Axes that the group has are used. ``dtypes`` by name of
-    the variable replace those in the table, and ``texts`` has the content of the text variables, by name.
+    rows along time are samples or images, each row is a chunk. Existing axes are used. ``dtypes`` and ``texts``, by
+    variable, replace types of the table and fill text variables.
     """
     scales: dict[str, h5py.Dataset] = {}
     variables = [(variable, _dims(variable, sizes)) for variable in table]

@@ -57,9 +57,9 @@ Progress = Callable[[int, int], None]
 def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lambda _done, _of: None) -> SealingResult:
     """Make the recording of a journal, verify and sync it, and then remove the journal.
 
-    Measurements damaged in the journal become gaps of the recording, and the journal is kept under another name. The
-    journal is also kept if poses in it are damaged, or if a recording cannot contain one of its sensors; the other
-    sensors are sealed. Measurements that were sealed before are not written again.
+    Measurements damaged in the journal become gaps of the recording, and the journal is kept under another name, also
+    if poses in it are damaged, or if a recording cannot contain one of its sensors; the others are sealed. Measurements
+    that were sealed before are not written again.
 
     ``overwrite`` replaces an existing file, even if it has other content. ``progress`` is called with the number of
     written measurements and of all. Raises JournalInUseError if another process has the journal open; or DataError if

@@ -99,7 +99,7 @@ class GroundTruthLog:
 
     ``scene`` is TOML. ``left_out`` are effects that were not simulated although they change the image slightly.
     ``folder`` is that of the temporary file, by default that of the system; the file has no name, and is removed with
-    the process. ``sources`` are sources of sound during the first measurement.
+    the process. ``sources`` are those during the first measurement.
     """
 
     def __init__(self, scene: str, seed: int, *, left_out: tuple[str, ...] = (), folder: Path | None = None) -> None:

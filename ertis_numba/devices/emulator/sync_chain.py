@@ -19,12 +19,12 @@ class SyncChain:
     """Trigger of emulated devices at a steady rate; use it in a ``with`` statement, or `start` it.
 
     Deadlines are absolute, so the rate does not drift; a pulse that would be too late for the next is skipped. Each
-    device gets a pulse `SYNC_STEP_S` after the previous device. This only matters in its own timestamps, because the
-    step is far below the resolution here. Samples from a scene contain it already.
+    device has its pulse `SYNC_STEP_S` after the previous one, but only in its timestamps: the step is far below the
+    resolution here, and samples from a scene contain it already.
 
     Pulses are numbered from the first that a device accepted. All devices send the samples of the same number.
-    ``devices`` are in the order of the chain. ``before`` is called with the number of each pulse before the pulse; if
-    it takes longer than a period, the pulses meanwhile are left out. ``pulses`` counts those that some device took.
+    ``devices`` are in the order of the chain. ``before`` is called before each pulse with its number, and pulses
+    meanwhile are left out. Some device took ``pulses`` of them.
     """
 
     def __init__(

@@ -43,9 +43,9 @@ _STUCK_S: Final = 5.0
 class Archive:
     """Storage of measurements in journals, which become recordings.
 
-    Only one archive can use ``folder`` at a time; it is created if it is missing. ``name`` is the prefix of recording
-    names, before the time. A recording is full after ``rotate_bytes`` of data and poses, or after ``rotate_s``. Without
-    ``seal``, journals are left to ``ertis recover``.
+    Only one archive can use ``folder`` at a time. ``name`` is the prefix of recording names, before the time. A
+    recording is full after ``rotate_bytes`` of data and poses, or after ``rotate_s``. Without ``seal``, journals are
+    left to ``ertis recover``.
     """
 
     def __init__(

@@ -83,13 +83,12 @@ class _Old(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 class Ledger:
     """Durable record of the highest acknowledged number of each session of a folder.
 
-    The file has a line for each entry: its CRC-32 in hexadecimal, and the entry as a JSON array. The reader omits
-    entries with a wrong CRC-32. The file keeps only the newest 64 sessions of each sensor.
+    Each line has the CRC-32 of an entry in hexadecimal, and the entry as a JSON array; wrong ones are omitted. The file
+    keeps the newest 64 sessions of each sensor.
 
-    ``is_new`` is true if the file did not exist; ``damage`` describes omitted entries and the consequence. In
-    ``acked_through``, the session that grew last comes last. ``open`` and ``unsealed`` are names of journals that may
-    contain more than ``acked_through``, and of those to seal. ``gaps`` are missing numbers that no recording contains
-    yet. ``tails`` has the CRC-32 of the newest measurements of sessions, by number.
+    ``damage`` describes omitted entries and the consequence. In ``acked_through``, the session that grew last comes
+    last. ``open`` journals may contain more; ``unsealed`` ones are to be sealed. ``gaps`` are in no recording yet.
+    ``tails`` has the CRC-32 of the newest measurements, by number.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -176,21 +175,9 @@ class Ledger:
         gaps: Sequence[SequenceGap] = (),
         tails: Mapping[SensorSession, Mapping[int, int]] | None = None,
     ) -> None:
-        """Replace the content of the file durably.
+        """Replace the content of the file durably; after an OSError or DataError, the old content stays.
 
-        Parameters
-        ----------
-        acked_through : mapping of SensorSession to int
-            The session that grew last comes last. Only the newest sessions of each sensor are kept.
-        open_, unsealed : iterable of str
-        gaps : sequence of SequenceGap
-        tails : mapping of SensorSession to dict of int to int, optional
-            CRC-32 of the newest measurements of each session.
-
-        Raises
-        ------
-        OSError, DataError
-            The file cannot be written; the old content stays.
+        The session that grew last comes last in ``acked_through``; only the newest sessions of each sensor are kept.
         """
         kept = _newest(acked_through)
         opened, left = list(open_), list(unsealed)

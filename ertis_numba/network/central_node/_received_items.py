@@ -34,10 +34,10 @@ class SensorSession(NamedTuple):
 class ReceivedItem:
     """Item to store.
 
-    ``first`` to ``last`` are the numbers acknowledged once it is stored, and ``source`` is the sensor for the journal.
-    The peer ``owner`` sent it; ``arrived_s`` is by `time.monotonic`. ``turn``, the number of the transmission, rises if
-    a session has to be sent again, which invalidates earlier items. ``again`` is true if the number was acknowledged
-    before: the item is stored only if the measurement differs. ``done`` is true once its result was reported.
+    ``first`` to ``last`` are acknowledged once it is stored. The peer ``owner`` sent it; ``arrived_s`` is by
+    `time.monotonic`. ``turn``, the number of the transmission, rises if a session has to be sent again, which
+    invalidates earlier items. ``again`` is true if the number was acknowledged before: the item is stored only if the
+    measurement differs. ``done`` is true once its result was reported.
     """
 
     run: SensorSession

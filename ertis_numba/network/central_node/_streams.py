@@ -138,10 +138,9 @@ class Stream:
     """A greeted session.
 
     Everything is acknowledged up to ``acked_through``, and will be up to ``taken`` once the waiting items are stored.
-    ``begins`` is the oldest number that the node has, and ``owner`` the peer that sent the latest hello. Measurements
-    up to ``shown`` were counted and shown; repeated ones are not shown again. ``turn`` is the number of the current
-    transmission; see `ReceivedItem`. ``dropped`` has the latest (sequence, reason) discarded by processing and not yet
-    reported to the node.
+    ``begins`` is the oldest number that the node has; the peer ``owner`` sent the latest hello. Measurements up to
+    ``shown`` were counted and shown. ``turn`` is as in `ReceivedItem`. ``dropped`` has the latest (sequence, reason)
+    discarded by processing and not yet reported to the node.
     """
 
     run: SensorSession

@@ -48,9 +48,9 @@ def sessions_in(journal: Journal) -> dict[SensorSession, int]:
 class Volume:
     """Journal in use, owned by this object.
 
-    ``acked`` has the highest number of each session that `append` or `note_gaps` has stored. ``n_bytes`` counts data
-    and poses in it. ``begun_s`` is the time of opening, by `time.monotonic`. ``next_pose`` is the first number of
-    `RecentPoses` that it lacks; 0 before any. ``posed`` are the sensors of which it has the poses before `next_pose`.
+    ``acked`` has the highest stored number of each session. ``n_bytes`` counts data and poses. ``begun_s`` is by
+    `time.monotonic`. ``next_pose`` is the first number of `RecentPoses` that it lacks; it has the earlier poses of the
+    sensors ``posed``.
     """
 
     def __init__(self, journal: Journal) -> None:

@@ -63,10 +63,10 @@ class Cluster:
     """`Runner` whose jobs run on the workers of a dask scheduler.
 
     Measurements and images go directly to and from each worker. Workers keep their pipelines, and need the same version
-    of this package. Each worker has as many jobs under way as threads. With more jobs, which would overlap transfer and
-    processing, each took 30 ms instead of 23 ms at the same throughput. A worker that misses the deadline, or whose
-    connection breaks, gets no jobs until it is reached again. Anyone who reaches a scheduler can run code on its
-    workers: keep it among trusted machines, or use dask's TLS.
+    of this package. Each worker has as many jobs under way as threads. With more, each took 30 ms instead of 23 ms at
+    the same throughput. A worker that misses the deadline or loses its connection gets no jobs until it is reached
+    again. Anyone who reaches a scheduler can run code on its workers: keep it among trusted machines, or use dask's
+    TLS.
 
     ``options.cluster`` is the scheduler's address. ``respawned`` counts workers that have left, or did not answer.
     """

@@ -20,10 +20,9 @@ SUPERSEDED: Final = "superseded"
 class ProcessingCounts:
     """Counts of one sensor's measurements.
 
-    ``received = published + sum(dropped.values()) + in_flight`` at any time. ``passive`` counts published measurements
-    without a call, of which no image was made, and ``dropped`` counts by reason. ``in_flight`` measurements wait, or
-    are in a worker or with the publisher; ``queue`` of them wait for a worker. ``times`` are from the arrival of a
-    measurement to the publication of its image.
+    ``received = published + sum(dropped.values()) + in_flight`` at any time. ``passive`` ones are published without a
+    call and an image, and ``dropped`` ones are counted by reason. ``in_flight`` includes the ``queue`` for a worker.
+    ``times`` are from arrival to publication.
     """
 
     received: int = 0

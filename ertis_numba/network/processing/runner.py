@@ -34,9 +34,8 @@ class Job:
 
     ``words`` are contiguous bytes, kept until the image is done for a second try. ``arrived_ns`` is by a monotonic
     clock. ``points`` are made if an application subscribes to them, and ``tries`` counts failed tries. ``predict``
-    predicts the error of the image, and logs a warning if images may exceed the budget; ``check_sound`` compares the
-    sound with the settings, and logs a warning if it contradicts them. ``slot`` has samples and image once it is
-    `FinishedJob`; release it afterwards.
+    warns if images may exceed the error budget; ``check_sound`` warns if the sound contradicts the settings. ``slot``
+    has samples and image once it is `FinishedJob`; release it afterwards.
     """
 
     number: int

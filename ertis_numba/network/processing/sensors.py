@@ -31,9 +31,9 @@ class RegisteredSensor:
 
     ``stated`` are the settings of its hello, and ``settings`` the same with air close to that of its latest
     measurement. ``kind`` is None if no pipeline can use its settings. ``passive`` is the kind of its measurements
-    without a call, of which no image is made. ``applied`` are the settings with the options of this node; None if the
-    options do not suit them. ``raw`` and ``image`` are the numbers of the descriptions of its products. ``air`` is
-    temperature, humidity and pressure of the latest measurement.
+    without a call or an image. ``applied`` are the settings with the options of this node; None if the options do not
+    suit them. ``raw`` and ``image`` are numbers of descriptions. ``air`` is temperature, humidity and pressure of the
+    latest measurement.
     """
 
     hello: Hello

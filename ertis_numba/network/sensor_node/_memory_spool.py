@@ -27,14 +27,12 @@ _ACKED_IN_ORDER = 1000  # Number of items.
 class SensorCounts:
     """Counts of one sensor's measurements at its node.
 
-    ``accepted = stored + taken + overwritten + damaged + unacked``, for measurements that this process has accepted or
-    found in its spool.
+    ``accepted = stored + taken + overwritten + damaged + unacked``, including measurements found in the spool.
 
-    ``refused`` counts measurements refused because the spool was full. Measurements were acknowledged as ``stored`` on
-    the central node's disk, or ``taken`` into its memory; ``dropped`` counts those of them that it has discarded, by
-    reason. Later measurements replaced ``overwritten`` ones in memory, and ``damaged`` ones were found in the spool.
-    ``missing`` counts the numbers reported as missing by the source of the measurements, by reason. ``unacked``
-    measurements are kept at present.
+    ``refused`` ones found the spool full. The central node acknowledged measurements as ``stored`` on its disk or
+    ``taken`` into its memory, and ``dropped`` some of them. Later ones replaced ``overwritten`` ones in memory;
+    ``damaged`` ones were found in the spool. The source of measurements reported ``missing`` numbers, by reason.
+    ``unacked`` ones are kept.
     """
 
     accepted: int = 0
@@ -52,9 +50,8 @@ class SensorCounts:
 class Spool:
     """Measurements in memory; the oldest become gaps if there is no more room.
 
-    ``max_bytes`` limits the data in memory. ``turn`` is the lock for access to `runs` and `counts`; ``acked``, a
-    condition of that lock, is notified of each acknowledgement. ``runs`` has sessions by (sensor, session_id), oldest
-    first; ``counts`` are by sensor.
+    ``max_bytes`` limits the data in memory. ``turn`` is the lock of `runs` and `counts`; its condition ``acked`` is
+    notified of each acknowledgement. ``runs`` has the oldest session first.
     """
 
     def __init__(self, max_bytes: int) -> None:

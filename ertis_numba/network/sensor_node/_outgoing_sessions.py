@@ -38,12 +38,11 @@ class UnackedItem:
 class OutgoingSession:
     """Items of one session of a sensor, oldest first, with a send window: go-back-N.
 
-    Positions are kept as numbers, so that items may be moved or replaced meanwhile. Callers ensure that only one thread
-    uses a session at a time.
+    Positions are numbers, so that items may be moved or replaced meanwhile. One thread at a time uses a session.
 
-    ``following`` is the number after the last item. Up to ``acked_through``, the central node has everything; up to
-    ``sent``, everything was sent; up to ``reached``, anything was ever sent: an ack beyond it belongs to other items.
-    The ``stage`` of the handshake began at ``since_s``; "waiting" ends then.
+    ``following`` is the number after the last item. The central node has everything up to ``acked_through``; everything
+    was sent up to ``sent``, and anything ever up to ``reached``: an ack beyond it belongs to other items. The ``stage``
+    of the handshake began at ``since_s``; "waiting" ends then.
     """
 
     sensor: JournalSensor
