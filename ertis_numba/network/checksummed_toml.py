@@ -24,7 +24,13 @@ class Checked(TomlDocument, frozen=True, kw_only=True):
 
     @classmethod
     def from_toml(cls, text: str, source: str | None = None, *, find_line: bool = True) -> Self:
-        """Read a document and compare its checksum, if it has one."""
+        """Read a document and compare its checksum, if it has one.
+
+        Raises
+        ------
+        SettingsError
+            The text cannot be used, or its checksum is wrong.
+        """
         if not text.strip():
             raise SettingsError(
                 f"{source or cls.label()} is empty; copy it again, or create a new one with 'ertis keys'"
