@@ -33,7 +33,7 @@ def pulses(*, count=3, absent=()):
     return [
         image(number, sensor=sensor, reflectors=[(20.0, range_m, 0.1)])
         for number in range(count)
-        for sensor, range_m in (("front", 1.5), ("back", 1.0))
+        for sensor, range_m in (("front", 1.3), ("back", 1.0))
         if (number, sensor) not in absent
     ]
 
@@ -49,7 +49,7 @@ def test_each_pulse_is_fused_once():
     assert counts == sorted(set(counts))
     last = arrivals[-1].fused
     assert (last.sensors, last.missing) == (("front", "back"), ())
-    assert sorted(round(float(x), 1) for x in last.points.position_m[:, 0]) == [-1.1, 1.6]
+    assert sorted(round(float(x), 1) for x in last.points.position_m[:, 0]) == [-1.1, 1.4]
 
 
 def test_pulses_that_arrive_while_tables_are_computed_are_fused_later(monkeypatch):
@@ -125,7 +125,7 @@ def test_mountings_of_the_central_node_are_used():
 @pytest.mark.parametrize(
     ("mountings", "peak", "reason"),
     [
-        ({"front": MOUNTINGS["front"]}, 0.1, "its mounting is unknown; pass mountings (--mounting FILE)"),
+        ({"front": MOUNTINGS["front"]}, 0.1, "its mounting is unknown; add the mounting (mountings), or start"),
         (MOUNTINGS, np.nan, "its images contain NaN or infinity"),
     ],
 )

@@ -168,7 +168,7 @@ class PulseReceiver:
         if mounting is None:
             self._leave_out(
                 sensor,
-                "its mounting is unknown; pass mountings (mountings), or start 'ertis capture' with --mounting",
+                "its mounting is unknown; add the mounting (mountings), or start 'ertis capture' with --mounting",
             )
             return None
         if not np.isfinite(image.amplitude).all():
