@@ -124,7 +124,7 @@ def _require_order(n_mics: int, order: int) -> None:
     if n_mics < order:
         raise ArgumentError(
             f"processing.dmas_order is {order}, but the array has {counted(n_mics, 'microphone')}; "
-            "the order must not exceed the number of microphones. Give a lower order or another processing.beamformer"
+            "the order must not exceed the number of microphones. Use a lower order or another processing.beamformer"
         )
 
 

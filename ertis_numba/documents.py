@@ -119,7 +119,7 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
             elif isinstance(own.get(name, getattr(self, name)), TomlTable):
                 nested.setdefault(name, {})[inner] = new
             else:
-                raise ArgumentError(f"{self.label()} key {key!r} is unknown: {name} is no table; use {name!r}")
+                raise ArgumentError(f"{self.label()} key {key!r} is unknown: {name} is not a table; use {name!r}")
         for name, within in nested.items():
             table: TomlTable = own.get(name, getattr(self, name))
             known = {inner.partition(".")[0] for inner in within} <= set(table.__struct_fields__)

@@ -235,7 +235,7 @@ class Pipeline:
     def stream(self) -> WordStream:
         """Return a stream that demodulates words while they arrive from a sensor; it has buffers of its own.
 
-        When the last words arrive, only the rest of the chain is left. Give the method `WordStream.add` to
+        When the last words arrive, only the rest of the chain is left. Pass the method `WordStream.add` to
         `SonarDriver.configure`, and the stream to `process`:
 
         Examples
@@ -305,7 +305,7 @@ class Pipeline:
             Recording, list or generator. It is read one batch at a time, when the next image is asked for.
         batch_size : int, optional
             Measurements per batch. By default, one for each thread, or 16 on a GPU, and fewer if a batch would
-            exceed 1 GiB. Give 1 for a live source, whose images should not wait for further measurements.
+            exceed 1 GiB. Use 1 for a live source, whose images should not wait for further measurements.
 
         Returns
         -------

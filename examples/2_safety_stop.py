@@ -76,7 +76,7 @@ def main(address: str, *sensors: str) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) < 3:
-        sys.exit("choose the address of a central node and the names of the sensors that face ahead")
+        sys.exit("pass the address of a central node and the names of the sensors that face ahead")
     try:
         main(*sys.argv[1:])
     except KeyboardInterrupt:

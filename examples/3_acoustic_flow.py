@@ -73,7 +73,7 @@ def main(address: str, sensor: str) -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) != 3:
-        sys.exit("choose the address of a central node and the name of a sensor")
+        sys.exit("pass the address of a central node and the name of a sensor")
     try:
         main(*sys.argv[1:])
     except KeyboardInterrupt:

@@ -68,5 +68,5 @@ def main(address: str, path: str, largest: str = "0") -> None:
 
 if __name__ == "__main__":
     if len(sys.argv) not in {3, 4}:
-        sys.exit("choose the address of a central node, a file (.csv or .npz) and, optionally, a number of clouds")
+        sys.exit("pass the address of a central node, a file (.csv or .npz) and, optionally, a number of clouds")
     main(*sys.argv[1:])

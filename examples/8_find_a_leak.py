@@ -1,6 +1,6 @@
 """Find a leak of compressed air in a recording, and print its direction and its level.
 
-Give a recording of a sensor that emits no call, real or emulated, and the distance of the leak in metres if you know
+Pass a recording of a sensor that emits no call, real or emulated, and the distance of the leak in metres if you know
 it. The level is then that at 1 m from the leak, if the layout of the sensor states the sensitivity of its microphones::
 
     ertis example leak
@@ -15,7 +15,7 @@ import ertis_numba as ertis
 from ertis_numba.storage import RecordingReader
 
 BAND_HZ = (40e3, 80e3)  # Machines are quieter here than leaks.
-USAGE = "choose a recording and, optionally, the distance of the leak in metres"
+USAGE = "pass a recording and, optionally, the distance of the leak in metres"
 
 
 def require_sound(recording: RecordingReader) -> None:

@@ -235,7 +235,11 @@ def test_map_lies_over_a_photo_as_a_pinhole_camera_sees_it(photo):
         ({"band_hz": "x"}, ArgumentError, "band_hz is 'x'; use two numbers, the smaller one first"),
         ({"band_hz": (30e3, "x")}, ArgumentError, r"band_hz is 'x'; use a number"),
         ({"band_hz": (30e3, 20e3)}, ArgumentError, "band_hz runs from 30000 to 20000"),
-        ({"photo": "x.png", "photo_fov_deg": 60}, ArgumentError, "photo_fov_deg is 60; use its width and height"),
+        (
+            {"photo": "x.png", "photo_fov_deg": 60},
+            ArgumentError,
+            "photo_fov_deg is 60; pass the angles of width",
+        ),
         ({"band_hz": (1e3, 2e3)}, ArgumentError, "no band lies within 1000 to 2000 Hz"),
         ({"photo_fov_deg": (60, 40)}, ArgumentError, "photo and photo_fov_deg belong together; use"),
         ({"photo": "none.png", "photo_fov_deg": (60, 180)}, ArgumentError, r"photo_fov_deg\[1\] is 180"),

@@ -176,7 +176,7 @@ def test_invalid_beamformer_settings_are_refused(options, reported):
 def test_dmas_of_too_few_microphones_is_refused(case, order, many):
     settings = cases.CASES[case]
     settings = settings.replace(processing=settings.processing.replace(beamformer="dmas", dmas_order=order))
-    message = rf"dmas_order is {order}, but the array has {many}; .*Give a lower order or another"
+    message = rf"dmas_order is {order}, but the array has {many}; .*Use a lower order or another"
     with pytest.raises(ArgumentError, match=message):
         Pipeline(settings)
 

@@ -166,7 +166,7 @@ def test_capture_output_stores_sensor_mounting(tmp_path):
 def test_capture_to_fails_when_nothing_is_acknowledged(tmp_path):
     code, events, err = run(tmp_path, "--to", "tcp://127.0.0.1:9", "-n", 3, "--patience", "0.1")
     assert code == 1
-    message = "3 measurements not acknowledged raise --spool-size tcp://127.0.0.1:9"
+    message = "3 measurements not acknowledged by the central node at tcp://127.0.0.1:9"
     assert err.splitlines()[-1].startswith(f"ertis: error: {message}, which does not answer; start 'ertis record' or ")
     assert (events[-1]["event"], events[-1]["kept"], events[-1]["unacked"]) == ("captured", 3, 3)
 
@@ -270,11 +270,11 @@ def test_capture_to_requires_allowed_keys(tmp_path):
         assert (code, events[-1]["kept"], central.taken) == (0, 2, 2), err
         code, _, err = run(tmp_path, *to)
         assert (code, central.taken) == (1, 2)
-        assert "set one (keys)" in err
+        assert "set one (--key)" in err
         other, _ = KeyPair.new("other").save(tmp_path / "keys")
         code, _, err = run(tmp_path, *to, "--key", other, "--server-key", theirs.public)
         assert (code, central.taken) == (1, 2)
-        reported = "2 measurements not acknowledged raise --spool-size tcp://127.0.0.1:"
+        reported = "2 measurements not acknowledged by the central node at tcp://127.0.0.1:"
         assert err.splitlines()[-1].startswith(f"ertis: error: {reported}")
         assert err.splitlines()[-1].endswith(": the central node does not know this key; add it there with "
                                              "'ertis keys allow'")  # fmt: skip
@@ -323,7 +323,7 @@ def test_capture_to_image_address_suggests_the_other_address(tmp_path):
     remedy = FOR_APPLICATIONS
     assert any(remedy in each.get("text", "") for each in events)
     assert code == 1
-    assert err.splitlines()[-1].endswith(f"not acknowledged raise --spool-size {publisher.address}: {remedy}")
+    assert err.splitlines()[-1].endswith(f"not acknowledged by the central node at {publisher.address}: {remedy}")
 
 
 def test_sensor_nodes_are_warned_of_a_shared_sensor_name(tmp_path):

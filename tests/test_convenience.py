@@ -58,7 +58,7 @@ def test_pipeline_accepts_a_settings_path(tmp_path):
         (lambda shown: shown.replace(elevation_rad=np.zeros(3)), r"elevation_rad has shape \(3,\); pass shape \(91,\)"),
         (
             lambda shown: shown.replace(amplitdue=shown.amplitude),
-            r"an image has no field 'amplitdue' \(did you mean 'amplitude'\?\); choose some of amplitude",
+            r"an image has no field 'amplitdue' \(did you mean 'amplitude'\?\); choose from amplitude",
         ),
     ],
 )
@@ -100,7 +100,8 @@ def test_peaks_command_lists_dbfs_levels_or_nothing_found(tmp_path):
     ertis.write_energyscapes(silent, [image()])
     runner = CliRunner()
     reported = runner.invoke(cli, ["peaks", str(found)])
-    assert reported.stdout.splitlines()[0].split()[-1] == "level_dbfs"
+    columns = reported.stdout.splitlines()[0].split()
+    assert columns[-4:] == ["level_dbfs", "angle_sd_deg", "range_sd_m", "level_sd_db"]
     reported = runner.invoke(cli, ["peaks", str(silent)])
     assert (reported.exit_code, reported.stdout, reported.stderr.splitlines()[-1]) == (0, "", "nothing found")
     assert json.loads(runner.invoke(cli, ["peaks", str(silent), "--json"]).stdout)["peaks"] == []

@@ -153,7 +153,7 @@ def test_delays_are_read_from_a_file_beside_the_settings(tmp_path, suffix):
             {"delay_matrix": ((1.0, 2.0), (3.0,))},
             "processing.delay_matrix has rows of 1 to 2 numbers; write one number for each",
         ),
-        ({"delay_matrix": np.zeros((1000, 32))}, "lists 1000 × 32 numbers; the limit is 20000, so give the name of a"),
+        ({"delay_matrix": np.zeros((1000, 32))}, "lists 1000 × 32 numbers; the limit is 20000, so pass the name of a"),
         ({"delay_matrix": ((1.0,),), "beamformer": "dmas"}, "is given, which processing.beamformer 'dmas' does not"),
         (
             {"delay_matrix": ((1.0,),), "wavefront": "spherical"},

@@ -114,7 +114,7 @@ def test_demo_keeps_files_of_an_earlier_demo():
     folder.mkdir()
     (folder / "image.png").write_text("mine")
     reported = run("demo", code=1).stderr
-    assert "image.png exists; choose another folder (--output), or overwrite the output (overwrite=True)" in reported
+    assert "image.png exists; choose another folder (--output), or overwrite it (--force)" in reported
     assert (folder / "image.png").read_text() == "mine"
 
 

@@ -324,7 +324,7 @@ def test_leak_example_explains_unusable_input_in_one_line(leak_recording, tmp_pa
     with ertis.AcousticCamera(heard.settings) as camera:
         ertis.write_acoustic_maps(tmp_path / "maps.h5", [camera.process(heard)])
     for arguments, message in {
-        ("--help",): "choose a recording and, optionally, the distance of the leak in metres",
+        ("--help",): "pass a recording and, optionally, the distance of the leak in metres",
         ("none.h5",): "none.h5: No such file or directory",
         ("maps.h5",): "maps.h5 is a file of acoustic maps, wanted a recording",
         ("call.h5",): "call.h5 has measurements with a call; choose a recording of 'ertis capture --passive'",

@@ -304,7 +304,7 @@ def test_options_that_do_not_fit_are_refused(tmp_path):
         read_trajectory(path, times=tmp_path / "none.txt")
     with pytest.raises(
         ArgumentError,
-        match=r"time_unit \(--time-unit\) is for text, but messages in .*a.mcap contain times; remove time_unit",
+        match=r"time_unit applies to text, but messages in .*a.mcap contain times; remove time_unit",
     ):
         read_trajectory(tmp_path / "a.mcap", time_unit="ms")
 
@@ -452,8 +452,11 @@ def test_angles_of_tables_turn_about_fixed_axes_as_in_ros(tmp_path, names, cells
             LEVEL.replace("1.0", "nan").replace("1.1", "").format("yaw_deg", "0", "0"),
             "there are no poses; 2 lines of 2",
         ),
-        ("time,x,y,yaw_deg\n2023-02-30T00:00:00,0,0,0\n", "line 2: '2023-02-30T00:00:00' is no date; use dates as in"),
-        ("time,x,y,yaw_deg\n2023-02-20T00:00:00,0,0,0\n7,0,0,0\n", "line 3: '7' is no date"),
+        (
+            "time,x,y,yaw_deg\n2023-02-30T00:00:00,0,0,0\n",
+            "line 2: '2023-02-30T00:00:00' is not a date; use dates as",
+        ),
+        ("time,x,y,yaw_deg\n2023-02-20T00:00:00,0,0,0\n7,0,0,0\n", "line 3: '7' is not a date"),
     ],
 )
 def test_columns_that_would_be_ignored_and_cells_that_are_no_numbers_are_refused(tmp_path, text, match):

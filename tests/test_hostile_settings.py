@@ -134,7 +134,7 @@ def test_received_settings_name_no_layout_file(layout):
 def test_workers_refuse_settings_that_need_too_much_memory(changes, megabytes):
     settings = Settings().replace(**changes)
     assert predicted_bytes(settings) / 1e6 == pytest.approx(megabytes, rel=0.02)
-    with pytest.raises(ArgumentError, match=r"needs about \d+ MB; the limit is 1000 MB. Give fewer directions"):
+    with pytest.raises(ArgumentError, match=r"needs about \d+ MB; the limit is 1000 MB. Use fewer directions"):
         SharedPipeline(settings.to_toml(), "cpu")
     assert predicted_bytes(Settings()) < memory.MAX_BYTES / 100
 

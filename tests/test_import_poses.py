@@ -68,7 +68,7 @@ def test_import_poses_replaces_the_recording_by_default(recording, trajectory):
     with open_recording(recording, sensor="left") as posed:
         assert len(posed.trajectory) == 3
     done = run("import-poses", recording, trajectory, code=1)
-    assert "REC.h5 has poses already (source 'file'); keep them, or replace them (replace=True)" in done.stderr
+    assert "REC.h5 has poses already (source 'file'); keep them, or replace them (--force)" in done.stderr
     run("import-poses", recording, trajectory, "--force")
     assert sorted(path.name for path in recording.parent.iterdir()) == ["REC.h5", "TRAJ.tum"]
 
@@ -93,8 +93,8 @@ def test_import_poses_reports_both_spans_and_changes_nothing(recording, tmp_path
     done = run("import-poses", recording, late, "-o", tmp_path / "OUT.h5", code=1)
     assert done.stderr == (
         f"ertis: error: {recording}: the poses cover 1700000099.123 to 1700000101.223 s, but the measurements of "
-        "sensor left cover 1700000000.123 to 1700000000.223 s; use poses of this time, or correct their clock "
-        "(offset_s)\n"
+        "sensor left cover 1700000000.123 to 1700000000.223 s; use poses of this time, or correct the offset of "
+        "their clock (--offset-s)\n"
     )
     assert recording.read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["REC.h5", "late.tum"]
@@ -137,7 +137,7 @@ def test_import_poses_reads_tables_and_refuses_other_topics(recording, tmp_path)
     first_ns, last_ns = TIMES_NS[0] - SECOND_NS, TIMES_NS[-1] + SECOND_NS
     table.write_text(f"time_ns,x_m,y_m,yaw_deg\n{first_ns},0,0,0\n{last_ns},2.1,0,0\n")
     done = run("import-poses", recording, table, "--topic", "/odom", code=1)
-    assert "topic is for .mcap files, but" in done.stderr
+    assert "is not an .mcap file and has no topics; remove the topic (--topic)" in done.stderr
     run("import-poses", recording, table)
     with open_recording(recording, sensor="left") as posed:
         np.testing.assert_allclose(posed.trajectory.position_m[:, 0], [1.0, 1.05, 1.1], rtol=0, atol=1e-9)

@@ -86,7 +86,7 @@ def test_numbers_must_rise_within_a_session(tmp_path):
         for late in (given[2], given[0]):
             with pytest.raises(
                 ArgumentError,
-                match=r"measurement 1[02] of sensor left follows 12; pass rising numbers, or another session_id",
+                match=r"measurement 1[02] of sensor left follows 12; pass increasing numbers, or another session_id",
             ):
                 journal.append([late])
         journal.append(entries(1, first=0, session_id=9))

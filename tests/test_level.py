@@ -453,7 +453,7 @@ def test_levelled_file_has_no_ground_truth_of_another_frame(tmp_path):
     for arguments, message in (
         (
             ["compare"],
-            "but the ground truth is in the frame of the sensor; process again without it (level_directions)",
+            "but the ground truth is in the frame of the sensor; process again without levelled directions",
         ),
         (["export", "-o", str(tmp_path / "img.mcap")], "but messages of ROS are in the frame of the sensor"),
     ):

@@ -52,10 +52,7 @@ def test_damaged_output_is_reported_or_replaced(runs, out, monkeypatch, spoil, s
     whole = (out / "a.energy.h5").read_bytes()
     spoil(out / "a.energy.h5")
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow))
-    assert (
-        f"exists and {stated}; choose another folder, or ask or replace the output (overwrite=True)"
-        in found["a.h5"].error
-    )
+    assert f"exists and {stated}; choose another folder, or replace the output (overwrite=True)" in found["a.h5"].error
     found, _ = run_here(monkeypatch, [runs / "a.h5"], out, CampaignOptions(settings=narrow, overwrite=True))
     assert outcomes(found) == {"a.h5": "made"}
     assert (out / "a.energy.h5").read_bytes() == whole

@@ -205,7 +205,7 @@ def test_odometry_command_refuses_settings_without_images(folder, tmp_path):
 def test_odometry_command_refuses_another_format_at_once(folder, tmp_path):
     code, _, stderr = run(folder / "both.h5", "-o", tmp_path / "path.csv")
     assert (code, stderr.count("\n")) == (1, 1)
-    assert "path.csv ends in .csv, but the file is text of TUM; choose a name in .tum or .txt" in stderr
+    assert "path.csv ends in .csv, but poses are written as TUM text; choose a name that ends in .tum or .txt" in stderr
 
 
 def test_odometry_command_notes_steps_without_matches(folder, tmp_path):

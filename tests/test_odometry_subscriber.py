@@ -411,7 +411,7 @@ def test_listen_refuses_mountings_without_the_sensor(mounting):
 def test_listen_refuses_a_trajectory_of_another_format_at_once(tmp_path):
     shown = CliRunner().invoke(cli, ["listen", "tcp://127.0.0.1:1", "--odometry", "-o", str(tmp_path / "path.csv")])
     assert shown.exit_code == 1
-    assert "path.csv ends in .csv, but the file is text of TUM" in str(shown.exception) + shown.output
+    assert "path.csv ends in .csv, but poses are written as TUM text" in str(shown.exception) + shown.output
 
 
 def test_listen_refuses_an_existing_trajectory_at_once(tmp_path):

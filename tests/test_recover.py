@@ -170,8 +170,7 @@ def test_recover_reports_unsealable_journals(tmp_path):
     crashed(tmp_path, name="b.h5")
     done = run("recover", tmp_path, "--json", "--quiet", code=1)
     assert done.stderr == (
-        f"ertis: error: {tmp_path}/rec.h5 exists with other content than {path}; move it, or replace it "
-        "(overwrite=True)\n"
+        f"ertis: error: {tmp_path}/rec.h5 exists with other content than {path}; move it, or replace it (--force)\n"
     )
     reported = json.loads(done.stdout)["journals"]
     assert [(report.get("measurements"), "error" in report) for report in reported] == [(3, False), (None, True)]

@@ -211,7 +211,7 @@ def test_command_publishes_the_images_of_sensors(tmp_path, monkeypatch):
     ("arguments", "message"),
     [
         (["missing.h5"], "file missing.h5 does not exist; choose an existing file, an address, or ports"),
-        (["one", "tcp://127.0.0.1:1"], "several sources are given, but only ports can be ports"),
+        (["one", "tcp://127.0.0.1:1"], "several sources are given, but only ports can be combined"),
         (["one", "one"], "port one is given 2 times"),
         (["one", "--loop"], "--loop is for files; remove it with ports"),
         (["tcp://127.0.0.1:1", "--trigger", "sync"], "--trigger is for ports; remove it with an address"),
@@ -333,5 +333,5 @@ def test_central_node_without_images_of_a_sensor_is_noted_once():
             signals=SimpleNamespace(obey=lambda _: None),
         )
     assert [note for note in notes if note.startswith("note")] == [
-        "note: sensor front has measurements without a call, which give no images"
+        "note: sensor front has measurements without a call, which yield no images"
     ]

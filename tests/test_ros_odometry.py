@@ -95,9 +95,7 @@ def test_sensor_without_mounting_is_left_out_and_noted():
                 ros.publish(cloud(pulse, "back"))
                 ros.publish(cloud(pulse), PLACE)
         assert ros.topics["/odom"].published + ros.skipped == 2
-    assert notes == [
-        "sensor back is left out of the odometry: its mounting is unknown; add its mounting with --mounting FILE"
-    ]
+    assert notes == ["odometry leaves out sensor back, whose mounting is unknown; add the mounting (mounting)"]
 
 
 def test_odometry_continues_while_paused():

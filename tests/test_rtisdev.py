@@ -478,9 +478,9 @@ def test_data_of_earlier_stages_that_are_no_finite_numbers_are_refused():
         with pytest.raises(ArgumentError, match=message):
             rtiscuda.processing(bad, 0, settings.nDirections, settings.nspses, "test")
     for name in (None, ["test"], 3):
-        with pytest.raises(ArgumentError, match=r"name is of type .*; pass a text"):
+        with pytest.raises(ArgumentError, match=r"name is of type .*; pass a string"):
             rtiscuda.processing(signals, 0, 5, settings.nspses, name)
-        with pytest.raises(ArgumentError, match=r"name is of type .*; pass a text"):
+        with pytest.raises(ArgumentError, match=r"name is of type .*; pass a string"):
             rtiscuda.unloadone(name)
 
 
@@ -558,17 +558,17 @@ def test_arguments_of_stages_that_are_off_are_not_used():
 
 
 def test_names_of_configurations_are_texts():
-    with pytest.raises(ArgumentError, match="name is of type list; pass a text"):
+    with pytest.raises(ArgumentError, match="name is of type list; pass a string"):
         rtiscuda.preload(**(arguments_of_preload() | {"name": ["a"]}))
 
 
 def test_serial_arguments_of_wrong_types_are_refused(caplog):
-    with pytest.raises(ArgumentError, match="port is of type NoneType; pass a text"):
+    with pytest.raises(ArgumentError, match="port is of type NoneType; pass a string"):
         rtisserial.connect(None, 115_200)
     parent, child = os.openpty()
     rtisserial.connect(os.ttyname(child), 115_200)
     try:
-        with pytest.raises(ArgumentError, match="command is of type bytes; pass a text"):
+        with pytest.raises(ArgumentError, match="command is of type bytes; pass a string"):
             rtisserial.command(b"!Y,0,0,0\n", wants_answer=True)
         with pytest.raises(ArgumentError, match="n_bytes is -1; use a whole number of at least 0"):
             rtisserial.getdata(-1)

@@ -47,7 +47,10 @@ def test_path_value_may_be_none():
         ("procesing.range_m", "did you mean 'processing.range_m'?"),
         ("accuracy.zzz", "settings key 'accuracy.zzz' is unknown; known in 'accuracy' are max_error_db, precision"),
         ("zzz", "settings key 'zzz' is unknown; known are array, call, recording, air, processing, accuracy"),
-        ("processing.range_m.first", "processing key 'range_m.first' is unknown: range_m is no table; use 'range_m'"),
+        (
+            "processing.range_m.first",
+            "processing key 'range_m.first' is unknown: range_m is not a table; use",
+        ),
     ],
 )
 def test_unknown_path_is_refused_with_similar_paths(path, message):

@@ -339,7 +339,7 @@ def numbered(*numbers, session_id=0):
     ids=["at once", "rising", "falling", "highest", "late"],
 )
 def test_sequence_numbers_are_unique_within_a_session(tmp_path, numbers, place):
-    message = rf"measurement {place} has sequence {numbers[place]} of session 0, like an earlier one; use for each"
+    message = rf"measurement {place} has sequence {numbers[place]} of session 0, like an earlier one; number the"
     with pytest.raises(ArgumentError, match=message):
         write_recording(tmp_path / "rec.h5", numbered(*numbers))
     given = [*numbered(*numbers[:place]), *numbered(*numbers[place:], session_id=1)]

@@ -168,7 +168,7 @@ def test_receive_returns_after_its_timeout(publisher):
         ({"address": "127.0.0.1:5602"}, "address '127.0.0.1:5602' cannot be used"),
         ({"address": "tcp://10.0.0.1:5602"}, "can be reached from other machines, but there are no keys"),
         ({"products": ["pictures"]}, "product 'pictures' is unknown"),
-        ({"products": []}, "products is empty; choose some of energyscape, points, raw, group, status"),
+        ({"products": []}, "products is empty; choose from energyscape, points, raw, group, status"),
         ({"sensors": []}, "sensors lists 0 names; use 1 to 32, or None for all"),
         ({"sensors": ["a b"]}, "sensor name 'a b' cannot name a group"),
         ({"credit": 65}, "credit is 65; use a whole number from 1 to 64"),

@@ -43,7 +43,7 @@ def test_tum_file_holds_the_trajectory(tmp_path_factory, seed, n_poses):
 
 
 def test_tum_file_has_no_suffix_of_another_format(tmp_path):
-    with pytest.raises(ArgumentError, match=r"ends in \.csv, but the file is text of TUM; choose a name in \.tum"):
+    with pytest.raises(ArgumentError, match=r"ends in \.csv, but poses are written as TUM text; choose a name that"):
         write_tum(tmp_path / "path.csv", some_trajectory(1, 2))
 
 
@@ -205,5 +205,5 @@ def test_missing_and_binary_files_are_refused(tmp_path):
     with pytest.raises(DataError, match="is not a text file"):
         read_trajectory(tmp_path / "b.tum")
     (tmp_path / "c.tum").write_text("1 0 0 0 0 0 0 1\n")
-    with pytest.raises(ArgumentError, match=r"topic is for .mcap files, but"):
+    with pytest.raises(ArgumentError, match=r"is not an .mcap file and has no topics"):
         read_trajectory(tmp_path / "c.tum", topic="/pose")

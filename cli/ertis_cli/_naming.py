@@ -126,12 +126,13 @@ def named(message: str, ctx: click.Context) -> str:
     return f"{found['before'] or ''}{names[_key(found)]}{_AGAIN.sub(again, message[found.end() :])}"
 
 
-def with_options(message: str) -> str:
+def with_options(message: str, ctx: click.Context | None = None) -> str:
     """Return a message of the package with the options of the running command in place of parameters of Python.
 
     ``overwrite=True`` becomes ``--force``, ``length_s`` becomes ``--length``, and ``(sensor)`` becomes ``(--sensor)``.
+    Threads other than the main one have no current context, and must pass that of their command.
     """
-    ctx = click.get_current_context(silent=True)
+    ctx = ctx or click.get_current_context(silent=True)
     if ctx is None:
         return message
     options = dict(_options_by_parameter(ctx.command))

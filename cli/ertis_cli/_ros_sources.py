@@ -66,7 +66,7 @@ def publish_node(
                 for name, state in item.sensors.items():
                     if state.passive and name not in silent and (not sensors or name in sensors):
                         silent.add(name)
-                        on_note(f"note: sensor {name} has measurements without a call, which give no images")
+                        on_note(f"note: sensor {name} has measurements without a call, which yield no images")
                 ros.publish_status(item)
                 continue
             place = None

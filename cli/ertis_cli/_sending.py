@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
+from ertis_cli._naming import with_options
 from ertis_cli._watch import Watch
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class _Watch(Watch):
 
     def linked(self, text: str) -> None:
         """Report an event of the connection to the central node."""
+        text = with_options(text, self._context)
         if self._as_json:
             self._print({"event": "note", "text": text})
         self._say(text)

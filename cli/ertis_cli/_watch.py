@@ -33,6 +33,7 @@ class Watch:
 
     def __init__(self, *, quiet: bool, as_json: bool) -> None:
         self._quiet, self._as_json = quiet, as_json
+        self._context = click.get_current_context(silent=True)  # Other threads report events, too.
         self._turn = threading.Lock()
         self._line = StatusLine(partial(click.echo, err=True, nl=False), quiet=quiet)
         self._next_s = 0.0

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from ertis_cli import _mountings, _network, options
+from ertis_cli._naming import with_options
 from ertis_cli._recording_settings import recording_settings, settings_from, warn_without_images
 from ertis_cli._saving import withdrawn
 from ertis_cli._sending import Sending
@@ -266,7 +267,9 @@ def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
     try:
         sealed = seal_in_subprocess(path, overwrite=overwrite)
     except (OSError, ValueError) as error:
-        reported = f"{error}; the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+        reported = (
+            f"{with_options(str(error))}; the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+        )
         if failure is None:
             raise DataError(reported) from error
         click.echo(f"ertis: error: {reported}", err=True)

@@ -38,10 +38,10 @@ def configure(
 ) -> None:
     """Change the settings of a sensor that sends to a central node.
 
-    ADDRESS is the address that sensors send to. Give the new settings with --preset or --settings; they replace all
+    ADDRESS is the address that sensors send to. Pass the new settings with --preset or --settings; they replace all
     former ones. The settings apply to all sensors of the same 'ertis capture --to', between two measurements. If one
     sensor cannot use them, all keep their former settings. A central node that computes images refuses settings from
-    which it cannot compute any. If the central node uses keys, use the key of an admin.
+    which it cannot compute any. If the central node uses keys, pass the key of an admin.
     """
     from ertis_numba import checks
     from ertis_numba.network.central_client import CentralClient

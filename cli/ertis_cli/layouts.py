@@ -18,7 +18,7 @@ def layouts(*, name: str | None, as_json: bool) -> None:
     NAME is a shipped layout, or a file of microphone positions, such as .csv in metres or .xml of Acoular. Its
     positions are printed in millimetres, relative to the centroid of the array.
 
-    To make your own layout, save the output to a file and edit it. Then give the file with --layout, or as array.layout
+    To make your own layout, save the output to a file and edit it. Then pass the file with --layout, or as array.layout
     in settings and scenes.
     """
     from ertis_numba.geometry import layout_file, layout_names, layout_text, load_layout

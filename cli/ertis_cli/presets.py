@@ -18,9 +18,9 @@ __all__ = ["presets"]
 def presets(*, name: str | None, as_json: bool) -> None:
     """List the shipped presets, or print one as TOML.
 
-    Recording presets define the record length and the call. Give their names with --preset to 'ertis capture' and
-    'ertis import'. Processing presets define directions and ranges. Give their names with --preset to 'ertis process'
-    and 'ertis serve'. To make your own preset, save the output to a file, edit it, and choose the file with --settings.
+    Recording presets define the record length and the call. Pass their names with --preset to 'ertis capture' and
+    'ertis import'. Processing presets define directions and ranges. Pass their names with --preset to 'ertis process'
+    and 'ertis serve'. To make your own preset, save the output to a file, edit it, and pass it with --settings.
     """
     from ertis_numba.settings import preset_text
 

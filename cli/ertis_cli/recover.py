@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from ertis_cli import options
+from ertis_cli._naming import with_options
 
 __all__ = ["recover"]
 
@@ -77,7 +78,11 @@ def _seal(journal: Path, *, force: bool, quiet: bool) -> dict[str, Any]:
         try:
             sealed = seal_in_subprocess(journal, overwrite=force, progress=progress)
         except (DataError, OSError) as error:
-            return {"journal": str(journal), "error": str(error), "in_use": isinstance(error, JournalInUseError)}
+            return {
+                "journal": str(journal),
+                "error": with_options(str(error)),
+                "in_use": isinstance(error, JournalInUseError),
+            }
         except KeyboardInterrupt as interrupt:
             click.echo(str(interrupt), err=True)
             raise

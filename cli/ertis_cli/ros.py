@@ -11,6 +11,7 @@ import click
 from click.core import ParameterSource
 
 from ertis_cli import _mountings, _network, _ros_sources, options
+from ertis_cli._naming import with_options
 from ertis_cli._recording_settings import recording_settings, settings_from
 from ertis_cli._stop_signals import stopped_by_signals
 
@@ -351,6 +352,7 @@ class _RosReport:
 
     def note(self, text: str) -> None:
         """Report an event of the connection."""
+        text = with_options(text)
         options.say(text, quiet=self._quiet)
         if self._as_json:
             options.print_json({"event": "note", "text": text})

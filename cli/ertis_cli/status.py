@@ -10,6 +10,7 @@ import click
 
 from ertis_cli import _network, _progress, _tables, options
 from ertis_cli._central_watch import size
+from ertis_cli._naming import with_options
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -55,7 +56,7 @@ def status(
     """Show the status of a central node.
 
     ADDRESS is the address that sensors send to, or the address at which the central node publishes. On a terminal, the
-    display is refreshed every second. If the central node uses keys, use the key of an application or an admin. If
+    display is refreshed every second. If the central node uses keys, pass the key of an application or an admin. If
     the node disappears, the command waits for it.
     """
     from ertis_numba import checks
@@ -85,7 +86,7 @@ def _looks(node: "CentralClient", patience_s: float, *, again: bool) -> "Iterato
         try:
             now, away = node.status(patience_s), ""
         except NetworkError as error:  # the node may restart
-            away = str(error)
+            away = with_options(str(error))
         yield now, away
 
 

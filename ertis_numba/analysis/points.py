@@ -47,7 +47,7 @@ class PointExtractor:
     settings : Settings
         Settings of the images. The air may differ between images.
     grid : Grid, optional
-        Directions of the images; by default, those of the settings. Give a grid if the file of the directions is not
+        Directions of the images; by default, those of the settings. Pass a grid if the file of the directions is not
         available.
     top : int
         Maximum number of points per image; the strongest 256 by default.

@@ -75,7 +75,7 @@ class DaskWorkerPool:
         """Return messages of workers, or an empty list after a timeout."""
         if self._client.status != "running":
             raise NetworkError(
-                f"the dask scheduler at {self._address} is gone; finished output stays. Give another scheduler "
+                f"the dask scheduler at {self._address} is gone; finished output stays. Use another scheduler "
                 "to continue"
             )
         self._update_size()

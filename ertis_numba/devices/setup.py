@@ -178,8 +178,8 @@ def _with_silence(codes: NDArray[np.uint16], rate_hz: float, period_s: float | N
     n_samples = round(checks.positive("emission_period_s", period_s) * rate_hz)
     if n_samples < len(codes):
         raise ArgumentError(
-            f"emission_period_s is {period_s:g} s, but the call lasts {len(codes) / rate_hz:.3g} s; use at least this "
-            "period"
+            f"emission_period_s is {period_s:g} s, but the call lasts {len(codes) / rate_hz:.3g} s; use a "
+            "period of at least this length"
         )
     if n_samples > DAC_SAMPLES[1]:
         raise ArgumentError(

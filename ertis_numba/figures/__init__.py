@@ -311,7 +311,7 @@ def acoustic_map(
     if photo is None or photo_fov_deg is None:
         return _acoustic.draw(canvas, found, band_hz=band_hz)
     if isinstance(photo_fov_deg, str) or not isinstance(photo_fov_deg, Sequence) or len(photo_fov_deg) != 2:
-        raise ArgumentError(f"photo_fov_deg is {photo_fov_deg!r:.80}; use its width and height in degrees")
+        raise ArgumentError(f"photo_fov_deg is {photo_fov_deg!r:.80}; pass the angles of width and height in °")
     for number, each_deg in enumerate(photo_fov_deg):
         checks.between(f"photo_fov_deg[{number}]", each_deg, 1.0, 170.0)
     return _acoustic.draw_on_photo(canvas, found, band_hz=band_hz, photo=_picture(photo), fov_deg=photo_fov_deg)

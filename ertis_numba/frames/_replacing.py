@@ -23,5 +23,5 @@ def replaced(name: str, given: _Frame, changes: dict[str, Any]) -> _Frame:
     for field in sorted(changes.keys() - set(known)):
         near = difflib.get_close_matches(field, known, n=1)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
-        raise ArgumentError(f"{name} has no field {field!r}{hint}; choose some of {', '.join(known)}")
+        raise ArgumentError(f"{name} has no field {field!r}{hint}; choose from {', '.join(known)}")
     return replace(given, **changes)  # type: ignore[type-var]

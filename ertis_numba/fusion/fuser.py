@@ -380,7 +380,7 @@ class Fuser:
         step_m = max(_STEP_M[kind], spacing_m) if self._step_m is None else self._step_m
         if step_m < spacing_m:
             raise ArgumentError(
-                f"range_step_m is {step_m:g}, but ranges are {spacing_m:.3g} m apart; use at least this spacing"
+                f"range_step_m is {step_m:g}, but ranges are {spacing_m:.3g} m apart; use a larger step"
             )
         # Of all sensors: one without an image now may reach farthest in a later group.
         farthest_m = max(float(np.linalg.norm(sensor.translation_m[:2])) for sensor in self._mountings)

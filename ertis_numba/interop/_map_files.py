@@ -37,7 +37,8 @@ def map_files(path: str | Path, *, n_dimensions: int = 2, probabilities: bool = 
     checks.file_ending("map", path, MAP_SUFFIXES)
     if n_dimensions == 3 and path.suffix.lower() in _PLANAR_SUFFIXES:
         raise ArgumentError(
-            f"{path} would hold a map of two dimensions, but the map has three; choose a name that ends in .h5 or .ply"
+            f"{path} would contain a two-dimensional map, but the map has three dimensions; choose a name that "
+            "ends in .h5 or .ply"
         )
     if probabilities and path.suffix.lower() not in _PLANAR_SUFFIXES:
         raise ArgumentError(

@@ -63,7 +63,7 @@ def _times_of_dates(
             zone = date["zone"] if date["zone"] and date["zone"] not in "Zz" else "+00:00"
             whole = datetime.fromisoformat(f"{date['day']}T{date['time']}{zone}")
         except ValueError:
-            raise DataError(f"line {line}: {text!r} is no date; use dates as in 2023-11-14T22:13:20.5Z") from None
+            raise DataError(f"line {line}: {text!r} is not a date; use dates as in 2023-11-14T22:13:20.5Z") from None
         times_ns.append(round(whole.timestamp()) * 10**9 + int((date["rest"] or "0").ljust(9, "0")[:9]))
     n_local = sum(not date["zone"] for date in dates if date is not None)
     note = f"dates without a time zone read as UTC; the first is {cells[0][1].strip()}; add a zone, as in +02:00, or Z"

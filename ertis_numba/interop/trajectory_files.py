@@ -97,11 +97,10 @@ def read_trajectory(
         checks.choice("time_unit", time_unit, TIME_UNITS)
     is_mcap = path.suffix.lower() == ".mcap"
     if topic is not None and not is_mcap:
-        raise ArgumentError(f"the topic is for .mcap files, but {path} is none; remove it (topic)")
+        raise ArgumentError(f"{path} is not an .mcap file and has no topics; remove the topic (topic)")
     for name, value in (("time_unit", time_unit), ("times", times)):
         if value is not None and is_mcap:
-            option = f"--{name.replace('_', '-')}"
-            raise ArgumentError(f"{name} ({option}) is for text, but messages in {path} contain times; remove {name}")
+            raise ArgumentError(f"{name} applies to text, but messages in {path} contain times; remove {name}")
     _require_poses(path)
     stamps = None if times is None else _text(Path(times))
     text = "" if is_mcap else _text(path)
@@ -201,6 +200,7 @@ def check_tum_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = (
     suffix = path.suffix.lower()
     if suffix in _OTHER_SUFFIXES:
         raise ArgumentError(
-            f"output {path} ends in {suffix}, but the file is text of TUM; choose a name in .tum or .txt"
+            f"output {path} ends in {suffix}, but poses are written as TUM text; choose a name that ends in "
+            ".tum or .txt"
         )
     check_target(path, overwrite=overwrite, sources=sources)

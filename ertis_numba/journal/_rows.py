@@ -97,7 +97,7 @@ class WritableJournal(ReadableJournal):
         key = (sensor.name, stamp.session_id)
         if stamp.sequence <= last.get(key, -1):
             raise ArgumentError(
-                f"measurement {stamp.sequence} of sensor {sensor.name} follows {last[key]}; pass rising numbers, "
+                f"measurement {stamp.sequence} of sensor {sensor.name} follows {last[key]}; pass increasing numbers, "
                 "or another session_id"
             )
         last[key] = stamp.sequence

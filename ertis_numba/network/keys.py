@@ -85,7 +85,7 @@ class KeyPair:
         path = Path(path)
         if path.name.endswith(".public.toml"):
             raise SettingsError(
-                f"{path} contains a public key; use the secret key, the file .secret.toml of the same name"
+                f"{path} contains a public key; use the secret key in the .secret.toml file of the same name"
             )
         try:
             mode, folder_mode = mode_of(path), mode_of(path.parent)

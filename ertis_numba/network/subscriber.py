@@ -145,7 +145,7 @@ class Subscriber(ReceivingLoop[Kind_co]):
         for product in given:
             checks.choice("product", product, PRODUCTS)
         if not given:
-            raise ArgumentError(f"products is empty; choose some of {', '.join(PRODUCTS)}")
+            raise ArgumentError(f"products is empty; choose from {', '.join(PRODUCTS)}")
         named = None if sensors is None else tuple([sensors] if isinstance(sensors, str) else dict.fromkeys(sensors))
         if named is not None and not 0 < len(named) <= _MAX_SENSORS:
             raise ArgumentError(f"sensors lists {len(named)} names; use 1 to {_MAX_SENSORS}, or None for all")

@@ -34,11 +34,11 @@ _TINY: Final = 1e-30
 class AcousticCamera:
     """Camera that computes acoustic maps from the measurements of one sensor.
 
-    Signals are cut into blocks that overlap by half. Their spectra, under a Hann window, use the cross-spectral matrix
-    of the microphones, which is averaged over blocks and measurements. A map is the power of this matrix for the wave
-    from each direction. Maps of CLEAN-SC and HR-CLEAN-SC sum the components of a direction and its neighbours at the
-    strongest of them, whose value is the power of the source. Measurements with a call are accepted; the time of the
-    call is left out. Use each object in one thread only.
+    Signals are cut into blocks that overlap by half. Their spectra, under a Hann window, yield the cross-spectral
+    matrix of the microphones, which is averaged over blocks and measurements. A map is the power of this matrix for the
+    wave from each direction. Maps of CLEAN-SC and HR-CLEAN-SC sum the components of a direction and its neighbours at
+    the strongest of them, whose value is the power of the source. Measurements with a call are accepted; the time of
+    the call is left out. Use each object in one thread only.
 
     Parameters
     ----------

@@ -58,7 +58,9 @@ class OdometryPublisher:
         if mounting is None:
             if sensor not in self._left_out:
                 self._left_out.add(sensor)
-                self._note(f"sensor {sensor} is left out of the odometry: its mounting is unknown; add it (mounting)")
+                self._note(
+                    f"odometry leaves out sensor {sensor}, whose mounting is unknown; add the mounting (mounting)"
+                )
             return
         self._mountings[sensor] = mounting
         for group in self._groups.add(item):

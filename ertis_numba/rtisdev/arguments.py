@@ -42,7 +42,7 @@ def whole(name: str, given: Any, low: int, high: int | None = None) -> int:
 def text(name: str, given: Any) -> str:
     """Return a text."""
     if not isinstance(given, str):
-        raise ArgumentError(f"{name} is of type {type(given).__name__}; pass a text")
+        raise ArgumentError(f"{name} is of type {type(given).__name__}; pass a string")
     return given
 
 

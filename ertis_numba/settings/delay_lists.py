@@ -27,5 +27,5 @@ def check_delays(given: tuple[tuple[float, ...], ...]) -> None:
     if sum(map(len, given)) > MAX_LISTED_DELAYS:
         raise ArgumentError(
             f"processing.delay_matrix lists {len(given)} × {len(given[0])} numbers; the limit is {MAX_LISTED_DELAYS}, "
-            "so give the name of a CSV or NPY file"
+            "so pass the name of a CSV or NPY file"
         )

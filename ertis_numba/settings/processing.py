@@ -393,7 +393,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         """
         if self.level_directions:
             raise ArgumentError(
-                f"processing.level_directions is true, but {reason}; process again without it (level_directions)"
+                f"processing.level_directions is true, but {reason}; process again without levelled "
+                "directions (level_directions)"
             )
 
     def require_beams(self, wanted: str) -> None:

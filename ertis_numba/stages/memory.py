@@ -84,7 +84,7 @@ def require_memory(settings: Settings, max_bytes: int) -> int:
     if n_bytes > max_bytes:
         raise ArgumentError(
             f"a pipeline for these settings needs about {n_bytes / 1e6:.0f} MB; the limit is {max_bytes / 1e6:.0f} MB. "
-            "Give fewer directions, a shorter processing.range_m, a shorter call or a lower sample rate"
+            "Use fewer directions, a shorter processing.range_m, a shorter call or a lower sample rate"
         )
     return max_bytes - n_bytes
 

@@ -82,7 +82,7 @@ class RowWriter:
         if self._numbered and self.runs.contains(sequence, session_id):
             raise ArgumentError(
                 f"measurement {self._n_rows} has sequence {sequence} of session {session_id}, like an earlier "
-                "one; use for each measurement of a sensor its own number (Stamp.sequence)"
+                "one; number the measurements of a sensor without repetition (Stamp.sequence)"
             )
 
     def flush(self) -> None:

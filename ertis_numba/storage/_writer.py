@@ -70,7 +70,7 @@ class FileWriter(ABC, Generic[Item]):
         self._rows: dict[str, RowWriter] = {}
         if self.path.suffix.lower() in _OTHER_SUFFIXES:
             raise ArgumentError(
-                f"output {self.path} ends in {self.path.suffix}, but the file is HDF5; choose a name in .h5"
+                f"output {self.path} ends in {self.path.suffix}, but the file is HDF5; choose a name that ends in .h5"
             )
         check_target(self.path, overwrite=overwrite)
         try:  # before warnings on what is to be written

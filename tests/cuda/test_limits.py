@@ -17,7 +17,7 @@ def _nothing(out):
 
 @pytest.mark.parametrize("grid", [(1, 65_536), (1, 1, 70_000)])
 def test_launch_of_too_many_blocks_is_refused(grid):
-    with pytest.raises(DeviceError, match=r"a grid of \d+,\d+ blocks; the limit is 65,535\. Give a shorter"):
+    with pytest.raises(DeviceError, match=r"a grid of \d+,\d+ blocks; the limit is 65,535\. Use a shorter"):
         lane.launch(_nothing, grid, (1,), np.zeros(1, np.float32))
 
 

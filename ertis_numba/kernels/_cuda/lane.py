@@ -142,7 +142,7 @@ def launch(kernel: Any, grid: tuple[int, ...], block: tuple[int, ...], *argument
     if max(grid[1:], default=0) > _MAX_BLOCKS:
         raise DeviceError(
             f"device 'cuda' would need a grid of {max(grid[1:]):,} blocks; the limit is {_MAX_BLOCKS:,}. "
-            "Give a shorter processing.range_m or fewer microphones, or use device 'cpu'"
+            "Use a shorter processing.range_m or fewer microphones, or use device 'cpu'"
         )
     if all(grid):  # launching an empty grid would be an error
         current().launch(kernel, grid, block, *arguments)

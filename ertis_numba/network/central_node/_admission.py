@@ -189,8 +189,8 @@ def require_same(
             if stream.run.sensor == source.name and not same(stream.source, source):
                 raise Unwanted(
                     "settings",
-                    f"another sensor node sends sensor {source.name}, with other settings; use for each sensor its "
-                    "own name, or end the other node",
+                    f"another sensor node sends sensor {source.name}, with other settings; use a different "
+                    "name for each, or end the other node",
                     "settings",
                 )
 

@@ -120,7 +120,7 @@ class Spool:
             key = stamp.sensor, stamp.session_id
             if stamp.sequence <= last.get(key, -1):
                 raise ArgumentError(
-                    f"measurement {stamp.sequence} of sensor {sensor.name} follows {last[key]}; pass rising "
+                    f"measurement {stamp.sequence} of sensor {sensor.name} follows {last[key]}; pass increasing "
                     "numbers, or another session_id"
                 )
             if key in self.runs:

@@ -76,7 +76,7 @@ class OutgoingSession:
         """Refuse a number that does not rise."""
         if self.following is not None and number < self.following:
             raise ArgumentError(
-                f"measurement {number} of sensor {self.sensor.name} follows {self.following - 1}; pass rising "
+                f"measurement {number} of sensor {self.sensor.name} follows {self.following - 1}; pass increasing "
                 "numbers, or another session_id"
             )
 
