@@ -162,7 +162,7 @@ def test_emission_is_masked_and_reported():
 
 def test_mixed_recording_becomes_images_of_its_calls():
     done = run("process mixed.h5 -o img.h5 --device cpu --json")
-    assert "mixed.h5: 2 of 4 measurements of sensor sensor are passive and left out; use mode='passive'" in done.stderr
+    assert "mixed.h5: 2 of 4 measurements of sensor sensor are passive and left out; use --mode passive" in done.stderr
     assert json.loads(done.stdout)["measurements"] == 2
     with ertis.open_energyscapes("img.h5") as images:
         assert [stamp.sequence for stamp in images.stamps()] == [0, 2]

@@ -526,8 +526,8 @@ def test_request_ends_at_once_if_the_sensor_node_leaves(tmp_path, says_bye):
 def test_arguments_of_configure_are_validated(tmp_path):
     with answering(tmp_path, None) as client:
         for arguments, message in (
-            ((3, SETTINGS), "sensor is of type int; choose the name of a sensor"),
-            (("front", "short_25_50"), "settings is of type str; use Settings, which"),
+            ((3, SETTINGS), "sensor is of type int; pass the name of a sensor"),
+            (("front", "short_25_50"), "settings is of type str; pass a Settings, which"),
             (("front", None), "settings is of type NoneType"),
             (("front", SETTINGS, float("nan")), "patience_s is nan; use a finite number"),
             (("front", SETTINGS, "long"), "patience_s is 'long'; use a number"),
@@ -536,7 +536,7 @@ def test_arguments_of_configure_are_validated(tmp_path):
                 client.configure(*arguments)
         with pytest.raises(ArgumentError, match="patience_s is 0; use a number above 0"):
             client.status(0)
-    with pytest.raises(ArgumentError, match="keys is of type str; use ClientKeys"):
+    with pytest.raises(ArgumentError, match="keys is of type str; pass a ClientKeys"):
         CentralClient("tcp://127.0.0.1:5601", keys="mine")
     with pytest.raises(ArgumentError, match="address 5601 cannot be used"):
         CentralClient(5601)
