@@ -205,7 +205,7 @@ def test_unknown_direction_is_printed_as_such(capsys, as_json):
     ("arguments", "message"),
     [
         (["--bearings", "--product", "raw"], "--product applies only without --bearings"),
-        (["--bearings", "--fuse"], "exclude each other"),
+        (["--bearings", "--fuse"], "--fuse and --bearings cannot be combined"),
         (["--average", "3"], "--average applies only with --bearings"),
         (["--fuse", "--directions", "90"], "--directions applies only with --bearings"),
     ],

@@ -194,7 +194,7 @@ def test_nonplanar_arrays_use_direct_sums(array):
 @pytest.mark.parametrize("array", NO_PLANE)
 def test_nonplanar_arrays_refuse_a_beam_grid(array, plan):
     settings = SHORT.replace(array=NO_PLANE[array], accuracy=plan)
-    with pytest.raises(ArgumentError, match=r"accuracy\.beam_taps is .*the array (has no extent|is neither).*give 0"):
+    with pytest.raises(ArgumentError, match=r"accuracy\.beam_taps is .*the array (has no extent|is neither).*use 0"):
         Pipeline(settings)
 
 

@@ -62,6 +62,6 @@ def test_images_with_different_axes_are_refused(tmp_path):
     ):
         with pytest.raises(ArgumentError, match=message):
             export(tmp_path / "a.npz", [first, other])
-    with pytest.raises(ArgumentError, match="no energyscape is given"):
+    with pytest.raises(ArgumentError, match="no energyscape is passed; pass at least one"):
         export(tmp_path / "a.npz", [])
     assert list(tmp_path.iterdir()) == []

@@ -50,7 +50,7 @@ def in_world_of_camera(place_m, rotation):
         (drive(roll_deg=90.0), "its z axis is 90° from vertical, and its y axis points up"),
         (
             drive(roll_deg=-90.0),
-            "its −y axis points up, as that of a camera does (z forward, y down); use --pose-axes camera",
+            "its −y axis points up, as that of a camera does (z forward, y down); convert them with",
         ),
         (drive(pitch_deg=90.0), "its z axis is 90° from vertical, and its −x axis points up"),
         (
@@ -59,15 +59,15 @@ def in_world_of_camera(place_m, rotation):
         ),
         (
             of_camera(*drive()),
-            "its −y axis points up, as that of a camera does (z forward, y down); use --pose-axes camera of",
+            "its −y axis points up, as that of a camera does (z forward, y down); convert them with --pose",
         ),
         (
             of_camera(*drive(pitch_deg=20.0)),
-            "use --pose-axes camera of 'ertis import-poses' or 'ertis map' (in Python, Trajectory.converted('camera'))",
+            "convert them with --pose-axes camera (ertis import-poses, ertis map) or Trajectory.converted('camera')",
         ),
         (
             in_world_of_camera(*drive()),
-            "as of a camera that turns about the y axis of the world; use --pose-axes camera-world",
+            "turns about the y axis of the world; convert them with --pose-axes camera-world (ertis import-poses, ",
         ),
         (in_world_of_camera(*(each[:4] for each in drive(90))), None),
         (drive(climb_m=0.1), None),
@@ -131,7 +131,7 @@ def test_mapper_warns_once_of_poses_of_a_camera(as_trajectory):
         for each in images
     ]
     mapper = ertis.Mapper({each.stamp.sensor: ((0.0, 0.0, 0.0), UNTURNED) for each in images})
-    with pytest.warns(ertis.PoseWarning, match="as that of a camera does .* use --pose-axes camera"):
+    with pytest.warns(ertis.PoseWarning, match="as that of a camera does .* convert them with --pose-axes camera "):
         mapper.add(at_start, path if as_trajectory else (place_m[0], rotation[0].as_quat()))
     mapper.add(at_start, path if as_trajectory else (place_m[1], rotation[1].as_quat()))
 

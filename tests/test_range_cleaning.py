@@ -120,7 +120,7 @@ def test_exact_image_is_compared_with_an_uncleaned_one():
     settings = cleaned_settings()
     (measurement,) = noise(settings, 1)
     with Pipeline(settings, device="cpu", predict=False) as pipeline:
-        with pytest.raises(ArgumentError, match=r"image is cleaned .* give that of Pipeline.process\(measurement, cle"):
+        with pytest.raises(ArgumentError, match=r"image is cleaned .* pass the image of Pipeline.process\(measurem"):
             measure(pipeline.process(measurement), measurement)
         assert measure(pipeline.process(measurement, clean=False), measurement).error_db < -40
 

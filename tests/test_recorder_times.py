@@ -296,13 +296,13 @@ def test_clock_that_was_never_set_is_noted(tmp_path, name):
 
 
 ORDERS = {  # name: notes, None if the order is clear
-    "180524_042537.wav": "the date may be 2018-05-24 (year first, as assumed) or 2024-05-18 (day first); use --start",
-    "240518_042537.wav": "the date may be 2024-05-18 (year first, as assumed) or 2018-05-24 (day first); use --start",
+    "180524_042537.wav": "the date may be 2018-05-24 (year first, as assumed) or 2024-05-18 (day first); use start_ns",
+    "240518_042537.wav": "the date may be 2024-05-18 (year first, as assumed) or 2018-05-24 (day first); use start_ns",
     "240538_042537.wav": "contains no time, so its time is unknown",  # no day
     "240531_042537.wav": None,  # not recorded in 2031
     "240524_042537.wav": None,
-    "18052024_042537.wav": "contains no time in a known order, so its time is unknown; use --start",
-    "05-06-2024 04.25.37.wav": "contains no time in a known order, so its time is unknown; use --start",
+    "18052024_042537.wav": "contains no time in a known order, so its time is unknown; set start_ns",
+    "05-06-2024 04.25.37.wav": "contains no time in a known order, so its time is unknown; set start_ns",
 }
 
 

@@ -110,7 +110,7 @@ def test_status_and_clock_arrive_in_rclpy():
         "h": (0, "processing"),
         "front": (0, "10.0 Hz"),
         "left": (3, "not connected"),
-        "right": (1, "3 measurements are missing"),
+        "right": (1, "3 measurements missing"),
     }
 
 

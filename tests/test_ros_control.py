@@ -161,8 +161,8 @@ def test_file_waits_while_it_is_paused(tmp_path):
     ("options", "message"),
     [
         (["--min-level", "-3"], "--min-level and --control cannot be combined; set the value in the file"),
-        (["--rate", "2"], "--rate and --control exclude each other"),
-        (["--max-rate", "points=2"], "--max-rate and --control exclude each other"),
+        (["--rate", "2"], "--rate and --control cannot be combined"),
+        (["--max-rate", "points=2"], "--max-rate and --control cannot be combined"),
     ],
 )
 def test_options_and_control_file_exclude_each_other(tmp_path, options, message):

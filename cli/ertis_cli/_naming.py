@@ -31,6 +31,7 @@ _PYTHON: Final = {
     "level_directions": "no-level",
     "mountings": "mounting",
     "overwrite": "force",
+    "pulse": "hook",
     "replace": "force",
 }
 """Parameters of the package whose option has another name."""

@@ -30,6 +30,6 @@ def pulse_reset_pin(pin: int = RESET_PIN) -> None:
             pins.output(pin, pins.HIGH)
     except Exception as error:  # The library raises plain exceptions, also on other computers.
         raise SonarError(
-            f"pin {pin} cannot be pulsed ({error}); on a Jetson, install Jetson.GPIO; elsewhere, name a program that "
-            "resets the sensor (hook), or unplug it and plug it in again"
+            f"pin {pin} cannot be pulsed ({error}); on a Jetson, install Jetson.GPIO; elsewhere, choose another way to "
+            "reset the sensor (pulse), or unplug it and plug it in again"
         ) from error
