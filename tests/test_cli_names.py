@@ -139,3 +139,26 @@ def test_plot_steer_rejects_a_single_number(folder, monkeypatch):
 def test_keys_that_are_no_options_keep_their_names(given, message, stated):
     ctx = cli.get_command(click.Context(cli), "process").make_context("process", ["a.h5", "-o", "b.h5", *given.split()])
     assert _naming.named(message, ctx) == f"{stated} {message.partition(' ')[2]}"
+
+
+@pytest.mark.parametrize(
+    ("names", "message", "stated"),
+    [
+        (
+            ("export",),
+            "choose one (sensor), or add them (mountings)",
+            "choose one (--sensor), or add them (--mounting)",
+        ),
+        (("keys", "allow"), "choose another name (name)", "choose another name (--name)"),
+        (("capture",), "spool_bytes and ring_bytes", "--spool-size and --ring"),
+        (("import",), "use join=True, sync_channel=3 or length_s", "use --join, --sync-channel 3 or --length"),
+        (("import",), "length_s.wav, in/length_s and x.length_s", "length_s.wav, in/length_s and x.length_s"),
+        (("info",), "replace it (overwrite=True)", "replace it (overwrite=True)"),
+    ],
+)
+def test_with_options_replaces_parameters_but_no_paths(names, message, stated):
+    command, ctx = cli, click.Context(cli)
+    for name in names:
+        command = command.get_command(ctx, name)
+        ctx = click.Context(command, parent=ctx)
+    assert _naming.with_options(message, ctx) == stated

@@ -33,6 +33,7 @@ _PYTHON: Final = {
     "overwrite": "force",
     "pulse": "hook",
     "replace": "force",
+    "spool_bytes": "spool-size",
 }
 """Parameters of the package whose option has another name."""
 _PARAMETER: Final = re.compile(
