@@ -178,7 +178,7 @@ def _peaks(image: Energyscape, each_top: list[Tops], errors_rad: list[float], no
             level_db=20 * math.log10(levels[k] / levels.max()),
             level_dbfs=20 * math.log10(levels[k]),
             grid_error_deg=math.degrees(errors_rad[k]),
-            angle_sd_deg=math.degrees(uncertainty.across_m[k] / tops.range_m[k]),
+            angle_sd_deg=math.degrees(uncertainty.across_rad[k]),
             range_sd_m=float(uncertainty.range_m[k]),
             level_sd_db=20 / math.log(10) * float(level_sd[k]),
         )

@@ -105,7 +105,7 @@ class PointExtractor:
         order = np.argsort(-levels, kind="stable")
         width_rad = np.where(self._are_open(image, tops), math.pi, tops.width_rad)
         found = self._uncertainty(image, tops._replace(width_rad=width_rad), noise=noise)
-        uncertainty_m = np.stack([found.range_m, found.across_m], axis=1).astype(np.float32)
+        uncertainty_m = np.stack([found.range_m, np.abs(tops.range_m) * found.across_rad], axis=1).astype(np.float32)
         return PointCloud(
             position_m[order], levels[order], image.settings, image.stamp, uncertainty_m=uncertainty_m[order]
         )

@@ -25,14 +25,14 @@ class Uncertainty(NamedTuple):
 
     Attributes
     ----------
-    range_m, across_m : (point,) float64
-        Along the range, and across it, in the direction that is least certain.
+    range_m, across_rad : (point,) float64
+        Along the range, and of the direction along its least certain axis.
     level : (point,) float64
         Of the level in nepers.
     """
 
     range_m: NDArray[np.float64]
-    across_m: NDArray[np.float64]
+    across_rad: NDArray[np.float64]
     level: NDArray[np.float64]
 
 
@@ -110,7 +110,7 @@ class PositionUncertainty:
         across_rad = np.where(is_fitted & (reach_m > 0), tops.across_sd_rad, across_rad)
         return Uncertainty(
             np.where(is_fitted, tops.range_sd_m, along_m),
-            tops.range_m * np.hypot(across_rad, _UNIFORM * tops.width_rad),
+            np.hypot(across_rad, _UNIFORM * tops.width_rad),
             np.where(is_fitted, tops.level_sd, relative),
         )
 

@@ -203,9 +203,24 @@ def test_any_settings_and_data_give_an_image_or_one_line(made, kind, seed, devic
         assert np.isfinite(peak.azimuth_deg) or not observable_angles(made.array).azimuth
         assert np.isfinite(peak.elevation_deg) or not observable_angles(made.array).elevation
         assert peak.level_db <= 0
+        assert not min(peak.range_sd_m, peak.angle_sd_deg, peak.level_sd_db) < 0
 
 
 # ---- errors found by random search -----------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("error")
+def test_echo_at_range_zero_has_an_uncertain_direction():
+    """The uncertainty across it is 0 m, but that of the angle is not 0 / 0."""
+    processing = Processing(directions="2d:19", range_m=(0.0, 0.0))
+    settings = Settings(recording=Recording(n_samples=40_960), processing=processing)
+    pipeline = Pipeline(settings, predict=False)
+    image = pipeline.process(Measurement(words_for(pipeline, "noise", 23), settings))
+    assert image.range_m.tolist() == [0.0]
+    found = find_peaks(image)
+    assert len(found) >= 1
+    assert min(peak.angle_sd_deg for peak in found) > 5  # degrees: echoes of noise
+    assert min(peak.range_sd_m for peak in found) > 0
 
 
 def test_call_shorter_than_a_period_is_refused():
