@@ -101,7 +101,7 @@ def test_own_bands_and_limits_cause_no_note():
 def test_advised_bands_locate_sound_below_the_default_bands():
     measurement = heard(384e3, 2e3, n_samples=38_400)
     _, note = mapped(measurement)
-    low_hz, high_hz = map(float, re.search(r"use --bands ([\d.]+):([\d.e+]+)", note).groups())
+    low_hz, high_hz = map(float, re.search(r"use the band ([\d.]+):([\d.e+]+) Hz", note).groups())
     own = measurement.settings.replace("passive.bands_hz", ((low_hz, high_hz),))
     found, _ = mapped(ertis.Measurement(measurement.data, own, measurement.stamp))
     assert ertis.find_sound_sources(found)[0].level_dbfs == pytest.approx(TONE_DBFS, abs=1.0)
@@ -143,7 +143,7 @@ def test_tones_at_edges_of_bands_are_named_with_their_level(rate_hz, method):
             measurement = heard(rate_hz, frequency_hz, **{"passive.method": method})
             _, note = mapped(measurement)
             named, level, low_hz, high_hz = re.search(
-                r"tone at (\S+) kHz of about (\S+) dBFS lies at the edge of two bands.* --bands (\d+):(\d+) ", note
+                r"tone at (\S+) kHz of about (\S+) dBFS lies at the edge of two bands.* the band (\d+):(\d+) Hz", note
             ).groups()
             assert 1e3 * float(named) == pytest.approx(frequency_hz, abs=0.12 * spacing_hz)
             assert float(level) == pytest.approx(TONE_DBFS, abs=1.0)
