@@ -105,6 +105,7 @@ def random_measurement(seed):
         elevation_limits_deg=(-60.0, 60.0),
         range_m=(0.3, 0.9),
         range_decimation=40 if wide else 100,
+        wavefront="plane",
     )
     points = tuple(
         Point(

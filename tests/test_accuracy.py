@@ -23,7 +23,9 @@ EVERY = 11  # each scene tests every 11th plan, with another start
 def real():
     """The real measurement with its reference image and its signal model."""
     settings = Settings.from_preset("default_25_50")
-    settings = settings.replace(processing=settings.processing.replace(directions="2d:181", range_m=(0.8, 5.0)))
+    settings = settings.replace(
+        processing=settings.processing.replace(directions="2d:181", range_m=(0.8, 5.0), wavefront="plane")
+    )
     return Rated(Measurement(np.fromfile(RAW, dtype="<u4"), settings), settings)
 
 

@@ -93,7 +93,7 @@ def test_memory_is_independent_of_the_recording_length(tmp_path):
 def real(request):
     """The real measurement, and the exact image of some directions of a grid."""
     settings = Settings.from_preset("default_25_50")
-    settings = settings.replace(processing=settings.processing.replace(directions=request.param))
+    settings = settings.replace(processing=settings.processing.replace(directions=request.param, wavefront="plane"))
     measurement = Measurement(np.fromfile(RAW, dtype="<u4"), settings)
     axes = ertis.Pipeline(settings)
     some = np.unique(np.linspace(0, len(axes.grid) - 1, 24).astype(int))
