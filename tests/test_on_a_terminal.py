@@ -217,7 +217,7 @@ def test_numbers_in_tables_are_never_wrapped(tmp_path, columns):
 def test_command_prints_the_same_on_a_terminal_and_in_a_pipe(tmp_path):
     path = write_energyscapes(tmp_path / "img.h5", [image()])
     piped = CliRunner().invoke(cli, ["peaks", str(path), "--top", "3"]).output
-    with Terminal(IMPORT, tmp_path, "peaks", path, "--top", "3") as terminal:
+    with Terminal(IMPORT, tmp_path, "peaks", path, "--top", "3", columns=200) as terminal:  # no heading is broken
         assert terminal.finish()[0] == 0
         assert "\n".join(terminal.lines).split() == piped.split()
         assert "\x1b[1m" in terminal.shown

@@ -177,7 +177,7 @@ def test_link_reconnects_to_a_silent_central_node():
     ("listed", "server", "message"),
     [
         (False, True, "does not know this key"),
-        (True, False, "--server-key"),
+        (True, False, "pass its key (server)"),
         (True, True, None),
     ],
 )

@@ -33,6 +33,7 @@ _PYTHON: Final = {
     "overwrite": "force",
     "pulse": "hook",
     "replace": "force",
+    "server": "server-key",
     "spool_bytes": "spool-size",
 }
 """Parameters of the package whose option has another name."""

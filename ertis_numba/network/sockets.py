@@ -43,7 +43,7 @@ _DESCRIPTORS = 8192
 _NO_ACCESS = 400  # Status code of ZAP.
 _HUNG_UP = (
     "the central node closed the connection before the handshake; if it requires a key, set one (keys)",
-    "the central node closed the connection: its key is not the expected one, or it has none; correct it (server_key)",
+    "the central node closed the connection: its key is not the expected one, or it has none; pass its key (server)",
 )
 _DISAGREE = (
     "the central node requires a key; set one (keys)",
