@@ -150,6 +150,8 @@ def test_keys_that_are_no_options_keep_their_names(given, message, stated):
             "choose one (--sensor), or add them (--mounting)",
         ),
         (("keys", "allow"), "choose another name (name)", "choose another name (--name)"),
+        (("capture",), "pass its key (server)", "pass its key (--server-key)"),
+        (("reset",), "reset the sensor (pulse)", "reset the sensor (--hook)"),
         (("capture",), "spool_bytes and ring_bytes", "--spool-size and --ring"),
         (("import",), "use join=True, sync_channel=3 or length_s", "use --join, --sync-channel 3 or --length"),
         (("import",), "length_s.wav, in/length_s and x.length_s", "length_s.wav, in/length_s and x.length_s"),
