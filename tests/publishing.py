@@ -1,6 +1,7 @@
 """A publisher for tests: the protocol of applications without image processing."""
 
 import contextlib
+import functools
 import json
 import threading
 import time
@@ -13,15 +14,16 @@ import numpy as np
 import pytest
 import zmq
 
+from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
-from ertis_numba.geometry import direction_grid
+from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.network import messages, sockets
 from ertis_numba.network.status import Status
 from ertis_numba.network.zap_authenticator import ZapAuthenticator
 from ertis_numba.settings import Processing, Settings
 
 SETTINGS = Settings(processing=Processing(directions="2d:31", range_m=(0.5, 3.0)))
-RANGE_M = np.arange(0.5, 3.0, 0.01)
+RANGE_M = np.arange(0.5, 3.0, 0.004)
 ALL = ("energyscape", "points", "raw", "group", "status")
 PATIENCE_S = 60.0
 PART = 5_000  # bytes per frame: images take several frames
@@ -34,17 +36,27 @@ def patient_applications(monkeypatch):
     monkeypatch.setattr("ertis_cli._product_printer._SOON_S", PATIENCE_S)
 
 
+@functools.cache
+def spread():
+    return PointSpread(SETTINGS)
+
+
 PATIENT_APPLICATIONS = pytest.mark.usefixtures("patient_applications")
 
 
 def image(sequence=0, *, sensor="front", reflectors=(), sync_count=None, **stamp):
-    """An image with reflectors, each given by azimuth in degrees, range in m and amplitude."""
+    """An image with reflectors, each given by azimuth in degrees, range in m and amplitude.
+
+    Echoes have the lobes of the array and the pulses of the call, because points are fits of these.
+    """
     grid = direction_grid(SETTINGS.processing)
     amplitude = np.full((len(grid), len(RANGE_M)), 1e-4, np.float32)
+    directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
     for azimuth_deg, range_m, peak in reflectors:
-        across = (grid.azimuth_rad - np.radians(azimuth_deg)) / np.radians(6)
-        along = (RANGE_M - range_m) / 0.02
-        amplitude += (peak * np.exp(-0.5 * (across[:, None] ** 2 + along**2))).astype(np.float32)
+        near = np.flatnonzero(np.abs(RANGE_M - range_m) < spread().reach_m)
+        offset = directions - unit_vectors(np.radians([azimuth_deg]), np.zeros(1))
+        found = spread()(np.repeat(offset, len(near), axis=0), np.tile(RANGE_M[near] - range_m, len(grid)))
+        amplitude[:, near] += (peak * found.reshape(len(grid), -1)).astype(np.float32)
     stamp = Stamp(
         sensor=sensor,
         sequence=sequence,

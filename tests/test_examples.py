@@ -169,8 +169,9 @@ def test_flow_measures_radial_speed_of_echoes(acoustic_flow):
     directions, speeds_m_s = acoustic_flow.flow(before, now)
     azimuth_deg = np.degrees(now.azimuth_rad[directions])
     assert {-36, 36} <= set(np.round(azimuth_deg))
-    np.testing.assert_allclose(speeds_m_s[azimuth_deg < 0], -0.5, atol=0.02)
-    np.testing.assert_allclose(speeds_m_s[azimuth_deg > 0], 0.13, atol=0.02)
+    # Elsewhere, the strongest echoes are side lobes of these.
+    np.testing.assert_allclose(speeds_m_s[np.abs(azimuth_deg + 36) < 7], -0.5, atol=0.02)
+    np.testing.assert_allclose(speeds_m_s[np.abs(azimuth_deg - 36) < 7], 0.13, atol=0.02)
 
 
 def test_flow_is_empty_without_matching_echoes(acoustic_flow):

@@ -116,7 +116,7 @@ def _heard_s(subscriber):
         (lambda p: p.raw(b"\x00" * 40), "header begins with"),
         (lambda p: p.raw(messages.encode(messages.Ping())), "message is 'ping'"),
         (lambda p: p.publish(image(), shape=(31, 17)), r"image has shape \(31, 17\), but its axes"),
-        (lambda p: p.publish(image(), dtype="float16"), "31000 bytes arrived for float16"),
+        (lambda p: p.publish(image(), dtype="float16"), "77500 bytes arrived for float16"),
         (lambda p: p.publish(image(), description=9), "refers to description 9, which has not arrived"),
         (lambda p: p.publish(cloud(), n_points=2**60), "16 bytes arrived for float32 of shape"),
         (lambda p: p.publish(measurement(), crc32=1), "does not match the CRC-32 in its header"),
