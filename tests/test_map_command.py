@@ -294,8 +294,8 @@ def test_map_notes_poses_of_a_camera_and_converts_them(folder):
     with pytest.warns(ertis.PoseWarning, match="as that of a camera"):
         add_poses(folder / "both.h5", of_camera(poses()), output=folder / "of_camera.h5")
     note = (
-        "its −y axis points up, as that of a camera does (z forward, y down); convert them with 'ertis import-poses "
-        "--pose-axes camera'"
+        "its −y axis points up, as that of a camera does (z forward, y down); convert them with --pose-axes camera "
+        "(ertis import-poses, ertis map)"
     )
     run(folder, "both.h5 --poses poses.tum -q -o level.h5")
     for number, line in enumerate(("both.h5 --poses camera.tum", "of_camera.h5")):
