@@ -18,7 +18,7 @@ from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import Grid, direction_grid, observable_angles, unit_vectors
 from ertis_numba.settings import Settings
 
-__all__ = ["MIN_LEVEL_DB", "TOP", "PointExtractor"]
+__all__ = ["MIN_LEVEL_DB", "TOP", "EchoPointExtractor", "PointExtractor"]
 
 TOP: Final = 256
 """Default of the largest number of points per image."""
@@ -69,6 +69,8 @@ class PointExtractor:
             clouds = [extract(pipeline.process(measurement)) for measurement in recording]
     """
 
+    _noise_only = False
+
     def __init__(
         self, settings: Settings, grid: Grid | None = None, *, top: int = TOP, min_level_db: float = MIN_LEVEL_DB
     ) -> None:
@@ -82,7 +84,9 @@ class PointExtractor:
         self._interpolator = PeakInterpolator(settings, self._directions, self._neighbours)
         spread = PointSpread(settings)
         self._edges, self._reach_m = EdgeFloor(self._directions, spread), spread.reach_m
-        self._uncertainty = PositionUncertainty(settings, is_planar=bool(np.ptp(self._directions[:, 2]) == 0))
+        self._uncertainty = PositionUncertainty(
+            settings, is_planar=bool(np.ptp(self._directions[:, 2]) == 0), noise_only=self._noise_only
+        )
 
     def __call__(self, image: Energyscape) -> PointCloud:
         """Return the points of an image.
@@ -157,3 +161,13 @@ class PointExtractor:
         some = amplitude[:, ::_THINNED].ravel()
         count = min(len(some), max(1, _BINS_OF_POINT * self._top // _THINNED))
         return np.float32(np.partition(some, len(some) - count)[len(some) - count])
+
+
+class EchoPointExtractor(PointExtractor):
+    """Extractor for fusion and odometry, whose uncertainties are those of noise only.
+
+    Both model the interference of echoes themselves. With the misfit to a single echo as well, they would accept echoes
+    of other reflectors as those of one.
+    """
+
+    _noise_only = True

@@ -74,13 +74,15 @@ class PositionUncertainty:
         Settings of the images; the air may differ between images.
     is_planar : bool
         True if all directions have the same elevation.
+    noise_only : bool
+        State the Cramér-Rao bounds for fitted echoes, too.
     """
 
-    def __init__(self, settings: Settings, *, is_planar: bool) -> None:
+    def __init__(self, settings: Settings, *, is_planar: bool, noise_only: bool = False) -> None:
         frequency_hz, power = matched_noise_spectrum(settings, n_waves=_WAVES)
         mean_square = float(power @ frequency_hz**2)
         positions_m = microphones(settings.array).enabled_positions_m
-        self._settings, self._is_planar = settings, is_planar
+        self._settings, self._is_planar, self._noise_only = settings, is_planar, noise_only
         self._width_hz = math.sqrt(mean_square - float(power @ frequency_hz) ** 2)
         self._frequency_hz = math.sqrt(mean_square)
         self._covariance_m2 = _effective_covariance_m2(positions_m, array_weights(settings))
@@ -106,7 +108,7 @@ class PositionUncertainty:
         wave_1_m = 2 * math.pi * self._frequency_hz / speed_m_s
         across_rad = np.full(len(relative), np.inf)
         np.divide(relative / wave_1_m, reach_m, out=across_rad, where=reach_m > 0)
-        is_fitted = np.isfinite(tops.across_sd_rad)
+        is_fitted = np.isfinite(tops.across_sd_rad) & (not self._noise_only)
         across_rad = np.where(is_fitted & (reach_m > 0), tops.across_sd_rad, across_rad)
         return Uncertainty(
             np.where(is_fitted, tops.range_sd_m, along_m),

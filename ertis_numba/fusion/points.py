@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.noise import EchoFloor, echo_floor
-from ertis_numba.analysis.points import PointExtractor
+from ertis_numba.analysis.points import EchoPointExtractor
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.association import Reflectors
 from ertis_numba.fusion.attribution import Shares
@@ -93,7 +93,7 @@ class PointFuser:
         self._number, self._mounting, self._receiver = number, sensors[number], receiver
         self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
         self._kept: tuple[tuple[Energyscape, HeardImage], ...] = ()
-        self._extract = PointExtractor(
+        self._extract = EchoPointExtractor(
             image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP, min_level_db=_MIN_LEVEL_DB
         )
 

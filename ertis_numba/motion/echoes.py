@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.air import sound_speed_m_s
-from ertis_numba.analysis.points import PointExtractor
+from ertis_numba.analysis.points import EchoPointExtractor
 from ertis_numba.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.rig import MountedSensor, emitter_diameter_m
@@ -100,7 +100,7 @@ class EchoExtractor:
         self._mounted = sensors
         self._is_ahead, self._is_alone = alone is True, alone is None and _is_platform(sensors)
         self._sensors = {sensor.name: (number, sensor) for number, sensor in enumerate(sensors)}
-        self._extractors: dict[str, tuple[tuple[int, ...], PointExtractor]] = {}
+        self._extractors: dict[str, tuple[tuple[int, ...], EchoPointExtractor]] = {}
 
     def __call__(self, group: Mapping[str, Energyscape | PointCloud]) -> GroupEchoes:
         """Return the echoes of a group of images or point clouds, by sensor."""
@@ -165,7 +165,7 @@ class EchoExtractor:
         known = self._extractors.get(image.stamp.sensor)
         if known is None or known[0] != image.amplitude.shape:
             grid = Grid(image.azimuth_rad, image.elevation_rad)
-            made = PointExtractor(image.settings, grid, top=_TOP, min_level_db=_MIN_LEVEL_DB)
+            made = EchoPointExtractor(image.settings, grid, top=_TOP, min_level_db=_MIN_LEVEL_DB)
             known = self._extractors[image.stamp.sensor] = image.amplitude.shape, made
         return known[1](image)
 
