@@ -132,7 +132,7 @@ def test_mountings_of_the_central_node_are_used():
 def test_sensor_that_cannot_be_fused_is_left_out_with_one_note(mountings, peak, reason):
     sent = [
         image(number, sensor=sensor, reflectors=[(20.0, 1.5, peak if sensor == "back" else 0.1)])
-        for number in range(4)
+        for number in range(8)  # Later pulses end the wait for the image of the sensor that is left out.
         for sensor in ("back", "front")
     ]
     notes = []
