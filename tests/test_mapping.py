@@ -636,7 +636,9 @@ def test_map_of_space_is_written_as_hdf5_and_ply(tmp_path):
     vertices = PlyData.read(str(tmp_path / "m.ply"))["vertex"]
     assert [vertices[name][0] for name in "xyz"] == pytest.approx([-0.65, 2.25, 0.65])
     for suffix in ("pgm", "mcap"):
-        with pytest.raises(ArgumentError, match=r"but the map has three dimensions; choose a name that ends in .h5 or .ply"):
+        with pytest.raises(
+            ArgumentError, match=r"but the map has three dimensions; choose a name that ends in .h5 or .ply"
+        ):
             ertis.write_map(tmp_path / f"m.{suffix}", voxels())
 
 

@@ -205,7 +205,7 @@ def test_subscriber_with_keys_receives_products(keys):
     [
         ("unknown", "the central node does not know this key"),
         ("none", "requires a key[;,] set one"),
-        ("wrong server", "server_key"),
+        ("wrong server", r"pass its key \(server\)"),
     ],
 )
 @pytest.mark.usefixtures("hasty")

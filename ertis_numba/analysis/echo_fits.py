@@ -140,7 +140,7 @@ class EchoFits:
             kept[:, 0],
             np.einsum("pi,pij->pj", kept[:, 1:3], axes),
             kept[:, 3],
-            np.hypot(sd[0], np.where(is_sparse, _UNIFORM * width_rad * extent_m / 2, 0.0)),
+            np.hypot(sd[0], np.where(is_sparse, _UNIFORM * np.minimum(width_rad, np.pi) * extent_m / 2, 0.0)),
             sd[1],
             np.hypot(sd[2], np.where(is_sparse, _SPARSE_NP, 0.0)),
             is_sparse,
