@@ -269,6 +269,7 @@ def test_images_continue_after_a_publisher_restart(keys):
         assert (subscriber.counts.received, subscriber.counts.missed, subscriber.counts.reconnects) == (6, 0, 1)
     with Pipeline(SETTINGS, device="numpy") as pipeline:
         expected = pipeline.process(measurement(5))
-    np.testing.assert_array_equal(images[5].amplitude, expected.amplitude)
+    # Sums of BLAS differ in the last digits between numbers of threads.
+    np.testing.assert_allclose(images[5].amplitude, expected.amplitude, rtol=1e-5)
     np.testing.assert_array_equal(images[5].range_m, expected.range_m)
     assert images[5].stamp == measurement(5).stamp
