@@ -41,8 +41,8 @@ class PositionUncertainty:
 
     `ertis_numba.analysis.echo_fits.EchoFits` states the errors of fitted echoes: the inverse of the Fisher information
     of the bins that were fitted. It contains the noise, the remaining errors of the plan, other places that explain the
-    bins nearly as well, and the deviation of the bins from the image of a single echo. For images of the method
-    ``paper``, the errors are the Cramér-Rao bounds of a single echo in white noise
+    bins nearly as well, and the deviation of the bins from the image of a single echo. With ``noise_only``, errors are
+    the Cramér-Rao bounds of a single echo in white noise
 
     ``σ_range = c / (4π β √(2ρ))``, ``σ_across = r / (k √(λ 2ρ))`` and ``σ_level = 1 / √(2ρ)`` nepers,
 
@@ -64,7 +64,8 @@ class PositionUncertainty:
     A direction that was not interpolated, or that ends at the border of its cell, contributes the spacing of the grid.
     Where the reflector may lie beyond an edge, the direction is unknown, and its standard deviation is 1 rad.
 
-    A value is infinite if the array cannot resolve that direction. It is NaN if the noise is unknown: for beamformers
+    A value is infinite if the array cannot resolve that direction. It is NaN for images of the method ``paper``, whose
+    errors by whole samples and plane waves exceed the noise, and if the noise is unknown: for beamformers
     other than delay-and-sum, whose noise is not Rayleigh-distributed, and if most of the image is 0, as after `clean`.
     Errors of layout and temperature are not included.
 
@@ -98,7 +99,8 @@ class PositionUncertainty:
         noise : float
             Root mean square of the noise of the image; 0 if it is unknown.
         """
-        if not noise:
+        is_paper = self._settings.processing.method == "paper" and not self._noise_only
+        if not noise or is_paper:
             unknown = np.full(len(tops.range_m), np.nan)
             return Uncertainty(unknown, unknown, unknown)
         relative = noise / tops.amplitude / math.sqrt(2)
