@@ -143,7 +143,7 @@ def test_sensor_that_cannot_be_fused_is_left_out_with_one_note(mountings, peak, 
             FusedSubscriber(publisher.address, mountings=mountings, on_note=notes.append) as subscriber,
         ):
             found = {}
-            while 3 not in found:
+            while max(found, default=0) < 3:  # A slow application skips pulses.
                 fused = subscriber.receive(PATIENCE_S).fused
                 found[fused.stamp.sync_count] = fused.sensors
     assert set(found.values()) == {("front",)}

@@ -17,7 +17,7 @@ def spot(azimuth_deg, range_m, *, sensor="front", sequence=0, level=0.5, **stamp
     """Image with one reflector, smooth enough to lie between directions and ranges."""
     made = image(np.linspace(-90, 90, 91))
     across = (np.degrees(made.azimuth_rad) - azimuth_deg) / 4
-    along = (made.range_m - range_m) / 0.03
+    along = (made.range_m - range_m) / 0.012  # Longer ones would be clicks.
     amplitude = made.amplitude * 0.01 + (level * np.exp(-0.5 * (across[:, None] ** 2 + along**2))).astype(np.float32)
     return made.replace(amplitude=amplitude.astype(np.float32), stamp=Stamp(sensor=sensor, sequence=sequence, **stamp))
 
