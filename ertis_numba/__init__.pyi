@@ -5,12 +5,7 @@ from .analysis.compare import compare as compare
 from .analysis.detect import find_peaks as find_peaks
 from .analysis.health import health as health
 from .analysis.points import PointExtractor as PointExtractor
-from .arrays import beamform as beamform, demodulate as demodulate, matched_filter as matched_filter
-from .calibration import Calibration as Calibration, calibrate as calibrate
-from .devices.driver import SonarDriver as SonarDriver
-from .devices.emulator import Emulator as Emulator
-from .devices.setup import Setup as Setup
-from .errors import (
+from .base.errors import (
     ArgumentError as ArgumentError,
     CallMismatchWarning as CallMismatchWarning,
     CoarseGridWarning as CoarseGridWarning,
@@ -34,6 +29,10 @@ from .errors import (
     SonarError as SonarError,
     StartMismatchWarning as StartMismatchWarning,
 )
+from .calibration import Calibration as Calibration, calibrate as calibrate
+from .devices.driver import SonarDriver as SonarDriver
+from .devices.emulator import Emulator as Emulator
+from .devices.setup import Setup as Setup
 from .figures import plot as plot
 from .frames import (
     AcousticMap as AcousticMap,
@@ -89,6 +88,7 @@ from .passive import (
     time_expanded as time_expanded,
 )
 from .pipeline import Pipeline as Pipeline
+from .pipeline.arrays import beamform as beamform, demodulate as demodulate, matched_filter as matched_filter
 from .settings import Call as Call, Settings as Settings, presets as presets
 from .simulation.render import Simulator as Simulator, render as render
 from .simulation.scene import Scene as Scene, load_scene as load_scene

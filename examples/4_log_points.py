@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import ertis_numba as ertis
-from ertis_numba.atomic_files import atomic_write
+from ertis_numba.base.atomic_files import atomic_write
 
 COLUMNS = ("timestamp_ns", "sensor", "sequence", "x_m", "y_m", "z_m", "amplitude")
 

@@ -18,7 +18,7 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from ertis_numba.errors import ArgumentError, RefusedError
+from ertis_numba.base.errors import ArgumentError, RefusedError
 from ertis_numba.network.pose_publisher import PosePublisher
 
 TURN_S = 0.1

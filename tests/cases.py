@@ -3,8 +3,8 @@
 import numpy as np
 
 from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recording, Settings
 
 LINE_8 = tuple((0.0, 0.004 * channel, 0.0) for channel in range(8))

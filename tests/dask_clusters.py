@@ -9,8 +9,8 @@ __all__ = ["client_of", "cluster_of_threads"]
 def cluster_of_threads(n_workers):
     """Yield the address of a scheduler; it and its workers run in this process.
 
-    Workers in processes, as of `ertis_numba.cluster.local_cluster`, need seconds of processor time to start. Use them
-    only where the process matters, such as for tests that kill it.
+    Workers in processes, as of `ertis_numba.processes.cluster.local_cluster`, need seconds of processor time to
+    start. Use them only where the process matters, such as for tests that kill it.
     """
     from distributed import LocalCluster  # noqa: PLC0415 - a slow import that few tests need
 

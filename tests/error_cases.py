@@ -5,13 +5,13 @@ import functools
 import numpy as np
 
 from ertis_numba import kernels
+from ertis_numba.chain.fast_chain import FastChain
+from ertis_numba.chain.planner import Planner
+from ertis_numba.chain.signal_model import signal_model_of
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages.fast_chain import FastChain
-from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.signal_model import signal_model_of
 from tests import reference
 from tests.scenes import only
 

@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import microphones
-from ertis_numba.waveform import matched_filter_spectrum
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import matched_filter_spectrum
 
 TINY = np.finfo(np.float32).tiny
 

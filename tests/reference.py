@@ -14,10 +14,10 @@ import scipy.signal
 from ertis_bench.error_trials import reference_image
 from ertis_bench.error_trials.reference_image import signals_of
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import array_weights, microphones
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Settings
-from ertis_numba.waveform import call_at
 
 
 def error_db(image, exact) -> float:

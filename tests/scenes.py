@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from ertis_numba.air import sound_speed_m_s
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Array, Call, Processing, Recording
 from ertis_numba.simulation import Emitter, Scene, Sensor
 from ertis_numba.simulation.arrivals import arrivals
@@ -11,7 +12,6 @@ from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.snapshot import snapshot
 from ertis_numba.simulation.stopwatch import CostStopwatch
-from ertis_numba.waveform import call_at
 
 RATE_HZ = 4_500_000.0
 ONE = Array(layout="one", positions_m=((0.0, 0.0, 0.0),), word_bits=8)

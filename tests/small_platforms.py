@@ -10,10 +10,10 @@ import numpy as np
 import scipy
 
 import ertis_numba as ertis
-from ertis_numba.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import absorption_db_m, sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Processing, Recording, Settings
-from ertis_numba.waveform import call_at
 
 __all__ = ["HEIGHT_M", "LEVEL", "RATE_HZ", "images_of", "mounted", "random_reflectors", "rendered", "settings_of"]
 

@@ -7,7 +7,7 @@ import zlib
 
 import zmq
 
-from ertis_numba.errors import ErtisError
+from ertis_numba.base.errors import ErtisError
 from ertis_numba.network import messages, sockets
 from ertis_numba.network.zap_authenticator import ZapAuthenticator
 from tests.ports import reserved_address

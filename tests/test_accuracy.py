@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
+from ertis_numba.chain.error_model import PARTS, SignalModel, decibels
+from ertis_numba.chain.planner import Planner
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.settings import Accuracy, Processing, Settings
-from ertis_numba.stages.error_model import PARTS, SignalModel, decibels
-from ertis_numba.stages.planner import Planner
 from tests import reference
 from tests.error_cases import BEST, CPU, PLANS, Rated, image_of, rated
 from tests.test_real import RAW

@@ -8,10 +8,10 @@ import threadpoolctl
 from scipy.signal import csd
 
 import ertis_numba as ertis
-from ertis_numba.air import transmission_loss_db
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import is_passive
 from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry.air import transmission_loss_db
 from ertis_numba.passive import AcousticCamera, CrossSpectrum, find_bearings, octave_bands
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.methods import METHODS
@@ -19,7 +19,7 @@ from ertis_numba.passive.parallel_bins import in_parts
 from ertis_numba.settings import MAP_METHODS, Settings
 from tests.on_device import KERNELS
 
-pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")  # Small grids save time.
+pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.base.errors.CoarseGridWarning")  # Small grids save time.
 
 SMALL = {
     "array.layout": "six",

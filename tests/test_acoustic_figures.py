@@ -13,15 +13,15 @@ from scipy.signal import welch
 
 import ertis_numba as ertis
 from ertis_numba import figures
-from ertis_numba.air import absorption_db_m, transmission_loss_db
-from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.figures import _acoustic_signals
 from ertis_numba.figures.style import angle
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
-from ertis_numba.method_titles import METHOD_TITLES
+from ertis_numba.geometry.air import absorption_db_m, transmission_loss_db
 from ertis_numba.settings import MAP_METHODS, Settings
+from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS
+from ertis_numba.settings.method_titles import METHOD_TITLES
 from tests.publishing import image
 from tests.test_acoustic_camera import settings_of, sound
 

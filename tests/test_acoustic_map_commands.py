@@ -14,9 +14,9 @@ from ertis_cli import process
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.air import transmission_loss_db
 from ertis_numba.campaign import Campaign, CampaignOptions, RecordingStarted, find_recordings
 from ertis_numba.frames import Stamp
+from ertis_numba.geometry.air import transmission_loss_db
 from ertis_numba.settings import MAP_METHODS
 from tests.campaigns import InlinePool, names_in
 from tests.pages import commands_in, page, python_in, run_code_here, run_here

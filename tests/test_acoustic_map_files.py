@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError, FormatVersionError
 from ertis_numba.settings import Array, Settings
 from ertis_numba.storage import file_kind, recorded_trajectory, sensor_names
 from tests.files import image, noise, open_dataset

@@ -11,9 +11,9 @@ from ertis_cli._listen_bearings import _show
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.air import transmission_loss_db
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Bearing, Measurement
+from ertis_numba.geometry.air import transmission_loss_db
 from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
 from ertis_numba.passive import AcousticCamera
 from tests.publishing import PATIENCE_S, PATIENT_APPLICATIONS, Publisher, measurement, patient_applications

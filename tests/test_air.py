@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, strategies as st
 from numpy.testing import assert_allclose
 
-from ertis_numba.air import absorption_db_m, sound_speed_m_s
+from ertis_numba.geometry.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.settings import Air
 
 airs = st.builds(

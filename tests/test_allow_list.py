@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import zmq
 
-from ertis_numba.errors import SettingsError
+from ertis_numba.base.errors import SettingsError
 from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.network.zap_authenticator import ZapAuthenticator

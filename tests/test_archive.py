@@ -8,7 +8,7 @@ from datetime import datetime
 
 import pytest
 
-from ertis_numba.errors import ArgumentError, DataError, DiskFullError, ErtisError, JournalInUseError
+from ertis_numba.base.errors import ArgumentError, DataError, DiskFullError, ErtisError, JournalInUseError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import SUFFIX, Journal, JournalPose, JournalSensor, seal_in_subprocess
 from ertis_numba.network.central_node import Archive, _recent_poses, _volumes

@@ -7,10 +7,10 @@ import pytest
 
 import ertis_numba as ertis
 from ertis_numba import kernels
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import array_weights, direction_grid, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_samples, matched_band_hz
 from ertis_numba.settings import Accuracy, Call, Processing
-from ertis_numba.waveform import call_samples, matched_band_hz
 from tests.cases import CASES, SHORT, noise
 from tests.reference import error_db, exact
 

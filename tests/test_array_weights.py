@@ -8,18 +8,18 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 from hypothesis import given, strategies as st
 
-from ertis_numba import kernels, verification
+from ertis_numba import kernels
 from ertis_numba.analysis.compare import _Lobe
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.uncertainty import _effective_covariance_m2
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.figures import _captions
 from ertis_numba.figures._array import pattern_db, width_deg
 from ertis_numba.geometry import array_weights, effective_count, microphones, unit_vectors
-from ertis_numba.pipeline import Pipeline
-from ertis_numba.prediction import planner_of, predict
+from ertis_numba.pipeline import Pipeline, verification
+from ertis_numba.pipeline.prediction import planner_of, predict
 from ertis_numba.settings import Array, Settings, parse_window
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.simulation import Point, Scene
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.storage import open_energyscapes, write_recording

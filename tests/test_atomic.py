@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.atomic_files import atomic_write
+from ertis_numba.base.atomic_files import atomic_write
 
 
 def test_failed_write_leaves_no_file(tmp_path):

@@ -12,16 +12,16 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.signals import signals_of
 from ertis_numba.frames import Measurement, Trajectory
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.interop import Drive, _batslam
 from ertis_numba.interop._virtual_ears import VirtualEars
 from ertis_numba.settings import Array
-from ertis_numba.stages.signals import signals_of
 from ertis_numba.storage import add_poses, write_recording
-from ertis_numba.waveform import call_samples
 from tests.files import SMALL, image, line, noise
 from tests.pages import commands_in, page, python_in, run_code_here, run_here
 

@@ -7,15 +7,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 from ertis_numba import kernels
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.beam_grid import Aperture, BeamGrid
+from ertis_numba.chain.interpolation_fit import Spectrum
+from ertis_numba.chain.planner import Planner
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import matched_noise_spectrum
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Settings
-from ertis_numba.stages.beam_grid import Aperture, BeamGrid
-from ertis_numba.stages.interpolation_fit import Spectrum
-from ertis_numba.stages.planner import Planner
-from ertis_numba.waveform import matched_noise_spectrum
 from tests import reference
 from tests.cases import SHORT, noise
 from tests.hard_cases.tuned import tuned

@@ -8,11 +8,11 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
+from ertis_numba.base.wav import read_wav
 from ertis_numba.geometry import microphones
 from ertis_numba.passive import BeamSound, HeardSignals, heterodyned, listen_to, time_expanded
 from ertis_numba.passive.wave_delays import WaveDelays
-from ertis_numba.wav import read_wav
 from tests.test_acoustic_camera import settings_of, sound
 
 

@@ -8,15 +8,15 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba import kernels
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain import planner
+from ertis_numba.chain.adaptive import AdaptiveBeamform
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.simulation import Point
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.stages import planner
-from ertis_numba.stages.adaptive import AdaptiveBeamform
-from ertis_numba.stages.fast_chain import FastChain
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests import cases
 from tests.files import noise

@@ -8,11 +8,17 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS, BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.adaptive import AdaptiveBeamform
+from ertis_numba.pipeline.verification import combine
 from ertis_numba.settings import Processing
-from ertis_numba.stages.adaptive import AdaptiveBeamform
-from ertis_numba.verification import combine
+from ertis_numba.settings.beamformers import (
+    ADAPTIVE_COMBINATIONS,
+    BEAMFORMERS,
+    WEIGHTINGS,
+    BeamformerName,
+    WeightingName,
+)
 from tests import reference
 from tests.on_device import KERNELS, sized
 from tests.pages import page

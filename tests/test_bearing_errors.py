@@ -9,7 +9,7 @@ from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.passive import AcousticCamera, BearingFinder
 from ertis_numba.passive.likelihood import moved, tangents
 
-pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")  # Small grids save time.
+pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.base.errors.CoarseGridWarning")  # Small grids save time.
 
 RATE_HZ, N_SAMPLES = 225e3, 8192
 

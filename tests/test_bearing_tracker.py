@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Bearing
 from ertis_numba.passive import BearingTracker
 from ertis_numba.passive.direction_filter import DirectionFilter

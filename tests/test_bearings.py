@@ -8,7 +8,7 @@ import scipy
 from ertis_bench.passive import bearings as passive_bearings
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.geometry import microphones, unit_vectors
 from ertis_numba.passive import AcousticCamera, BearingFinder, find_bearings
 from ertis_numba.passive.bands import bin_shares
@@ -19,7 +19,7 @@ from ertis_numba.passive.noise_model import NoiseModel
 from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
 from tests.test_acoustic_camera import settings_of, sound
 
-pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")  # Small grids save time.
+pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.base.errors.CoarseGridWarning")  # Small grids save time.
 
 SPACE = {"processing__directions": "3d:400", "passive__bands_hz": [[30e3, 45e3]]}
 

@@ -10,9 +10,9 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
+from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.setup import Setup
-from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.interop import export
 from ertis_numba.journal import Journal, JournalEntry

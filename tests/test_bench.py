@@ -26,13 +26,13 @@ from ertis_bench.cpu_times import beamformers, scaling
 from ertis_bench.simulation_trials import simulation
 from ertis_cli.main import cli
 
-from ertis_numba import figures, kernels, verification
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba import figures, kernels
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.kernels._cpu import ceilings
-from ertis_numba.pipeline import Pipeline
-from ertis_numba.prediction import Prediction
+from ertis_numba.pipeline import Pipeline, verification
+from ertis_numba.pipeline.prediction import Prediction
 from ertis_numba.settings import ERROR_PRESETS_DB
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.simulation import Point
 from ertis_numba.simulation.effects import EFFECTS
 from tests.cases import SHORT, noise

@@ -16,10 +16,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from ertis_numba import open_recording
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.devices import splice_detection
 from ertis_numba.devices.bit_means import BitMeans
 from ertis_numba.devices.bits import BitCheck
-from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import load_layout
 from ertis_numba.settings import Recording
 from ertis_numba.simulation import load_scene
@@ -319,7 +319,7 @@ def test_bit_means_equal_means_of_samples(n_samples):
 
 def test_bit_check_loads_no_compiled_kernels():
     program = (
-        "import sys, ertis_numba.capture, ertis_numba.devices.bits as bits, numpy as np\n"
+        "import sys, ertis_numba.devices.capture, ertis_numba.devices.bits as bits, numpy as np\n"
         "bits.BitCheck(4096, 4.5e6).check(np.zeros(4096, np.uint32))\n"
         "sys.exit('numba' in sys.modules)"
     )

@@ -10,18 +10,18 @@ from ertis_bench.error_trials import budgets, reference_image
 from ertis_bench.error_trials.random_settings import random_measurement
 from ertis_cli.main import cli
 
-from ertis_numba import kernels, verification
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
-from ertis_numba.errors import ErrorBudgetWarning
+from ertis_numba import kernels
+from ertis_numba.base.errors import ErrorBudgetWarning
+from ertis_numba.chain.planner import Planner
+from ertis_numba.chain.sensitivity import Sensitivity
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import direction_grid, unit_vectors
-from ertis_numba.pipeline import Pipeline
-from ertis_numba.prediction import planner_of, predict
+from ertis_numba.geometry.waveform import call_at
+from ertis_numba.pipeline import Pipeline, verification
+from ertis_numba.pipeline.prediction import planner_of, predict
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
-from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.sensitivity import Sensitivity
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.storage import open_energyscapes, write_recording
-from ertis_numba.waveform import call_at
 
 CPU = kernels.load("cpu")
 PCM = Settings(

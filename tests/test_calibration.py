@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from ertis_bench.error_trials.faulty_arrays import FaultyArray, calibration_errors, faulty_array, image_losses, record
 
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.calibration import calibrate
 from ertis_numba.calibration.channel_order import find_swaps
 from ertis_numba.calibration.observations import Observations, Tolerances
 from ertis_numba.calibration.separable_problem import SeparableProblem
 from ertis_numba.calibration.wavefronts import TARGETS, travel_times
-from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import load_layout
 from ertis_numba.pipeline import Pipeline

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import scipy
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.calibration import calibrate
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Processing, Recording, Settings
 from tests.echo_draws import sweep, unit
 

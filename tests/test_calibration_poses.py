@@ -9,12 +9,12 @@ from ertis_cli._calibrate_poses import write_poses
 from ertis_cli._mountings import mountings
 from scipy.spatial.transform import Rotation
 
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.calibration.pose_fit import PoseProblem, WaveTable
 from ertis_numba.calibration.pose_result import PoseCalibration, SensorPose
 from ertis_numba.calibration.poses import calibrate_poses
 from ertis_numba.calibration.spherical_waves import fit_wave, wave_lags, wave_slopes
 from ertis_numba.calibration.wave_finder import find_waves
-from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.settings import Array, Call, Recording
 from ertis_numba.simulation import Emitter, Point, Scene, Sensor
 from ertis_numba.simulation.render import Simulator

@@ -11,12 +11,12 @@ from ertis_cli.main import cli
 from scipy.signal import chirp
 
 from ertis_numba.analysis.call_match import SILENT, call_match, first_call_match
-from ertis_numba.errors import CallMismatchWarning
+from ertis_numba.base.errors import CallMismatchWarning
 from ertis_numba.frames import Measurement
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Call, Processing, Recording, Settings
 from ertis_numba.storage import open_energyscapes, write_recording
-from ertis_numba.waveform import call_at
 
 SETTINGS = Settings(
     recording=Recording(sample_rate_hz=450e3, n_samples=8100, encoding="float32"),

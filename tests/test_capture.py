@@ -17,13 +17,13 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.capture import CaptureSession
-from ertis_numba.capture.gap_reasons import DROPPED, NOT_TRIGGERED
+from ertis_numba.base.errors import ArgumentError, SonarError
+from ertis_numba.devices.capture import CaptureSession
+from ertis_numba.devices.capture.gap_reasons import DROPPED, NOT_TRIGGERED
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator import Emulator, Quirks, SyncChain
 from ertis_numba.devices.emulator.faults import BlockFault, Faults, Spoilt
 from ertis_numba.devices.setup import Setup
-from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.journal import Journal
 from ertis_numba.settings import Recording, Settings
 from ertis_numba.storage import open_recording

@@ -13,11 +13,11 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.capture import CaptureSession
+from ertis_numba.base.errors import RefusedError
+from ertis_numba.devices.capture import CaptureSession
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup
-from ertis_numba.errors import RefusedError
 from ertis_numba.network import messages
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.central_client import CentralClient

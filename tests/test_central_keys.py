@@ -4,7 +4,7 @@ import select
 
 import pytest
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.network import messages
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.central_node import Archive, CentralNode

@@ -5,7 +5,7 @@ import random
 import msgspec
 import pytest
 
-from ertis_numba.errors import ArgumentError, JournalInUseError
+from ertis_numba.base.errors import ArgumentError, JournalInUseError
 from ertis_numba.network import messages
 from ertis_numba.network.central_node import Archive, CentralNode
 from ertis_numba.network.central_node._reporting import Condition

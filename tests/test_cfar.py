@@ -10,7 +10,7 @@ import scipy.special
 from ertis_numba.analysis.cfar import METHODS, _reference, cfar, cfar_peaks, threshold_factor
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.analysis.range_cleaning import clean
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording, Settings

@@ -13,8 +13,8 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba.analysis.health import Finding, health, limits
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.calibration import OtherLayoutError
-from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import load_layout
 from ertis_numba.sensor_check import ArrayFinding, check_recording, write_page

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from ertis_numba import checks, errors
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks, errors
+from ertis_numba.base.errors import ArgumentError
 
 REFUSED = [
     (checks.finite, ("x", math.nan), "x is nan; use a finite number"),

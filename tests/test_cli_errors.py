@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from ertis_cli import options
 from ertis_cli.main import cli
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.frames import Stamp
 from ertis_numba.storage import GroundTruth, open_recording, write_energyscapes, write_recording
 from tests.files import image, noise

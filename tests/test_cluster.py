@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.cluster import connect, local_cluster
 from ertis_numba.network.messages import Data
 from ertis_numba.network.processing.cluster import Cluster
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.parallelism import Load
 from ertis_numba.network.processing.runner import FinishedJob, Job, JobKind, KindFailed, KindReady, Lost
+from ertis_numba.processes.cluster import connect, local_cluster
 from tests.dask_clusters import cluster_of_threads
 from tests.driven import MEASUREMENT
 

@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 
-from ertis_numba.errors import CoarseGridWarning
+from ertis_numba.base.errors import CoarseGridWarning
 from ertis_numba.network.processing._predictions import Predictions
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.storage import write_acoustic_maps, write_recording

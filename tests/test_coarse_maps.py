@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.errors import CoarseGridWarning
+from ertis_numba.base.errors import CoarseGridWarning
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.passive.search_grid import coarse_map_warning
 from ertis_numba.settings import Array, Recording

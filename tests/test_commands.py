@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.devices import blocks, commands
 from ertis_numba.devices.commands import Command
 from ertis_numba.devices.setup import Setup, call_codes, call_hash
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Array, Call, Recording, Settings
-from ertis_numba.waveform import call_samples
 from tests.cases import LINE_8
 
 NUMBERS = st.integers(0, 2**32 - 1)

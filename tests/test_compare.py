@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.analysis.compare import Comparison, Match, compare, errors_of
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Peak, Reflector
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.analysis.compare_places import compare_map, compare_points, errors_of_places, joined, positions_m
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import OccupancyMap, PointCloud, Reflector, Surfaces
 from ertis_numba.settings import Settings
 from ertis_numba.simulation import Box, Point, Scene, Sphere, Wall

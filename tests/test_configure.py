@@ -13,11 +13,12 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.capture import CaptureSession, SettingsChange
+from ertis_numba.base.errors import ArgumentError, NetworkError, RefusedError, SonarError
+from ertis_numba.chain.memory import require_images
+from ertis_numba.devices.capture import CaptureSession, SettingsChange
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator import Emulator, Quirks, SyncChain
 from ertis_numba.devices.setup import Setup
-from ertis_numba.errors import ArgumentError, NetworkError, RefusedError, SonarError
 from ertis_numba.journal import Journal
 from ertis_numba.network import messages
 from ertis_numba.network.allow_list import AllowList, Permission
@@ -25,7 +26,6 @@ from ertis_numba.network.central_client import CentralClient
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys
 from ertis_numba.network.sensor_node import SensorNode
 from ertis_numba.settings import Air, Processing, Recording, Settings
-from ertis_numba.stages.memory import require_images
 from ertis_numba.storage import open_recording
 from tests.central import Node, running
 from tests.emulated import N_SAMPLES, PATIENT, PATIENT_ERTIS, WORDS, patient

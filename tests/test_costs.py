@@ -7,8 +7,8 @@ import math
 import pytest
 
 from ertis_numba import kernels
+from ertis_numba.chain import costs
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.stages import costs
 from tests.cases import SHORT, noise
 
 CPU = kernels.load("cpu")

@@ -14,9 +14,9 @@ import pytest
 from ertis_bench.platform_trials.furnished_rooms import hall
 from numpy.testing import assert_allclose, assert_array_equal
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.compare import compare
 from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.passive import AcousticCamera
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Scene, load_scene

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.errors import OutsideBandsWarning
+from ertis_numba.base.errors import OutsideBandsWarning
 from ertis_numba.figures._acoustic_signals import _spectra
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.passive.bands import band_edges
@@ -19,7 +19,7 @@ SPEED_M_S = 331.3 * math.sqrt(1 + 20 / 273.15)
 TONE_DBFS = -16.99  # of an amplitude of 0.2
 AZIMUTH_DEG = 20.0
 
-pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.base.errors.CoarseGridWarning")
 
 
 def heard(rate_hz, frequency_hz, *, noise=1e-3, offset=0.0, amplitude=0.2, n_samples=16_384, **changes):

@@ -7,8 +7,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import (
     delay_matrix,
     direction_grid,
@@ -19,10 +18,11 @@ from ertis_numba.geometry import (
     storable,
     unit_vectors,
 )
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline.verification import error_db, exact_image
 from ertis_numba.settings import Call, Processing, Settings
 from ertis_numba.storage import open_energyscapes, write_recording
-from ertis_numba.verification import error_db, exact_image
 from tests.cases import CASES, SHORT, noise
 from tests.files import noise as measurements_of
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.analysis.side_lobes import without_side_lobes
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import matched_filter_spectrum
 from ertis_numba.settings import Processing, Settings
-from ertis_numba.waveform import matched_filter_spectrum
 
 
 def image_of(reflectors, *, directions="2d:181", range_m=(0.8, 1.6), noise=0.0, errors_m=0.0, settings=None):

@@ -11,12 +11,12 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
+from ertis_numba.base.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.reset import reset_sensor
 from ertis_numba.devices.reset_pin import pulse_reset_pin
 from ertis_numba.devices.setup import Setup
-from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.settings import Call
 from ertis_numba.storage import open_recording
 from tests.emulated import N_SAMPLES, PATIENT, WORDS, patient

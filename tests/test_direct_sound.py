@@ -10,15 +10,15 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.constants import SYNC_STEP_S
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.constants import SYNC_STEP_S
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.fusion import DirectSoundCheck
 from ertis_numba.fusion.audibility import audible_ratio
+from ertis_numba.geometry.waveform import matched_filter_spectrum
 from ertis_numba.settings import Call, Processing, Recording
 from ertis_numba.simulation import Emitter, Point, Scene
 from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.storage import write_recording
-from ertis_numba.waveform import matched_filter_spectrum
 from tests import test_fusion
 
 SENSORS = tuple(test_fusion.YAWS)

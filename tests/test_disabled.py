@@ -13,15 +13,15 @@ from numpy.testing import assert_allclose, assert_array_equal
 from ertis_numba import export, figures
 from ertis_numba.analysis.compare import compare
 from ertis_numba.analysis.health import health
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import load_layout, microphones, received_settings, self_contained
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline.verification import measure
 from ertis_numba.settings import Array, Settings
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.simulation import load_scene
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.storage import open_energyscapes, open_recording
-from ertis_numba.verification import measure
 from tests.files import SMALL, line, noise
 
 ROOT = Path(__file__).parents[1]

@@ -14,8 +14,8 @@ from ertis_cli import _diagnosis
 from ertis_cli.main import cli
 
 from ertis_numba import kernels
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.devices.ports import Port
-from ertis_numba.errors import DeviceError
 from ertis_numba.network.keys import KeyPair
 
 permission = vars(_diagnosis)["_permission"]

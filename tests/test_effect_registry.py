@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings import Processing, Recording
 from ertis_numba.simulation import Scene, effects
 from ertis_numba.simulation.effect_plan import make_plan

@@ -7,8 +7,8 @@ import pytest
 import scipy.optimize
 from numpy.testing import assert_allclose, assert_array_equal
 
-from ertis_numba.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.settings import Air, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point, Sphere, Wall
 from ertis_numba.simulation.render import Simulator

@@ -10,9 +10,9 @@ from ertis_bench.platform_trials.furnished_rooms import PlatformImager, mounting
 from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.fusion.rig import mounted_sensors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.motion.echoes import EchoExtractor
 from ertis_numba.motion.flow import fit_flow
 from ertis_numba.motion.odometry import PlanarPose

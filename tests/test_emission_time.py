@@ -9,13 +9,13 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.emission_time import EmissionTimes, describe_start, emission_time_s, emissions_of
 from ertis_numba.analysis.health.emission import describe_shift, fit_emission
 from ertis_numba.analysis.sound_checks import SoundChecks
-from ertis_numba.errors import StartMismatchWarning
+from ertis_numba.base.errors import StartMismatchWarning
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.network.processing._predictions import Predictions
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.sensor_check import check_recording

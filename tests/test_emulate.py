@@ -17,16 +17,16 @@ from ertis_cli._emulation import SceneRenderer
 from ertis_cli.emulate import _Estimate, _get_ready, _render_all
 from ertis_cli.main import cli
 
+from ertis_numba.base.errors import ArgumentError, SonarError
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.setup import Setup, call_codes, call_from_codes
-from ertis_numba.errors import ArgumentError, SonarError
 from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Call, Processing, Recording, Settings
 from ertis_numba.simulation import Scene
 from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.engine import Engine
 from ertis_numba.storage import open_recording, write_recording
-from ertis_numba.waveform import call_samples
 from tests.emulated import N_SAMPLES, PATIENT, TIMEOUT_S, WORDS, ask, block, is_block, patient
 from tests.files import noise
 

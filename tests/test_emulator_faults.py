@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import serial
 
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.devices.blocks import FOOTER, HEADER
 from ertis_numba.devices.emulator import Emulator, Quirks
 from ertis_numba.devices.emulator.faults import Faults
 from ertis_numba.devices.links import HeldLink, emulated_folder
-from ertis_numba.errors import ArgumentError
 from tests.emulated import N_SAMPLES, TIMEOUT_S, WORDS, Log, Numbered, ask, opened
 
 

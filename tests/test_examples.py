@@ -344,7 +344,7 @@ def test_leak_example_explains_unusable_input_in_one_line(leak_recording, tmp_pa
         assert done.stderr.startswith(message)
 
 
-@pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")  # A small grid saves time.
+@pytest.mark.filterwarnings("ignore::ertis_numba.base.errors.CoarseGridWarning")  # A small grid saves time.
 def test_leak_example_finds_nothing_in_noise(tmp_path, capsys):
     settings = ertis.Settings().replace(**{"processing.directions": "3d:300", "processing.mode": "passive"})
     write_recording(tmp_path / "noise.h5", noise(settings, count=1))

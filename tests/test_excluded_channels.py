@@ -8,8 +8,8 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 from numpy.testing import assert_array_equal
 
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.campaign import CampaignOptions
-from ertis_numba.errors import ArgumentError
 from ertis_numba.network.processing import ProcessingOptions
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.sensor_check import check_recording

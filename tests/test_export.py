@@ -13,7 +13,7 @@ from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba.analysis.point_finder import PointFinder
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.interop import FORMATS, TOPICS, Drive, choose_format, export, output_files
 from ertis_numba.settings import Air

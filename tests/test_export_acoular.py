@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
+from ertis_numba.chain.signals import signals_of
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.interop import export
 from ertis_numba.settings import Settings
-from ertis_numba.stages.signals import signals_of
-from ertis_numba.waveform import call_at
 from tests.cases import words_of
 from tests.files import image, line, noise
 
@@ -132,7 +132,7 @@ def test_acoular_export_refuses_invalid_input(tmp_path, monkeypatch):
     with pytest.raises(ArgumentError, match=r"a.xml exists; choose another name"):
         export(tmp_path / "a.h5", noise(count=1))
     assert [item.name for item in tmp_path.iterdir()] == ["a.xml"]
-    monkeypatch.setattr("ertis_numba.atomic_files.RESERVED_BYTES", 2**62)
+    monkeypatch.setattr("ertis_numba.base.atomic_files.RESERVED_BYTES", 2**62)
     with pytest.raises(DataError, match=r"MB free, but .* including a reserve of .*; free some space"):
         export(tmp_path / "b.h5", noise(count=1))
     assert [item.name for item in tmp_path.iterdir()] == ["a.xml"]

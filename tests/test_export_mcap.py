@@ -9,12 +9,12 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosReliability
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.nearest_echo import nearest_echo
 from ertis_numba.analysis.points import PointExtractor
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import PointCloud, Stamp
 from ertis_numba.geometry import Grid, direction_grid, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.interop import TOPICS, export
 from ertis_numba.interop.ros_definitions import DEFINITIONS, schema
 from ertis_numba.settings import Processing, Settings

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Stamp
 from ertis_numba.interop import FORMATS, export
 from ertis_numba.settings import Air, Settings

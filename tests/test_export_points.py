@@ -9,7 +9,7 @@ import pytest
 
 import ertis_numba as ertis
 from ertis_numba.analysis.points import PointExtractor
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import Grid
 from ertis_numba.interop import FORMATS, export

@@ -8,11 +8,13 @@ import pytest
 import ertis_numba
 from ertis_numba import kernels
 
-NEED_A_GPU = {"ertis_numba.fft._cufft", "ertis_numba.kernels._cuda.gpu"} if "cuda" not in kernels.usable() else set()
+NEED_A_GPU = (
+    {"ertis_numba.kernels.fft._cufft", "ertis_numba.kernels._cuda.gpu"} if "cuda" not in kernels.usable() else set()
+)
 MODULES = sorted(
     module.name
     for module in pkgutil.walk_packages(ertis_numba.__path__, "ertis_numba.")
-    if not module.name.startswith("ertis_numba.layouts") and module.name not in NEED_A_GPU
+    if module.name not in NEED_A_GPU
 )
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.devices.blocks import encode_block
 from ertis_numba.devices.emulator.faults import KINDS, Faults, Stall, Unplug
-from ertis_numba.errors import ArgumentError
 from tests.wire import block_of
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.figures import _sampling, plot
 from ertis_numba.frames import Peak
 from ertis_numba.geometry import direction_grid, unit_vectors

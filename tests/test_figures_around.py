@@ -9,8 +9,8 @@ from ertis_numba.figures._microphone_traces import MicrophoneTraces
 from ertis_numba.figures._signals import spectrogram
 from ertis_numba.frames import Peak
 from ertis_numba.geometry import unrolled_rad
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Array, Call, Recording, Settings
-from ertis_numba.waveform import call_at
 from tests.files import image
 
 REAR = np.concatenate([np.arange(-180, -99, 3), np.arange(100, 178, 3)])

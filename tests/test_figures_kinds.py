@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from ertis_numba import figures
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.figures import _images, _slices
 from ertis_numba.figures._captions import of_image, of_measurement
 from ertis_numba.frames import Measurement, Peak, Stamp
 from ertis_numba.geometry import direction_grid
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Array, Processing, Recording, Settings
-from ertis_numba.waveform import call_at
 from tests.cases import words_of
 from tests.files import image
 from tests.promises import best_ratio

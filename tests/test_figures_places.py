@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from ertis_numba import figures
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.figures._array import pattern_db, width_deg
 from ertis_numba.figures._captions import of_image
 from ertis_numba.figures._microphone_traces import echoes, signals
 from ertis_numba.figures._signals import spectrogram
 from ertis_numba.frames import Measurement, Peak
 from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Array, Call, Settings
 from ertis_numba.storage import open_recording
-from ertis_numba.waveform import call_at
 from tests.cases import words_of
 from tests.files import image
 from tests.test_figures_kinds import ONE, SETTINGS, STAMP, heard, solid

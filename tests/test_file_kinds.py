@@ -22,8 +22,8 @@ from ertis_cli.main import cli
 from scipy.io import wavfile
 
 import ertis_numba as ertis
-from ertis_numba.errors import DataError
-from ertis_numba.file_kinds import kind_of, problem_of
+from ertis_numba.base.errors import DataError
+from ertis_numba.base.file_kinds import kind_of, problem_of
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
 N_WORDS = 65_536

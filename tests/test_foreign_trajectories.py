@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ertis_numba import read_trajectory
-from ertis_numba.errors import ArgumentError, DataError, PoseWarning
+from ertis_numba.base.errors import ArgumentError, DataError, PoseWarning
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::ertis_numba.PoseWarning"

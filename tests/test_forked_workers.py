@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.errors import NetworkError
+from ertis_numba.base.errors import NetworkError
 from ertis_numba.network.pose_publisher import PosePublisher
 from ertis_numba.network.pulse_receiver import PulseReceiver
 from tests.forked_workers import WAYS

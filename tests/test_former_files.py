@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from ertis_numba.errors import SettingsError
+from ertis_numba.base.errors import SettingsError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import Journal
 from ertis_numba.network.central_node._ledger import Ledger

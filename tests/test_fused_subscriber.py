@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from ertis_bench.network.processes import until
 from ertis_cli.main import cli
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.fusion import Fuser
 from ertis_numba.network.fused_subscriber import FusedSubscriber
 from tests.publishing import PATIENCE_S, PATIENT_APPLICATIONS, Publisher, image, patient_applications

@@ -14,13 +14,13 @@ from ertis_bench.platform_trials.platform_scenes import platform_scene, random_r
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.air import absorption_db_m
-from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.fusion.pairs import hypothesis, pair_of
 from ertis_numba.fusion.polar_grid import PolarGrid, close_directions
 from ertis_numba.fusion.receivers import Receiver
 from ertis_numba.fusion.rig import Emitters, mounted_sensors
 from ertis_numba.fusion.tables import FusionTables
+from ertis_numba.geometry.air import absorption_db_m
 from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.storage import open_energyscapes, open_recording, write_energyscapes, write_recording

@@ -8,7 +8,7 @@ import pytest
 
 import ertis_numba as ertis
 from ertis_numba import kernels
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.kernels import _dispatch, _numpy_fusion
 from ertis_numba.kernels._contract.fusion import FusionKernels
 from tests.test_fusion import images, mountings

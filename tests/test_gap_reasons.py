@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ertis_numba.capture.gap_reasons import DAMAGED, DISK_BUSY, DROPPED, NOT_TRIGGERED, gap_reason
-from ertis_numba.capture.readers import BlockArrived
 from ertis_numba.devices.blocks import Block, Instant
+from ertis_numba.devices.capture.gap_reasons import DAMAGED, DISK_BUSY, DROPPED, NOT_TRIGGERED, gap_reason
+from ertis_numba.devices.capture.readers import BlockArrived
 from ertis_numba.frames import SequenceGap
 
 

@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import loadmat
 from scipy.spatial import cKDTree
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.base.units import sound_pressure_level_db
 from ertis_numba.geometry import (
     PAPER_GRIDS,
     Fan,
@@ -29,7 +30,6 @@ from ertis_numba.geometry import (
     written_out,
 )
 from ertis_numba.settings import Array, Processing
-from ertis_numba.units import sound_pressure_level_db
 
 NAMES = ("eRTIS_v2", "eRTIS_v2REC", "eRTIS_v3D1", "eRTIS_v3D1REC", "uRTIS_v1", "xRTIS_v1")
 

@@ -11,9 +11,9 @@ from click.testing import CliRunner
 from ertis_bench.gpu_trials import gpu, gpu_tables, rival_mach, rivals
 from ertis_cli.main import cli
 
-from ertis_numba import kernels, verification
-from ertis_numba.errors import DeviceError
-from ertis_numba.pipeline import Pipeline
+from ertis_numba import kernels
+from ertis_numba.base.errors import DeviceError
+from ertis_numba.pipeline import Pipeline, verification
 from tests.cases import CASES, SHORT, noise
 
 MARKED = "# Mine\n\n<!-- ertis bench {0} -->\nold\n<!-- /ertis bench {0} -->\n"

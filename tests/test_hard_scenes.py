@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from ertis_numba.analysis.detect import find_peaks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings import Recording
 from ertis_numba.simulation import (
     Ambient,

@@ -7,8 +7,9 @@ import zlib
 
 import pytest
 
-from ertis_numba.documents import MAX_KEY_PARTS
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
+from ertis_numba.chain import memory
+from ertis_numba.chain.memory import predicted_bytes
 from ertis_numba.geometry import received_settings, storable
 from ertis_numba.network.central_node import _validation
 from ertis_numba.network.central_node._admission import Unwanted
@@ -17,8 +18,7 @@ from ertis_numba.network.central_node._validation import Greeting, Greetings
 from ertis_numba.network.messages import Ack, Hello, Refused, Welcome
 from ertis_numba.network.processing.shared_pipeline import SharedPipeline
 from ertis_numba.settings import MAX_CALL_SAMPLES, Array, Call, Processing, Recording, Settings
-from ertis_numba.stages import memory
-from ertis_numba.stages.memory import predicted_bytes
+from ertis_numba.settings.documents import MAX_KEY_PARTS
 from tests.central import Node, running, stored
 from tests.faults.network import all_trials as faults, hostile, table
 from tests.faults.network.hostile_hellos import hostile_texts

@@ -11,12 +11,12 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.interop import open_rtis_folder
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline.verification import error_db
 from ertis_numba.settings import PRESETS, Air, Array, Processing, Settings
 from ertis_numba.storage import open_recording
-from ertis_numba.verification import error_db
 
 SHORT = {
     "microphoneSamples": 65_536,

@@ -14,14 +14,14 @@ from ertis_cli.main import cli
 from scipy.io import wavfile
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.geometry import microphones
 from ertis_numba.interop import PcmReader
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline.verification import error_db
 from ertis_numba.sensor_check import check_recording
 from ertis_numba.settings import Array, Call, Processing, Recording, Settings
 from ertis_numba.storage import open_recording, write_recording
-from ertis_numba.verification import error_db
 from tests.rings import PCM, RATE_HZ, RING, heard
 
 

@@ -9,8 +9,8 @@ from ertis_cli.main import cli
 from scipy.io import wavfile
 
 import ertis_numba as ertis
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.sensor_check import check_recording
 from ertis_numba.settings import Array, Call, Recording, Settings, record_range_m

@@ -9,7 +9,7 @@ from ertis_cli.main import cli
 from scipy.io import wavfile
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, DataError, SettingsError
+from ertis_numba.base.errors import ArgumentError, DataError, SettingsError
 from ertis_numba.storage import write_recording
 from tests.files import noise
 

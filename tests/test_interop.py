@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.interop import open_raw
 from ertis_numba.settings import Array, Recording, Settings
 from tests.files import line, noise

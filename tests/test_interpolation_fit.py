@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 
+from ertis_numba.chain.interpolation_fit import DelayFit, Spectrum, fit, weights_of
+from ertis_numba.geometry.waveform import matched_noise_spectrum
 from ertis_numba.settings import Call, Settings
-from ertis_numba.stages.interpolation_fit import DelayFit, Spectrum, fit, weights_of
-from ertis_numba.waveform import matched_noise_spectrum
 from tests.textbook_weights import TEXTBOOK, fitted_error, textbook_error
 
 RATE_HZ = 45_000.0  # of the default ranges

@@ -80,7 +80,9 @@ def test_no_peak_is_louder_than_its_image():
         assert (cloud.amplitude <= image.amplitude.max() * 10 ** (LIMIT_DB / 20)).all(), seed
 
 
-@pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")  # Coarse grids must hold the limit, too.
+@pytest.mark.filterwarnings(
+    "ignore::ertis_numba.base.errors.CoarseGridWarning"
+)  # Coarse grids must hold the limit, too.
 @pytest.mark.parametrize("diagonal_removal", [False, True])
 @pytest.mark.parametrize("method", MAP_METHODS)
 def test_sources_of_a_camera_stay_within_its_map(method, diagonal_removal):
@@ -188,7 +190,7 @@ def test_neighbours_of_equal_directions_are_different_ones(azimuth_deg):
         assert len(np.unique(row[:3])) == 3
 
 
-@pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")
+@pytest.mark.filterwarnings("ignore::ertis_numba.base.errors.CoarseGridWarning")
 def test_direction_that_is_listed_twice_is_one_source():
     for copies in (1, 2, 9):
         azimuth_deg = np.repeat(np.arange(-20.0, 21), copies)

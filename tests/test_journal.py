@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, SequenceGap
 from ertis_numba.journal import TABLES, VERSION, Journal
 from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES

@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 import pytest
 
-from ertis_numba.errors import DamagedError, DataError, FormatVersionError, JournalInUseError
+from ertis_numba.base.errors import DamagedError, DataError, FormatVersionError, JournalInUseError
 from ertis_numba.journal import Journal
 from ertis_numba.journal._database import PAGE_BYTES, Database
 from ertis_numba.journal._tables import row_crc32

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from ertis_numba.errors import JournalInUseError
+from ertis_numba.base.errors import JournalInUseError
 from ertis_numba.journal import Journal
 from ertis_numba.journal._database import PAGE_BYTES
 from ertis_numba.storage.sealing import seal
@@ -15,7 +15,7 @@ from tests.journals import ENVIRONMENT, TINY, crashed, create, entries, python, 
 
 OPEN = """
 import sys
-from ertis_numba.errors import JournalInUseError
+from ertis_numba.base.errors import JournalInUseError
 from ertis_numba.journal import Journal
 try:
     Journal.open(sys.argv[1])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ertis_numba.errors import DamagedError, DataError
+from ertis_numba.base.errors import DamagedError, DataError
 from ertis_numba.journal import Journal, seal_in_subprocess
 from ertis_numba.journal._limit import read_limit
 from ertis_numba.storage import open_recording

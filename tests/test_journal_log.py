@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.journal import LOST, TALLY, Journal
 from ertis_numba.journal._database import PAGE_BYTES
 from ertis_numba.journal._log import read_log

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.journal import VERSION, Journal
 from ertis_numba.settings import Recording
 from ertis_numba.storage import open_recording

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from ertis_numba.errors import DataError, DiskFullError
+from ertis_numba.base.errors import DataError, DiskFullError
 from ertis_numba.journal import Journal, JournalPose
 from ertis_numba.journal._database import Database
 from tests.journals import ENVIRONMENT, EPOCH, TINY, create, entries, same
@@ -63,7 +63,7 @@ def test_size_of_poses_is_close_to_that_in_a_journal(tmp_path):
 APPEND = """
 import sys
 from pathlib import Path
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.journal import Journal, _free_space
 from ertis_numba.settings import Recording, Settings
 from tests.journals import create, entries, same
@@ -168,7 +168,7 @@ def test_full_disk_keeps_stored_measurements(tmp_path):
 LEFT = """
 import os, sys
 from pathlib import Path
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.journal import Journal
 from tests.journals import crashed, entries, same
 folder = Path(sys.argv[1])

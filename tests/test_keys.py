@@ -15,7 +15,7 @@ from ertis_cli.keys import keys as keys_command
 from ertis_cli.main import cli
 from hypothesis import given, strategies as st
 
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.network import addresses
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys, default_folder, public_key

@@ -13,7 +13,7 @@ from ertis_bench.network import imaging, latency
 from ertis_bench.network.processor_time import ProcessorTime
 from ertis_cli.main import cli
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.network import trace
 
 

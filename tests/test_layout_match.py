@@ -13,14 +13,14 @@ from ertis_cli.main import cli
 
 from ertis_numba.analysis.health import health, merge
 from ertis_numba.analysis.layout_match import first_layout_match, layout_match
-from ertis_numba.errors import LayoutMismatchWarning
+from ertis_numba.base.errors import LayoutMismatchWarning
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import layout_names, load_layout
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.network.processing._predictions import Predictions
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Processing, Recording, Settings
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
-from ertis_numba.waveform import call_at
 
 DATA = Path(__file__).parents[1] / "data" / "synthetic"
 SETTINGS = Settings(

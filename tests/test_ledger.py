@@ -6,7 +6,7 @@ import zlib
 
 import pytest
 
-from ertis_numba.errors import DataError, FormatVersionError, JournalInUseError
+from ertis_numba.base.errors import DataError, FormatVersionError, JournalInUseError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import seal_in_subprocess
 from ertis_numba.network.central_node._ledger import Ledger, Lock, read_acked_through

@@ -15,14 +15,15 @@ from hypothesis import given, settings as hypothesis_settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
-from ertis_numba import figures, kernels, verification
+from ertis_numba import figures, kernels
+from ertis_numba.chain.fast_chain import FastChain
+from ertis_numba.chain.memory import require_images
 from ertis_numba.geometry import Grid, levelled_grid, unit_vectors
 from ertis_numba.network.processing.shared_pipeline import SharedPipeline
 from ertis_numba.passive import AcousticCamera
+from ertis_numba.pipeline import verification
 from ertis_numba.settings import Accuracy, Processing
 from ertis_numba.simulation import Electronics, Point, Scene, Sensor
-from ertis_numba.stages.fast_chain import FastChain
-from ertis_numba.stages.memory import require_images
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
 from ertis_numba.storage.schema import to_python
 from tests.publishing import results_of
@@ -225,7 +226,7 @@ def test_tables_are_computed_by_the_kernels_and_threads_of_the_pipeline(device, 
 
         return replace(steering, sum_polynomials=sum_polynomials)
 
-    monkeypatch.setattr("ertis_numba.stages.fast_chain.load_steering", load)
+    monkeypatch.setattr("ertis_numba.chain.fast_chain.load_steering", load)
     settings = levelled(measurement).replace("processing.range_m", (1.4, 1.75))
     with ertis.Pipeline(settings, device, predict=False) as pipeline:
         pipeline.process(measurement, attitude_xyzw=attitude(*TILTS_DEG[0]).as_quat(), threads=1)

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import direction_grid, received_settings
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Processing, Settings

@@ -7,8 +7,8 @@ from click.testing import CliRunner
 from ertis_bench.cpu_times import campaign_scaling
 from ertis_cli.main import cli
 
+from ertis_numba.base.errors import DataError
 from ertis_numba.campaign import Campaign
-from ertis_numba.errors import DataError
 from tests.campaigns import InlinePool
 from tests.dask_clusters import cluster_of_threads
 

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba import cluster
+from ertis_numba.base.errors import NetworkError
 from ertis_numba.campaign import (
     Campaign,
     CampaignOptions,
@@ -20,7 +20,7 @@ from ertis_numba.campaign import (
     find_recordings,
 )
 from ertis_numba.campaign.tasks import Task
-from ertis_numba.errors import NetworkError
+from ertis_numba.processes import cluster
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
 from tests.dask_clusters import client_of, cluster_of_threads

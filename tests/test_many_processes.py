@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.campaign import Campaign, CampaignOptions, RecordingProgress, find_recordings, process_pool
 from ertis_numba.campaign.process_pool import ProcessPool
 from ertis_numba.campaign.tasks import Task
-from ertis_numba.errors import DeviceError
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.campaigns import ended, names_in, outcomes, run_here, write_recordings
 from tests.files import line, noise

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.campaign import Campaign, RecordingFile, find_recordings, output_paths
 from ertis_numba.campaign.folder import clear_parts, exclusive_folder
-from ertis_numba.errors import ArgumentError, DataError
 from tests.campaigns import names_in
 
 

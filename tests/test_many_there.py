@@ -4,8 +4,8 @@ import h5py
 import numpy as np
 import pytest
 
-from ertis_numba import verification
 from ertis_numba.campaign import CampaignOptions, existing_output
+from ertis_numba.pipeline import verification
 from ertis_numba.storage import write_recording
 from tests.campaigns import outcomes, run_here, write_recordings
 from tests.files import line, noise

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
 from ertis_numba import figures
-from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.fusion.rig import mounted_sensors
 from ertis_numba.mapping import sensor_model
 from ertis_numba.mapping.cell_grid import CellGrid

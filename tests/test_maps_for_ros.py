@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 
 yaml = pytest.importorskip("yaml")  # a requirement of the extra cluster
 

@@ -7,7 +7,7 @@ import pytest
 from ertis_cli._product_printer import PRINTERS
 from hypothesis import given, settings, strategies as st
 
-from ertis_numba.errors import DataError, FormatVersionError
+from ertis_numba.base.errors import DataError, FormatVersionError
 from ertis_numba.network import messages
 from ertis_numba.network.messages import (
     HEADER_BYTES,

@@ -12,7 +12,7 @@ import urllib.request
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from ertis_numba.errors import ArgumentError, NetworkError
+from ertis_numba.base.errors import ArgumentError, NetworkError
 from ertis_numba.network import log
 from ertis_numba.network._metrics_server import Handler
 from ertis_numba.network.metrics import Metrics

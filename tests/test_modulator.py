@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.signal import lfilter
 
 from ertis_numba import kernels
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import Layout
 from ertis_numba.simulation.modulator import Modulator, loop_gains, noise_transfer
 from tests.on_device import KERNELS, SIMULATED

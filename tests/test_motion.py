@@ -5,11 +5,11 @@ import pytest
 import scipy.optimize
 from numpy.testing import assert_allclose, assert_array_equal
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Call, Recording
 from ertis_numba.simulation import Box, Emitter, Noise, Point, Scene, Sonar, Sphere, Tone, Wall
-from ertis_numba.waveform import call_at
 from tests.scenes import (
     EAR,
     SENSOR,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Platform, Point, Scene, Sensor
 from ertis_numba.simulation.render import Simulator

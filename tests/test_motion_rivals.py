@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from tests.test_ego_motion import MOUNTINGS, TIME_NS, places_m, seen_from
 
 TWIST = (1.2, 0.0, 0.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.analysis.nearest_echo import nearest_echo
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from tests.files import image
 
 RANGES_M = np.linspace(0.5, 4.5, 401)

@@ -16,7 +16,7 @@ from ertis_bench.network.sender import SMALL, SenderJob, words_of
 from ertis_bench.network.sent import Sent, read_diaries
 from ertis_bench.network_trials.oracle import compare, judged as judged_by_checker, read_folder
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.network.messages import Group
 from ertis_numba.network.status import SensorStatus, Status

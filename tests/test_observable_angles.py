@@ -10,7 +10,7 @@ from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba import figures
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import Grid, direction_grid, direction_note, load_layout, observable_angles
 from ertis_numba.interop import export
 from ertis_numba.settings import Array, Processing

@@ -21,7 +21,7 @@ from ertis_cli._product_printer import MicrophoneTable
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.network.odometry_subscriber import OdometrySubscriber
 from tests.pages import environment
 from tests.publishing import (

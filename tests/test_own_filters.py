@@ -6,15 +6,15 @@ import scipy
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
+from ertis_numba.chain.signals import matched
 from ertis_numba.geometry import received_settings
+from ertis_numba.geometry.waveform import call_spectrum, matched_filter_spectrum
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.prediction import UNCERTAINTY_DB
+from ertis_numba.pipeline.prediction import UNCERTAINTY_DB
+from ertis_numba.pipeline.verification import error_db, exact_image, measure
 from ertis_numba.settings import Call, Processing, Settings
-from ertis_numba.stages.signals import matched
 from ertis_numba.storage import open_energyscapes, write_recording
-from ertis_numba.verification import error_db, exact_image, measure
-from ertis_numba.waveform import call_spectrum, matched_filter_spectrum
 from tests.cases import SHORT, noise
 from tests.files import noise as measurements_of
 from tests.test_call_match import CALL, SETTINGS as ECHO_SETTINGS, heard

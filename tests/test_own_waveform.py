@@ -9,18 +9,18 @@ from ertis_cli.main import cli
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import wavfile
 
+from ertis_numba.base.errors import ArgumentError, DataError, SettingsError
 from ertis_numba.devices.driver import SonarDriver as Driver
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup, call_codes
-from ertis_numba.errors import ArgumentError, DataError, SettingsError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import received_settings
+from ertis_numba.geometry.waveform import call_at, call_samples
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import MAX_WAVEFORM_SAMPLES, Call, Processing, Recording, Settings
 from ertis_numba.simulation import Point, Scene, Sensor, Sonar, load_scene
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.storage import open_recording, write_recording
-from ertis_numba.waveform import call_at, call_samples
 
 DEFAULT = Call()
 SHORT = Call(start_frequency_hz=60e3, stop_frequency_hz=30e3, duration_s=1.5e-3, modulation="linear")

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from ertis_numba import kernels
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.paper import PaperChain
+from ertis_numba.chain.plan_elements import chain_taps
 from ertis_numba.frames import Measurement
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import array_weights, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at, filter_response, matched_filter_spectrum
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Call, Processing, Recording, Settings
-from ertis_numba.stages.paper import PaperChain
-from ertis_numba.stages.plan_elements import chain_taps
-from ertis_numba.waveform import call_at, filter_response, matched_filter_spectrum
 from tests import reference
 from tests.cases import CASES, SHORT, noise, words_of
 

@@ -15,7 +15,7 @@ from ertis_bench import passive
 from ertis_bench.passive import agreement, false_alarms, separation, times
 from ertis_bench.passive.bearings import plane_wave_settings
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 
 SCRIPT = """
 import json, warnings

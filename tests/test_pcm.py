@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.beamformers import BEAMFORMERS
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.journal import Journal
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Call, Recording, Settings
+from ertis_numba.settings.beamformers import BEAMFORMERS
 from ertis_numba.simulation import Electronics, Point, Scene
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.storage import RecordingWriter, open_recording, write_recording

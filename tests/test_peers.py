@@ -18,7 +18,7 @@ from ertis_bench import timing
 from ertis_bench.peers import comparison, table
 from ertis_cli.main import cli
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 
 OURS = comparison.OURS
 SCRIPT = """

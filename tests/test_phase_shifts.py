@@ -5,16 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain import phase_shifts
+from ertis_numba.chain.plan_response import deviation_of
+from ertis_numba.chain.planner import Planner
+from ertis_numba.chain.signal_model import signal_model_of
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.kernels._scalar import cosine_and_sine
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Array, Processing, Settings
-from ertis_numba.stages import phase_shifts
-from ertis_numba.stages.plan_response import deviation_of
-from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.signal_model import signal_model_of
 from tests import reference
 from tests.cases import CASES, LINE_8, SHORT, noise
 from tests.error_cases import CPU, random_measurement

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from ertis_numba import kernels
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError, DataError, DeviceError
+from ertis_numba.base.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Processing, Settings
 from tests import cases, reference

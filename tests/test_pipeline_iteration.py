@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ertis_numba import pipeline as pipelines
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Stamp
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.pipeline import Pipeline
 from tests.cases import CASES, noise
 from tests.test_call_match import CALL, REVERSED, SETTINGS, heard

@@ -10,12 +10,12 @@ from ertis_bench.cpu_times import costs as bench_costs
 from ertis_cli.main import cli
 
 from ertis_numba import kernels
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.campaign import Campaign, CampaignOptions, find_recordings
-from ertis_numba.errors import ArgumentError
+from ertis_numba.chain import costs, nominal_costs, planner
 from ertis_numba.network.processing import ProcessingOptions as ServeOptions
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy
-from ertis_numba.stages import costs, nominal_costs, planner
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.cases import SHORT, noise
 from tests.files import noise as many_noise

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from ertis_numba import kernels
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain import planner
+from ertis_numba.chain.memory import available_bytes
+from ertis_numba.chain.planner import Planner
+from ertis_numba.chain.signal_model import signal_model_of
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Accuracy, Processing, Recording, Settings
-from ertis_numba.stages import planner
-from ertis_numba.stages.memory import available_bytes
-from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.signal_model import signal_model_of
 
 CPU = kernels.load("cpu")
 SETTINGS = Settings(

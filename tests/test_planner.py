@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from ertis_numba import kernels
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain import planner
+from ertis_numba.chain.planner import Planner, complete
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import ERROR_PRESETS_DB, Accuracy, Array, Call, Processing
-from ertis_numba.stages import planner
-from ertis_numba.stages.planner import Planner, complete
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS
 from tests import error_cases, reference
 from tests.cases import CASES, LINE_8, SHORT, noise
 from tests.hard_cases.tuned import tuned

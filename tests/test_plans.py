@@ -8,13 +8,13 @@ from click.testing import CliRunner
 from ertis_bench.plans import in_words, plans
 from ertis_cli.main import cli
 
-from ertis_numba import verification
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.frames import Peak
 from ertis_numba.geometry import unit_vectors
+from ertis_numba.pipeline import verification
+from ertis_numba.pipeline.verification import _peaks
 from ertis_numba.settings import ERROR_PRESETS_DB, Accuracy
 from ertis_numba.storage import open_energyscapes, write_recording
-from ertis_numba.verification import _peaks
 from tests import reference
 from tests.files import SMALL, noise
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Processing
 from ertis_numba.simulation import Platform, Point, Scene, Sensor, Wall

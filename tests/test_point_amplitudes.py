@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.air import absorption_db_m
-from ertis_numba.waveform import call_at
+from ertis_numba.geometry.air import absorption_db_m
+from ertis_numba.geometry.waveform import call_at
 from tests.small_platforms import HEIGHT_M, LEVEL, RATE_HZ, images_of, mounted, rendered, settings_of
 
 PLACES = (0.8, 20.0), (1.2, 119.7), (1.5, 62.0), (1.9, -1.2), (2.7, 74.5), (3.3, 110.0), (3.6, 16.7)

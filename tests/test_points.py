@@ -9,15 +9,15 @@ from ertis_numba.analysis.detect import find_peaks, neighbours_of
 from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.analysis.points import EchoPointExtractor, PointExtractor
 from ertis_numba.analysis.range_cleaning import clean
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain import planner
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.simulation import Point, Scene, Sensor
-from ertis_numba.stages import planner
-from ertis_numba.stages.fast_chain import FastChain
 from tests.cases import noise as words_of_noise
 from tests.parabolas import edge_floor, interpolated
 from tests.scenes import heard

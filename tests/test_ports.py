@@ -14,12 +14,12 @@ from ertis_cli.devices import devices
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
+from ertis_numba.base.errors import SonarError
 from ertis_numba.devices import ports
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator import Emulator, Quirks
 from ertis_numba.devices.ports import Port, find_again, find_ports, resolve
 from ertis_numba.devices.survey import survey
-from ertis_numba.errors import SonarError
 from tests.emulated import TIMEOUT_S
 
 WORDS = [np.zeros(32_768, dtype=np.uint32)]

@@ -18,7 +18,7 @@ from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, DataError, NetworkError, RefusedError
+from ertis_numba.base.errors import ArgumentError, DataError, NetworkError, RefusedError
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalPose
 from ertis_numba.journal._tables import row_crc32
 from ertis_numba.network import messages, sockets

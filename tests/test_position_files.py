@@ -13,9 +13,9 @@ from numpy.testing import assert_allclose
 from scipy.io import wavfile
 
 from ertis_numba import Settings
-from ertis_numba.accepted_words import AcceptedWords
-from ertis_numba.errors import ArgumentError, LayoutUnitWarning, SettingsError
+from ertis_numba.base.errors import ArgumentError, LayoutUnitWarning, SettingsError
 from ertis_numba.geometry import load_layout, microphones, require_plausible_size, self_contained, written_out
+from ertis_numba.pipeline.accepted_words import AcceptedWords
 from ertis_numba.settings import Array
 
 PLACES = np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.5, 1.0, 0.75]])

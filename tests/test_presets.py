@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import direction_grid
 from ertis_numba.settings import Processing, Settings, preset_tables, preset_text
 from ertis_numba.storage import open_energyscapes, write_recording

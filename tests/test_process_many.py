@@ -12,8 +12,8 @@ from click.testing import CliRunner
 from ertis_cli import _process_many
 from ertis_cli.main import cli
 
-from ertis_numba import verification
 from ertis_numba.campaign import Campaign, CampaignOptions, RecordingEnded, RecordingProgress, RecordingStarted
+from ertis_numba.pipeline import verification
 from tests.campaigns import InlinePool, names_in, write_recordings
 from tests.files import line
 

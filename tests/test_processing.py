@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.analysis.points import PointExtractor
-from ertis_numba.errors import ArgumentError, NetworkError
+from ertis_numba.base.errors import ArgumentError, NetworkError
 from ertis_numba.geometry import self_contained
 from ertis_numba.network.messages import Points, Raw
 from ertis_numba.network.processing import ImageProcessing, ProcessingOptions

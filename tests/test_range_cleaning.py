@@ -10,13 +10,13 @@ from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.analysis.noise import noise_of
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.analysis.range_cleaning import clean
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.network.processing.shared_pipeline import SharedPipeline
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.sample_format import sample_format
+from ertis_numba.pipeline.verification import measure
 from ertis_numba.settings import Processing
 from ertis_numba.storage import open_energyscapes, write_energyscapes, write_recording
-from ertis_numba.verification import measure
 from ertis_numba.viewer import Choices, ViewedScene
 from tests.cases import SHORT
 from tests.files import image as speckle, noise

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.interop.recorder_names import times_in_names
 from ertis_numba.settings import Array, Settings
 

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from ertis_cli.capture import _seal
 from ertis_cli.main import cli
 
-from ertis_numba.errors import DataError, JournalInUseError, SonarError
+from ertis_numba.base.errors import DataError, JournalInUseError, SonarError
 from ertis_numba.journal import seal_in_subprocess, storage_processes
 from ertis_numba.processes import child
 from ertis_numba.storage import sealing_process

@@ -5,10 +5,10 @@ import importlib.metadata
 import numpy as np
 import pytest
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Array, Call, Recording, Settings
-from ertis_numba.waveform import call_at
 from tests import reference
 from tests.cases import SHORT, noise, words_of
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.settings import Recording
 from ertis_numba.storage import open_recording, write_recording

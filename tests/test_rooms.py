@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Array, Call, Recording
 from ertis_numba.simulation import Box, Emitter, Point, Scene, Sensor
-from ertis_numba.waveform import call_samples
 from tests.scenes import EAR, SPEED_M_S, error_db, heard, sorted_ways
 
 SIZE_M = (3.0, 4.0, 2.5)

@@ -20,11 +20,11 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 from scipy.ndimage import maximum_filter1d
 
-import ertis_numba.rtisdev
+import ertis_numba.interop.rtisdev
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.devices.setup import Setup
-from ertis_numba.errors import ArgumentError
-from ertis_numba.rtisdev import rtiscuda, rtisserial
+from ertis_numba.interop.rtisdev import rtiscuda, rtisserial
 from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation import Point, Scene
 from ertis_numba.simulation.render import render
@@ -322,9 +322,9 @@ def test_forked_workers_of_a_process_that_has_processed_return_the_same_images(t
         """
 import multiprocessing
 import numpy as np
-import ertis_numba.rtisdev
+import ertis_numba.interop.rtisdev
 import rtisdev
-from ertis_numba.rtisdev import rtiscuda
+from ertis_numba.interop.rtisdev import rtiscuda
 
 def work(raw):
     return rtiscuda.processing(raw, 1, 5, settings.nspses, "test")
@@ -666,11 +666,11 @@ def test_serial_errors_are_those_that_callers_expect(monkeypatch, caplog):
 
 
 def test_modules_of_a_foreign_name_appear_only_on_request():
-    code = "import sys, ertis_numba; print({'rtisserial', 'rtiscuda'} & set(sys.modules)); import ertis_numba.rtisdev"
-    code += "; import rtisserial, rtiscuda; print(rtiscuda.__name__)"
+    code = "import sys, ertis_numba; print({'rtisserial', 'rtiscuda'} & set(sys.modules))"
+    code += "; import ertis_numba.interop.rtisdev, rtisserial, rtiscuda; print(rtiscuda.__name__)"
     done = subprocess.run([sys.executable, "-c", code], env=ENVIRONMENT, capture_output=True, text=True, check=True)
-    assert done.stdout == "set()\nertis_numba.rtisdev.rtiscuda\n"
-    assert ertis_numba.rtisdev.rtiscuda is sys.modules["rtiscuda"]
+    assert done.stdout == "set()\nertis_numba.interop.rtisdev.rtiscuda\n"
+    assert ertis_numba.interop.rtisdev.rtiscuda is sys.modules["rtiscuda"]
 
 
 def test_rtisdev_command_needs_the_package(monkeypatch, tmp_path):
@@ -686,7 +686,11 @@ def test_rtisdev_command_needs_the_package(monkeypatch, tmp_path):
     [
         ("def f():\n    raise KeyError('x')\nf()\n", 2, "KeyError: 'x'"),
         ("open('none.bin')\n", 1, "FileNotFoundError: [Errno 2] No such file or directory: 'none.bin'"),
-        ("import rtiscuda\nrtiscuda.unloadone(3)\n", 2, "ertis_numba.errors.ArgumentError: name is of type int; pass"),
+        (
+            "import rtiscuda\nrtiscuda.unloadone(3)\n",
+            2,
+            "ertis_numba.base.errors.ArgumentError: name is of type int; pass",
+        ),
         ("x = (\n", 1, "SyntaxError: '(' was never closed"),
     ],
     ids=["own", "system", "package", "syntax"],

@@ -9,7 +9,7 @@ import scipy.spatial.transform
 from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import Air, Array, Call, Settings
 from ertis_numba.simulation import (

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ertis_numba import atomic_files
-from ertis_numba.errors import ArgumentError, DataError, JournalInUseError
+from ertis_numba.base import atomic_files
+from ertis_numba.base.errors import ArgumentError, DataError, JournalInUseError
 from ertis_numba.settings import Air
 from ertis_numba.storage import RecordingWriter, open_recording, sensor_names, write_recording
 from ertis_numba.storage._gaps import UNKNOWN, SequenceNumbers

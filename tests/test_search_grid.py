@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.passive.search_grid import coarse_map_warning, search_changes, search_warning
 from ertis_numba.settings import Array, Recording
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network import messages
 from ertis_numba.network.sensor_node import SensorNode, _link as link, _outgoing_sessions as runs

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import direction_grid, microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import (
     ERROR_PRESETS_DB,
     PRESETS,

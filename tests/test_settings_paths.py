@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings import Accuracy, Processing, Settings
 from ertis_numba.simulation import Scene
 

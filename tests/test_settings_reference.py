@@ -10,13 +10,13 @@ from pathlib import Path
 import msgspec
 import pytest
 from click.testing import CliRunner
+from ertis_cli._toml_reference import DOCUMENTS, reference
 from ertis_cli.main import cli
 
-from ertis_numba.documents import TomlTable
 from ertis_numba.geometry import load_layout
 from ertis_numba.settings import Settings
+from ertis_numba.settings.documents import TomlTable
 from ertis_numba.simulation import load_scene
-from ertis_numba.toml_reference import DOCUMENTS, reference
 from tests.pages import page
 
 ROOT = Path(__file__).parents[1]

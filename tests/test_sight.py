@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.air import absorption_db_m
 from ertis_numba.fusion.rig import Emitters, mounted_sensors
 from ertis_numba.fusion.sight import Viewers, mirrored, tangents
+from ertis_numba.geometry.air import absorption_db_m
 
 AHEAD, TO_THE_LEFT = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 SENSORS = mounted_sensors({"front": ((0.2, 0.0, 0.0), AHEAD), "left": ((0.0, 0.1, 0.0), TO_THE_LEFT)})

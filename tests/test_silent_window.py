@@ -7,7 +7,7 @@ import pytest
 
 import ertis_numba as ertis
 from ertis_numba import kernels
-from ertis_numba.prediction import planner_of, predict
+from ertis_numba.pipeline.prediction import planner_of, predict
 
 REFLECTORS = Path(__file__).parents[1] / "data" / "synthetic" / "reflectors.h5"
 

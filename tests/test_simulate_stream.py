@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from ertis_cli import simulate as command
 from ertis_cli.main import cli
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector
 from ertis_numba.geometry import load_layout, shipped_layouts
 from ertis_numba.simulation import Box, Point, Scene, Tone

@@ -9,13 +9,13 @@ from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from ertis_numba import kernels
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import load_layout, microphones, unit_vectors
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Array, Call, Recording
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.simulation.effect_plan import make_plan
 from ertis_numba.simulation.render import Simulator, render
-from ertis_numba.waveform import call_at
 from tests.scenes import (
     EAR,
     NARROW,

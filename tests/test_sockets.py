@@ -8,7 +8,7 @@ import socket as raw
 import pytest
 import zmq
 
-from ertis_numba.errors import ArgumentError, NetworkError
+from ertis_numba.base.errors import ArgumentError, NetworkError
 from ertis_numba.network import sockets
 from ertis_numba.network.keys import ClientKeys, ServerKeys
 from tests.zap_clients import CENTRAL, LISTED, LOOPBACK, MOMENT_S, PATIENCE_S, ROBOT, STRANGER, VIEWER, Door

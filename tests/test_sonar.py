@@ -18,13 +18,13 @@ import serial
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
+from ertis_numba.base.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.devices.blocks import encode_block
 from ertis_numba.devices.commands import encode_answer
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator import Emulator, Quirks, SyncChain
 from ertis_numba.devices.line import SerialLine
 from ertis_numba.devices.setup import Setup, call_hash
-from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.settings import Call, Recording, Settings
 from tests.emulated import N_SAMPLES, PATIENT, TIMEOUT_S, WORDS, Log, patient
 

@@ -7,10 +7,10 @@ from matplotlib.text import Text
 
 import ertis_numba as ertis
 from ertis_numba import figures
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import unit_vectors
 
-pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.errors.CoarseGridWarning")  # Small grids save time.
+pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.base.errors.CoarseGridWarning")  # Small grids save time.
 
 OWN_RMS, RMS = 0.005, 0.05
 BANDS_HZ = [[20e3, 24e3], [38e3, 42e3]]

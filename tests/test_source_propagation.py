@@ -9,9 +9,9 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 from numpy.testing import assert_allclose, assert_array_equal
 
-from ertis_numba.air import absorption_db_m
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import absorption_db_m
 from ertis_numba.settings import Call, Recording
 from ertis_numba.simulation import Emitter, Noise, Platform, Scene, Sonar, Tone, Wall
 from ertis_numba.simulation.effect_plan import make_plan

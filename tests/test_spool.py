@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from ertis_numba.errors import ArgumentError, DataError, NetworkError
+from ertis_numba.base.errors import ArgumentError, DataError, NetworkError
 from ertis_numba.journal import LOST, Journal, JournalEntry
 from ertis_numba.journal._database import PAGE_BYTES
 from ertis_numba.network.sensor_node import _disk_spool as disk, _link as link, _outgoing_sessions as runs

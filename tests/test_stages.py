@@ -8,14 +8,14 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Beams, Energyscape, MicrophoneSignals, Stamp
 from ertis_numba.network.processing.shared_pipeline import SharedPipeline
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline.verification import error_db, exact_image
+from ertis_numba.pipeline.verification._exact import ExactImage
 from ertis_numba.settings import STAGES, Processing, Settings
 from ertis_numba.storage import write_recording
-from ertis_numba.verification import error_db, exact_image
-from ertis_numba.verification._exact import ExactImage
 from tests.cases import CASES, SHORT, noise
 from tests.files import noise as measurements_of
 

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 from ertis_cli.status import _drawn
 
-from ertis_numba.errors import ArgumentError, NetworkError, RefusedError
+from ertis_numba.base.errors import ArgumentError, NetworkError, RefusedError
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.central_client import CentralClient
 from ertis_numba.network.central_node import Archive, CentralNode

@@ -7,10 +7,10 @@ import h5py
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, SequenceGap, Stamp
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
 from ertis_numba.storage import (
     EnergyscapeWriter,

@@ -10,8 +10,8 @@ import h5py
 import numpy as np
 import pytest
 
-from ertis_numba import atomic_files
-from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
+from ertis_numba.base import atomic_files
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError, FormatVersionError
 from ertis_numba.frames import Reflector
 from ertis_numba.settings import Recording
 from ertis_numba.storage import (
@@ -308,7 +308,7 @@ def test_full_disk_leaves_no_file(tmp_path, monkeypatch):
 WRITE_UNDER_A_LIMIT = """
 import sys
 import tests.files as files
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.storage import write_recording
 
 try:

@@ -5,7 +5,7 @@ import re
 import h5py
 import pytest
 
-from ertis_numba.errors import DataError, ForeignDataError
+from ertis_numba.base.errors import DataError, ForeignDataError
 from ertis_numba.storage import open_recording, structure
 from ertis_numba.storage.verify import verify
 from tests.faults.network.hostile_files import hostile_files, write_good

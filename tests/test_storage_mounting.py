@@ -10,8 +10,8 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
+from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.campaign import Campaign
-from ertis_numba.errors import ArgumentError, DamagedError
 from ertis_numba.frames import PointCloud
 from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.network.messages import Hello, decode, encode

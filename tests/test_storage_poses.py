@@ -11,7 +11,7 @@ from ertis_cli.main import cli
 from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError, DamagedError, ForeignDataError
+from ertis_numba.base.errors import ArgumentError, DamagedError, ForeignDataError
 from ertis_numba.storage import (
     RecordingWriter,
     open_recording,

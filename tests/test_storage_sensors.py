@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array
 from ertis_numba.storage import (

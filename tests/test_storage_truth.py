@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector, TrueSource
 from ertis_numba.storage import (
     GroundTruth,

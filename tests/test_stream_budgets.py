@@ -5,15 +5,15 @@ import functools
 import numpy as np
 import pytest
 
-from ertis_numba import kernels, verification
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba import kernels
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.stream_recipe import uses_streams
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
-from ertis_numba.pipeline import Pipeline
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
+from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import Accuracy, Array, Processing, Recording, Settings
-from ertis_numba.stages.stream_recipe import uses_streams
-from ertis_numba.waveform import call_at
 
 CPU = kernels.load("cpu")
 BASE = Settings(

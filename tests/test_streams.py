@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from ertis_numba.beamformers import WEIGHTINGS, Weighting
+from ertis_numba.chain import stream_recipe
 from ertis_numba.kernels import KernelSet
+from ertis_numba.pipeline.verification import error_db
 from ertis_numba.settings import Processing
-from ertis_numba.stages import stream_recipe
-from ertis_numba.verification import error_db
+from ertis_numba.settings.beamformers import WEIGHTINGS, Weighting
 from tests.on_device import KERNELS
 
 STREAMS = {

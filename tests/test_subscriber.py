@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.network import messages
 from ertis_numba.network.subscriber import Subscriber
 from tests.publishing import (

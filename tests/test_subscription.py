@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import zmq
 
-from ertis_numba.errors import RefusedError
+from ertis_numba.base.errors import RefusedError
 from ertis_numba.network import _subscription, connection, messages, subscriber as subscriber_module
 from ertis_numba.network.allow_list import AllowList
 from ertis_numba.network.keys import ClientKeys, KeyPair, ServerKeys

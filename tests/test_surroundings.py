@@ -15,7 +15,7 @@ import numba
 import pytest
 from ertis_cli import _output
 
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.kernels import _numba_setup
 from ertis_numba.kernels._cpu import loading
 

@@ -9,8 +9,8 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.devices.emulator import Emulator, SyncChain
-from ertis_numba.errors import ArgumentError
 from tests.emulated import TIMEOUT_S, Numbered, ask, block, opened
 
 

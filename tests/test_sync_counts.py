@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.capture.sync_counts import PulseAligner
+from ertis_numba.devices.capture.sync_counts import PulseAligner
 
 SHORTEST_S = 0.0364
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.passive import HeardSignals, time_differences
 from ertis_numba.passive.wave_delays import WaveDelays
 from tests.test_acoustic_camera import settings_of, sound

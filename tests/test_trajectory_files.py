@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from ertis_numba import Trajectory, read_trajectory, write_tum
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 
 pytestmark = pytest.mark.filterwarnings("ignore::ertis_numba.PoseWarning")  # Random poses are hardly those of a robot.
 

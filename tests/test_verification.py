@@ -10,15 +10,14 @@ from ertis_bench.error_trials import reference_image, verify_trials as campaign
 from ertis_bench.error_trials.random_settings import Limits, random_measurement, random_settings
 from ertis_cli.main import cli
 
-from ertis_numba import verification
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS, BEAMFORMERS, WEIGHTINGS
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
-from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline import Pipeline, verification
+from ertis_numba.pipeline.verification import ExactImage, _measured
 from ertis_numba.settings import Array, Call, Processing, Recording
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS, BEAMFORMERS, WEIGHTINGS
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
-from ertis_numba.verification import ExactImage, _measured
 from tests import reference
 from tests.files import SMALL, noise
 

@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.journal import Journal
 from ertis_numba.storage import RecordingWriter, open_recording, write_energyscapes, write_recording
 from ertis_numba.storage._gaps import UNKNOWN

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from ertis_numba.analysis.side_lobes import without_side_lobes
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import Fan, direction_grid
 from ertis_numba.settings import Call, Processing
 from ertis_numba.viewer import COLOURS, Choices, Dome, Polar, Pose, ReceivedImage, Sector, ViewedScene, _axes

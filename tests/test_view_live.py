@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from ertis_numba.errors import RefusedError
+from ertis_numba.base.errors import RefusedError
 from ertis_numba.network.messages import Refused
 from ertis_numba.network.status import SensorStatus
 from ertis_numba.viewer import Choices, Live, Pose, Viewer, _live

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import AcousticMap, Measurement, Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.passive import AcousticCamera

@@ -13,7 +13,7 @@ import pytest
 import viser
 import zstandard
 
-from ertis_numba.errors import ArgumentError, NetworkError
+from ertis_numba.base.errors import ArgumentError, NetworkError
 from ertis_numba.storage import write_energyscapes
 from ertis_numba.viewer import Choices, Playback, Viewer, _recordings as recordings, _view as viewing
 from ertis_numba.viewer._origins import is_loopback

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ertis_numba import kernels
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.frames import Stamp
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air

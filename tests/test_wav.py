@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.io import wavfile
 
-from ertis_numba.errors import DataError
-from ertis_numba.wav import read_wav
+from ertis_numba.base.errors import DataError
+from ertis_numba.base.wav import read_wav
 
 RATE_HZ, N_CHANNELS, N_SAMPLES = 96_000, 4, 480
 VALUES = np.random.default_rng(1).integers(-9_000, 9_000, (N_SAMPLES, N_CHANNELS)).astype("<i2")

@@ -6,9 +6,8 @@ import scipy.signal
 from hypothesis import assume, given, settings, strategies as st
 from numpy.testing import assert_allclose
 
-from ertis_numba.errors import ArgumentError
-from ertis_numba.settings import Call, Processing, Recording, Settings
-from ertis_numba.waveform import (
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.geometry.waveform import (
     call_at,
     call_samples,
     decimation_taps,
@@ -18,6 +17,7 @@ from ertis_numba.waveform import (
     matched_filter_spectrum,
     matched_guard_s,
 )
+from ertis_numba.settings import Call, Processing, Recording, Settings
 
 RATE_HZ = 450_000.0
 PCM = Recording(sample_rate_hz=RATE_HZ, encoding="float32")

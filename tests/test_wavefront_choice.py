@@ -5,12 +5,12 @@ import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
 
-from ertis_numba import kernels, verification
-from ertis_numba.errors import ArgumentError
-from ertis_numba.pipeline import Pipeline
+from ertis_numba import kernels
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.planner import Planner, complete
+from ertis_numba.chain.wavefronts import plane_wave_error_db
+from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import Accuracy, Settings
-from ertis_numba.stages.planner import Planner, complete
-from ertis_numba.stages.wavefronts import plane_wave_error_db
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests.test_call_match import CALL, SETTINGS, heard
 

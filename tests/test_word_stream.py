@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.devices.block_receiver import BlockReceiver
 from ertis_numba.devices.blocks import Instant, encode_block
-from ertis_numba.errors import ArgumentError
 from ertis_numba.settings import Processing, Recording
 from tests.pages import python_in
 
@@ -111,7 +111,7 @@ def near(monkeypatch):
         images, clock = [], Clock()
         chain = type(pipeline._chain)  # noqa: SLF001  the only place where work is visible
         image = chain._image  # noqa: SLF001
-        monkeypatch.setattr("ertis_numba.stages.word_stream.perf_counter", clock)
+        monkeypatch.setattr("ertis_numba.chain.word_stream.perf_counter", clock)
 
         def timed(*given, **options):
             images.append(given)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.network.processing import ProcessingOptions
 from ertis_numba.network.processing.dead_letter_queue import DeadLetterQueue

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import direction_grid
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.interop._points import PointTable
 from ertis_numba.settings import Processing
 from ertis_numba.storage import open_energyscapes, write_energyscapes, write_recording

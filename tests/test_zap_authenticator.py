@@ -6,7 +6,7 @@ import time
 import pytest
 import zmq
 
-from ertis_numba.errors import ArgumentError, NetworkError
+from ertis_numba.base.errors import ArgumentError, NetworkError
 from ertis_numba.network import sockets
 from ertis_numba.network.zap_authenticator import EVERYBODY, ZapAuthenticator
 from tests.zap_clients import DESK, LISTED, LOOPBACK, PATIENCE_S, ROBOT, STRANGER, VIEWER, Door

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from ertis_numba import kernels
+from ertis_numba.chain.focal_zones import zone_edges
+from ertis_numba.chain.planner import Planner
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Array, Processing
-from ertis_numba.stages.focal_zones import zone_edges
-from ertis_numba.stages.planner import Planner
 from tests import reference
 from tests.cases import LINE_8, SHORT, noise
 from tests.hard_cases.echoes import echo_words

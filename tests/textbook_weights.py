@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.stages.interpolation_fit import DelayFit, Spectrum
+from ertis_numba.chain.interpolation_fit import DelayFit, Spectrum
 
 TEXTBOOK = {
     "nearest sample": (1, False),

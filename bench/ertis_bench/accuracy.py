@@ -9,14 +9,14 @@ import numpy as np
 
 from ertis_bench import input_measurements, machine, timing
 from ertis_bench.plans import in_words, plans
-from ertis_numba import kernels, verification
+from ertis_numba import kernels
 from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.chain.planner import Planner
+from ertis_numba.chain.signal_model import signal_model_of
 from ertis_numba.frames import Measurement, Peak
 from ertis_numba.kernels import KernelSet
-from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import ERROR_PRESETS_DB, Settings
-from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.signal_model import signal_model_of
 
 __all__ = ["DIRECTIONS", "PAPER", "RANGE_M", "TURN", "beats", "comparable", "plot", "run"]
 

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import unit_vectors
-from ertis_numba.verification import ExactImage
+from ertis_numba.pipeline.verification import ExactImage
 
 __all__ = ["MAX_ERROR_DB", "require_error", "require_exact", "require_same_reflector"]
 

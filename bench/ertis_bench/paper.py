@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from ertis_bench import checks, input_measurements, instruction_sets, machine, timing
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
+from ertis_numba.chain.interpolation_fit import one_thread
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.stages.interpolation_fit import one_thread
 
 __all__ = ["BACKENDS", "DIRECTIONS", "PUBLISHED_MS", "RESTRICTED", "run"]
 

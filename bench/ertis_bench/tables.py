@@ -8,7 +8,7 @@ from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import or_dash, table
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RESTRICTED
-from ertis_numba.verification import PEAKS
+from ertis_numba.pipeline.verification import PEAKS
 
 __all__ = ["FORMS", "accuracy", "accuracy_front", "paper"]
 

@@ -66,7 +66,7 @@ def plot_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def is_acoustic(path: Path, sensor: str | None, index: int) -> bool:
     """Return True for a file of acoustic maps, and for a passive measurement; False for files that cannot be read."""
-    from ertis_numba.errors import ErtisError
+    from ertis_numba.base.errors import ErtisError
     from ertis_numba.frames import is_passive
     from ertis_numba.storage import file_kind, open_recording
 
@@ -82,7 +82,7 @@ def is_acoustic(path: Path, sensor: str | None, index: int) -> bool:
 
 def require_fitting(kind: str, path: Path) -> None:
     """Raise an error for a file of acoustic maps and a kind of plot that it does not support."""
-    from ertis_numba.errors import ErtisError
+    from ertis_numba.base.errors import ErtisError
     from ertis_numba.storage import file_kind
 
     with suppress(ErtisError):  # Reading the file reports the error.

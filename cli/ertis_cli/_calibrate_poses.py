@@ -44,9 +44,9 @@ def write_poses(
     Raise ArgumentError if the target cannot be written, or no recording contains a sensor. Raise DataError if the
     recordings do not determine the poses; nothing is written.
     """
-    from ertis_numba.atomic_files import atomic_write, check_target
+    from ertis_numba.base.atomic_files import atomic_write, check_target
+    from ertis_numba.base.errors import ArgumentError, DataError
     from ertis_numba.calibration.poses import calibrate_poses
-    from ertis_numba.errors import ArgumentError, DataError
 
     if target is not None:
         if target.suffix.lower() != ".toml":
@@ -88,7 +88,7 @@ def _opened(
     paths: Sequence[Path], sensors: Sequence[str] | None, stack: ExitStack
 ) -> "dict[str, list[tuple[int, RecordingReader]]]":
     """Return the recordings of each sensor with the numbers of their files."""
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
     from ertis_numba.storage import open_recording, sensor_names
 
     contained = [sensor_names(path, "a recording") for path in paths]

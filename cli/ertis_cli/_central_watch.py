@@ -162,8 +162,8 @@ class CentralWatch:
 
 def archive(folder: Path, name: str, rotate_mb: float, rotate_s: float) -> "Archive":
     """Return an archive that stores measurements according to the options."""
-    from ertis_numba import checks
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base import checks
+    from ertis_numba.base.errors import ArgumentError
     from ertis_numba.network.central_node import Archive
 
     checks.between("--rotate-size", rotate_mb, 1.0, 1e9)

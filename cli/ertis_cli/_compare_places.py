@@ -15,7 +15,7 @@ __all__ = ["compare_fused", "compare_map"]
 def compare_fused(path: Path, min_level_db: float, *, as_json: bool) -> None:
     """Print the errors of the points of fused images."""
     from ertis_numba.analysis.compare_places import compare_points, errors_of_places
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
     from ertis_numba.fusion import PLATFORM
     from ertis_numba.storage import open_energyscapes
     from ertis_numba.storage.placed_truth import surfaces_at
@@ -48,7 +48,7 @@ def compare_fused(path: Path, min_level_db: float, *, as_json: bool) -> None:
 def compare_map(path: Path, min_level_db: float, *, as_json: bool) -> None:
     """Print the errors of the occupied cells of a map."""
     from ertis_numba.analysis.compare_places import compare_map as compared, errors_of_places, joined
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
     from ertis_numba.storage import read_map, read_map_truth
     from ertis_numba.storage.placed_truth import surfaces_at
 

@@ -126,7 +126,7 @@ def _take(ctx: click.Context, path: Path) -> None:
     try:
         tables = tomllib.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
-        from ertis_numba import checks
+        from ertis_numba.base import checks
 
         reason = checks.reason_unreadable(error) if isinstance(error, OSError | UnicodeDecodeError) else error
         raise click.ClickException(f"{path}: {reason}; choose a readable TOML file (--config)") from error

@@ -100,7 +100,7 @@ def _versions(_folder: Path) -> Iterator[InstallationFinding]:
 
 def _processor(_folder: Path) -> Iterator[InstallationFinding]:
     from ertis_numba import kernels
-    from ertis_numba.cpu_cores import usable_cores
+    from ertis_numba.base.cpu_cores import usable_cores
     from ertis_numba.frames import Measurement
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings
@@ -166,7 +166,7 @@ def _threading_layer() -> str:
 
 def _gpu(_folder: Path) -> Iterator[InstallationFinding]:
     from ertis_numba import kernels
-    from ertis_numba.errors import DeviceError
+    from ertis_numba.base.errors import DeviceError
 
     driver = Path("/proc/driver/nvidia/version").exists() or Path("/dev/nvidiactl").exists()
     wanted = importlib.util.find_spec("cupy") is not None
@@ -268,7 +268,7 @@ def _commits_s(folder: Path) -> Sequence[float]:
 
 
 def _keys(_folder: Path) -> Iterator[InstallationFinding]:
-    from ertis_numba.errors import SettingsError
+    from ertis_numba.base.errors import SettingsError
     from ertis_numba.network.keys import KeyPair, default_folder
 
     folder = default_folder()

@@ -40,7 +40,7 @@ class SceneRenderer:
 
     def refusal(self, name: str, config: "DeviceConfig") -> str:
         """Render for this configuration from now on; return the reason if that is impossible, or an empty text."""
-        from ertis_numba.errors import ArgumentError
+        from ertis_numba.base.errors import ArgumentError
         from ertis_numba.settings import PRESETS, Settings
 
         sensor = self._scene.sensor(name)

@@ -47,7 +47,7 @@ def examples() -> dict[str, Traversable]:
 
 def named(name: str) -> dict[str, Traversable]:
     """Return the source of the example with this name, or without a suffix of all examples of that name."""
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
 
     every = examples()
     found = {file: item for file, item in every.items() if name in {file, stem(file)}}
@@ -63,7 +63,7 @@ def stem(file: str) -> str:
 
 def is_written(path: Path, item: Traversable) -> bool:
     """Return True if a file is the example with its name: a copy of the source, or a recording with equal samples."""
-    from ertis_numba.errors import ErtisError
+    from ertis_numba.base.errors import ErtisError
 
     if path.is_symlink() or not path.is_file():
         return False

@@ -107,7 +107,7 @@ def drive_of(
     needed but unknown. Raise DataError if a file cannot be read, or no motion could be measured.
     """
     from ertis_numba import load_scene
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
     from ertis_numba.interop import Drive
 
     true = ears.trajectory if poses is None else _poses.trajectory_of(poses, quiet=quiet)

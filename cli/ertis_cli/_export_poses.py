@@ -28,8 +28,8 @@ def is_chosen(target: Path, file_format: str | None) -> bool:
 def export_poses(path: Path, target: Path, sensor: str | None, *, force: bool, quiet: bool, as_json: bool) -> None:
     """Write the poses of a recording in the TUM format."""
     from ertis_numba import write_tum
-    from ertis_numba.atomic_files import check_target
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.atomic_files import check_target
+    from ertis_numba.base.errors import DataError
     from ertis_numba.storage import recorded_trajectory, sensor_names
 
     for parameter, option in _OF_IMAGES.items():

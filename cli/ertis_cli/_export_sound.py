@@ -115,10 +115,10 @@ def export_sound(
     """Write the sound of one direction in some measurements as WAV, amplified to a peak of -1 dBFS."""
     import numpy as np
 
-    from ertis_numba import checks
-    from ertis_numba.atomic_files import atomic_write, check_target
+    from ertis_numba.base import checks
+    from ertis_numba.base.atomic_files import atomic_write, check_target
+    from ertis_numba.base.wav import wav_bytes
     from ertis_numba.passive import heterodyned, time_expanded
-    from ertis_numba.wav import wav_bytes
 
     check_target(target, overwrite=force, sources=[reader.path])
     heard = _joined(reader, places, sound)
@@ -157,7 +157,7 @@ def _joined(reader: "RecordingReader", places: range, sound: SoundOptions) -> "B
     """Return the sounds of measurements, one after the other."""
     import numpy as np
 
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
     from ertis_numba.passive import BeamSound, HeardSignals, listen_to
 
     parts: list[np.ndarray[Any, np.dtype[np.float32]]] = []

@@ -28,7 +28,7 @@ def mountings(path: Path | None, sensors: Iterable[str] | None) -> dict[str, Mou
     """Return the mountings of some or all sensors, at the start of a scene; return None without a file."""
     if path is None:
         return None
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
 
     known = _of_scene(path) if path.suffix.lower() == ".toml" else _of_file(path)
     if not known:

@@ -75,7 +75,7 @@ def _naming(callback: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return callback(*arguments, **options)
         except Exception as error:
-            from ertis_numba.errors import ArgumentError, ErtisError
+            from ertis_numba.base.errors import ArgumentError, ErtisError
 
             if not isinstance(error, ErtisError) or not error.args:
                 raise

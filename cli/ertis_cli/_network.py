@@ -57,7 +57,7 @@ def server_keys(key: str | None, allow: Path | None) -> "ServerKeys | None":
 
 def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
     """Return the keys of a sensor node or an application, or None if no keys were given."""
-    from ertis_numba.errors import SettingsError
+    from ertis_numba.base.errors import SettingsError
     from ertis_numba.network.keys import ClientKeys, KeyPair, public_key
 
     if key is None and server_key is None:
@@ -76,7 +76,7 @@ def client_keys(key: str | None, server_key: str | None) -> "ClientKeys | None":
 
 def metrics(given: str | None, latest: "Callable[[], Status]") -> "Metrics | None":
     """Return a metrics server that has not started, or None without an address."""
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
     from ertis_numba.network.addresses import endpoint
     from ertis_numba.network.metrics import Metrics
 
@@ -99,7 +99,7 @@ def require_address(option: str, given: str | None) -> None:
 
 def require_duration(given: float | None) -> None:
     """Raise ArgumentError if a duration is not above zero, before anything is opened."""
-    from ertis_numba import checks
+    from ertis_numba.base import checks
 
     if given is not None:
         checks.positive("--duration", given)

@@ -17,7 +17,7 @@ _COUNTS = ("maps", "measurements", "pulses")
 
 def files_of(paths: Iterable[Path]) -> Iterator[Path]:
     """Yield the given files, and the HDF5 files below the given folders, in natural order."""
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
     from ertis_numba.interop.pcm_files import natural_order
 
     for path in paths:
@@ -33,7 +33,7 @@ def files_of(paths: Iterable[Path]) -> Iterator[Path]:
 
 def overview(paths: Iterable[Path], read: Callable[[Path], _Sections], *, as_json: bool) -> int:
     """Print a line for each file, and the errors of files that cannot be read; return the exit code."""
-    from ertis_numba.errors import ErtisError
+    from ertis_numba.base.errors import ErtisError
 
     reported: list[dict[str, Any]] = []
     for path in paths:

@@ -32,7 +32,7 @@ def _is_output(parameter: click.Parameter) -> bool:
 
 
 def _require_own_output(ctx: click.Context) -> None:
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
 
     parameters = [(each, ctx.params.get(each.name or "")) for each in ctx.command.params]
     inputs = [path for each, value in parameters if not _is_output(each) for path in _files(value)]

@@ -16,7 +16,7 @@ def require_no_pipes(options: Mapping[str, Any]) -> None:
         except (OSError, ValueError):  # missing, or no path at all
             continue
         if is_pipe and path.parts[:2] not in {("/", "dev"), ("/", "proc")}:
-            from ertis_numba.errors import ArgumentError
+            from ertis_numba.base.errors import ArgumentError
 
             raise ArgumentError(f"{path} is a named pipe; write its content to a file, and use the file")
 

@@ -48,7 +48,7 @@ def reading(command: "Callable[..., Any]") -> "Callable[..., Any]":
 def trajectory_of(path: Path, *, quiet: bool, **chosen: Any) -> "Trajectory":
     """Return the trajectory in a file, and print its notes."""
     from ertis_numba import read_trajectory
-    from ertis_numba.errors import PoseWarning
+    from ertis_numba.base.errors import PoseWarning
 
     with warnings.catch_warnings(category=PoseWarning, action="ignore"):  # Notes say the same.
         found = read_trajectory(path, **chosen)

@@ -141,7 +141,7 @@ def note_missing(groups: "Sequence[Mapping[str, StampedIndex]]", sensors: "Seque
 
 
 def _mounting(reader: "RecordingReader") -> "Mounting":
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
 
     if reader.translation_m is None or reader.rotation_xyzw is None:
         raise ArgumentError(
@@ -173,7 +173,7 @@ def _require_one_chain(places: "Sequence[StampedIndex]", groups: "Sequence[dict[
 
     Only counts that each sensor has once in a session are compared, since others do not identify a pulse.
     """
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
     from ertis_numba.fusion.pulses import is_same_pulse
 
     stamps: dict[tuple[str, int], dict[int, list[Stamp]]] = {}  # By session of a sensor, and by SYNC count.
@@ -214,7 +214,7 @@ def active_groups(
     note states the number of other pulses. With the ``processing.mode`` of the settings that ``changed`` returns,
     `is_passive` decides.
     """
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
     from ertis_numba.frames import is_passive
 
     settings = {reader.sensor: changed(reader.settings) for reader in readers}

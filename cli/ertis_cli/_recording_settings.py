@@ -73,8 +73,8 @@ def settings_from(
 
 def warn_without_images(settings: "Settings") -> None:
     """Print a warning if no image can be computed from measurements with these settings."""
-    from ertis_numba.errors import ArgumentError
-    from ertis_numba.stages.memory import require_images
+    from ertis_numba.base.errors import ArgumentError
+    from ertis_numba.chain.memory import require_images
 
     try:
         require_images(settings)

@@ -10,9 +10,9 @@ from ertis_cli._sensors import ConfiguredSensors, named_sensors, opened_sensors,
 from ertis_cli._stop_signals import Signals
 
 if TYPE_CHECKING:
+    from ertis_numba.interop.ros import RosPublisher
     from ertis_numba.journal import JournalEntry
     from ertis_numba.network.keys import ClientKeys
-    from ertis_numba.ros import RosPublisher
     from ertis_numba.settings import Settings
 
 __all__ = ["publish_file", "publish_node", "publish_ports"]
@@ -44,7 +44,7 @@ def publish_node(
     Without ``images``, points are received, which are smaller. A central node sends its status each second, also
     without sensors. If nothing arrives, a NetworkError is raised at the end.
     """
-    from ertis_numba.errors import NetworkError
+    from ertis_numba.base.errors import NetworkError
     from ertis_numba.network.status import Status
     from ertis_numba.network.subscriber import Subscriber
 
@@ -156,7 +156,7 @@ def publish_ports(
 ) -> None:
     """Measure with the sensors on some ports, and publish their images, until the program is to end."""
     from ertis_cli import options
-    from ertis_numba.capture import CaptureSession
+    from ertis_numba.devices.capture import CaptureSession
     from ertis_numba.devices.setup import Setup
 
     with ExitStack() as stack:
@@ -229,7 +229,7 @@ def _with_call(
     path: Path, readers: Mapping[str, Any], order: list[_Place], on_passive: Callable[[int], None]
 ) -> list[_Place]:
     """Return the measurements of a recording that have echoes of a call, and report the number of others."""
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
     from ertis_numba.frames import is_passive
 
     stamps = {name: reader.stamps() for name, reader in readers.items()}

@@ -45,7 +45,7 @@ def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
 @contextmanager
 def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Write]:
     """Yield a function that saves a product; the file appears when the block ends without an error."""
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
 
     if target is None:
         yield lambda _: None
@@ -77,7 +77,7 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
 
 def _require_place(target: Path) -> None:
     """Raise an error now, before any wait, if the folder of a file is missing or not writable."""
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
 
     try:
         with tempfile.TemporaryFile(dir=target.parent):
@@ -90,8 +90,8 @@ def _require_place(target: Path) -> None:
 
 def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
     """Yield a function that appends measurements to a journal; the journal is then sealed into a recording."""
-    from ertis_numba.atomic_files import check_target
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.atomic_files import check_target
+    from ertis_numba.base.errors import DataError
     from ertis_numba.journal import SUFFIX, Journal, JournalEntry, seal_in_subprocess
 
     check_target(target, overwrite=overwrite)

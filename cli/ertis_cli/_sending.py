@@ -12,8 +12,8 @@ from ertis_cli._naming import with_options
 from ertis_cli._watch import Watch
 
 if TYPE_CHECKING:
-    from ertis_numba.capture import CaptureSession
     from ertis_numba.devices.bits import BitCheck
+    from ertis_numba.devices.capture import CaptureSession
     from ertis_numba.network.keys import ClientKeys
     from ertis_numba.network.sensor_node import Acknowledged, SensorNode, SettingsRequest
     from ertis_numba.settings import Settings
@@ -106,7 +106,7 @@ class Sending:
 
     def run(self, session: "CaptureSession", checks: "dict[str, BitCheck]", *, patience_s: float) -> Exception | None:
         """Capture, wait for the acknowledgement of all measurements, and return the error, if any."""
-        from ertis_numba.errors import NetworkError
+        from ertis_numba.base.errors import NetworkError
 
         where = (
             f"unacknowledged measurements are safe in {self._spool}; the next capture with --spool sends them"
@@ -131,8 +131,8 @@ class Sending:
 
     def _change(self, request: "SettingsRequest") -> None:
         """Change the settings of all sensors at the request of an admin."""
-        from ertis_numba.capture import SettingsChange
-        from ertis_numba.errors import SonarError
+        from ertis_numba.base.errors import SonarError
+        from ertis_numba.devices.capture import SettingsChange
 
         session = self._session
         if session is None:
@@ -196,7 +196,7 @@ class Sending:
 
 
 def _require_room(option: str, size_mb: float, settings: "Settings") -> None:
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
     from ertis_numba.journal import JournalSensor
 
     min_mb = 1e-6 * JournalSensor.from_settings("any", settings).n_bytes

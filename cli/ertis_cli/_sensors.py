@@ -32,7 +32,7 @@ def require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
             raise click.UsageError(f"port {port} is given {ports.count(port)} times; name each sensor once")
     if names and len(names) != len(ports):
         raise click.UsageError(f"{len(names)} names are given for {len(ports)} ports; use one --name for each --port")
-    from ertis_numba import checks
+    from ertis_numba.base import checks
 
     for name in names:
         checks.sensor_name(name)
@@ -40,8 +40,8 @@ def require_one_each(ports: tuple[str, ...], names: tuple[str, ...]) -> None:
 
 def wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet: bool) -> None:
     """Wait until all ports exist; raise an error for the first port that is missing after ``wait_s``."""
+    from ertis_numba.base.errors import SonarError
     from ertis_numba.devices.ports import resolve
-    from ertis_numba.errors import SonarError
 
     end_s = time.monotonic() + wait_s
     with options.note_when_slow(f"waiting for {', '.join(ports)} ...", quiet=quiet):
@@ -61,7 +61,7 @@ def wait_for(ports: tuple[str, ...], wait_s: float, signals: Signals, *, quiet: 
 @contextmanager
 def _interruptible(signals: Signals) -> "Iterator[Callable[[], bool]]":
     """Yield a function that returns True once a signal has arrived; a failed dialogue then ends the command."""
-    from ertis_numba.errors import SonarError
+    from ertis_numba.base.errors import SonarError
 
     try:
         yield lambda: bool(signals.came)

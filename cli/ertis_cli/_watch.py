@@ -13,8 +13,8 @@ from ertis_cli import options
 from ertis_cli._progress import StatusLine
 
 if TYPE_CHECKING:
-    from ertis_numba.capture import CaptureSession, MeasurementSink
     from ertis_numba.devices.bits import BitCheck
+    from ertis_numba.devices.capture import CaptureSession, MeasurementSink
     from ertis_numba.journal import JournalEntry
 
 __all__ = ["Watch", "report"]

@@ -159,7 +159,7 @@ def costs(*, count: int, targets: tuple[Path, ...], units: tuple[str, ...], quie
             markdown.around(target, benchmark.MARKER)
         elif target.name != "nominal_costs.py":
             raise click.BadParameter(
-                f"{target} is not nominal_costs.py; choose ertis_numba/stages/nominal_costs.py, or a Markdown file",
+                f"{target} is not nominal_costs.py; choose ertis_numba/chain/nominal_costs.py, or a Markdown file",
                 param_hint="--update",
             )
     report = benchmark.run(count=count, say=lambda text: options.say(text, quiet=quiet), units=units or benchmark.UNITS)
@@ -406,7 +406,7 @@ def simulation(*, verdicts: int | None, **given: Any) -> None:
     if verdicts is None:
         _run("simulation", _in_source_folder("simulation", "simulation_trials.simulation"), **given)
         return
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
 
     if given["targets"]:
         raise click.UsageError("--verdicts writes no table; remove --update")
@@ -485,7 +485,7 @@ def network(*, only: tuple[str, ...], **given: Any) -> None:
 
     Uses keys, and checks every sample and image.
     """
-    from ertis_numba import checks
+    from ertis_numba.base import checks
 
     benchmark = _in_source_folder("network", "network_trials.performance")
     for part in only:
@@ -548,7 +548,7 @@ def _in_source_folder(name: str, package: str | None = None) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name not in {module, module.rpartition(".")[0]}:
             raise
-        from ertis_numba.errors import ArgumentError
+        from ertis_numba.base.errors import ArgumentError
 
         raise ArgumentError(
             f"'ertis bench {name}' exists only in the source folder; run 'pip install --editable .' in that folder"

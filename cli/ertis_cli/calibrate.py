@@ -142,9 +142,9 @@ def calibrate(
     With --poses, the recordings contain several sensors of one SYNC chain, and one small reflector at 10 to 20 places
     that they see together. The mounting file is for --mounting of 'ertis capture' and other commands.
     """
-    from ertis_numba.atomic_files import atomic_write, check_target
+    from ertis_numba.base.atomic_files import atomic_write, check_target
+    from ertis_numba.base.errors import ArgumentError
     from ertis_numba.calibration import calibrate as calibrated
-    from ertis_numba.errors import ArgumentError
     from ertis_numba.geometry import layout_file
 
     if poses:
@@ -207,7 +207,7 @@ def _require_no_other_options(ctx: click.Context) -> None:
 
 def _opened(paths: tuple[Path, ...], sensor: str | None, stack: ExitStack) -> "tuple[list[str], Iterator[Measurement]]":
     """Return the places of all measurements, as file and index, and the measurements of one sensor."""
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
     from ertis_numba.storage import open_recording, sensor_names
 
     found = []

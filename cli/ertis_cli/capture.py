@@ -21,8 +21,8 @@ from ertis_cli._watch import Watch, report
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ertis_numba.capture import CaptureSession
     from ertis_numba.devices.bits import BitCheck
+    from ertis_numba.devices.capture import CaptureSession
     from ertis_numba.devices.setup import Setup
 
 __all__ = ["capture"]
@@ -176,8 +176,8 @@ def capture(
     _require_one_place(address, target, for_address=(spool, spool_mb, ring_mb, fixed_settings, key, server_key))
     _require_spool(spool, spool_mb)
     _network.require_duration(duration)
-    from ertis_numba.atomic_files import check_target
-    from ertis_numba.capture import CaptureSession
+    from ertis_numba.base.atomic_files import check_target
+    from ertis_numba.devices.capture import CaptureSession
 
     if target is not None:
         check_target(target, overwrite=force)
@@ -261,7 +261,7 @@ def _record(
 
 def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
     """Seal the journal into a recording, then raise the error that ended the capture, if any."""
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
     from ertis_numba.journal import seal_in_subprocess
 
     try:

@@ -64,9 +64,9 @@ def check(
     The exit code is 0 if all sensors are fit for use, and 1 if a fault was found or a file cannot be read. The page of
     --report lists every file. A check is "not known" if the recording does not show its result; this is not a fault.
     """
-    from ertis_numba import checks
-    from ertis_numba.atomic_files import check_target
-    from ertis_numba.errors import ErtisError
+    from ertis_numba.base import checks
+    from ertis_numba.base.atomic_files import check_target
+    from ertis_numba.base.errors import ErtisError
     from ertis_numba.sensor_check import check_recording, uncheckable_recording, write_page
 
     if nominal_rate_hz is not None:

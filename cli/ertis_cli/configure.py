@@ -43,7 +43,7 @@ def configure(
     sensor cannot use them, all keep their former settings. A central node that computes images refuses settings from
     which it cannot compute any. If the central node uses keys, pass the key of an admin.
     """
-    from ertis_numba import checks
+    from ertis_numba.base import checks
     from ertis_numba.network.central_client import CentralClient
 
     checks.positive("--patience", patience_s)

@@ -103,7 +103,7 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
 
 def _make(folder: Path, *, force: bool) -> None:
     """Make the folder, and remove the files of an earlier demo."""
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
 
     there = [folder / name for name in _WRITTEN if (folder / name).exists() or (folder / name).is_symlink()]
     if there and not force:

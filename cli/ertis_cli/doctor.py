@@ -39,7 +39,7 @@ def doctor(
     """
     from ertis_cli._diagnosis import CHECKS, InstallationFinding
     from ertis_cli._ros_diagnosis import ros_findings
-    from ertis_numba.errors import ArgumentError, ErtisError
+    from ertis_numba.base.errors import ArgumentError, ErtisError
 
     if not ros and (domain is not None or interface is not None):
         raise click.UsageError("--domain and --interface require --ros; add --ros")

@@ -129,10 +129,10 @@ def emulate(
 
     'ertis capture' can read the mounting of the sensors from the same file: --mounting SCENE.toml|REC.h5.
     """
+    from ertis_numba.base.errors import ArgumentError
     from ertis_numba.devices.emulator import Emulator, SyncChain
     from ertis_numba.devices.emulator.faults import Faults
     from ertis_numba.devices.links import HeldLink, emulated_folder
-    from ertis_numba.errors import ArgumentError
 
     _require_log(log_path)
     kinds = dict(faults)
@@ -195,7 +195,7 @@ def emulate(
 
 def _require_log(path: Path | None) -> None:
     """Refuse to append lines to a file of another kind, such as a recording."""
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
 
     if path is not None and path.is_file():
         with path.open("rb") as file:
@@ -319,7 +319,7 @@ def _report_difference(replayed: "Replayed", index: int, active: bool) -> None: 
 
 def _get_ready(devices: "Sequence[Emulator]", given: "Given", pulse: int) -> None:
     """Render the measurements of a pulse in advance, also for devices that are about to be armed."""
-    from ertis_numba.errors import ErtisError
+    from ertis_numba.base.errors import ErtisError
 
     registers = {device.name: device.registers for device in devices if device.error is None}
     if not any(each.armed for each in registers.values()):

@@ -47,7 +47,7 @@ def example(
     if not names:
         _list(as_json=as_json)
         return
-    from ertis_numba.atomic_files import atomic_write, check_target
+    from ertis_numba.base.atomic_files import atomic_write, check_target
 
     sources: dict[Path, Traversable] = {}
     for name in names:

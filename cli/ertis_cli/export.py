@@ -205,7 +205,8 @@ def _readers(
 
 def _format_of(target: Path, file_format: str | None) -> str:
     """Return the name of the format of images or signals, given or by the suffix; refuse unknown suffixes."""
-    from ertis_numba import checks, interop
+    from ertis_numba import interop
+    from ertis_numba.base import checks
 
     if file_format is None:
         others = (f".{name}" for name in (*FORMATS_OF_POSES, *FORMATS_OF_SOUND))
@@ -280,7 +281,7 @@ class _Items:
 
 def _with_call(reader: "RecordingReader | EnergyscapeReader", chosen: range) -> "Sequence[int]":
     """Return the chosen measurements of a recording that have echoes of a call."""
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
     from ertis_numba.frames import is_passive
 
     stamps = list(reader.stamps())

@@ -60,9 +60,9 @@ def import_poses(
     across more than a second. A folder stands for its recordings (*.h5). A recording is replaced only when the new one
     is complete.
     """
-    from ertis_numba import checks
-    from ertis_numba.atomic_files import make_folder
-    from ertis_numba.errors import PoseWarning
+    from ertis_numba.base import checks
+    from ertis_numba.base.atomic_files import make_folder
+    from ertis_numba.base.errors import PoseWarning
     from ertis_numba.storage import add_poses, check_target, recorded_trajectory, require_fitting_poses
     from ertis_numba.storage.poses import count_in_gaps
 
@@ -104,7 +104,7 @@ def import_poses(
 
 def _require_order(path: Path, trajectory_file: Path) -> None:
     """Refuse poses before a recording."""
-    from ertis_numba.file_kinds import kind_of, quoted
+    from ertis_numba.base.file_kinds import kind_of, quoted
 
     first, second = kind_of(path), kind_of(trajectory_file)
     if second is not None and second.is_hdf5 and not (path.is_dir() or (first is not None and first.is_hdf5)):
@@ -114,8 +114,8 @@ def _require_order(path: Path, trajectory_file: Path) -> None:
 
 def _recordings(path: Path) -> list[Path]:
     """Return the recordings of a folder, or the recording itself."""
+    from ertis_numba.base.errors import DataError
     from ertis_numba.campaign import find_recordings
-    from ertis_numba.errors import DataError
     from ertis_numba.storage import file_kind
 
     if not path.is_dir():

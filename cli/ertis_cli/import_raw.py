@@ -200,8 +200,8 @@ def _folder(raw: tuple[Path, ...]) -> Path | None:
 
 def _is_pcm(path: Path, *, is_raw: bool) -> bool:
     """Return True for PCM by the content of a file, otherwise by its ending; refuse other formats and endings."""
-    from ertis_numba.errors import DataError
-    from ertis_numba.file_kinds import kind_of, problem_of
+    from ertis_numba.base.errors import DataError
+    from ertis_numba.base.file_kinds import kind_of, problem_of
 
     kind, suffix = None if is_raw else kind_of(path), path.suffix.lower()
     if kind is not None and not (kind.is_wav or kind.is_hdf5):
@@ -219,7 +219,7 @@ def _is_pcm(path: Path, *, is_raw: bool) -> bool:
 
 def _require_content(paths: tuple[Path, ...]) -> None:
     """Refuse missing and empty files, before anything is said about options."""
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
 
     for path in paths:
         try:
@@ -314,10 +314,10 @@ def _since_1970_ns(start: datetime) -> int:
 
 def _report_obstacle(settings: "Settings", *, quiet: bool) -> None:
     """Print a note if the recording cannot be processed with its own settings."""
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
+    from ertis_numba.chain.time_window import time_window
     from ertis_numba.geometry import direction_grid
     from ertis_numba.passive.heard_signals import heard_bands
-    from ertis_numba.stages.time_window import time_window
 
     try:
         direction_grid(settings.processing)

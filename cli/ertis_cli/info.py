@@ -130,7 +130,7 @@ def _map(path: Path) -> dict[str, Any]:
 
 def _label(name: str) -> tuple[str, str]:
     """Return a key as a label, and its unit after a space."""
-    from ertis_numba.units import unit_of
+    from ertis_numba.base.units import unit_of
 
     suffix, unit = unit_of(name)
     return name.removesuffix(suffix).replace("_", " "), f" {unit}" if unit else ""
@@ -173,8 +173,8 @@ def _origin(reader: "EnergyscapeReader | AcousticMapReader") -> dict[str, Any]:
 
 
 def _sensor(reader: "_Reader") -> dict[str, Any]:
-    from ertis_numba.air import sound_speed_m_s
     from ertis_numba.geometry import microphones
+    from ertis_numba.geometry.air import sound_speed_m_s
 
     settings = reader.settings
     return {

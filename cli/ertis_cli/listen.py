@@ -235,7 +235,7 @@ def _require_options_of(outputs: dict[str, bool]) -> None:
 
 def _saved(save: "Write", arrival: "Arrival") -> Exception | None:
     """Save a product; return the error if it does not match earlier products, which are kept."""
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
 
     try:
         save(arrival)

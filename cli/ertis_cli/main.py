@@ -157,8 +157,8 @@ def _unexpected(error: Exception) -> str:
 
 def _of_system(error: Exception) -> str:
     """Return an operating-system error as file, cause and remedy; return an empty text for an error of the package."""
-    from ertis_numba.atomic_files import remedy
-    from ertis_numba.errors import ErtisError
+    from ertis_numba.base.atomic_files import remedy
+    from ertis_numba.base.errors import ErtisError
 
     if isinstance(error, ErtisError) or not isinstance(error, OSError) or not error.strerror:
         return ""
@@ -170,7 +170,7 @@ def _of_system(error: Exception) -> str:
 
 def _is_expected(error: Exception) -> bool:
     """Return True if an error is reported in one line, and False for a programming error."""
-    from ertis_numba.errors import ErtisError
+    from ertis_numba.base.errors import ErtisError
 
     return isinstance(error, ErtisError | OSError | MemoryError)
 

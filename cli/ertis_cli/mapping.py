@@ -98,7 +98,7 @@ def mapping(
     'ertis process --fuse'. Images of 'ertis process' are used as they are. Cells with echoes become occupied, and cells
     in front of the first clear echo of a direction become free. Pulses outside of the time of the poses are left out.
     """
-    from ertis_numba.errors import PoseWarning
+    from ertis_numba.base.errors import PoseWarning
     from ertis_numba.interop import map_files, write_map
     from ertis_numba.mapping import Mapper
     from ertis_numba.storage import check_target
@@ -171,7 +171,7 @@ def mapping(
 
 def _report_heights(occupancy: "OccupancyMap", height_m: tuple[float, float], *, quiet: bool) -> None:
     """State that no point lies within the heights, as an error if the map has no known cell."""
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
 
     low_m, high_m = height_m
     reason = (
@@ -212,7 +212,7 @@ def _trajectory(
 
 def _located(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Trajectory") -> "list[dict[str, StampedIndex]]":
     """Return the groups within the time of a trajectory."""
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
 
     times_ns = _times_ns(groups)
     if len(groups) > 1 and len(set(times_ns)) == 1:

@@ -120,7 +120,7 @@ def odometry_of(
     A sensor without a call hears the echoes of others, whose paths begin elsewhere. Its images are left out.
     ``groups``: measurements of each pulse, by sensor. ``alone``: as for `Odometry`.
     """
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
     from ertis_numba.frames import is_passive
     from ertis_numba.motion import Odometry
 
@@ -143,7 +143,7 @@ def odometry_of(
 
 def _require_times(readers: "Sequence[RecordingReader]", groups: "Sequence[Mapping[str, StampedIndex]]") -> None:
     """Raise DataError if the times of pulses do not increase, or if sensors share no pulse."""
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
 
     if len(groups) < 2:
         raise DataError(f"{readers[0].path} contains one pulse; at least two are needed, from a moving platform")

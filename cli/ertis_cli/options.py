@@ -15,16 +15,16 @@ from click.shell_completion import CompletionItem
 
 from ertis_cli import _progress
 from ertis_cli._naming import with_options
-from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerOption
-from ertis_numba.constants import MAX_MICROPHONES
-from ertis_numba.units import counted
+from ertis_numba.base.constants import MAX_MICROPHONES
+from ertis_numba.base.units import counted
+from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerOption
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
-    from ertis_numba.angles import DegreesFromRadians
+    from ertis_numba.base.angles import DegreesFromRadians
+    from ertis_numba.chain.costs import PlanCosts
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Array, ExcludedChannels, Settings
-    from ertis_numba.stages.costs import PlanCosts
     from ertis_numba.storage import EnergyscapeReader, RecordingReader
 
 __all__ = [
@@ -113,7 +113,7 @@ class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, tuple[int, ...]]:
-        from ertis_numba.checks import sensor_name
+        from ertis_numba.base.checks import sensor_name
 
         name, _, numbers = str(value).rpartition(":")
         with suppress(ValueError):  # also of names that no sensor can have
@@ -383,8 +383,8 @@ def comparisons(
 ) -> "Iterator[tuple[int, Comparison]]":
     """Yield the index of each measurement, or of one, and the comparison of its energyscape with the ground truth."""
     from ertis_numba.analysis.compare import compare
-    from ertis_numba.errors import DataError
-    from ertis_numba.file_kinds import quoted
+    from ertis_numba.base.errors import DataError
+    from ertis_numba.base.file_kinds import quoted
     from ertis_numba.fusion import PLATFORM
     from ertis_numba.storage import open_energyscapes
 
@@ -410,7 +410,7 @@ def places(index: int | None, count: int) -> Sequence[int]:
 
 def place(index: int, count: int) -> int:
     """Return the index of a measurement of ``count``; raise ArgumentError if it is outside the file."""
-    from ertis_numba import checks
+    from ertis_numba.base import checks
 
     return checks.integer("--measurement", index, 0, count - 1)
 

@@ -156,8 +156,9 @@ def plot(
 
     To plot an image of a recording, the recording is first processed with its own settings.
     """
-    from ertis_numba import checks, figures
-    from ertis_numba.errors import DataError
+    from ertis_numba import figures
+    from ertis_numba.base import checks
+    from ertis_numba.base.errors import DataError
     from ertis_numba.storage import atomic_write, check_target, read_map
 
     given: dict[str, object] = {

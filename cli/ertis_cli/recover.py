@@ -63,7 +63,7 @@ def _found(place: Path) -> list[Path]:
 
 def _seal(journal: Path, *, force: bool, quiet: bool) -> dict[str, Any]:
     """Seal a journal and return a report of the result."""
-    from ertis_numba.errors import DataError, JournalInUseError
+    from ertis_numba.base.errors import DataError, JournalInUseError
     from ertis_numba.journal import seal_in_subprocess
 
     with options.progress(range(_STEPS), length=_STEPS, label=journal.name, quiet=quiet) as shown:

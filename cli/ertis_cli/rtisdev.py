@@ -32,10 +32,10 @@ def rtisdev(*, port: str | None, device: str, method: str | None, script: Path, 
     """Run a script for RTIS Dev.
 
     RTIS Dev is the package of the University of Antwerp for eRTIS sensors. Its scripts run unchanged and without a GPU,
-    because ertis_numba.rtisdev replaces the closed-source modules rtisserial and rtiscuda. The command needs the extra
-    'rtisdev'.
+    because ertis_numba.interop.rtisdev replaces the closed-source modules rtisserial and rtiscuda. The command
+    needs the extra 'rtisdev'.
     """
-    from ertis_numba.extras import extra
+    from ertis_numba.base.extras import extra
 
     if port is not None:
         os.environ["ERTIS_RTISDEV_PORT"] = port
@@ -44,7 +44,7 @@ def rtisdev(*, port: str | None, device: str, method: str | None, script: Path, 
         os.environ["ERTIS_RTISDEV_METHOD"] = method
     with extra("rtisdev", "scripts for RTIS Dev need rtisdev"):
         _require("rtisdev")
-    import ertis_numba.rtisdev  # noqa: F401  puts our modules in the place of the closed ones
+    import ertis_numba.interop.rtisdev  # noqa: F401  puts our modules in the place of the closed ones
 
     # The script may handle signals itself, or catch KeyboardInterrupt and continue.
     signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -178,7 +178,7 @@ def serve(
 
 def _warn_of_unknown(without: "ExcludedChannels", sensors: "Collection[str]") -> None:
     """Warn of channels that were excluded of a sensor which never connected: its name may be wrong."""
-    from ertis_numba.errors import ArgumentError
+    from ertis_numba.base.errors import ArgumentError
 
     try:
         without.require_known(sensors)
@@ -187,7 +187,7 @@ def _warn_of_unknown(without: "ExcludedChannels", sensors: "Collection[str]") ->
 
 
 def _make(folder: Path) -> None:
-    from ertis_numba.errors import DataError
+    from ertis_numba.base.errors import DataError
 
     try:
         folder.mkdir(exist_ok=True)

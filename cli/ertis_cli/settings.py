@@ -10,7 +10,7 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.toml_reference import TableReference
+    from ertis_cli._toml_reference import TableReference
 
 __all__ = ["settings"]
 
@@ -28,7 +28,7 @@ def settings(*, document: str, as_json: bool) -> None:
     KIND is settings (the default), scene, layout or mounting. The output is a template: save it, and remove the # from
     the keys to set. The template states the meaning, type, unit and default of each key, with an example.
     """
-    from ertis_numba.toml_reference import reference
+    from ertis_cli._toml_reference import reference
 
     sections = reference(document)
     if as_json:

@@ -69,7 +69,7 @@ def simulate(
     position at which an image should show each reflector. Only effects that matter in the scene are simulated. Scene,
     seed, sensor and measurement index determine every bit.
     """
-    from ertis_numba.errors import PoseWarning
+    from ertis_numba.base.errors import PoseWarning
     from ertis_numba.simulation import load_scene
     from ertis_numba.storage import check_target, write_recording
 
@@ -142,8 +142,8 @@ def simulate(
 
 def _require_room(target: Path, scene: "Scene", names: "Sequence[str]", n_reflectors: int = 0) -> None:
     """Raise an error if the recording exceeds the free disk space."""
-    from ertis_numba.atomic_files import require_free_space
-    from ertis_numba.sample_format import sample_format
+    from ertis_numba.base.atomic_files import require_free_space
+    from ertis_numba.frames.sample_format import sample_format
 
     n_bytes = sum(sample_format(scene.sensor(name).settings()).n_bytes + _COLUMN_BYTES for name in names)
     require_free_space(

@@ -59,7 +59,7 @@ def status(
     display is refreshed every second. If the central node uses keys, pass the key of an application or an admin. If
     the node disappears, the command waits for it.
     """
-    from ertis_numba import checks
+    from ertis_numba.base import checks
     from ertis_numba.network.central_client import CentralClient
 
     if once and watch:
@@ -77,7 +77,7 @@ def status(
 
 def _looks(node: "CentralClient", patience_s: float, *, again: bool) -> "Iterator[tuple[Status, str]]":
     """Yield the current status, or the last one and the reason for a missing answer; the first must be answered."""
-    from ertis_numba.errors import NetworkError
+    from ertis_numba.base.errors import NetworkError
 
     now = node.status(patience_s)
     yield now, ""

@@ -30,7 +30,7 @@ def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json:
     exit code is 0 if all measurements are present, and all measurements and poses are intact. It is 3 if measurements
     are missing or out of order, or if measurements or poses are damaged, and 1 if a file cannot be read.
     """
-    from ertis_numba.errors import ErtisError
+    from ertis_numba.base.errors import ErtisError
     from ertis_numba.storage.verify import verify as verified
 
     files: list[dict[str, Any]] = []

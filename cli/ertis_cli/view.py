@@ -178,7 +178,7 @@ def view(
     _require_use(kind, (_MAPS if acoustic_maps else _IMAGES,) if is_known else (_IMAGES, _MAPS))
     _network.require_duration(duration)
     if html is not None:
-        from ertis_numba import checks
+        from ertis_numba.base import checks
         from ertis_numba.storage import check_target
 
         check_target(html, overwrite=force, sources=[] if live else [Path(location)])

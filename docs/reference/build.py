@@ -9,9 +9,8 @@ from pathlib import Path
 
 import click
 from click.testing import CliRunner
+from ertis_cli._toml_reference import reference
 from ertis_cli.main import cli
-
-from ertis_numba.toml_reference import reference
 
 FOLDER = Path(__file__).parent
 _BLOCK = re.compile(r"(<!-- (keys|names|commands) of (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)

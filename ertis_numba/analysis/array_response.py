@@ -8,9 +8,9 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.geometry import array_weights, microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
 __all__ = ["ArrayAxes", "CallResponse", "Response", "ToneResponse"]

@@ -26,8 +26,8 @@ from ertis_numba.analysis.sweep_search import (
 )
 from ertis_numba.analysis.sweeps import Curve, Sweep, curve_of
 from ertis_numba.frames import Measurement
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Call
-from ertis_numba.waveform import call_samples
 
 __all__ = ["SILENT", "CallMatch", "call_match", "first_call_match"]
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.sound_spectra import SoundSpectra, sound_spectra
 from ertis_numba.analysis.sweep_search import GatedArrival, arrival_of
 from ertis_numba.analysis.sweeps import Curve
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Call
-from ertis_numba.waveform import call_at
 
 __all__ = ["WIDER", "StartMatch", "start_match"]
 

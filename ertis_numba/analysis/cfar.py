@@ -7,13 +7,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.analysis.range_cleaning import clean
 from ertis_numba.analysis.side_lobes import SIDE_LOBE_DB
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
 __all__ = ["METHODS", "Method", "cfar", "cfar_peaks", "threshold_factor"]

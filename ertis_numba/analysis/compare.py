@@ -9,13 +9,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.detect import peaks_of_grid
+from ertis_numba.base import checks
 from ertis_numba.frames import Energyscape, Peak, Reflector
 from ertis_numba.geometry import array_weights, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import matched_filter_spectrum
 from ertis_numba.settings import Settings
-from ertis_numba.waveform import matched_filter_spectrum
 
 __all__ = ["Comparison", "Errors", "Match", "compare", "errors_of", "visible"]
 

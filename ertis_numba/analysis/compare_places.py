@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
 from ertis_numba.frames import OccupancyMap, PointCloud, Reflector, Surfaces
 from ertis_numba.geometry import unit_vectors
 

@@ -8,14 +8,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba import checks
 from ertis_numba.analysis.noise import noise_of, threshold_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.side_lobes import EdgeFloor, SideLobes
 from ertis_numba.analysis.uncertainty import PositionUncertainty
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak, PointCloud
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
 

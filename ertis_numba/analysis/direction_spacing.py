@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.analysis.array_response import ArrayAxes, CallResponse, Response
 from ertis_numba.analysis.between_directions import Between, farthest_places
-from ertis_numba.angles import DegreesFromRadians
+from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.geometry import direction_grid, microphones, named_grid, observable_angles, spacing_rad, unit_vectors
 from ertis_numba.settings import Processing, Settings
 

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from ertis_numba import kernels
 from ertis_numba.analysis.point_spread import PointSpread
+from ertis_numba.chain.plan_response import deviation_of
 from ertis_numba.frames import Energyscape
 from ertis_numba.settings import Settings
-from ertis_numba.stages.plan_response import deviation_of
 
 __all__ = ["EchoFits", "Fitted"]
 

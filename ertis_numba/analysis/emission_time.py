@@ -6,12 +6,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.health.arrival import compress, strongest
 from ertis_numba.analysis.health.emission import describe_shift, fit_emission
+from ertis_numba.chain.signals import signals_of
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
-from ertis_numba.stages.signals import signals_of
+from ertis_numba.geometry.air import sound_speed_m_s
 
 __all__ = ["EmissionTimes", "describe_start", "emission_time_s", "emissions_of"]
 

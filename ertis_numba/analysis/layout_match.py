@@ -14,8 +14,8 @@ from ertis_numba.analysis.health.limits import MAX_SAMPLES, MIN_SAMPLES
 from ertis_numba.analysis.health.pcm_samples import scaled
 from ertis_numba.analysis.health.wavefront import by_array
 from ertis_numba.frames import Measurement
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import microphones
-from ertis_numba.sample_format import sample_format
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
 from ertis_numba.analysis.side_lobes import side_lobe_floor
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 
 __all__ = ["nearest_echo"]

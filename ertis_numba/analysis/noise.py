@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
+from ertis_numba.base import checks
 from ertis_numba.frames import Energyscape
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Processing
 
 __all__ = ["EchoFloor", "echo_floor", "medians_of", "noise_of", "threshold_of"]

@@ -6,11 +6,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.outside_grid import OutsidePatterns, OutsideSource
 from ertis_numba.analysis.point_spread import PULSE_M, PointSpread
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import far_field_delays, microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
 __all__ = ["has_outside", "outside_of"]

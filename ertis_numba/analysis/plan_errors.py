@@ -4,10 +4,10 @@ import functools
 import math
 
 from ertis_numba import kernels
+from ertis_numba.chain.error_model import SignalModel
+from ertis_numba.chain.planner import Planner
 from ertis_numba.geometry import array_weights, effective_count
 from ertis_numba.settings import Settings
-from ertis_numba.stages.error_model import SignalModel
-from ertis_numba.stages.planner import Planner
 
 __all__ = ["plan_error"]
 

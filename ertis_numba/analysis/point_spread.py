@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
-from ertis_numba.air import sound_speed_m_s
+from ertis_numba.chain.plan_response import Deviation
 from ertis_numba.geometry import array_weights, microphones
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import matched_filter_spectrum
 from ertis_numba.settings import Air, Settings
-from ertis_numba.stages.plan_response import Deviation
-from ertis_numba.waveform import matched_filter_spectrum
 
 __all__ = ["PULSE_M", "PointSpread"]
 

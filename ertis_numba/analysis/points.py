@@ -6,7 +6,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
 from ertis_numba.analysis.detect import neighbours_of
 from ertis_numba.analysis.noise import noise_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
@@ -14,6 +13,7 @@ from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, list
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.side_lobes import EdgeFloor, side_lobe_floor
 from ertis_numba.analysis.uncertainty import PositionUncertainty
+from ertis_numba.base import checks
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import Grid, direction_grid, observable_angles, unit_vectors
 from ertis_numba.settings import Settings

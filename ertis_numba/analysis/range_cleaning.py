@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
 from ertis_numba.frames import Energyscape
 
 __all__ = ["clean", "clean_in_place", "keep_strongest"]

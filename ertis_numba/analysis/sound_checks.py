@@ -2,11 +2,11 @@
 
 from typing import Final, Literal, NamedTuple
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import SILENT, call_match
 from ertis_numba.analysis.emission_time import EmissionTimes, describe_start, emissions_of
 from ertis_numba.analysis.layout_match import layout_match
 from ertis_numba.frames import Measurement
+from ertis_numba.geometry.air import sound_speed_m_s
 
 __all__ = ["SoundChecks", "SoundMismatch", "Subject"]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ertis_numba import kernels
 from ertis_numba.frames import Measurement
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import microphones
-from ertis_numba.sample_format import sample_format
 
 __all__ = ["SoundSpectra", "some_signals", "sound_spectra"]
 

@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.peak_interpolation import Tops
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import array_weights, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import matched_noise_spectrum
 from ertis_numba.settings import Settings
-from ertis_numba.waveform import matched_noise_spectrum
 
 __all__ = ["PositionUncertainty", "Uncertainty"]
 

@@ -6,9 +6,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.base.errors import DataError
+from ertis_numba.base.units import counted
 from ertis_numba.calibration.wavefronts import Target
-from ertis_numba.errors import DataError
-from ertis_numba.units import counted
 
 __all__ = ["how_to_record", "not_observable", "require_directions"]
 

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.air import absorption_db_m
+from ertis_numba.base import checks
+from ertis_numba.base.errors import DataError
 from ertis_numba.calibration.advice import how_to_record, not_observable, require_directions
 from ertis_numba.calibration.array_fit import ArrayFit, fit_array, fit_gains
 from ertis_numba.calibration.channel_order import find_swaps
@@ -36,9 +36,9 @@ from ertis_numba.calibration.usable_sounds import (
     unclear_channels,
 )
 from ertis_numba.calibration.wavefronts import TARGETS, Target, locate_source, travel_times
-from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout
+from ertis_numba.geometry.air import absorption_db_m
 
 __all__ = ["calibrate"]
 

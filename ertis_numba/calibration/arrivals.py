@@ -8,8 +8,8 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.health.arrival import Compressed
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Call
-from ertis_numba.waveform import call_samples
 
 __all__ = ["SoundArrival", "measure_arrival"]
 

@@ -6,10 +6,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.base.constants import SYNC_STEP_S
 from ertis_numba.calibration.pose_fit import WaveTable, predicted_waves
 from ertis_numba.calibration.pose_links import WavesOfSensor, echo_points
 from ertis_numba.calibration.wave_finder import Wave
-from ertis_numba.constants import SYNC_STEP_S
 
 __all__ = ["Gates", "Matched", "match_waves", "without_outliers"]
 

@@ -7,10 +7,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.base.errors import DataError
 from ertis_numba.calibration.pose_fit import PoseProblem, fit_poses
 from ertis_numba.calibration.pose_links import RigidLink, WavesOfSensor, candidate_links
 from ertis_numba.calibration.pose_matching import Gates, match_waves
-from ertis_numba.errors import DataError
 
 __all__ = ["MIN_REFLECTORS", "place_sensors", "too_few"]
 

@@ -9,17 +9,17 @@ import scipy
 import threadpoolctl
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DataError
+from ertis_numba.base.units import counted
 from ertis_numba.calibration.pose_fit import PoseFit, PoseProblem, fit_poses
 from ertis_numba.calibration.pose_links import echo_points
 from ertis_numba.calibration.pose_matching import Gates, Matched, match_waves, without_outliers
 from ertis_numba.calibration.pose_result import PoseCalibration, SensorPose
 from ertis_numba.calibration.pose_start import MIN_REFLECTORS, place_sensors, too_few
 from ertis_numba.calibration.wave_finder import Wave, find_waves
-from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.units import counted
+from ertis_numba.geometry.air import sound_speed_m_s
 
 __all__ = ["calibrate_poses"]
 

@@ -7,9 +7,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
+from ertis_numba.base.errors import DataError
 from ertis_numba.calibration.wavefronts import Target, travel_times
-from ertis_numba.errors import DataError
 from ertis_numba.geometry import unit_vectors
 
 __all__ = ["ReflectorPlace", "SoundSpeed", "flipped", "mirror_of", "speed_from_distance", "speed_from_spread"]

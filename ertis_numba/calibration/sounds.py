@@ -9,17 +9,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis import _bits
 from ertis_numba.analysis.health.arrival import Compressed, Fit, compress, fit_delays, strongest
 from ertis_numba.analysis.health.bits import by_bits
 from ertis_numba.analysis.health.limits import MAX_DELAY_S
 from ertis_numba.analysis.health.pcm_samples import by_numbers, scaled
+from ertis_numba.base.errors import DataError
 from ertis_numba.calibration.arrivals import SoundArrival, measure_arrival
 from ertis_numba.calibration.wavefronts import Target, locate_source, travel_times
-from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.sample_format import sample_format
+from ertis_numba.frames.sample_format import sample_format
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
 __all__ = ["MAX_DIRECT_PATH_M", "Sound", "Source", "find_source", "hear", "identical_channels", "is_line"]

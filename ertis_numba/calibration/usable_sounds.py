@@ -8,12 +8,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.calibration.advice import how_to_record
 from ertis_numba.calibration.channel_order import find_order
 from ertis_numba.calibration.sounds import Sound, Source, find_source, hear, identical_channels
 from ertis_numba.calibration.wavefronts import Target
-from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout, load_layout, microphones
 

@@ -5,10 +5,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.calibration.spherical_waves import N_PARAMETERS, fit_wave, wave_lags, wave_slopes
 from ertis_numba.calibration.wave_records import FINER, WaveRecord, WorkingMicrophones, wave_record
 from ertis_numba.frames import Measurement
+from ertis_numba.geometry.air import sound_speed_m_s
 
 __all__ = ["Wave", "find_waves"]
 

@@ -8,15 +8,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.air import absorption_db_m
 from ertis_numba.analysis.health.arrival import Compressed, compress
+from ertis_numba.base.errors import DataError
 from ertis_numba.calibration.sounds import _signals
 from ertis_numba.calibration.spherical_waves import wave_lags
-from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import absorption_db_m
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Air, Array, Call
-from ertis_numba.waveform import call_samples
 
 __all__ = ["FINER", "EchoPulses", "WaveRecord", "WorkingMicrophones", "wave_record"]
 

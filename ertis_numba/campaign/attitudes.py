@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement, Stamp
 from ertis_numba.frames.pose_doubts import pose_doubts
 from ertis_numba.pipeline import Pipeline

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_numba import checks
+from ertis_numba.base import checks
+from ertis_numba.base.cpu_cores import usable_cores
+from ertis_numba.base.errors import ArgumentError, ErtisError
 from ertis_numba.campaign.echo_measurements import count_images, passive_note
 from ertis_numba.campaign.events import Event, Outcome, RecordingEnded, RecordingProgress, RecordingStarted
 from ertis_numba.campaign.existing_output import difference
@@ -23,8 +25,6 @@ from ertis_numba.campaign.tasks import (
     TaskUpdate,
     WorkerPool,
 )
-from ertis_numba.cpu_cores import usable_cores
-from ertis_numba.errors import ArgumentError, ErtisError
 from ertis_numba.geometry import self_contained
 from ertis_numba.settings import Accuracy, Settings
 

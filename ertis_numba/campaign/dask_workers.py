@@ -7,10 +7,10 @@ from concurrent.futures import CancelledError
 from contextlib import ExitStack
 from typing import Any, Final
 
-from ertis_numba import cluster
+from ertis_numba.base.errors import NetworkError
 from ertis_numba.campaign.task_actions import run_task
 from ertis_numba.campaign.tasks import Task, TaskUpdate
-from ertis_numba.errors import NetworkError
+from ertis_numba.processes import cluster
 from ertis_numba.storage.schema import software_versions
 
 __all__ = ["DaskWorkerPool", "run_on_dask_worker"]

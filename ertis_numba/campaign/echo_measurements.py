@@ -4,8 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import overload
 
+from ertis_numba.base.errors import DataError
 from ertis_numba.campaign.attitudes import Attitudes
-from ertis_numba.errors import DataError
 from ertis_numba.frames import Behaviour, Measurement, Stamp, is_passive
 from ertis_numba.settings import Settings
 from ertis_numba.storage import RecordingReader

@@ -4,17 +4,17 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from ertis_numba import kernels, verification
+from ertis_numba import kernels
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.campaign.attitudes import unlevelled_image
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.chain.error_model import PARTS, ErrorModel, decibels
+from ertis_numba.chain.planner import Planner
+from ertis_numba.chain.stream_recipe import uses_streams
+from ertis_numba.chain.wavefronts import plane_wave_error_db
 from ertis_numba.frames import Measurement
-from ertis_numba.pipeline import Pipeline
-from ertis_numba.prediction import planner_of
+from ertis_numba.pipeline import Pipeline, verification
+from ertis_numba.pipeline.prediction import planner_of
 from ertis_numba.settings import Settings
-from ertis_numba.stages.error_model import PARTS, ErrorModel, decibels
-from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.stream_recipe import uses_streams
-from ertis_numba.stages.wavefronts import plane_wave_error_db
 
 __all__ = ["examine"]
 

@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from ertis_numba.base.errors import DamagedError, ErtisError
 from ertis_numba.campaign.recordings import ResultKind
-from ertis_numba.errors import DamagedError, ErtisError
 from ertis_numba.geometry import direction_grid, grid_count, self_contained
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.storage import (

@@ -7,11 +7,11 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 
 __all__ = ["clear_parts", "exclusive_folder", "final_name"]
 
-_PART = re.compile(r"(.+)\.[0-9a-f]{8}\.part")  # Names of `ertis_numba.atomic_files.atomic_write`.
+_PART = re.compile(r"(.+)\.[0-9a-f]{8}\.part")  # Names of `ertis_numba.base.atomic_files.atomic_write`.
 
 
 @contextmanager

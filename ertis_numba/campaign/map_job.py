@@ -12,9 +12,9 @@ import numpy as np
 
 from ertis_numba.analysis.health import health
 from ertis_numba.analysis.layout_match import LayoutMatch
+from ertis_numba.base.errors import DataError
 from ertis_numba.campaign.sensor_processing import describe_faults, require_same_air
 from ertis_numba.campaign.tasks import CampaignOptions
-from ertis_numba.errors import DataError
 from ertis_numba.frames import AcousticMap
 from ertis_numba.passive import AcousticCamera, find_sound_sources
 from ertis_numba.passive.bands import shaped_noise_warning

@@ -4,8 +4,8 @@ import json
 from dataclasses import dataclass
 from typing import Final
 
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.campaign.tasks import FromWorkerProcess, RunTask, Task, TaskReport, TaskUpdate
-from ertis_numba.errors import DeviceError
 from ertis_numba.processes import Child, wait_for
 
 __all__ = ["ProcessPool"]

@@ -10,24 +10,24 @@ from pathlib import Path
 from typing import Any
 
 from ertis_numba import kernels
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import CallMatch, first_call_match
 from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.analysis.emission_time import describe_start, emissions_of
 from ertis_numba.analysis.health import health
 from ertis_numba.analysis.layout_match import LayoutMatch, first_layout_match
+from ertis_numba.base.errors import DataError
 from ertis_numba.campaign.attitudes import unlevelled_image
 from ertis_numba.campaign.echo_measurements import EchoMeasurements, require_images
 from ertis_numba.campaign.sensor_processing import SensorProcessing, describe_faults
 from ertis_numba.campaign.tasks import CampaignOptions
-from ertis_numba.errors import DataError
+from ertis_numba.chain.planner import Planner
+from ertis_numba.chain.wavefronts import plane_wave_error_db
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import observable_angles
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.prediction import planner_of, predict
+from ertis_numba.pipeline.prediction import planner_of, predict
 from ertis_numba.settings import Settings
-from ertis_numba.stages.planner import Planner
-from ertis_numba.stages.wavefronts import plane_wave_error_db
 from ertis_numba.storage import EnergyscapeWriter, open_recording, sensor_names
 
 __all__ = ["Pipelines", "RecordingJob", "check_recording", "prepare_recording"]

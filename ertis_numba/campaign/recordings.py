@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from ertis_numba.errors import ArgumentError, DataError, ErtisError
+from ertis_numba.base.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.storage import is_map, sensor_names
 
 __all__ = ["RecordingFile", "ResultKind", "find_recordings", "known_sensors", "map_path", "output_paths"]

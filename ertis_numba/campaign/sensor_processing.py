@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ertis_numba.analysis.health import ARRAY_FAULTS, Health
 from ertis_numba.analysis.health.kinds import DISABLE
+from ertis_numba.base.errors import DataError
 from ertis_numba.campaign.attitudes import Attitudes
 from ertis_numba.campaign.echo_measurements import EchoMeasurements
 from ertis_numba.campaign.tasks import MAX_WAITING_BYTES
-from ertis_numba.errors import DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
 from ertis_numba.storage import EnergyscapeWriter
 
 if TYPE_CHECKING:
-    from ertis_numba.prediction import Prediction
+    from ertis_numba.pipeline.prediction import Prediction
 
 __all__ = ["SensorProcessing", "describe_faults", "require_same_air"]
 

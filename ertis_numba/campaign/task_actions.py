@@ -15,20 +15,20 @@ from typing import Any, Final
 import numpy as np
 
 from ertis_numba import kernels
-from ertis_numba.atomic_files import remedy
+from ertis_numba.base.atomic_files import remedy
+from ertis_numba.base.errors import ErtisError
 from ertis_numba.campaign.existing_output import inspect_output
 from ertis_numba.campaign.folder import final_name
 from ertis_numba.campaign.map_job import MapJob, check_maps, prepare_maps
 from ertis_numba.campaign.recording_job import Pipelines, RecordingJob, check_recording, prepare_recording
 from ertis_numba.campaign.tasks import TASK_OPTIONS, CampaignOptions
-from ertis_numba.errors import ErtisError
+from ertis_numba.chain import planner
+from ertis_numba.chain.costs import PlanCosts
 from ertis_numba.frames import Measurement
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.passive import AcousticCamera
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
-from ertis_numba.stages import planner
-from ertis_numba.stages.costs import PlanCosts
 from ertis_numba.storage import file_kind, open_recording, sensor_names
 
 __all__ = ["run_task"]

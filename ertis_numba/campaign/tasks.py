@@ -7,10 +7,10 @@ from typing import Any, Final, Literal, Protocol, TypeAlias
 
 import msgspec
 
-from ertis_numba import checks
-from ertis_numba.errors import DataError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import DataError
+from ertis_numba.chain.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.settings import ExcludedChannels, Settings
-from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.storage.recording import Mounting
 
 __all__ = [

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.devices.bit_means import MEAN_OF, BitMeans
 from ertis_numba.devices.blocks import CHANNELS
 from ertis_numba.devices.splice_detection import Splices
-from ertis_numba.errors import ArgumentError
 
 __all__ = ["BitCheck"]
 

@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Behaviour
 
 __all__ = ["CHANNELS", "COUNTERS", "FOOTER", "FRAME_BYTES", "HEADER", "Block", "Instant", "encode_block"]

@@ -7,9 +7,9 @@ import re
 from dataclasses import dataclass
 from typing import Final, Self
 
-from ertis_numba import checks
-from ertis_numba.constants import ERTIS_PDM_RATE_HZ
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base import checks
+from ertis_numba.base.constants import ERTIS_PDM_RATE_HZ
+from ertis_numba.base.errors import ArgumentError, DataError
 
 __all__ = [
     "CODES",

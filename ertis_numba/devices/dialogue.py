@@ -5,10 +5,10 @@ import logging
 import time
 from collections.abc import Callable, Sequence
 
+from ertis_numba.base.errors import SonarError
 from ertis_numba.devices.commands import Command, CustomCommand, decode_answer
 from ertis_numba.devices.line import SerialLine, sonar_error
 from ertis_numba.devices.setup import Setup, call_hash
-from ertis_numba.errors import SonarError
 
 __all__ = ["Dialogue"]
 

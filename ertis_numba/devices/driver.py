@@ -12,7 +12,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.devices.block_receiver import Block, BlockReceiver
 from ertis_numba.devices.blocks import COUNTERS, FRAME_BYTES
 from ertis_numba.devices.commands import DAC_SAMPLES, Command, CustomCommand, firmware_version
@@ -21,7 +22,6 @@ from ertis_numba.devices.line import closed_error
 from ertis_numba.devices.ports import Port, find_again, resolve
 from ertis_numba.devices.reset_pin import pulse_reset_pin
 from ertis_numba.devices.setup import Setup
-from ertis_numba.errors import ArgumentError, SonarDisconnectedError, SonarError
 from ertis_numba.frames import Behaviour
 
 __all__ = ["SonarDriver"]

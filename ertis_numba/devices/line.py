@@ -11,8 +11,8 @@ from contextlib import suppress
 
 import serial
 
+from ertis_numba.base.errors import SonarDisconnectedError, SonarError
 from ertis_numba.devices.blocks import Instant
-from ertis_numba.errors import SonarDisconnectedError, SonarError
 
 try:
     import fcntl

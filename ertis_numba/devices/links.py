@@ -8,7 +8,7 @@ from pathlib import Path
 
 import platformdirs
 
-from ertis_numba.errors import ArgumentError, SonarError
+from ertis_numba.base.errors import ArgumentError, SonarError
 
 try:
     import fcntl

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
+from ertis_numba.base.errors import SonarError
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.reset_pin import pulse_reset_pin
-from ertis_numba.errors import SonarError
 
 __all__ = ["reset_sensor"]
 

@@ -4,7 +4,7 @@ import importlib
 import time
 from typing import Final
 
-from ertis_numba.errors import SonarError
+from ertis_numba.base.errors import SonarError
 
 __all__ = ["RESET_PIN", "pulse_reset_pin"]
 

@@ -6,7 +6,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.devices.blocks import CHANNELS
 from ertis_numba.devices.commands import (
     DAC_CODE_MAX,
@@ -19,11 +20,10 @@ from ertis_numba.devices.commands import (
     PINS,
     Command,
 )
-from ertis_numba.errors import ArgumentError
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Array, Call, Settings
 from ertis_numba.settings.waveform import MAX_WAVEFORM_SAMPLES
-from ertis_numba.waveform import call_samples
 
 __all__ = ["Setup", "call_codes", "call_from_codes", "call_hash"]
 

@@ -6,9 +6,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
 
+from ertis_numba.base.errors import SonarError
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.ports import Port
-from ertis_numba.errors import SonarError
 
 __all__ = ["Answer", "State", "survey"]
 

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from numpy.typing import NDArray
 
-from ertis_numba import checks
 from ertis_numba.analysis.side_lobes import without_side_lobes
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.calibration import Calibration
-from ertis_numba.errors import ArgumentError, DataError
 from ertis_numba.figures import (
     _acoustic,
     _acoustic_signals,

@@ -10,15 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.figures import _captions
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._marks import name_points
 from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures.style import LINES, angle
 from ertis_numba.geometry import Layout, array_weights, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
 __all__ = ["Cut", "draw", "pattern_db", "width_deg"]

@@ -8,15 +8,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
+from ertis_numba.base.units import counted
 from ertis_numba.calibration import Calibration
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._captions import Heading
 from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures.style import LINES, angle
 from ertis_numba.geometry import Layout, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
-from ertis_numba.units import counted
 
 __all__ = ["draw"]
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.base.units import counted
 from ertis_numba.figures.style import angle, minus
 from ertis_numba.frames import AcousticMap, Energyscape, Stamp
 from ertis_numba.geometry import microphones, observable_angles
-from ertis_numba.method_titles import METHOD_TITLES
 from ertis_numba.settings import Settings
-from ertis_numba.units import counted
+from ertis_numba.settings.method_titles import METHOD_TITLES
 
 __all__ = [
     "Heading",

@@ -5,14 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import fft, kernels
+from ertis_numba import kernels
+from ertis_numba.chain.matched_filter import MatchedFilter
+from ertis_numba.chain.plan_elements import chain_taps
+from ertis_numba.chain.signals import signals_of
+from ertis_numba.chain.time_window import time_window
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.kernels import fft
 from ertis_numba.settings import Accuracy, Processing, Settings
-from ertis_numba.stages.matched_filter import MatchedFilter
-from ertis_numba.stages.plan_elements import chain_taps
-from ertis_numba.stages.signals import signals_of
-from ertis_numba.stages.time_window import time_window
 
 __all__ = ["MicrophoneTraces", "echoes", "signals"]
 

@@ -11,8 +11,8 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.figures import _captions
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._microphone_traces import MicrophoneTraces, echoes, signals

@@ -11,9 +11,9 @@ from cycler import cycler
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
-from ertis_numba.forks import ForkSafeLock
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.base.forks import ForkSafeLock
 
 __all__ = [
     "COLUMNS_MM",

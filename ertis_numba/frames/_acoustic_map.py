@@ -7,9 +7,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.angles import DegreesFromRadians
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.angles import DegreesFromRadians
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelReference, LevelUnit, level_offset_db
 from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames._stamp import Stamp

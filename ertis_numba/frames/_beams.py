@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.angles import DegreesFromRadians
+from ertis_numba.base import checks
+from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.frames._energyscape import Energyscape
 from ertis_numba.frames._stamp import Stamp
 from ertis_numba.settings import Settings

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from ertis_numba.angles import RadiansFromDegrees
+from ertis_numba.base.angles import RadiansFromDegrees
 from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelUnit
 
 __all__ = ["Bearing"]

@@ -5,9 +5,9 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import absorption_db_m, transmission_loss_db
+from ertis_numba.base.units import sound_pressure_level_db
+from ertis_numba.geometry.air import absorption_db_m, transmission_loss_db
 from ertis_numba.settings import Settings
-from ertis_numba.units import sound_pressure_level_db
 
 __all__ = ["LEVEL_UNITS", "LevelReference", "LevelUnit", "level_offset_db"]
 

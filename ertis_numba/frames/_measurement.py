@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
 from ertis_numba.frames._stamp import Stamp
 from ertis_numba.frames._xarray import data_array
 from ertis_numba.settings import Settings

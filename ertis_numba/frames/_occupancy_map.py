@@ -6,8 +6,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames._replacing import replaced
 
 __all__ = ["FREE_BELOW", "MAX_CELLS", "OCCUPIED_ABOVE", "OccupancyMap"]

@@ -6,9 +6,9 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.angles import DegreesFromRadians
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.angles import DegreesFromRadians
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames._stamp import Stamp
 from ertis_numba.settings import Settings

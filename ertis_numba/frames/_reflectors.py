@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
-from ertis_numba.angles import RadiansFromDegrees
+from ertis_numba.base.angles import RadiansFromDegrees
 
 __all__ = ["Peak", "Reflector"]
 

@@ -4,7 +4,7 @@ import difflib
 from dataclasses import fields, replace
 from typing import Any, TypeVar
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 
 __all__ = ["replaced"]
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ertis_numba.angles import RadiansFromDegrees
+from ertis_numba.base.angles import RadiansFromDegrees
 
 __all__ = ["SoundEvent"]
 

@@ -6,11 +6,11 @@ from typing import Any, Final, Literal, TypeAlias, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.base.units import counted
 from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames.platform_tilt import turned_axes
-from ertis_numba.units import counted
 
 __all__ = ["PoseAxes", "Trajectory"]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.extras import extra
+from ertis_numba.base.extras import extra
 from ertis_numba.frames._stamp import Stamp
 from ertis_numba.settings import Settings
 

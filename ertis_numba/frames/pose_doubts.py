@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import PoseWarning
+from ertis_numba.base.errors import PoseWarning
 from ertis_numba.frames._trajectory import Trajectory
 from ertis_numba.frames.platform_tilt import tilt_note
 

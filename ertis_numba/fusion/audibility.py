@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 import scipy
 
+from ertis_numba.geometry.waveform import matched_filter_spectrum
 from ertis_numba.settings import Settings
-from ertis_numba.waveform import matched_filter_spectrum
 
 __all__ = ["audible_ratio"]
 

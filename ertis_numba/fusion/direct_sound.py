@@ -10,17 +10,17 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.constants import SYNC_STEP_S
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.constants import SYNC_STEP_S
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.signals import matched, signals_of
 from ertis_numba.frames import Measurement
 from ertis_numba.fusion.audibility import audible_ratio
 from ertis_numba.fusion.rig import MountedSensor, Mountings, mounted_sensors
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import matched_filter_spectrum, matched_guard_s
 from ertis_numba.settings import Settings
-from ertis_numba.stages.signals import matched, signals_of
-from ertis_numba.waveform import matched_filter_spectrum, matched_guard_s
 
 __all__ = ["DirectSound", "DirectSoundCheck"]
 

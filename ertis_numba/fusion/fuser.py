@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.fusion.emissions import is_much_better
 from ertis_numba.fusion.polar_grid import PolarGrid

@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.noise import EchoFloor, echo_floor
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.points import EchoPointExtractor
@@ -21,6 +20,7 @@ from ertis_numba.fusion.rig import MountedSensor
 from ertis_numba.fusion.sensor_echoes import SensorEchoes
 from ertis_numba.fusion.sight import tangents
 from ertis_numba.geometry import Grid
+from ertis_numba.geometry.air import sound_speed_m_s
 
 __all__ = ["HeardImage", "PointFuser", "joined"]
 

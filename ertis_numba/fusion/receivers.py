@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.noise import medians_of
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion.polar_grid import close_directions
 from ertis_numba.fusion.rig import MountedSensor
 from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 
 __all__ = ["Beam", "CoarseImage", "Receiver"]
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ertis_numba import kernels
-from ertis_numba.air import absorption_db_m, sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import microphones, mounting
+from ertis_numba.geometry.air import absorption_db_m, sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Array, Call, Settings
-from ertis_numba.waveform import call_at
 
 __all__ = ["USUAL_DIAMETER_M", "Emitters", "MountedSensor", "Mountings", "emitter_diameter_m", "mounted_sensors"]
 

@@ -8,7 +8,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.noise import EchoFloor
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.fusion.association import Reflectors
@@ -31,6 +30,7 @@ from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.receivers import CoarseImage, Receiver
 from ertis_numba.fusion.rig import Emitters, MountedSensor
 from ertis_numba.fusion.sensor_echoes import SensorEchoes
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Air, Call, Settings
 
 __all__ = ["PLATFORM", "FusionTables", "PulseReflectors"]

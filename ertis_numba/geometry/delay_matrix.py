@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.csv_numbers import csv_rows, npy_content
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.csv_numbers import csv_rows, npy_content
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry.delays import far_field_delays, unit_vectors
 from ertis_numba.geometry.grids import Grid
 from ertis_numba.geometry.layouts import microphones

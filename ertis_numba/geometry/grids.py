@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.angles import DegreesFromRadians
-from ertis_numba.csv_numbers import csv_rows
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.angles import DegreesFromRadians
+from ertis_numba.base.csv_numbers import csv_rows
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings import Processing
 
 __all__ = ["MAX_DIRECTIONS", "PAPER_GRIDS", "Grid", "direction_grid", "grid_count", "named_grid"]

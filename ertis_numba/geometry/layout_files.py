@@ -9,14 +9,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.constants import MAX_MICROPHONES
-from ertis_numba.documents import TomlDocument
-from ertis_numba.errors import ArgumentError, LayoutUnitWarning, SettingsError
+from ertis_numba.base import checks
+from ertis_numba.base.constants import MAX_MICROPHONES
+from ertis_numba.base.errors import ArgumentError, LayoutUnitWarning, SettingsError
 from ertis_numba.geometry.position_files import FLAT, layout_bytes, layout_file_text, read_position_file
 from ertis_numba.geometry.position_headings import AXES
 from ertis_numba.geometry.position_tables import HEADER_EXAMPLES
 from ertis_numba.settings import LENGTH_UNITS_M, MAX_SPAN_M, MIN_SPAN_M, Array
+from ertis_numba.settings.documents import TomlDocument
 
 __all__ = ["LayoutFile", "ReadLayout", "parse_layout", "read_layout", "unclear_unit"]
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.geometry.grids import grid_count
 from ertis_numba.geometry.layout_files import LayoutFile, parse_layout, read_layout, unclear_unit
 from ertis_numba.geometry.shipped_layouts import layout_text

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry.delays import unit_vectors
 from ertis_numba.geometry.grids import Grid
 from ertis_numba.geometry.mountings import require_unit_quaternion

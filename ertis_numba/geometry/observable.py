@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.angles import DegreesFromRadians
+from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.geometry.delays import unit_vectors
 from ertis_numba.geometry.layouts import microphones
 from ertis_numba.settings import Array

@@ -7,9 +7,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ertis_numba import checks
-from ertis_numba.csv_numbers import npy_content
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.csv_numbers import npy_content
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry.position_headings import AXES
 from ertis_numba.geometry.position_tables import PositionTable, read_position_table
 from ertis_numba.geometry.shipped_layouts import layout_names

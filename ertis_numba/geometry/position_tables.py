@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry.position_headings import AXES, ColumnHeading, heading, unit_in_comment, unit_named
 from ertis_numba.settings import LENGTH_UNITS_M
 

@@ -4,11 +4,11 @@ import functools
 from importlib import resources
 from typing import Final
 
-from ertis_numba import checks
+from ertis_numba.base import checks
 
 __all__ = ["layout_names", "layout_text"]
 
-_FOLDER: Final = resources.files("ertis_numba").joinpath("layouts")
+_FOLDER: Final = resources.files("ertis_numba.geometry").joinpath("shipped")
 
 
 @functools.cache

@@ -1,6 +1,6 @@
 """Settings from an untrusted source: another machine, or a recording."""
 
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.geometry.grids import grid_count
 from ertis_numba.geometry.shipped_layouts import layout_names
 from ertis_numba.settings import Settings

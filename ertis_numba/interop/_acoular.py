@@ -12,17 +12,17 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.atomic_files import require_free_space
-from ertis_numba.errors import DataError
+from ertis_numba.base.atomic_files import require_free_space
+from ertis_numba.base.errors import DataError
+from ertis_numba.base.wav import Samples
+from ertis_numba.chain.signals import signals_of
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import SENSOR_FRAME, Layout, microphones, received_settings, self_contained
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Array, Recording, Settings
-from ertis_numba.stages.signals import signals_of
 from ertis_numba.storage.opening import open_file, reading
 from ertis_numba.storage.schema import to_python
 from ertis_numba.storage.structure import local_member, require_attributes, stored_bytes
-from ertis_numba.wav import Samples
 
 __all__ = ["read_acoular", "write_acoular"]
 

@@ -12,9 +12,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Measurement, Trajectory
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.interop._drive import Drive
 from ertis_numba.interop._mountings import Mounting, Mountings
 from ertis_numba.interop._virtual_ears import VirtualEars

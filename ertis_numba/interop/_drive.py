@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Trajectory
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
-from ertis_numba import checks
-from ertis_numba.atomic_files import atomic_write, check_target, remedy
-from ertis_numba.errors import ArgumentError, DataError, ErtisError
+from ertis_numba.base import checks
+from ertis_numba.base.atomic_files import atomic_write, check_target, remedy
+from ertis_numba.base.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Beams, Energyscape, Measurement, MicrophoneSignals
 from ertis_numba.geometry import observable_angles
 from ertis_numba.interop._drive import Drive

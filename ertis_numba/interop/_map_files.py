@@ -10,9 +10,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.atomic_files import atomic_write, check_target, remedy
-from ertis_numba.errors import ArgumentError, DataError, ErtisError
+from ertis_numba.base import checks
+from ertis_numba.base.atomic_files import atomic_write, check_target, remedy
+from ertis_numba.base.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import FREE_BELOW, OCCUPIED_ABOVE, OccupancyMap
 from ertis_numba.interop._mcap import map_mcap, require_mcap
 from ertis_numba.interop.ros_messages import occupancy_values

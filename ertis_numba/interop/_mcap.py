@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
-from ertis_numba.extras import extra
+from ertis_numba.base.extras import extra
 from ertis_numba.frames import BEHAVIOURS, Behaviour, Energyscape, OccupancyMap, Stamp
 from ertis_numba.geometry import self_contained
 from ertis_numba.interop._mountings import PLATFORM, Mountings

@@ -11,7 +11,7 @@ from typing import IO, Any, TypeAlias
 
 import numpy as np
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Beams, Energyscape, MicrophoneSignals, Stamp
 from ertis_numba.geometry import observable_angles, self_contained
 

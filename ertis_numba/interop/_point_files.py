@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
 from ertis_numba.interop._points import PointTable
 
 __all__ = ["CSV_COLUMNS", "POINT_FIELDS", "write_csv", "write_pcd", "write_ply"]

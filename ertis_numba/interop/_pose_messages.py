@@ -10,8 +10,8 @@ from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 
-from ertis_numba.errors import ArgumentError, DataError, ErtisError
-from ertis_numba.extras import extra
+from ertis_numba.base.errors import ArgumentError, DataError, ErtisError
+from ertis_numba.base.extras import extra
 from ertis_numba.interop._pose_rows import PoseRows
 
 __all__ = ["read_messages"]

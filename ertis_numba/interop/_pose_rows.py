@@ -6,10 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
+from ertis_numba.base.units import counted
 from ertis_numba.frames import PoseAxes, Trajectory
 from ertis_numba.frames.pose_doubts import pose_doubts
-from ertis_numba.units import counted
 
 __all__ = ["PoseRows", "trajectory_of"]
 

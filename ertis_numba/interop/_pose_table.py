@@ -8,10 +8,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
+from ertis_numba.base.units import counted
 from ertis_numba.interop._pose_rows import PoseRows
 from ertis_numba.interop._pose_times import times_of
-from ertis_numba.units import counted
 
 __all__ = ["TUM", "read_table"]
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 
 __all__ = ["TIME_UNITS", "times_of"]
 

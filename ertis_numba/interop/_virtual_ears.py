@@ -12,13 +12,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.signals import signals_of
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Settings
-from ertis_numba.stages.signals import signals_of
-from ertis_numba.waveform import call_samples
 
 __all__ = ["BinauralSignals", "VirtualEars"]
 

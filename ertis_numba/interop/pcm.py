@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.interop.pcm_cuts import cut_at_emissions, cut_regularly
 from ertis_numba.interop.pcm_files import PcmFile, inspect, joined, per_file, require_alike
 from ertis_numba.interop.pcm_folder import is_wav_folder, left_out, wav_files

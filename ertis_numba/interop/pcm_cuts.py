@@ -9,12 +9,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.errors import DataError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import DataError
+from ertis_numba.base.units import counted
 from ertis_numba.interop.pcm_files import PcmFile, per_file
 from ertis_numba.interop.sync_channel import find_emissions, louder_and_earlier
 from ertis_numba.settings import Call
-from ertis_numba.units import counted
 
 __all__ = ["Cuts", "cut_at_emissions", "cut_regularly"]
 

@@ -10,14 +10,14 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.file_kinds import kind_of, problem_of
+from ertis_numba.base.errors import ArgumentError, DataError
+from ertis_numba.base.file_kinds import kind_of, problem_of
+from ertis_numba.base.wav import Samples, read_wav
 from ertis_numba.interop._acoular import read_acoular
 from ertis_numba.interop.recorder_metadata import RecorderMetadata, read_metadata
 from ertis_numba.interop.recorder_names import MAX_DIFFERENCE_S, StatedTime, times_in_names
 from ertis_numba.interop.time_expansion import true_rate_hz
 from ertis_numba.settings import Recording, Settings
-from ertis_numba.wav import Samples, read_wav
 
 __all__ = [
     "PcmFile",

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.errors import DataError
-from ertis_numba.file_kinds import kind_of
+from ertis_numba.base.errors import DataError
+from ertis_numba.base.file_kinds import kind_of
 from ertis_numba.interop.pcm_files import first_stated_times, inspect, natural_order
 
 __all__ = ["is_wav_folder", "left_out", "wav_files"]

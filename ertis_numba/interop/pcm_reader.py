@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ertis_numba import checks
+from ertis_numba.base import checks
 from ertis_numba.frames import Behaviour, Measurement, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.interop.pcm_cuts import Cuts

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ertis_numba.errors import ArgumentError, DataError
-from ertis_numba.file_kinds import problem_of
+from ertis_numba.base.errors import ArgumentError, DataError
+from ertis_numba.base.file_kinds import problem_of
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.sample_format import SampleFormat, sample_format
+from ertis_numba.frames.sample_format import SampleFormat, sample_format
 from ertis_numba.settings import PRESETS, Settings
 
 __all__ = ["RawReader", "open_raw"]

@@ -42,7 +42,7 @@ class RecorderMetadata:
 
 
 def read_metadata(chunks: Mapping[str, bytes], rate_hz: float) -> RecorderMetadata:
-    """Return time and time expansion in the chunks of a WAV file (`ertis_numba.wav.WavFile`) with a stated rate."""
+    """Return time and time expansion in the chunks of a `ertis_numba.base.wav.WavFile` with a stated rate."""
     found = RecorderMetadata()
     _read_guano(chunks.get("guan", b""), found)
     _read_wamd(chunks.get("wamd", b""), found)

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.interop.pcm_files import PcmFile, first_stated_times
 from ertis_numba.interop.recorder_names import (
     MAX_DIFFERENCE_S,

@@ -12,11 +12,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.point_finder import same_directions
+from ertis_numba.base import checks
 from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Stamp
 from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.interop._grey_image import GreyImage
 from ertis_numba.interop._mountings import PLATFORM, Mounting
 from ertis_numba.interop._points import ros_time

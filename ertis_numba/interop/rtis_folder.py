@@ -6,8 +6,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.interop.raw_pdm import RawReader
 from ertis_numba.interop.rtis_custom import CUSTOM_KEYS, with_custom_files
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings, fit_ranges

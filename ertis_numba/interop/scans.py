@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.nearest_echo import nearest_echo
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import microphones, unrolled_rad
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.interop._mountings import Mounting
 from ertis_numba.interop.ros_messages import header
 from ertis_numba.settings import Settings

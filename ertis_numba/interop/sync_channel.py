@@ -11,9 +11,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Call
-from ertis_numba.waveform import call_samples
 
 __all__ = ["Emissions", "find_emissions", "louder_and_earlier"]
 

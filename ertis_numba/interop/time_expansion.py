@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.interop.recorder_metadata import RecorderMetadata
 
 __all__ = ["true_rate_hz"]

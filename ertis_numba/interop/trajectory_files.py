@@ -6,10 +6,10 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Final
 
-from ertis_numba import checks
-from ertis_numba.atomic_files import atomic_write, check_target
-from ertis_numba.errors import ArgumentError, DataError, PoseWarning
-from ertis_numba.file_kinds import kind_of, markup_of, quoted
+from ertis_numba.base import checks
+from ertis_numba.base.atomic_files import atomic_write, check_target
+from ertis_numba.base.errors import ArgumentError, DataError, PoseWarning
+from ertis_numba.base.file_kinds import kind_of, markup_of, quoted
 from ertis_numba.frames import PoseAxes, Trajectory
 from ertis_numba.interop._pose_messages import read_messages
 from ertis_numba.interop._pose_rows import trajectory_of

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Final, Self
 
-from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import JournalEntry, JournalKey, JournalSensor, verified_values

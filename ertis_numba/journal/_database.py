@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
 
-from ertis_numba.atomic_files import fsync
-from ertis_numba.errors import DamagedError, DataError, FormatVersionError, JournalInUseError
+from ertis_numba.base.atomic_files import fsync
+from ertis_numba.base.errors import DamagedError, DataError, FormatVersionError, JournalInUseError
 from ertis_numba.journal._files import companion
 from ertis_numba.journal._tables import (
     APPLICATION_ID,

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DamagedError, DataError, SettingsError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError, SettingsError
 from ertis_numba.frames import BEHAVIOURS, Measurement, Stamp
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import mounting, received_settings, self_contained, storable
 from ertis_numba.journal._tables import row_crc32
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Settings
 
 __all__ = ["JournalEntry", "JournalKey", "JournalSensor", "require_same_settings", "verified_values"]

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.journal._limit import LIMIT
 from ertis_numba.journal._tally import TALLY
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.atomic_files import RESERVED_BYTES
-from ertis_numba.errors import DataError, DiskFullError
+from ertis_numba.base.atomic_files import RESERVED_BYTES
+from ertis_numba.base.errors import DataError, DiskFullError
 from ertis_numba.journal._database import LOG_BYTES, PAGE_BYTES
 
 __all__ = ["appendable_bytes", "recording_bytes", "require_free_space"]

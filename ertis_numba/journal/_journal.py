@@ -7,8 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
-from ertis_numba.atomic_files import fsync
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.atomic_files import fsync
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.journal._contents import SUFFIX
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._files import LOGS, companion, disk_errors, rename_orphans, unlink_all, unused_path

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.atomic_files import atomic_write
-from ertis_numba.errors import DamagedError, DataError
+from ertis_numba.base.atomic_files import atomic_write
+from ertis_numba.base.errors import DamagedError, DataError
 
 __all__ = ["LIMIT", "read_limit", "write_limit"]
 

@@ -13,8 +13,8 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.atomic_files import fsync
-from ertis_numba.errors import DamagedError, DataError
+from ertis_numba.base.atomic_files import fsync
+from ertis_numba.base.errors import DamagedError, DataError
 from ertis_numba.journal._files import companion, keep_damaged_log
 from ertis_numba.journal._log import WriteAheadLog
 

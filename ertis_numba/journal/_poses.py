@@ -9,7 +9,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ertis_numba.errors import DamagedError
+from ertis_numba.base.errors import DamagedError
 from ertis_numba.frames import Trajectory
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import verified_values

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.base.units import counted
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal._database import Database
 from ertis_numba.journal._entries import JournalEntry, JournalSensor, verified_values
@@ -16,7 +17,6 @@ from ertis_numba.journal._files import keep_damaged_log
 from ertis_numba.journal._log import WriteAheadLog
 from ertis_numba.journal._poses import JournalPose, read_poses
 from ertis_numba.journal._tables import POSES, select_statement
-from ertis_numba.units import counted
 
 if TYPE_CHECKING:
     from ertis_numba.journal._journal import Journal

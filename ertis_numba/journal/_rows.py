@@ -5,7 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import _free_space
 from ertis_numba.journal._contents import ReadableJournal

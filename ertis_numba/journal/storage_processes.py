@@ -7,7 +7,7 @@ from typing import Any, Final, TypeAlias
 
 import msgspec
 
-from ertis_numba.errors import DataError, JournalInUseError
+from ertis_numba.base.errors import DataError, JournalInUseError
 from ertis_numba.processes import Child
 
 __all__ = [

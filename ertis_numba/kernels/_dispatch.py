@@ -7,8 +7,8 @@ import importlib.util
 import logging
 from typing import Any, Final
 
-from ertis_numba import checks
-from ertis_numba.errors import DeviceError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.kernels import _numba_setup
 from ertis_numba.kernels._contract.fusion import FusionKernels
 from ertis_numba.kernels._contract.mapping import MappingKernels

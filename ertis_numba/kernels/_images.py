@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.forks import ForkSafeLock
+from ertis_numba.base.forks import ForkSafeLock
 
 __all__ = ["ImagePool"]
 

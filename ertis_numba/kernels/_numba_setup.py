@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 
 __all__ = ["prepare"]
 

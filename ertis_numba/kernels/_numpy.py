@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
 from ertis_numba.kernels._contract import Complex, ComplexOrDouble, Index, Pcm, Real, Short, Taps, Turns, Words
 from ertis_numba.kernels._contract.passive import (
     CLEAN_GROWTH,

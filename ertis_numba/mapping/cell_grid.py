@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import MAX_CELLS
 
 __all__ = ["CellGrid", "Window"]

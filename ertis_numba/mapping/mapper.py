@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Trajectory
 from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.fusion.rig import Emitters, Mountings, emitter_diameter_m, mounted_sensors

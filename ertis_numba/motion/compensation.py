@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import PointCloud
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.motion.echoes import sweep_delay_s
 
 __all__ = ["compensate_motion"]

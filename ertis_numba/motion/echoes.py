@@ -8,12 +8,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.points import EchoPointExtractor
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.rig import MountedSensor, emitter_diameter_m
 from ertis_numba.geometry import Grid, microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Array, Call
 
 __all__ = ["EchoExtractor", "GroupEchoes", "sweep_delay_s"]

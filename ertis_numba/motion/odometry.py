@@ -7,7 +7,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.frames import Trajectory
 from ertis_numba.fusion.rig import MountedSensor, Mountings, mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor, GroupEchoes

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.fusion.pulses import is_same_pulse
 from ertis_numba.fusion.rig import Mountings, mounted_sensors

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import zmq
 
-from ertis_numba.errors import ErtisError, FormatVersionError, RefusedError
+from ertis_numba.base.errors import ErtisError, FormatVersionError, RefusedError
 from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import (

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import AcousticMap, Bearing, Measurement, is_passive
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.result_subscriber import ResultSubscriber
 from ertis_numba.network.subscriber import Arrival, Subscriber

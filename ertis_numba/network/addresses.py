@@ -4,7 +4,7 @@ import ipaddress
 import re
 from typing import Final
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 
 __all__ = [
     "DEFAULT_LISTEN",

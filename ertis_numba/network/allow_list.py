@@ -7,12 +7,12 @@ from typing import Annotated, Final, Literal, Self, TypeAlias, get_args
 
 import msgspec
 
-from ertis_numba import checks
-from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.network.checksummed_toml import Checked
 from ertis_numba.network.keys import require_key, require_name
 from ertis_numba.network.private_files import locked, require_own, write
+from ertis_numba.settings.documents import TomlTable
 
 __all__ = ["ALLOW_LIST", "ROLES", "AllowList", "Permission", "Role"]
 

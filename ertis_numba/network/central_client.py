@@ -9,8 +9,8 @@ from typing import Final, Self, TypeVar
 
 import zmq
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, NetworkError, RefusedError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, NetworkError, RefusedError
 from ertis_numba.journal import JournalSensor
 from ertis_numba.network import addresses, messages
 from ertis_numba.network.connection import Connection

@@ -5,8 +5,8 @@ from typing import Any, Self
 
 import msgspec
 
-from ertis_numba.documents import TomlDocument
-from ertis_numba.errors import SettingsError
+from ertis_numba.base.errors import SettingsError
+from ertis_numba.settings.documents import TomlDocument
 
 __all__ = ["Checked"]
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 
-from ertis_numba.errors import ErtisError
+from ertis_numba.base.errors import ErtisError
 from ertis_numba.frames import Energyscape
 from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.fusion.loading import load_kernels

@@ -10,7 +10,7 @@ import platformdirs
 import zmq
 from zmq.utils import z85
 
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.network.checksummed_toml import Checked
 from ertis_numba.network.private_files import OTHERS, mode_of, private_folder, require_own, write
 

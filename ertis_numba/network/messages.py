@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from ertis_numba.errors import DataError, FormatVersionError
+from ertis_numba.base.errors import DataError, FormatVersionError
 from ertis_numba.frames import Trajectory
 from ertis_numba.network.message_fields import (
     MAX_SEQUENCE,

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from ertis_numba.errors import ArgumentError, NetworkError
-from ertis_numba.extras import extra
+from ertis_numba.base.errors import ArgumentError, NetworkError
+from ertis_numba.base.extras import extra
 from ertis_numba.network import addresses
 from ertis_numba.network.status import Percentiles, Status
 

@@ -2,7 +2,7 @@
 
 import os
 
-from ertis_numba.errors import NetworkError
+from ertis_numba.base.errors import NetworkError
 
 __all__ = ["Owner"]
 

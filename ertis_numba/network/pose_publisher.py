@@ -11,8 +11,9 @@ import numpy as np
 import zmq
 from numpy.typing import ArrayLike
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, NetworkError, RefusedError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, NetworkError, RefusedError
+from ertis_numba.base.units import counted
 from ertis_numba.frames import Trajectory
 from ertis_numba.frames.pose_doubts import PoseWatch
 from ertis_numba.network import addresses, messages
@@ -20,7 +21,6 @@ from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.messages import SILENCE_LIMIT_S, Bye, Ping, PlatformPose, Pong, Refused
 from ertis_numba.network.owner import Owner
-from ertis_numba.units import counted
 
 __all__ = ["PosePublisher"]
 

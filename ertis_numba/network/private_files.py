@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.atomic_files import atomic_write
-from ertis_numba.errors import ArgumentError, NetworkError, SettingsError
+from ertis_numba.base.atomic_files import atomic_write
+from ertis_numba.base.errors import ArgumentError, NetworkError, SettingsError
 
 if sys.platform == "win32":
     import msvcrt

@@ -8,13 +8,13 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DataError, ErtisError
+from ertis_numba.base.errors import DataError, ErtisError
 from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import received_settings
 from ertis_numba.network.messages import Description, Group, Image, Message, Points, Raw, Report
 from ertis_numba.network.status import Status
 from ertis_numba.network.trace import mark
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
 
 __all__ = ["Arrival", "Header", "Item", "Payload", "ProductReader", "trace"]

@@ -11,7 +11,7 @@ from typing import Final
 
 import zmq
 
-from ertis_numba.errors import NetworkError
+from ertis_numba.base.errors import NetworkError
 from ertis_numba.network import addresses
 from ertis_numba.network.keys import ClientKeys, ServerKeys
 

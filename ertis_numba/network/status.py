@@ -5,7 +5,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 import msgspec
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 
 __all__ = [
     "ArchiveStatus",

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict, TypeVar, Unpac
 
 import zmq
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.network import addresses
 from ertis_numba.network._subscription import SubscriberCounts, Subscription
 from ertis_numba.network.keys import ClientKeys

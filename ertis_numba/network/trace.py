@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 
 __all__ = ["VARIABLE", "TraceWriter", "ignore", "mark"]
 

@@ -16,7 +16,7 @@ from typing import Final
 import zmq
 from zmq.utils import z85
 
-from ertis_numba.errors import ArgumentError, NetworkError, SettingsError
+from ertis_numba.base.errors import ArgumentError, NetworkError, SettingsError
 from ertis_numba.network.allow_list import AllowList, Permission
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.network.private_files import require_own

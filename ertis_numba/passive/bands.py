@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.constants import SHAPED_NOISE_SHARE
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.constants import SHAPED_NOISE_SHARE
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings import HIGHEST_SHARE, Passive, Recording, Settings
 
 __all__ = ["band_edges", "bin_shares", "octave_bands", "shaped_noise_warning", "typed_hz"]

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 import scipy
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Bearing, SoundEvent
 from ertis_numba.passive.direction_filter import DirectionFilter
 

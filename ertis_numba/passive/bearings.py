@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
+from ertis_numba.base import checks
 from ertis_numba.frames import LEVEL_UNITS, Bearing, level_offset_db
 from ertis_numba.geometry import direction_note, microphones, spacing_rad, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.camera import AcousticCamera
 from ertis_numba.passive.noise_model import NoiseModel

@@ -7,8 +7,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
 __all__ = ["BINS_OF_A_BAND", "block_length", "block_warning", "spacing_of"]

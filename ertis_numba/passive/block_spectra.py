@@ -7,10 +7,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba import fft
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
-from ertis_numba.kernels import KernelSet
+from ertis_numba.kernels import KernelSet, fft
 from ertis_numba.passive.block_lengths import BINS_OF_A_BAND, block_length, spacing_of
 from ertis_numba.passive.heard_signals import HeardSignals, heard_bands
 from ertis_numba.settings import Settings

@@ -9,8 +9,10 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks, kernels
-from ertis_numba.errors import ArgumentError, CoarseGridWarning, DataError, OutsideBandsWarning
+from ertis_numba import kernels
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, CoarseGridWarning, DataError, OutsideBandsWarning
+from ertis_numba.chain.interpolation_fit import one_thread
 from ertis_numba.frames import AcousticMap, Measurement, Stamp
 from ertis_numba.geometry import Grid, direction_grid, microphones, unit_vectors
 from ertis_numba.passive.bands import bin_shares
@@ -24,7 +26,6 @@ from ertis_numba.passive.search_grid import coarse_map_warning
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.passive.waves import Waves
 from ertis_numba.settings import HIGHEST_SHARE, Settings
-from ertis_numba.stages.interpolation_fit import one_thread
 
 __all__ = ["AcousticCamera"]
 

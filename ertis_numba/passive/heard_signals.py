@@ -6,16 +6,17 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks, kernels
-from ertis_numba.accepted_words import AcceptedWords
-from ertis_numba.errors import DataError
+from ertis_numba import kernels
+from ertis_numba.base import checks
+from ertis_numba.base.errors import DataError
+from ertis_numba.chain.demodulate import demodulation
+from ertis_numba.chain.time_window import TimeWindow
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.waveform import decimation_taps, integer_taps
 from ertis_numba.passive.bands import band_edges
+from ertis_numba.pipeline.accepted_words import AcceptedWords
 from ertis_numba.settings import Settings
-from ertis_numba.stages.demodulate import demodulation
-from ertis_numba.stages.time_window import TimeWindow
-from ertis_numba.waveform import decimation_taps, integer_taps
 
 __all__ = ["HeardSignals", "heard_bands"]
 

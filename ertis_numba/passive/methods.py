@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.high_resolution import HighResolutionClean
 from ertis_numba.passive.parallel_bins import in_parts

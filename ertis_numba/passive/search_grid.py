@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.analysis.array_response import ToneResponse
 from ertis_numba.analysis.direction_spacing import LARGEST_GRID, MAX_LOSS_DB, GridCheck, Lobe, Peak, rounded_down
-from ertis_numba.angles import DegreesFromRadians
+from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
 from ertis_numba.passive.block_lengths import block_warning
 from ertis_numba.passive.heard_signals import heard_bands

@@ -8,10 +8,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
 from ertis_numba.analysis.detect import neighbours_of
 from ertis_numba.analysis.outside_grid import OutsidePatterns, OutsideSource
 from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
+from ertis_numba.base import checks
 from ertis_numba.frames import AcousticMap, SoundDirection
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
 from ertis_numba.passive.components import COMPONENT_METHODS, strongest_first

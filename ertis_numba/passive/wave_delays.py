@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import far_field_delays, microphones, spherical_delays
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
 __all__ = ["WaveDelays"]

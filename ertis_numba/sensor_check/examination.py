@@ -7,16 +7,16 @@ from typing import Final
 
 import numpy as np
 
-from ertis_numba import checks
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.call_match import first_call_match
 from ertis_numba.analysis.emission_time import describe_start, emissions_of
 from ertis_numba.analysis.health import Health, health, merge
-from ertis_numba.atomic_files import remedy
+from ertis_numba.base import checks
+from ertis_numba.base.atomic_files import remedy
+from ertis_numba.base.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.calibration import OtherLayoutError
-from ertis_numba.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.passive.heard_signals import heard_bands
 from ertis_numba.passive.outside_bands import OutsideBands
 from ertis_numba.sensor_check import items
@@ -129,7 +129,7 @@ def uncheckable_recording(path: str | Path, error: Exception) -> RecordingCheck:
 
     Examples
     --------
-    >>> from ertis_numba.errors import DataError
+    >>> from ertis_numba.base.errors import DataError
     >>> from ertis_numba.sensor_check import uncheckable_recording
     >>> uncheckable_recording("a.h5", DataError("a.h5 is empty; choose a recording")).verdict
     'a.h5: 1 fault: the file is empty. Remedy: choose a recording'

@@ -7,6 +7,7 @@ from typing import Final, Literal, NamedTuple
 from ertis_numba.analysis.call_match import CallMatch
 from ertis_numba.analysis.health import Health
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_GAIN_DB, MAX_WHITE_DB
+from ertis_numba.base.units import counted
 from ertis_numba.calibration import OtherLayoutError
 from ertis_numba.sensor_check.clock import ClockCheck
 from ertis_numba.sensor_check.lost_words import LostWords
@@ -21,7 +22,6 @@ from ertis_numba.sensor_check.residuals import CalibrationResiduals
 from ertis_numba.sensor_check.result import CheckFault
 from ertis_numba.settings import Settings
 from ertis_numba.storage.verify import SensorReport
-from ertis_numba.units import counted
 
 __all__ = [
     "CALIBRATION",

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from ertis_numba import figures
-from ertis_numba.atomic_files import atomic_write
-from ertis_numba.errors import DataError, ErtisError
+from ertis_numba.base.atomic_files import atomic_write
+from ertis_numba.base.errors import DataError, ErtisError
 from ertis_numba.frames import Measurement
 from ertis_numba.sensor_check.result import RecordingCheck, SensorCheck
 from ertis_numba.storage import open_recording

@@ -6,12 +6,12 @@ from typing import Literal
 
 from ertis_numba.analysis.call_match import CallMatch
 from ertis_numba.analysis.health import Health, NotObservable, not_observable_text
+from ertis_numba.base.units import counted
 from ertis_numba.sensor_check.clock import ClockCheck
 from ertis_numba.sensor_check.lost_words import LostWords
 from ertis_numba.sensor_check.residuals import CalibrationResiduals
 from ertis_numba.settings import Settings
 from ertis_numba.storage.verify import SensorReport
-from ertis_numba.units import counted
 
 __all__ = ["CheckFault", "CheckItem", "RecordingCheck", "SensorCheck"]
 

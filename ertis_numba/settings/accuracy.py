@@ -2,9 +2,9 @@
 
 from typing import Literal
 
-from ertis_numba import checks
-from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.settings.documents import TomlTable
 
 __all__ = ["ERROR_PRESETS_DB", "MAX_FOCAL_ZONES", "Accuracy"]
 

@@ -6,10 +6,10 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from ertis_numba import checks
-from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH, WORD_BITS
-from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.constants import MAX_MICROPHONES, MAX_NAME_LENGTH, WORD_BITS
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.settings.documents import TomlTable
 
 __all__ = ["LAYOUT_SUFFIXES", "LENGTH_UNITS_M", "MAX_EMITTER_M", "MAX_SPAN_M", "MIN_SPAN_M", "OWN_ARRAY", "Array"]
 

@@ -2,8 +2,8 @@
 
 from typing import Final, NamedTuple
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 
 __all__ = ["WINDOWS", "ArrayWindow", "parse_window"]
 

@@ -6,9 +6,9 @@ from typing import Any, Literal, Self
 
 import msgspec
 
-from ertis_numba import checks
-from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, SettingsError
+from ertis_numba.settings.documents import TomlTable
 from ertis_numba.settings.waveform import band_hz, normalise, read_waveform
 
 __all__ = ["MAX_CALL_SAMPLES", "Call"]

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 
 __all__ = ["MAX_LISTED_DELAYS", "check_delays"]
 

@@ -3,9 +3,9 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
-from ertis_numba import checks
-from ertis_numba.constants import MAX_MICROPHONES
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.constants import MAX_MICROPHONES
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings.settings import Settings
 
 __all__ = ["ExcludedChannels"]

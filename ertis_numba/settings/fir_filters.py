@@ -7,8 +7,8 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 
 __all__ = ["FILTERS", "MAX_FILTER_TAPS", "FirFilters", "check_taps"]
 

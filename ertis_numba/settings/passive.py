@@ -3,9 +3,9 @@
 import itertools
 from typing import Final, Literal
 
-from ertis_numba import checks
-from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.settings.documents import TomlTable
 from ertis_numba.settings.recording import Recording
 
 __all__ = ["HIGHEST_SHARE", "MAP_METHODS", "MAX_BANDS", "MapMethod", "Passive"]

@@ -4,15 +4,15 @@ import math
 from pathlib import Path
 from typing import Any, Final, Literal, Self
 
-from ertis_numba import checks
-from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
-from ertis_numba.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
-from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base import checks
+from ertis_numba.base.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.settings.array_windows import parse_window
+from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
 from ertis_numba.settings.delay_lists import check_delays
+from ertis_numba.settings.documents import TomlTable
 from ertis_numba.settings.fir_filters import FILTERS, FirFilters, check_taps
-from ertis_numba.settings.presets import preset_tables
+from ertis_numba.settings.preset_files import preset_tables
 from ertis_numba.settings.waveform import read_waveform
 
 __all__ = ["MAX_LISTED_DIRECTIONS", "STAGES", "Processing"]

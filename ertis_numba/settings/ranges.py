@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings.call import Call
 from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.recording import Recording

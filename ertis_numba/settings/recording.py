@@ -2,14 +2,14 @@
 
 from typing import Literal
 
-from ertis_numba import checks
-from ertis_numba.constants import (
+from ertis_numba.base import checks
+from ertis_numba.base.constants import (
     ERTIS_PDM_RATE_HZ,
     STANDARD_HUMIDITY_PERCENT,
     STANDARD_PRESSURE_PA,
     STANDARD_TEMPERATURE_C,
 )
-from ertis_numba.documents import TomlTable
+from ertis_numba.settings.documents import TomlTable
 
 __all__ = ["DEFAULT_SAMPLES", "ENCODINGS", "Air", "Recording"]
 

@@ -6,14 +6,14 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from ertis_numba.beamformers import BEAMFORMERS
-from ertis_numba.documents import TomlDocument
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.settings.accuracy import Accuracy
 from ertis_numba.settings.array import Array
+from ertis_numba.settings.beamformers import BEAMFORMERS
 from ertis_numba.settings.call import Call
+from ertis_numba.settings.documents import TomlDocument
 from ertis_numba.settings.passive import Passive
-from ertis_numba.settings.presets import preset_tables
+from ertis_numba.settings.preset_files import preset_tables
 from ertis_numba.settings.processing import Processing
 from ertis_numba.settings.ranges import fit_ranges, max_decimation
 from ertis_numba.settings.recording import Air, Recording

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.csv_numbers import csv_rows, npy_content
-from ertis_numba.errors import ArgumentError, DataError, SettingsError
-from ertis_numba.wav import read_wav
+from ertis_numba.base import checks
+from ertis_numba.base.csv_numbers import csv_rows, npy_content
+from ertis_numba.base.errors import ArgumentError, DataError, SettingsError
+from ertis_numba.base.wav import read_wav
 
 __all__ = ["MAX_WAVEFORM_SAMPLES", "WAVEFORM_FILES", "band_hz", "normalise", "read_waveform"]
 

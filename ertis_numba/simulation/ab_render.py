@@ -8,17 +8,17 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain import planner
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.geometry import direction_grid
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 from ertis_numba.simulation.engine import Engine
 from ertis_numba.simulation.image_estimate import SAME_RANGE_M, Sight
 from ertis_numba.simulation.loudness import LOUD
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.snapshot import snapshot
-from ertis_numba.stages import planner
-from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["ABRender", "image_change_db"]
 

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks, kernels
-from ertis_numba.constants import SYNC_STEP_S
+from ertis_numba import kernels
+from ertis_numba.base import checks
+from ertis_numba.base.constants import SYNC_STEP_S
 from ertis_numba.frames import Measurement, Reflector, Stamp, TrueSource
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import Layout, microphones
-from ertis_numba.sample_format import sample_format
 from ertis_numba.simulation import noise_frames, synthesis
 from ertis_numba.simulation.arrivals import arrivals, gains
 from ertis_numba.simulation.converter import Converter

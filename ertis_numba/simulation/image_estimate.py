@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.constants import ERTIS_PDM_RATE_HZ
+from ertis_numba.base.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.settings import Call
 from ertis_numba.simulation import pulse

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks, kernels
+from ertis_numba import kernels
+from ertis_numba.base import checks
 from ertis_numba.geometry import Layout
 
 __all__ = ["Modulator", "loop_gains", "noise_transfer"]

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Trajectory
+from ertis_numba.settings.documents import TomlTable
 from ertis_numba.simulation.trajectory import MAX_DISTANCE_M, MAX_SPEED_M_S, check_vector
 
 __all__ = ["MovingPose", "Platform"]

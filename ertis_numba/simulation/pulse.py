@@ -6,9 +6,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.geometry.waveform import MatchedFilterSpectrum, call_spectrum, matched_band_hz, matched_filter_spectrum
 from ertis_numba.settings import Call, Settings
 from ertis_numba.simulation.arrivals import CallFilter
-from ertis_numba.waveform import MatchedFilterSpectrum, call_spectrum, matched_band_hz, matched_filter_spectrum
 
 __all__ = ["N_NODES", "band", "baseband", "envelope", "match", "matched"]
 

@@ -1,6 +1,6 @@
 """Rendering of a scene to the raw samples that its sensors would record."""
 
-from ertis_numba import checks
+from ertis_numba.base import checks
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Array, Recording
 from ertis_numba.simulation.effect_plan import EffectPlan, make_plan

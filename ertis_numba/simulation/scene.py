@@ -9,10 +9,10 @@ from typing import Any, ClassVar, Self
 import msgspec
 import numpy as np
 
-from ertis_numba import checks
-from ertis_numba.documents import TomlDocument
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import require_plausible_size, written_out
+from ertis_numba.settings.documents import TomlDocument
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.platform import MovingPose, Platform
 from ertis_numba.simulation.sensors import Sensor

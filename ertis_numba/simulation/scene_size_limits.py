@@ -1,6 +1,6 @@
 """Limits on the size of a scene."""
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 
 __all__ = [
     "MAX_AMPLITUDES",

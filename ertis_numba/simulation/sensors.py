@@ -7,11 +7,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import microphones
 from ertis_numba.settings import MAX_EMITTER_M, Settings
+from ertis_numba.settings.documents import TomlTable
 from ertis_numba.simulation.trajectory import Placed, Vector, check_vector
 
 __all__ = ["Electronics", "Emitter", "Sensor"]

@@ -7,8 +7,8 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import Layout, microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.simulation.cache import Cache
 from ertis_numba.simulation.scene import Scene
 from ertis_numba.simulation.sensors import Sensor

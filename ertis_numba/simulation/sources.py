@@ -7,10 +7,10 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings import Call
+from ertis_numba.settings.documents import TomlTable
 from ertis_numba.simulation.trajectory import Placed, direction
 
 __all__ = ["Ambient", "Noise", "Sonar", "SoundSource", "Tone"]

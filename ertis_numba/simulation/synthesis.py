@@ -10,12 +10,12 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Call
 from ertis_numba.simulation import noise_frames
 from ertis_numba.simulation.arrivals import Arrivals
 from ertis_numba.simulation.noise_frames import NoiseFrame
 from ertis_numba.simulation.stopwatch import CostStopwatch
-from ertis_numba.waveform import call_at
 
 __all__ = ["BLOCK", "NODE_HZ", "highest_hz", "node_frequencies", "signals"]
 

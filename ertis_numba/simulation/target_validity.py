@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.simulation.arrivals import transmitter_of
 from ertis_numba.simulation.effects.spreading import NEAREST_M
 from ertis_numba.simulation.sensors import Sensor

@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.documents import TomlTable
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import unit_vectors
+from ertis_numba.settings.documents import TomlTable
 
 __all__ = ["MAX_DISTANCE_M", "MAX_SPEED_M_S", "Placed", "Vector", "check_vector", "direction"]
 

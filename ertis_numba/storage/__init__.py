@@ -1,6 +1,6 @@
 """Files of recordings, energyscapes, acoustic and occupancy maps; the only package that imports h5py."""
 
-from ertis_numba.atomic_files import atomic_write, check_target
+from ertis_numba.base.atomic_files import atomic_write, check_target
 from ertis_numba.storage._reader import file_kind, sensor_names
 from ertis_numba.storage.acoustic_maps import (
     AcousticMapReader,

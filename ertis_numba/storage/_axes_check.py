@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import h5py
 
-from ertis_numba.errors import DamagedError, ForeignDataError
+from ertis_numba.base.errors import DamagedError, ForeignDataError
 from ertis_numba.storage.schema import POSES, RECORDING, RECORDING_OF_PCM
 from ertis_numba.storage.structure import require_attributes, stored_bytes
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from ertis_numba.errors import DamagedError
+from ertis_numba.base.errors import DamagedError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import Journal, JournalEntry
 from ertis_numba.storage._gaps import SensorSequences

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import ArgumentError, DamagedError
+from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.geometry import mounting
 from ertis_numba.storage.schema import set_attributes, to_python
 

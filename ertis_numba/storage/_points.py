@@ -7,7 +7,7 @@ from typing import Final
 import h5py
 import numpy as np
 
-from ertis_numba.errors import ArgumentError, DamagedError
+from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.settings import Settings
 from ertis_numba.storage.schema import POINTS, create_variables

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.errors import ArgumentError, DamagedError
+from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Trajectory
 from ertis_numba.storage.schema import POSES, create_variables
 from ertis_numba.storage.structure import MAX_TEXT_BYTES, local_member

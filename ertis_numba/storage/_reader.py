@@ -11,8 +11,8 @@ from typing import ClassVar, Self, TypeVar, overload
 
 import h5py
 
-from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
-from ertis_numba.file_kinds import kind_of, problem_of, quoted
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError, FormatVersionError
+from ertis_numba.base.file_kinds import kind_of, problem_of, quoted
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader

@@ -8,9 +8,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.angles import DegreesFromRadians
-from ertis_numba.atomic_files import check_target
-from ertis_numba.errors import ArgumentError, DamagedError
+from ertis_numba.base.angles import DegreesFromRadians
+from ertis_numba.base.atomic_files import check_target
+from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import AcousticMap, Energyscape, Trajectory
 from ertis_numba.geometry import mounting as mounted, self_contained
 from ertis_numba.storage._mounting import read_mounting, write_mounting

@@ -8,9 +8,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.atomic_files import require_free_space
-from ertis_numba.errors import ArgumentError, DamagedError
+from ertis_numba.base import checks
+from ertis_numba.base.atomic_files import require_free_space
+from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import BEHAVIOURS, Behaviour, Stamp
 from ertis_numba.storage._gaps import SensorSequences
 from ertis_numba.storage.schema import CHUNK_ROWS

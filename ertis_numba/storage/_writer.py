@@ -12,8 +12,15 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import h5py
 from numpy.typing import NDArray
 
-from ertis_numba.atomic_files import atomic_write, check_target, reason, remedy, require_free_space, require_writable
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.atomic_files import (
+    atomic_write,
+    check_target,
+    reason,
+    remedy,
+    require_free_space,
+    require_writable,
+)
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import AcousticMap, Energyscape, Measurement
 from ertis_numba.storage._rows import RowReader, RowWriter
 from ertis_numba.storage.schema import (

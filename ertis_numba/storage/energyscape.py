@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DamagedError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.storage._points import POINT_SIZES, PointReader, require_uniform, write_points
 from ertis_numba.storage._results import ResultFile, ResultReader, ResultWriter

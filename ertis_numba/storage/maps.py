@@ -8,9 +8,9 @@ from typing import Final
 import h5py
 import numpy as np
 
-from ertis_numba import checks
-from ertis_numba.atomic_files import atomic_write, reason, remedy
-from ertis_numba.errors import ArgumentError, DamagedError, DataError, FormatVersionError
+from ertis_numba.base import checks
+from ertis_numba.base.atomic_files import atomic_write, reason, remedy
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError, FormatVersionError
 from ertis_numba.frames import OccupancyMap
 from ertis_numba.storage.opening import open_file, reading
 from ertis_numba.storage.schema import (

@@ -11,8 +11,8 @@ from typing import Final
 
 import h5py
 
-from ertis_numba.errors import ArgumentError, DamagedError, DataError, SettingsError
-from ertis_numba.file_kinds import HDF5_PLACES, HDF5_SIGNATURE, problem_of, quoted
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError, SettingsError
+from ertis_numba.base.file_kinds import HDF5_PLACES, HDF5_SIGNATURE, problem_of, quoted
 
 __all__ = ["RESULT_OR_RECORDING", "open_file", "reading"]
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ertis_numba.analysis.compare import visible
 from ertis_numba.analysis.compare_places import joined, positions_m
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.frames import Energyscape, Reflector, Surfaces, Trajectory
 from ertis_numba.simulation import Scene
 from ertis_numba.simulation.surfaces import surfaces_of

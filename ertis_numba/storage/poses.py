@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ertis_numba.atomic_files import atomic_write, check_target, reason, remedy, require_free_space
-from ertis_numba.errors import ArgumentError, DataError, ErtisError
+from ertis_numba.base.atomic_files import atomic_write, check_target, reason, remedy, require_free_space
+from ertis_numba.base.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.frames import Trajectory
 from ertis_numba.frames.pose_doubts import warn_of_poses
 from ertis_numba.storage._poses import MAX_GAP_S, checked_poses, remove_poses, require_times, write_poses

@@ -9,12 +9,13 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError
 from ertis_numba.frames import Measurement, SequenceGap, Trajectory
 from ertis_numba.frames.pose_doubts import warn_of_poses
+from ertis_numba.frames.sample_format import SampleFormat, sample_format
 from ertis_numba.geometry import Layout, microphones, mounting as mounted, self_contained, storable
-from ertis_numba.sample_format import SampleFormat, sample_format
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Air, Settings
 from ertis_numba.storage._mounting import read_mounting, write_mounting
 from ertis_numba.storage._poses import (
@@ -40,7 +41,6 @@ from ertis_numba.storage.schema import (
     to_python,
 )
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
-from ertis_numba.waveform import call_samples
 
 __all__ = [
     "JOURNAL_DAMAGE",

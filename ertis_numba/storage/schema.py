@@ -18,8 +18,8 @@ from typing import Any, Final
 import h5py
 import numpy as np
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 
 __all__ = [
     "ACOUSTIC_MAP",

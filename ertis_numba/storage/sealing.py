@@ -17,8 +17,8 @@ from typing import ClassVar
 import h5py
 import numpy as np
 
-from ertis_numba.atomic_files import fsync, temporary_path
-from ertis_numba.errors import DamagedError, DataError
+from ertis_numba.base.atomic_files import fsync, temporary_path
+from ertis_numba.base.errors import DamagedError, DataError
 from ertis_numba.frames import Measurement, Trajectory
 from ertis_numba.geometry import mounting as mounted, storable
 from ertis_numba.journal import (

@@ -11,8 +11,8 @@ from typing import TextIO
 
 from msgspec import structs
 
-from ertis_numba.atomic_files import temporary_path
-from ertis_numba.errors import ErtisError, JournalInUseError
+from ertis_numba.base.atomic_files import temporary_path
+from ertis_numba.base.errors import ErtisError, JournalInUseError
 from ertis_numba.journal import SUFFIX, SealingResult
 from ertis_numba.journal.storage_processes import FromSealing, Sealed, SealingProgress, SealJournal, StorageFailed
 from ertis_numba.processes import connect, is_child

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.journal.storage_processes import FoundSessions, ReadSessions, StorageFailed
 from ertis_numba.processes import connect
 from ertis_numba.storage._reader import file_kind, sensor_names

@@ -12,8 +12,8 @@ from typing import Any, Final
 import h5py
 import numpy as np
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError, DamagedError, ForeignDataError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError, DamagedError, ForeignDataError
 from ertis_numba.settings import Settings
 from ertis_numba.storage.schema import TRUTH, Variable
 

@@ -12,9 +12,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
-from ertis_numba.atomic_files import remedy
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base import checks
+from ertis_numba.base.atomic_files import remedy
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector, TrueSource
 from ertis_numba.storage.schema import TRUTH, create_variables, set_attributes, text_type, to_python
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ertis_numba.errors import ArgumentError, DamagedError, DataError, ForeignDataError
+from ertis_numba.base.errors import ArgumentError, DamagedError, DataError, ForeignDataError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import Journal
 from ertis_numba.storage._axes_check import find_damage

@@ -8,7 +8,7 @@ choices made there.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from ertis_numba.extras import extra
+from ertis_numba.base.extras import extra
 from ertis_numba.viewer._acoustic_maps import ViewedMaps
 from ertis_numba.viewer._choices import COLOURS, Choices
 from ertis_numba.viewer._polar import Polar

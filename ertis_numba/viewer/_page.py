@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import viser
 
-from ertis_numba.errors import NetworkError
+from ertis_numba.base.errors import NetworkError
 from ertis_numba.geometry import round_step
 from ertis_numba.viewer._choices import COLOURS, DYNAMIC_RANGE_DB, LOWEST_THRESHOLD_DB, MAX_DECAY_S, Choices
 from ertis_numba.viewer._level_controls import LevelControls

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, Self, TypeAlias
 
 from ertis_numba import kernels
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import AcousticMap, Energyscape, Measurement, Stamp, is_passive
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.storage import (

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.levels import below_strongest_db
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import Fan
 from ertis_numba.viewer._axes import PAGE, SIDE_PX, Ink, Place, draw_axes, draw_text

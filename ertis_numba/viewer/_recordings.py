@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from ertis_numba.atomic_files import atomic_write, check_target
+from ertis_numba.base.atomic_files import atomic_write, check_target
 
 __all__ = ["MAX_BYTES", "Recordings", "ToBrowser", "ToFile"]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self
 
-from ertis_numba.errors import ArgumentError, ErtisError
+from ertis_numba.base.errors import ArgumentError, ErtisError
 from ertis_numba.viewer._acoustic_maps import ViewedMaps
 from ertis_numba.viewer._choices import Choices
 from ertis_numba.viewer._origins import is_loopback

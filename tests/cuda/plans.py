@@ -1,7 +1,7 @@
 """Settings small enough for the slow CUDA simulator, and the processing plans to test with them."""
 
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS
 
 TINY = Settings(
     array=Array(layout="line", positions_m=tuple((0.0, 0.004 * mic, 0.0) for mic in range(2)), word_bits=8),

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ertis_numba import kernels
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.stages.fast_chain import FastChain
 from tests import reference
 from tests.cases import noise
 from tests.cuda.plans import PLANS, TINY

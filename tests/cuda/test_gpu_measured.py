@@ -9,7 +9,7 @@ from ertis_bench.gpu_trials import gpu_parts, gpu_stages, rivals
 from numba import cuda
 
 from ertis_numba import kernels
-from ertis_numba.errors import DataError, DeviceError
+from ertis_numba.base.errors import DataError, DeviceError
 from ertis_numba.kernels._cuda import ceilings
 from ertis_numba.kernels._cuda.stopwatch import Stopwatch
 from ertis_numba.pipeline import Pipeline

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import cuda
 
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.kernels._cuda import beam_sums, lane
 
 

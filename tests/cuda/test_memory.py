@@ -10,7 +10,7 @@ from numba import cuda
 from numba.cuda.cudadrv.driver import CudaAPIError
 
 from ertis_numba import kernels
-from ertis_numba.errors import ArgumentError, DeviceError
+from ertis_numba.base.errors import ArgumentError, DeviceError
 from ertis_numba.kernels import _images
 from ertis_numba.pipeline import Pipeline
 from tests.cases import noise

@@ -9,8 +9,8 @@ import click
 from ertis_bench import markdown
 from ertis_cli import options
 
-from ertis_numba import checks
-from ertis_numba.errors import ErtisError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ErtisError
 from tests.faults import reliability as reliability_trials, reliability_table
 from tests.faults.network import all_trials as network_trials, table as network_table
 

@@ -20,8 +20,8 @@ from typing import Any
 
 from ertis_bench.network.processes import ask
 
+from ertis_numba.base.errors import DataError
 from ertis_numba.devices.emulator import Emulator, SyncChain
-from ertis_numba.errors import DataError
 from ertis_numba.simulation import Point, Scene, Sensor
 from ertis_numba.storage import open_recording, sensor_names
 

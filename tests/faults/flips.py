@@ -22,7 +22,7 @@ from typing import Any, Final
 import h5py
 import numpy as np
 
-from ertis_numba.errors import ErtisError
+from ertis_numba.base.errors import ErtisError
 from ertis_numba.frames import Measurement, SequenceGap, Stamp
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalSensor
 from ertis_numba.journal._tables import insert_statement

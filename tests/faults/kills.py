@@ -39,7 +39,7 @@ _JITTER_S = 0.004
 _KILLS_PER_JOURNAL = 3  # consecutive processes that are killed over the same journal
 _LIFE_S = 60  # lifetime of a process that is not killed
 _PACKAGE = Path(ertis_numba.__file__).parent
-_OURS = tuple(str(_PACKAGE / name) for name in ("journal", "storage", "atomic.py"))
+_OURS = tuple(str(_PACKAGE / name) for name in ("journal", "storage", "base/atomic_files.py"))
 
 
 def appending(folder: Path, *, seed: int, count: int) -> dict[str, int]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from ertis_numba.constants import ERTIS_PDM_RATE_HZ
+from ertis_numba.base.constants import ERTIS_PDM_RATE_HZ
 from ertis_numba.devices.bits import BitCheck
 from ertis_numba.devices.commands import LENGTH_STEP
 from ertis_numba.storage import open_recording

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import microphones, unit_vectors
-from ertis_numba.waveform import call_at
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from tests.cases import words_of
 
 

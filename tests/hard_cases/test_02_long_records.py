@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Processing, Recording, Settings
 from ertis_numba.storage import write_recording
-from ertis_numba.waveform import call_at
 from tests import reference
 from tests.hard_cases.tuned import tuned
 

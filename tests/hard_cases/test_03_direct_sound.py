@@ -9,11 +9,11 @@ import pytest
 
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing, Recording, Settings
 from ertis_numba.simulation import Emitter, Point, Sensor
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.waveform import call_samples
 from tests.cases import noise
 from tests.hard_cases.tuned import chain_of
 from tests.scenes import only, scene_of

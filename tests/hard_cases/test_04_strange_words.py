@@ -5,8 +5,8 @@ import pytest
 
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.frames import Measurement
+from ertis_numba.geometry.waveform import matched_filter_spectrum
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.waveform import matched_filter_spectrum
 from tests.cases import SHORT, words_of
 from tests.hard_cases.echoes import echo_signals, echo_words
 

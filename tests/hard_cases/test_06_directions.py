@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array
 from ertis_numba.simulation import Point

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import decimation_taps, matched_band_hz
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Recording
 from ertis_numba.simulation import Point, Sensor
 from ertis_numba.simulation.effects import EFFECTS
 from ertis_numba.simulation.render import Simulator
-from ertis_numba.waveform import decimation_taps, matched_band_hz
 from tests import reference
 from tests.cases import LINE_8, SHORT, noise
 from tests.hard_cases.forced import FULL, forced

@@ -6,11 +6,11 @@ import mpmath
 import numpy as np
 import pytest
 
-from ertis_numba.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.analysis.detect import find_peaks
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import direction_grid, load_layout
+from ertis_numba.geometry.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air, Array, Processing, Settings
 from ertis_numba.simulation import Point

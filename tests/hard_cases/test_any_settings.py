@@ -10,12 +10,12 @@ import pytest
 from hypothesis import Phase, event, given, settings, strategies as st
 
 from ertis_numba.analysis.detect import find_peaks
-from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
-from ertis_numba.errors import ArgumentError, DataError, DeviceError
+from ertis_numba.base.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import observable_angles
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Air, Array, Call, Processing, Recording, Settings
+from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS
 from tests.hard_cases.tuned import tuned
 
 EXAMPLES = int(os.environ.get("ERTIS_EXAMPLES", "120"))

@@ -1,8 +1,8 @@
 """Settings with changed accuracy, and the chain that processes signals before modulation."""
 
 from ertis_numba import kernels
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.stages.fast_chain import FastChain
 
 
 def tuned(settings, **changes):

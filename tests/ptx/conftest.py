@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from tests.ptx import launches, offline_compilation
 
 

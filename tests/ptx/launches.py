@@ -4,10 +4,10 @@ import functools
 
 import numpy as np
 
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS
+from ertis_numba.chain import planner
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.settings import Accuracy, Processing, Settings
-from ertis_numba.stages import planner
-from ertis_numba.stages.fast_chain import FastChain
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS
 from tests.ptx import offline_compilation
 
 ERTIS = Settings.from_preset("default_25_50")

@@ -25,7 +25,7 @@ import numpy as np
 from numba import cuda
 from numpy.typing import NDArray
 
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.kernels._cuda import kernel_set
 from ertis_numba.kernels._cuda.lane import SIMULATED, Lane
 from ertis_numba.kernels._device_protocols import Array

@@ -8,7 +8,7 @@ import pytest
 from cuda import pathfinder
 from numba import cuda
 
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.kernels._cuda.lane import launch
 from tests.ptx import offline_compilation
 from tests.ptx.faults import contracts, faults

@@ -9,10 +9,10 @@ import numpy as np
 from ertis_bench import checks, input_measurements, instruction_sets, machine, timing
 from ertis_bench.accuracy import DIRECTIONS, TURN
 from ertis_bench.markdown import table
-from ertis_numba import kernels, verification
-from ertis_numba.beamformers import BEAMFORMERS, BeamformerName, WeightingName
-from ertis_numba.pipeline import Pipeline
-from ertis_numba.prediction import planner_of, predict
+from ertis_numba import kernels
+from ertis_numba.pipeline import Pipeline, verification
+from ertis_numba.pipeline.prediction import planner_of, predict
+from ertis_numba.settings.beamformers import BEAMFORMERS, BeamformerName, WeightingName
 
 __all__ = ["FORMS", "form", "run"]
 

@@ -16,10 +16,10 @@ import numpy as np
 from ertis_bench import checks, input_measurements, machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table as _table
-from ertis_numba import cluster
+from ertis_numba.base.errors import DataError
 from ertis_numba.campaign import Campaign, CampaignOptions, RecordingEnded, RecordingStarted, find_recordings
-from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
+from ertis_numba.processes import cluster
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
 
 __all__ = ["FORMS", "form", "run"]

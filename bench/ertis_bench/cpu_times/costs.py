@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from ertis_bench import instruction_sets, machine, markdown
 from ertis_numba import kernels
-from ertis_numba.stages.costs import UNITS, measure
-from ertis_numba.stages.nominal_costs import NOMINAL_COSTS
+from ertis_numba.chain.costs import UNITS, measure
+from ertis_numba.chain.nominal_costs import NOMINAL_COSTS
 
 __all__ = ["MARKER", "UNITS", "as_markdown", "as_python", "nominal_as_markdown", "run", "update"]
 

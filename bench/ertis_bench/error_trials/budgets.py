@@ -17,15 +17,15 @@ from ertis_bench.error_trials.random_settings import Limits, recorded
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.network.processes import ask
-from ertis_numba import verification
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
+from ertis_numba.pipeline import verification
 from ertis_numba.settings import Accuracy, Array, Call, Processing, Recording, Settings
+from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerName, WeightingName
 from ertis_numba.storage import open_energyscapes, write_recording
-from ertis_numba.waveform import call_at
 
 __all__ = ["FORMS", "form", "measurement_of", "run", "tried"]
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.calibration import Calibration
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import load_layout, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Array
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor
 from ertis_numba.simulation.render import Simulator

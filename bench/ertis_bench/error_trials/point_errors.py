@@ -14,14 +14,14 @@ from ertis_bench import machine
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_numba import kernels
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.chain import planner
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Accuracy, Processing, Recording, Settings
-from ertis_numba.stages import planner
-from ertis_numba.stages.fast_chain import FastChain
-from ertis_numba.waveform import call_at
 
 __all__ = ["BUDGETS_DB", "FORMS", "GRIDS", "RATIOS", "Trials", "form", "run"]
 

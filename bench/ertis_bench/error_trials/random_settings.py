@@ -7,14 +7,14 @@ from typing import Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.beamformers import ADAPTIVE_COMBINATIONS, BeamformerName, WeightingName
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Measurement
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import microphones
-from ertis_numba.sample_format import sample_format
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recording, Settings
-from ertis_numba.waveform import call_at
+from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS, BeamformerName, WeightingName
 
 __all__ = ["Limits", "random_measurement", "random_settings", "recorded"]
 

@@ -11,11 +11,11 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.geometry import array_weights, microphones
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at
+from ertis_numba.pipeline.verification import combine
 from ertis_numba.settings import Array, Call, Processing, Recording, Settings
-from ertis_numba.verification import combine
-from ertis_numba.waveform import call_at
 
 __all__ = ["amplitudes", "beamformed", "capon", "coherence_factor", "dmas", "exact", "signals_of", "unpack_bits"]
 

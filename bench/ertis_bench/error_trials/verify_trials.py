@@ -10,13 +10,12 @@ from ertis_bench.error_trials import reference_image
 from ertis_bench.error_trials.random_settings import random_measurement
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_numba import verification
-from ertis_numba.beamformers import BEAMFORMERS, WEIGHTINGS
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.geometry import unit_vectors
-from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import Settings
+from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS
 
 __all__ = ["FORMS", "MAX_DIFFERENCE_DB", "compared", "form", "run"]
 

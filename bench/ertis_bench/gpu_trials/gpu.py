@@ -23,7 +23,7 @@ from typing import Any
 
 from ertis_bench import input_measurements, machine
 from ertis_bench.gpu_trials import gpu_tables
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 
 __all__ = [
     "BUDGETS_S",

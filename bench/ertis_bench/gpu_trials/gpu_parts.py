@@ -24,14 +24,14 @@ from ertis_bench.gpu_trials.gpu_stages import stages
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RANGE_M
 from ertis_bench.passive.sound_signals import OWN_RMS, SOURCES, listening, noise
 from ertis_bench.plans import in_words
-from ertis_numba import kernels, verification
-from ertis_numba.errors import DataError, DeviceError
+from ertis_numba import kernels
+from ertis_numba.base.errors import DataError, DeviceError
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.frames import Measurement
 from ertis_numba.kernels._cuda import ceilings
 from ertis_numba.passive import AcousticCamera
-from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["FULL", "PARTS", "Scale", "acoustic_maps", "ceilings_of", "machine", "paper", "side_by_side"]
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from ertis_bench.plans import BEAMFORMING_KERNELS
 from ertis_numba import kernels
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.kernels import KernelSet, Lane, Memory
 from ertis_numba.kernels._cuda.ceilings import occupy
 from ertis_numba.kernels._cuda.stopwatch import Stopwatch
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["STAGES", "TRANSFERS", "stages"]
 

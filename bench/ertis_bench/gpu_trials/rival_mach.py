@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from ertis_bench import timing
 from ertis_bench.gpu_trials.gpu_stages import stages
 from ertis_bench.plans import in_words
-from ertis_numba import kernels, verification
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import DataError
+from ertis_numba import kernels
+from ertis_numba.base.errors import DataError
+from ertis_numba.chain.fast_chain import FastChain
+from ertis_numba.chain.plan_elements import spectrum_of
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
-from ertis_numba.pipeline import Pipeline
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fast_chain import FastChain
-from ertis_numba.stages.plan_elements import spectrum_of
 
 __all__ = ["FRAMES", "problem", "race", "settings_for"]
 

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from ertis_bench import timing
 from ertis_bench.gpu_trials import rival_mach
 from ertis_bench.plans import in_words
-from ertis_numba import kernels, verification
-from ertis_numba.errors import DataError
+from ertis_numba import kernels
+from ertis_numba.base.errors import DataError
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.frames import Measurement
-from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["LIBRARIES", "ArrayChain", "Library", "Tables", "is_installed", "numpy_library", "race", "tables_of"]
 

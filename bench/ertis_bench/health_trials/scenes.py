@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import layout_names, microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Array, Call, Recording
 from ertis_numba.simulation import Ambient, Electronics, Emitter, Noise, Point, Scene, Sensor, Sonar, Sphere, Tone, Wall
 from ertis_numba.simulation.render import Simulator

@@ -19,11 +19,11 @@ import numpy as np
 
 from ertis_bench.network.processes import JsonLinesProcess
 from ertis_bench.network.serving import percentile, some_words
+from ertis_numba.base.errors import DataError
 from ertis_numba.devices.blocks import encode_block
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.devices.emulator.terminal import Terminal
 from ertis_numba.devices.setup import Setup
-from ertis_numba.errors import DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings

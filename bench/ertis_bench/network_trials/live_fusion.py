@@ -15,7 +15,7 @@ from ertis_bench.network.sent import read_diaries
 from ertis_bench.network.serving import Serve, create_keys, percentile
 from ertis_bench.network_trials.fused_receiver import FusedPulse, FusedReceiverJob, read_fused
 from ertis_bench.platform_trials.platform_scenes import EMITTERS_M, platform_scene, random_reflectors
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import Scene
 from ertis_numba.simulation.effect_plan import make_plan

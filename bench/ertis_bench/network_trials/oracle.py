@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from ertis_bench.network.diary import DiaryKey, Row
 from ertis_bench.network.sent import Sent, read_diaries
-from ertis_numba.errors import ErtisError
+from ertis_numba.base.errors import ErtisError
 from ertis_numba.frames import Measurement, SequenceGap
 from ertis_numba.storage import open_recording, sensor_names
 

@@ -17,8 +17,8 @@ from ertis_bench.network.serving import create_keys, percentile
 from ertis_bench.network_trials import live_fusion, live_maps
 from ertis_bench.network_trials.oracle import judged
 from ertis_bench.network_trials.table import network
-from ertis_numba import cluster
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
+from ertis_numba.processes import cluster
 
 __all__ = ["FORMS", "PARTS", "run", "storage"]
 

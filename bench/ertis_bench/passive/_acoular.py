@@ -11,9 +11,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
 __all__ = ["PACKAGE", "AcousticMapper"]

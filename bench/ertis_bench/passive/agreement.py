@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_bench.passive._acoular import AcousticMapper
 from ertis_bench.passive.sound_signals import N_BLOCK, OWN_RMS, SOURCES, listening, noise
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.passive import AcousticCamera
 
 __all__ = ["CASES", "WITHIN_DB", "Case", "bins_of", "compare"]

@@ -7,9 +7,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Bearing, Measurement, Stamp
 from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.passive import AcousticCamera, BearingFinder
 from ertis_numba.settings import Settings
 from ertis_numba.simulation import Scene

@@ -5,9 +5,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones, spherical_delays, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
 __all__ = ["N_BLOCK", "OWN_RMS", "SOURCES", "NoiseSource", "listening", "noise"]

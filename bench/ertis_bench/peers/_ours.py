@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from ertis_bench.peers.problem import Implementation
 from ertis_bench.plans import BEAMFORMING_KERNELS
 from ertis_numba import kernels
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Settings
-from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["paper", "this_package"]
 

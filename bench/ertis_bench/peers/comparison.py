@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from ertis_bench import accuracy, checks, input_measurements, machine, timing
 from ertis_bench.peers import _acoular, _jax, _numpy, _ours, _torch
 from ertis_bench.peers.problem import Implementation, Problem
-from ertis_numba import verification
+from ertis_numba.chain.interpolation_fit import one_thread
 from ertis_numba.frames import Energyscape, Measurement
-from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import Settings
-from ertis_numba.stages.interpolation_fit import one_thread
 
 __all__ = ["DIRECTIONS", "OURS", "PAPER", "PEERS", "Peer", "run"]
 

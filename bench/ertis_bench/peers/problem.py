@@ -7,11 +7,11 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
+from ertis_numba.chain.time_window import time_window
 from ertis_numba.geometry import array_weights, direction_grid, far_field_delays, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import decimation_taps, filter_response, matched_band_hz, matched_filter_spectrum
 from ertis_numba.settings import Settings
-from ertis_numba.stages.time_window import time_window
-from ertis_numba.waveform import decimation_taps, filter_response, matched_band_hz, matched_filter_spectrum
 
 __all__ = ["N_PHASES", "Implementation", "Problem"]
 

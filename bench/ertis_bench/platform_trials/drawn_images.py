@@ -12,9 +12,9 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Processing
 from ertis_numba.simulation import Sensor
 

@@ -9,7 +9,7 @@ import numpy as np
 from ertis_bench import machine, timing
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.simulation import (
     Ambient,

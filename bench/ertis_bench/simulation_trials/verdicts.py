@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ertis_bench.simulation_trials.random_scenes import varied_scene
 from ertis_numba import kernels
+from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy, Settings
 from ertis_numba.simulation import Scene, Sensor
@@ -20,7 +21,6 @@ from ertis_numba.simulation.image_estimate import SAME_RANGE_M, Sight
 from ertis_numba.simulation.loudness import LOUD
 from ertis_numba.simulation.render import Simulator
 from ertis_numba.simulation.snapshot import Snapshot, snapshot
-from ertis_numba.stages.fast_chain import FastChain
 
 __all__ = ["Trial", "run", "with_one"]
 

@@ -9,8 +9,8 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.health.limits import MAX_DELAY_S
+from ertis_numba.geometry.waveform import call_samples
 from ertis_numba.settings import Call
-from ertis_numba.waveform import call_samples
 
 __all__ = ["Compressed", "Fit", "compress", "fit_delays", "fit_emitter", "strongest"]
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
 from ertis_numba.analysis import _bits
 from ertis_numba.analysis.health.bits import by_bits
 from ertis_numba.analysis.health.kinds import kind_of
@@ -31,9 +30,10 @@ from ertis_numba.analysis.health.repeats import duplicates, hum, repeated_blocks
 from ertis_numba.analysis.health.report import ChannelHealth, Finding, Health
 from ertis_numba.analysis.health.spectra import by_spectra
 from ertis_numba.analysis.health.wavefront import by_wavefront
+from ertis_numba.base import checks
 from ertis_numba.frames import Measurement
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import microphones
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
 
 __all__ = ["health"]

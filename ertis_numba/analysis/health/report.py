@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ertis_numba.analysis.health.kinds import kind_of
 from ertis_numba.analysis.health.not_observable import NotObservable, in_all, not_observable_text
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 
 __all__ = ["ChannelHealth", "Finding", "Health", "merge"]
 

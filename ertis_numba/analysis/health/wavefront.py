@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import sound_speed_m_s
 from ertis_numba.analysis.health.array_match import SIZE, find_other_array, unobservable
 from ertis_numba.analysis.health.arrival import Compressed, Fit, compress, fit_delays, fit_emitter, strongest
 from ertis_numba.analysis.health.coherence import aligned, correlate, half_bands, mean_of
@@ -16,6 +15,7 @@ from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_SHIFT_S
 from ertis_numba.analysis.health.not_observable import KNOWN_PLACE, OF_ARRIVAL, SINGLE_ECHO, NotObservable
 from ertis_numba.analysis.health.report import Finding
 from ertis_numba.geometry import Layout, microphones
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
 __all__ = ["by_array", "by_wavefront"]

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from ertis_numba import checks
+from ertis_numba.base import checks
 from ertis_numba.devices.blocks import FRAME_BYTES
 
 __all__ = ["KINDS", "BlockFault", "Faults", "Spoilt", "Stall", "Unplug"]

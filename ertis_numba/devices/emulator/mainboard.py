@@ -4,14 +4,14 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from ertis_numba import checks
+from ertis_numba.base import checks
+from ertis_numba.base.errors import DataError
 from ertis_numba.devices.blocks import COUNTERS
 from ertis_numba.devices.commands import Command, encode_answer
 from ertis_numba.devices.emulator.faults import Stall
 from ertis_numba.devices.emulator.measurements import Measurements, Output
 from ertis_numba.devices.emulator.registers import DeviceConfig, Registers
 from ertis_numba.devices.emulator.terminal import CommandReader
-from ertis_numba.errors import DataError
 
 __all__ = ["Accepts", "Mainboard", "Quirks"]
 

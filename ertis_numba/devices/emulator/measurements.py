@@ -12,10 +12,10 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba import checks
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.devices.blocks import encode_block
 from ertis_numba.devices.emulator.faults import Faults, Stall, Unplug
-from ertis_numba.errors import ArgumentError
 
 __all__ = ["Measurements", "Output", "Pieces", "Words"]
 

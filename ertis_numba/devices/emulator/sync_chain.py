@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Self
 
-from ertis_numba import checks
-from ertis_numba.constants import SYNC_STEP_S
+from ertis_numba.base import checks
+from ertis_numba.base.constants import SYNC_STEP_S
 from ertis_numba.devices.emulator.device import Emulator
 
 __all__ = ["SyncChain"]

@@ -14,9 +14,9 @@ os.environ.setdefault("GOMP_SPINCOUNT", "1000")
 import numba
 from numba.core import event
 
-from ertis_numba import checks
-from ertis_numba.errors import DeviceError
-from ertis_numba.forks import ForkSafeLock
+from ertis_numba.base import checks
+from ertis_numba.base.errors import DeviceError
+from ertis_numba.base.forks import ForkSafeLock
 from ertis_numba.kernels import _compile_notice
 from ertis_numba.kernels._cpu.after_fork import run_kernels_after_forks
 from ertis_numba.kernels._cpu.dot16 import RANGES

@@ -3,7 +3,7 @@
 import contextlib
 from collections.abc import Iterator
 
-from ertis_numba import checks
+from ertis_numba.base import checks
 from ertis_numba.kernels._cuda.delay_and_sum_envelope_int16 import TILE_RANGES
 from ertis_numba.kernels._cuda.lane import SIMULATED, require_own_process
 from ertis_numba.kernels._device_protocols import NewMemory

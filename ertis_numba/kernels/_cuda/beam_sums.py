@@ -8,7 +8,7 @@ complex64 would take two loads. Indices are unsigned, because Numba tests signed
 import numpy as np
 from numba import cuda
 
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.kernels._scalar import imag_of, real_of
 
 __all__ = [

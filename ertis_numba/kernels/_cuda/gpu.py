@@ -5,7 +5,7 @@ import importlib.util
 
 from numba import cuda
 
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.kernels._cuda import kernel_set
 from ertis_numba.kernels._cuda.lane import SIMULATED
 from ertis_numba.kernels._cuda.memory import CudaMemory

@@ -11,7 +11,7 @@ import numpy as np
 from numba import cuda
 from numpy.typing import DTypeLike, NDArray
 
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.kernels._cuda.copies import Copies
 from ertis_numba.kernels._cuda.graph import Graph
 

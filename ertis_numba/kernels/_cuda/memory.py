@@ -8,7 +8,7 @@ from numba import cuda
 from numba.cuda.cudadrv.driver import CudaAPIError
 from numpy.typing import DTypeLike, NDArray
 
-from ertis_numba.errors import DeviceError
+from ertis_numba.base.errors import DeviceError
 from ertis_numba.kernels._cuda.lane import SIMULATED, Lane, require_own_process
 from ertis_numba.kernels._device_protocols import Array
 from ertis_numba.kernels._images import ImagePool

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import zmq
 
-from ertis_numba.errors import ArgumentError, DataError, FormatVersionError
+from ertis_numba.base.errors import ArgumentError, DataError, FormatVersionError
 from ertis_numba.frames import Measurement
 from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network import messages

@@ -11,9 +11,9 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from ertis_numba import checks
-from ertis_numba.atomic_files import make_folder
-from ertis_numba.errors import ArgumentError, DataError
+from ertis_numba.base import checks
+from ertis_numba.base.atomic_files import make_folder
+from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.journal import SUFFIX, JournalPose, SealingResult
 from ertis_numba.network.central_node._journal_store import JournalStore
 from ertis_numba.network.central_node._ledger import Ledger, Lock

@@ -5,7 +5,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from typing import Final
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network.central_node._admission import Unwanted, entry_in, require_room, require_same, source_in

@@ -7,7 +7,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.errors import ArgumentError, DataError, DiskFullError
+from ertis_numba.base.errors import ArgumentError, DataError, DiskFullError
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalPose
 from ertis_numba.network.central_node._ledger import Ledger, read_acked_through
 from ertis_numba.network.central_node._received_items import (

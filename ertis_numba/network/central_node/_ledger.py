@@ -11,8 +11,8 @@ from typing import Annotated, Final, TypeAlias
 
 import msgspec
 
-from ertis_numba.atomic_files import atomic_write
-from ertis_numba.errors import DataError, FormatVersionError, JournalInUseError
+from ertis_numba.base.atomic_files import atomic_write
+from ertis_numba.base.errors import DataError, FormatVersionError, JournalInUseError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import sessions_in_recordings
 from ertis_numba.network.central_node._received_items import SensorSession

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import zmq
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.network.addresses import DEFAULT_LISTEN
 from ertis_numba.network.central_node._admission import ReceivedMessage, Unwanted, handlers_of, read, require_role
 from ertis_numba.network.central_node._archive import Archive

@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.journal import JournalPose
 from ertis_numba.network.allow_list import Permission
 from ertis_numba.network.central_node._admission import Unwanted

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.errors import JournalInUseError
+from ertis_numba.base.errors import JournalInUseError
 from ertis_numba.journal import SUFFIX, SealingResult, seal_in_subprocess
 
 __all__ = ["Sealing"]

@@ -9,7 +9,7 @@ from itertools import count, pairwise
 from statistics import median
 from typing import Final, Literal, NamedTuple
 
-from ertis_numba.errors import ArgumentError, SettingsError
+from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import received_settings
 from ertis_numba.journal import JournalSensor
 from ertis_numba.network.central_node._received_items import SensorSession

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, Self
 
-from ertis_numba.errors import DamagedError
+from ertis_numba.base.errors import DamagedError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry, JournalPose, JournalSensor
 from ertis_numba.network.central_node._received_items import ReceivedItem, SensorSession

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.cluster import current_worker
-from ertis_numba.errors import ArgumentError, DataError, DeviceError
+from ertis_numba.base.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.network.processing.shared_slots import POINTS_BYTES
+from ertis_numba.processes.cluster import current_worker
 
 if TYPE_CHECKING:
+    from ertis_numba.chain.costs import PlanCosts
     from ertis_numba.network.processing.pipe_messages import Prepared
     from ertis_numba.network.processing.shared_pipeline import SharedPipeline
-    from ertis_numba.stages.costs import PlanCosts
 
 __all__ = ["ClusterResult", "prepare", "process"]
 

@@ -92,7 +92,7 @@ class Predictions:
         if image.settings.processing.method == "paper" or not image.amplitude.any():
             return  # The paper's method has no plan, and silence no relative error.
         from ertis_numba import kernels  # noqa: PLC0415  in a process that has loaded them
-        from ertis_numba.prediction import MAX_MEMORY_BYTES, memory_bytes, planner_of, predict  # noqa: PLC0415
+        from ertis_numba.pipeline.prediction import MAX_MEMORY_BYTES, memory_bytes, planner_of, predict  # noqa: PLC0415
 
         try:
             needed = memory_bytes(image)

@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from ertis_numba.cluster import RemoteError, WorkerActors, connect
 from ertis_numba.network.processing import _cluster_worker as there
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.parallelism import Load
@@ -29,6 +28,7 @@ from ertis_numba.network.processing.runner import (
 from ertis_numba.network.processing.shared_slots import Slot, SlotPool
 from ertis_numba.network.status import WorkerStatus
 from ertis_numba.network.wakeup_socket import WakeupSocket
+from ertis_numba.processes.cluster import RemoteError, WorkerActors, connect
 
 __all__ = ["Cluster"]
 

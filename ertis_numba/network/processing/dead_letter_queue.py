@@ -8,12 +8,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Measurement
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.network.log import EventLog
 from ertis_numba.network.processing.runner import Job, bytes_of
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
 
 __all__ = ["DeadLetterQueue", "entry_of"]

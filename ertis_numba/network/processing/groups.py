@@ -5,7 +5,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from ertis_numba.capture.sync_counts import PulseAligner
+from ertis_numba.devices.capture.sync_counts import PulseAligner
 from ertis_numba.network.messages import Data, Group
 
 __all__ = ["Groups"]

@@ -4,13 +4,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.geometry import direction_grid
 from ertis_numba.network.addresses import DEFAULT_PUBLISH
 from ertis_numba.network.keys import ServerKeys
 from ertis_numba.settings import ExcludedChannels, Settings
-from ertis_numba.stages.costs import PLAN_COSTS, PlanCosts
 
 __all__ = ["ProcessingOptions"]
 

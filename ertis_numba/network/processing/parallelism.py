@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from ertis_numba.units import counted
+from ertis_numba.base.units import counted
 
 __all__ = ["Choice", "Load", "Mode"]
 

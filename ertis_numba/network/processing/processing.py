@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.chain.memory import require_images
 from ertis_numba.network.log import EventLog, logger
 from ertis_numba.network.messages import Data, Group, Hello
 from ertis_numba.network.processing import pipe_messages
@@ -35,7 +36,6 @@ from ertis_numba.network.processing.worker_pool import LocalWorkerPool
 from ertis_numba.network.status import Latencies, ProcessingStatus, Status
 from ertis_numba.network.trace import mark
 from ertis_numba.settings import Settings
-from ertis_numba.stages.memory import require_images
 
 __all__ = ["ImageProcessing"]
 

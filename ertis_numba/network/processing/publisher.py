@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from ertis_numba.errors import NetworkError
+from ertis_numba.base.errors import NetworkError
 from ertis_numba.network.log import EventLog
 from ertis_numba.network.messages import Description, Group
 from ertis_numba.network.processing import pipe_messages

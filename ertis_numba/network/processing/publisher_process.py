@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import zmq
 
-from ertis_numba.errors import DataError, ErtisError, FormatVersionError
+from ertis_numba.base.errors import DataError, ErtisError, FormatVersionError
 from ertis_numba.network import sockets
 from ertis_numba.network.keys import KeyPair, ServerKeys
 from ertis_numba.network.message_fields import as_line

@@ -5,17 +5,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.memory import require_image_size
 from ertis_numba.frames import is_passive
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import self_contained
 from ertis_numba.network.log import EventLog
 from ertis_numba.network.messages import Data, Description, Hello
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.pipe_messages import Prepared
 from ertis_numba.network.processing.runner import JobKind
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Air, Settings
-from ertis_numba.stages.memory import require_image_size
 
 __all__ = ["RegisteredSensor", "Sensors"]
 

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.points import PointExtractor
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
+from ertis_numba.chain import memory
+from ertis_numba.chain.costs import PlanCosts
 from ertis_numba.frames import Energyscape, Measurement
+from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.network.processing.pipe_messages import Prepared
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.sample_format import sample_format
 from ertis_numba.settings import Settings
-from ertis_numba.stages import memory
-from ertis_numba.stages.costs import PlanCosts
 
 __all__ = ["SharedPipeline"]
 

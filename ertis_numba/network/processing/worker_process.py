@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ertis_numba.errors import ArgumentError, DataError, DeviceError
+from ertis_numba.base.errors import ArgumentError, DataError, DeviceError
 from ertis_numba.frames import Measurement
 from ertis_numba.network.processing._predictions import Predictions
 from ertis_numba.network.processing.pipe_messages import (
@@ -49,7 +49,7 @@ class _ImageWorker:
     def run(self) -> None:
         # In this process alone, and before it is ready, so that the first sensor does not wait for imports.
         from ertis_numba import kernels  # noqa: PLC0415
-        from ertis_numba.fft import _scipy  # noqa: F401, PLC0415
+        from ertis_numba.kernels.fft import _scipy  # noqa: F401, PLC0415
         from ertis_numba.network.processing import shared_pipeline  # noqa: F401, PLC0415
 
         try:

@@ -9,9 +9,9 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final, Literal
 
-from ertis_numba import checks
-from ertis_numba.atomic_files import make_folder
-from ertis_numba.errors import DamagedError, DataError, JournalInUseError, NetworkError
+from ertis_numba.base import checks
+from ertis_numba.base.atomic_files import make_folder
+from ertis_numba.base.errors import DamagedError, DataError, JournalInUseError, NetworkError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import LOST, SUFFIX, Journal, JournalEntry
 from ertis_numba.network.messages import MAX_SEQUENCE

@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 import zmq
 
-from ertis_numba.errors import DataError, FormatVersionError
+from ertis_numba.base.errors import DataError, FormatVersionError
 from ertis_numba.network import messages
 from ertis_numba.network.connection import Connection
 from ertis_numba.network.keys import ClientKeys

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import SequenceGap, Stamp
 from ertis_numba.journal import JournalEntry, JournalSensor, require_same_settings
 from ertis_numba.network.messages import MAX_SEQUENCE

@@ -5,8 +5,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Generic, Self, TypeVar
 
-from ertis_numba import checks
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import JournalEntry, JournalSensor
 from ertis_numba.network import addresses
@@ -47,8 +47,8 @@ class _UserCallback(Generic[CallbackArgument]):
 class SensorNode:
     """Node that keeps measurements and sends them until the central node has acknowledged them.
 
-    Use it in a ``with`` statement. It is a sink of `ertis_numba.capture.CaptureSession`. Threads may share it. It never
-    waits for the network: while the central node is away, it keeps measurements in memory or on disk.
+    Use it in a ``with`` statement. It is a sink of `ertis_numba.devices.capture.CaptureSession`. Threads may share it.
+    It never waits for the network: while the central node is away, it keeps measurements in memory or on disk.
 
     Parameters
     ----------

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Final, Literal
 
-from ertis_numba.errors import ArgumentError
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.journal import Journal, JournalEntry, JournalSensor
 
 __all__ = ["MEMORY_FULL", "NEVER_GIVEN", "OutgoingSession", "UnackedItem"]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.air import absorption_db_m
+from ertis_numba.geometry.air import absorption_db_m
 from ertis_numba.simulation.estimates import Estimate, filtered
 from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.paths import Paths

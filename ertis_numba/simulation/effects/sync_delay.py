@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.constants import SYNC_STEP_S
+from ertis_numba.base.constants import SYNC_STEP_S
 from ertis_numba.simulation.effects.cross_emission import other_emitters
 from ertis_numba.simulation.estimates import Estimate
 from ertis_numba.simulation.image_estimate import Sight

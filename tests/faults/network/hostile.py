@@ -17,7 +17,7 @@ from ertis_bench.network.sender import SenderJob
 from ertis_bench.network.sent import read_diaries
 from ertis_bench.network_trials.oracle import judged
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.network import messages
 from tests.faults.network.hostile_hellos import HostileHello, hostile_hellos
 from tests.faults.network.zmtp import ZmtpPeer

@@ -17,7 +17,7 @@ from ertis_bench.network.processes import until
 from ertis_bench.network.sender import SMALL
 from ertis_bench.network_trials.oracle import judged
 
-from ertis_numba.errors import ErtisError
+from ertis_numba.base.errors import ErtisError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import JournalEntry
 from ertis_numba.network.allow_list import AllowList

@@ -19,7 +19,7 @@ from ertis_bench.network.sender import SenderJob
 from ertis_bench.network.sent import read_diaries
 from ertis_bench.network_trials.oracle import judged
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from tests.faults.network.self_kill import in_trap
 from tests.faults.network.sender_thread import SenderThread
 from tests.ports import reserved_address

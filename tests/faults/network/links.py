@@ -17,7 +17,7 @@ from ertis_bench.network.sent import read_diaries
 from ertis_bench.network_trials.oracle import judged
 from ertis_cli.main import cli
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from tests.faults.network.kills import RestartedRecorder
 from tests.faults.network.meddler import ACKS, Meddler
 from tests.faults.network.sender_thread import SenderThread

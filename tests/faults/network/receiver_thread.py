@@ -7,7 +7,7 @@ from typing import Final, Self
 from ertis_bench.network.processes import until
 from ertis_bench.network.receiver import ReceiverJob, receive, subscriber_of
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 
 __all__ = ["ReceiverThread"]
 

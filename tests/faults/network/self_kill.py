@@ -19,7 +19,7 @@ import ertis_numba
 __all__ = ["in_trap"]
 
 _PACKAGE: Final = Path(ertis_numba.__file__).parent
-_OURS: Final = tuple(str(_PACKAGE / name) for name in ("network", "journal", "atomic_files.py"))
+_OURS: Final = tuple(str(_PACKAGE / name) for name in ("network", "journal", "base/atomic_files.py"))
 
 
 def in_trap(max_lines: int | None, command: Sequence[str]) -> list[str]:

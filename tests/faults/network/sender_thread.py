@@ -7,7 +7,7 @@ from typing import Any, Final, Self
 
 from ertis_bench.network.sender import Sender, SenderJob
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 
 __all__ = ["SenderThread"]
 

@@ -18,7 +18,7 @@ from ertis_bench.network.sender import SenderJob
 from ertis_bench.network.sent import read_diaries
 from ertis_bench.network_trials.oracle import judged
 
-from ertis_numba.errors import DataError, ErtisError
+from ertis_numba.base.errors import DataError, ErtisError
 from ertis_numba.network.central_client import CentralClient
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.subscriber import Subscriber

@@ -10,7 +10,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 
 __all__ = ["DiskOperation", "DiskRecord", "build", "environment", "read"]
 

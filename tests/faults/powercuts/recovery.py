@@ -10,7 +10,7 @@ from ertis_bench.network.processes import ask
 from ertis_bench.network.sent import Sent
 from ertis_bench.network_trials.oracle import Archived, compare, read_folder
 
-from ertis_numba.errors import ErtisError
+from ertis_numba.base.errors import ErtisError
 from ertis_numba.journal import SUFFIX
 from ertis_numba.network.central_node._journal_store import JournalStore
 from ertis_numba.network.central_node._ledger import Ledger

@@ -14,7 +14,7 @@ from ertis_bench.network.processes import ERTIS, JsonLinesProcess
 from ertis_bench.network.sender import SenderJob
 from ertis_bench.network.sent import Sent, note
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from tests.faults import captures
 from tests.faults.powercuts.log import DiskOperation, DiskRecord, environment
 from tests.ports import reserved_address

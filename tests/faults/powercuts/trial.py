@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from tests.faults.powercuts import log as logs, scenarios
 from tests.faults.powercuts.disk import Disk
 from tests.faults.powercuts.recovery import Found, recover_archive, recover_capture, recover_spool

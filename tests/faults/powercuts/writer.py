@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from ertis_bench.network.diary import Row
 
-from ertis_numba.errors import DataError
+from ertis_numba.base.errors import DataError
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import SUFFIX, Journal, JournalEntry
 from ertis_numba.settings import Recording, Settings

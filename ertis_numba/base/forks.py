@@ -1,0 +1,83 @@
+"""Objects in forked processes, in which only the thread exists that called the fork.
+
+A lock that another thread held stays locked in the fork for ever, and a thread pool waits for threads that are gone.
+"""
+
+import functools
+import itertools
+import os
+import sys
+import threading
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+__all__ = ["ForkSafeLock", "call_in_forks"]
+
+_methods: set["weakref.WeakMethod[Callable[[], None]]"] = set()
+
+
+def call_in_forks(method: Callable[[], None]) -> None:
+    """Call a method at the start of each forked process, as long as its object exists.
+
+    Parameters
+    ----------
+    method : bound method
+        Makes the object usable without the threads of the parent. It must raise no error.
+    """
+    _methods.add(weakref.WeakMethod(method, _methods.discard))
+
+
+class ForkSafeLock:
+    """Context manager that admits one thread at a time; free in a forked process, even if another thread was inside.
+
+    Parameters
+    ----------
+    make : callable
+        Type of the lock: `threading.Lock`, the default, or `threading.RLock`.
+
+    Examples
+    --------
+    >>> from ertis_numba.base.forks import ForkSafeLock
+    >>> lock = ForkSafeLock()
+    >>> with lock:
+    ...     print("alone")
+    alone
+    """
+
+    def __init__(self, make: Callable[[], Any] = threading.Lock) -> None:
+        self._make = make
+        self._renew()
+        call_in_forks(self._renew)
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def _renew(self) -> None:
+        self._lock = self._make()
+
+
+def _after_fork() -> None:
+    if sys.version_info < (3, 12):
+        _renew_cached_properties()
+    for reference in tuple(_methods):
+        method = reference()
+        if method is not None:
+            method()
+
+
+def _renew_cached_properties() -> None:
+    """Replace the locks of cached properties, which Python 3.12 removed."""
+    for name, module in tuple(sys.modules.items()):
+        if name.startswith(f"{__package__}."):
+            classes = [each for each in vars(module).values() if isinstance(each, type)]
+            for attribute in itertools.chain.from_iterable(vars(each).values() for each in classes):
+                if isinstance(attribute, functools.cached_property):
+                    attribute.lock = threading.RLock()  # type: ignore[attr-defined]  # before Python 3.12
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

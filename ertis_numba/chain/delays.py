@@ -1,0 +1,104 @@
+"""Delay tables of the kernels: indices and weights of the samples that each microphone adds to a beam."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.interpolation_fit import DelayFit
+from ertis_numba.kernels import SteeringKernels
+
+__all__ = ["DelayTable", "Zone"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DelayTable:
+    """Samples that contribute to the first range of each beam, and their weights.
+
+    A term is one sample of one microphone. The number of terms of a microphone is the number of taps of the delay
+    interpolation.
+
+    Attributes
+    ----------
+    rows, samples : (beam, term) int64
+        Row of the sample, ``microphone · n_phases + phase``, and its index in that row.
+    weights : (beam, term) complex128
+    """
+
+    rows: NDArray[np.int64]
+    samples: NDArray[np.int64]
+    weights: NDArray[np.complex128]
+
+    @classmethod
+    def of(
+        cls,
+        delays_s: NDArray[np.float64],
+        amplitudes: NDArray[np.float64],
+        fit: DelayFit,
+        steering: SteeringKernels | None = None,
+        *,
+        n_phases: int,
+        lead: int,
+    ) -> Self:
+        """Return the delay table of given delays.
+
+        Parameters
+        ----------
+        delays_s : (beam, mic) float64
+            Delays in seconds.
+        amplitudes : (mic,) float64
+            Weight of each microphone.
+        fit : DelayFit
+            Fractional-delay filters.
+        steering : SteeringKernels, optional
+            Kernels that compute the weights on several threads.
+        n_phases : int
+            Number of phases of the analytic signals.
+        lead : int
+            Index of the sample at the first range.
+        """
+        n_beams, n_mics = delays_s.shape
+        first, fractions = fit.split(delays_s)
+        samples, phases = np.divmod(first[:, :, None] + np.arange(fit.n_taps), n_phases)
+        rows = np.arange(n_mics)[:, None] * n_phases + phases
+        weights = fit.weights(fractions, steering) * amplitudes[:, None]
+        flat = (n_beams, n_mics * fit.n_taps)
+        return cls(rows.reshape(flat), samples.reshape(flat) + lead, weights.reshape(flat))
+
+    def offsets(self, width: int) -> NDArray[np.int32]:
+        """Return the indices of the first samples in a flattened array of (mic, phase, ``width``).
+
+        Raises
+        ------
+        ArgumentError
+            A delay reaches before the first sample, or the array has too many samples for 32-bit indices.
+        """
+        if self.samples.min() < 0:
+            raise ArgumentError(
+                "delays reach before the first sample of the record; start processing.range_m at a larger range"
+            )
+        last = int(self.rows.max() + 1) * width
+        if last > np.iinfo(np.int32).max:
+            raise ArgumentError(
+                f"the signals have {int(self.rows.max()) + 1} rows (microphones times phases) of {width} samples, too "
+                "many for 32-bit indices; use a shorter processing.range_m or a lower accuracy.oversampling"
+            )
+        return (self.rows * width + self.samples).astype(np.int32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Zone:
+    """Focal zone: a part of the range axis whose ranges share one set of delays.
+
+    Attributes
+    ----------
+    first, stop : int
+        Index of the first range, and index after the last range.
+    table : DelayTable
+    """
+
+    first: int
+    stop: int
+    table: DelayTable

@@ -1,0 +1,380 @@
+"""Error model: the image error that each step of a plan causes, predicted before processing.
+
+The error is ``‖image − exact‖ / ‖exact‖`` over all directions and ranges, in decibels. The exact image is that of
+`tests/reference.py`: float64, no decimation, delays as exact phase shifts.
+
+Most steps cause errors of complex beams. These errors add up like noise, both between microphones and between steps,
+because `interpolation_fit` leaves hardly any error that microphones share. Let ε be the error power of a step, relative
+to the power of a microphone's signal after the matched filter. Let ``gain`` be the mean power of the image, relative to
+the image of uncorrelated microphones. The step then contributes the error power
+
+    s ε / gain ,   s = ½ for gain ≤ 1,   s = 1 − ½ / gain beyond.
+
+s is the share of a complex error that changes a magnitude. In noise it is one half: the other half turns the phase,
+which the envelope does not contain. s is larger if a few coherent echoes dominate the image: beam and error are then
+sums of the same waves and tend to have the same phase. The gain of coherent echoes does not follow from the settings.
+A `SignalModel` measures it; without a measurement, the model assumes safe values.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from ertis_numba.chain.beam_grid import Aperture, BeamGrid
+from ertis_numba.chain.focal_zones import NEAREST_M
+from ertis_numba.chain.interpolation_fit import WAVES, DelayFit
+from ertis_numba.geometry import array_weights, effective_count
+from ertis_numba.geometry.waveform import matched_band_hz, matched_filter_spectrum, matched_noise_spectrum
+from ertis_numba.settings import Settings
+
+__all__ = ["PARTS", "ErrorModel", "SignalModel", "decibels"]
+
+PARTS: Final = {
+    "delays": "interpolation of delayed samples",
+    "beams": "interpolation between beam-grid points",
+    "zones": "one set of delays for each focal zone",
+    "samples": "16-bit samples and weights",
+    "filter": "noise aliased by the decimation",
+    "window": "ringing of the matched filter cut off at the time window",
+    "arithmetic": "single precision",
+}
+"""Name and cause of the error of each step."""
+
+_ARITHMETIC = 10 ** (-114 / 10)  # Single precision through two transforms and a sum, of any sound.
+# Single precision by cause, fitted to phase shifts: real and synthetic measurements, noise, hum, and random scenes.
+_OF_IMAGE = 10 ** (-137 / 10)  # Sums and output, relative to the image.
+_OF_BAND = 10 ** (-136 / 10)  # Inverse transforms, which spread errors over all ranges, relative to the whole record.
+_OF_SIGNALS = 10 ** (-146 / 10)  # Forward transforms, relative to the signals at all frequencies.
+_OF_BAND_PCM, _OF_SIGNALS_PCM = 10 ** (-130 / 10), 10 ** (-139 / 10)  # PCM may be equal in all microphones.
+_PHASE_STEP = 2 * math.pi / 2**32  # Resolution of phases in radians.
+_SAFE_GAIN = 0.5  # Most of the sound comes from outside the directions of the image.
+_SAFE_COLOUR = 2.0  # Echoes are strongest at the edges of the band.
+_SAFE_CREST = 10 ** (17 / 10)  # A tile contains one echo.
+_ECHO_CREST = 10 ** (16 / 10)  # A tile of 96 ranges contains one echo.
+_SAFE_LEVEL = 10 ** (-24 / 10)  # Level in a quiet room that eRTIS was tested in.
+_UNLIKE = 1.3  # Margin for differences between images: 1 dB, from the scenes of tests/test_accuracy.py.
+_NOISE_CORNER_HZ = 500e3  # Corner of the shaped noise of eRTIS at 4.5 MHz.
+_NOISE_RATE_HZ = 4.5e6
+_GUARDS = 8  # Ringing is computed over so many times the time by which a window extends beyond the image.
+
+
+def decibels(power: float) -> float:
+    """Return a power in decibels, ``10 log10(power)``; -300 for powers below 1e-30."""
+    return 10 * math.log10(max(power, 1e-30))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SignalModel:
+    """Signal statistics that the error of an image depends on, besides the settings.
+
+    Attributes
+    ----------
+    shares : (wave,) float64
+        Distribution of the power after the matched filter over the frequencies of the model; the sum is 1.
+    gain : float
+        Mean power of the image, relative to the image of uncorrelated microphones.
+    crest : float
+        Largest sample power in a tile of ranges, averaged over tiles, relative to the mean sample power.
+    noise : (bin,) float64
+        Power density of the recorded samples from 0 to half the sample rate, relative to white bits.
+    level : float
+        Power after the matched filter in the ranges of the image, relative to white bits.
+    places : (quantile,) float64
+        Quantiles of the power of the image points in ascending order, relative to the mean.
+    covariance : (tile, wave, mic, mic) complex128, optional
+        Covariance of the signals of some microphones in each tile of ranges, at the frequencies of an estimate of
+        `BeamGrid`; None by default.
+    colour : float
+        Margin on interpolation errors computed from ``shares``; 1 (the default) if ``shares`` was measured.
+    loudness : float
+        Power of the signals before the matched filter, over all times and frequencies, relative to ``level``. Both are
+        relative to white bits. It is 0 (the default) if it was not measured.
+    record_level : float
+        Power after the matched filter over the whole record, relative to ``level``. It exceeds 1 if there is louder
+        sound at other ranges than those of the image. It is 0 (the default) if it was not measured.
+    """
+
+    shares: NDArray[np.float64]
+    gain: float
+    crest: float
+    noise: NDArray[np.float64]
+    level: float
+    places: NDArray[np.float64]
+    covariance: NDArray[np.complex128] | None = None
+    colour: float = 1.0
+    loudness: float = 0.0
+    record_level: float = 0.0
+
+    @classmethod
+    def unknown(cls, settings: Settings) -> "SignalModel":
+        """Return the safe signal model that is assumed without a measurement."""
+        _, shares = matched_noise_spectrum(settings, n_waves=WAVES)
+        if not settings.recording.is_pdm:  # There may be as much sound outside the band as inside.
+            return cls(shares, _SAFE_GAIN, _SAFE_CREST, np.ones(2), 1.0, np.ones(1), colour=_SAFE_COLOUR)
+        frequency_hz = np.linspace(0, settings.recording.sample_rate_hz / 2, 1025)
+        corner_hz = _NOISE_CORNER_HZ * settings.recording.sample_rate_hz / _NOISE_RATE_HZ
+        noise = np.minimum(1.0, (frequency_hz / corner_hz) ** 4)
+        return cls(shares, _SAFE_GAIN, _SAFE_CREST, noise, _SAFE_LEVEL, np.ones(1), colour=_SAFE_COLOUR)
+
+    @classmethod
+    def echo(cls, settings: Settings, n_mics: float) -> "SignalModel":
+        """Return the signal model of a single echo that all microphones receive in phase."""
+        _, shares = matched_noise_spectrum(settings, n_waves=WAVES)
+        power = shares**2  # The spectrum of the echo times that of the filter.
+        return cls(power / power.sum(), float(n_mics), _ECHO_CREST, np.ones(2), 1.0, np.ones(1))
+
+
+class ErrorModel:
+    """Predictor of the error power of each processing step, relative to the power of the exact image.
+
+    Parameters
+    ----------
+    settings : Settings
+    signal_model : SignalModel, optional
+        Measured signal model; by default, `SignalModel.unknown`.
+    """
+
+    def __init__(self, settings: Settings, signal_model: SignalModel | None = None) -> None:
+        self._settings = settings
+        self.signal_model = signal_model or SignalModel.unknown(settings)
+        self.frequency_hz, _ = matched_noise_spectrum(settings, n_waves=WAVES)
+        self._weights = array_weights(settings)
+
+    def delays(
+        self,
+        fit: DelayFit,
+        *,
+        n_mics: float,
+        fractions: NDArray[np.float64] | None = None,
+        passed: NDArray[np.float64] | None = None,
+    ) -> float:
+        """Return the error power of delay interpolation: the residual of the fit, weighted by the signal spectrum.
+
+        The mean error over all delays acts as a filter on the image itself, whether or not echoes are coherent. The
+        remaining error differs between microphones, so its phase is independent of the beam. With few microphones, it
+        averages out less: the error of a single microphone is a filter on its own signal.
+
+        Parameters
+        ----------
+        fit : DelayFit
+        n_mics : float
+            Effective number of microphones: see `ertis_numba.geometry.effective_count`.
+        fractions : (delay,) float64, optional
+            Fractional parts of the delays in steps, if there are too few delays to spread evenly over a step.
+        passed : (wave,) float64, optional
+            Share of the errors at beam-grid points that remains in the interpolated beams; 1 by default.
+        """
+        signal_model = self.signal_model
+        if fractions is not None:
+            return (
+                signal_model.colour
+                * float(fit.errors_at(fractions) @ signal_model.shares)
+                * max(1.0, 0.5 / signal_model.gain)
+            )
+        errors = fit.errors if passed is None else fit.errors * passed
+        varying, shared = float(errors @ signal_model.shares), float(fit.biases @ signal_model.shares)
+        independent = 0.5 * (1 + 1 / n_mics) * varying / signal_model.gain
+        return signal_model.colour * (independent + 0.5 * shared)
+
+    @property
+    def needs_steering(self) -> bool:
+        """True if the error of plane-wave beams depends on a measured covariance."""
+        return self.signal_model.covariance is not None
+
+    def uniform_beams(self, errors: NDArray[np.float64]) -> float:
+        """Return the error power of beam interpolation without a covariance, from the errors at each frequency."""
+        return self._of(_UNLIKE * self.signal_model.colour * float(errors @ self.signal_model.shares))
+
+    def beams(self, nodes: BeamGrid) -> float:
+        """Return the error power of beam interpolation, from an estimate of `BeamGrid`.
+
+        Without a measured covariance, the signal spectrum weights the errors, as in `delays`. With a covariance R, the
+        error is computed for each tile: the beam ``b = hᵀx`` and its error ``e = dᵀx`` are sums of the same signals x.
+        The error power of the envelope is
+
+            Re(C_eb)² / C_bb + ½ (C_ee − |C_eb|² / C_bb),   C_eb = dᵀ R h*, and likewise C_bb and C_ee.
+        """
+        covariance = self.signal_model.covariance
+        if covariance is None or nodes.is_curved:
+            return self.uniform_beams(nodes.errors)
+        n_tiles, n_waves, _, _ = covariance.shape
+        n_directions = nodes.steering.shape[2]
+        beams, errors = np.zeros((2, n_tiles, n_directions))
+        both = np.zeros((n_tiles, n_directions), dtype=np.complex128)
+        for wave in range(n_waves):  # One frequency at a time keeps all arrays in the cache.
+            steering, missed = nodes.steering[:, wave], nodes.wrong[:, wave]
+            sums = covariance[:, wave] @ np.conj(np.concatenate([steering, missed], axis=1))
+            heard, lost = sums[:, :, :n_directions], sums[:, :, n_directions:]
+            beams += np.sum(steering * heard, axis=1).real
+            both += np.sum(missed * heard, axis=1)
+            errors += np.sum(missed * lost, axis=1).real
+        beams = np.maximum(beams, 1e-9 * beams.max(initial=1e-30))
+        wrong = both.real**2 / beams + 0.5 * np.maximum(errors - np.abs(both) ** 2 / beams, 0.0)
+        return _UNLIKE * float(wrong.sum() / beams.sum())
+
+    def zones(self, aperture: Aperture, curvature_2: float, *, sound_speed_m_s: float) -> float:
+        """Return the error power of focal zones, whose ranges share one set of delays.
+
+        A wavefront of curvature b = 1/r reaches a microphone at p with the extra delay ``b (p² − (u·p)²) / 2c``. The
+        mean extra delay of all microphones turns the phase of the beam and shifts its envelope. Only the phase at the
+        mean frequency has no effect on the image.
+
+        Parameters
+        ----------
+        aperture : Aperture
+        curvature_2 : float
+            Mean squared deviation of the curvature from that of its focal zone, in 1/m²: see
+            `focal_zones.squared_curvature`.
+        sound_speed_m_s : float
+        """
+        along_m = aperture.directions @ aperture.positions_m.T
+        across_m2 = np.maximum(aperture.square_m2 - along_m**2, 0.0)
+        weights, power = self._weights, self._weights**2 / np.mean(self._weights**2)
+        middle_m2 = np.mean(weights * across_m2, axis=1)
+        spread_m4 = float(np.mean(np.mean(power * (across_m2 - middle_m2[:, None]) ** 2, axis=1)))
+        turn_2 = (2 * math.pi * self.frequency_hz / (2 * sound_speed_m_s)) ** 2 * spread_m4
+        shares = self.signal_model.shares
+        centre_hz = float(self.frequency_hz @ shares)
+        shared_m4 = float(np.mean(middle_m2**2))
+        shift_2 = (2 * math.pi * (self.frequency_hz - centre_hz) / (2 * sound_speed_m_s)) ** 2 * shared_m4
+        return self._of(float(turn_2 @ shares) * curvature_2) + float(shift_2 @ shares) * curvature_2
+
+    def plane_waves(self, aperture: Aperture, range_m: float, *, sound_speed_m_s: float) -> float:
+        """Return the error power of plane wavefronts relative to spherical ones at one range, at most 1."""
+        return min(1.0, self.zones(aperture, max(range_m, NEAREST_M) ** -2, sound_speed_m_s=sound_speed_m_s))
+
+    def samples(self, *, n_terms: int, terms: float, limit: float, weight_limit: float, taps: float) -> float:
+        """Return the error power of 16-bit samples and weights.
+
+        Rounding moves the real and imaginary parts of samples and weights by up to half a step. The step of samples is
+        the largest magnitude in the tile, divided by ``limit``. The step of weights is the largest weight, divided by
+        ``weight_limit``.
+
+        Parameters
+        ----------
+        n_terms : int
+            Number of terms of one microphone.
+        terms : float
+            Sum of the squared weights of these terms; 1 for a single term.
+        limit, weight_limit : float
+            Largest integer values of samples and of weights.
+        taps : float
+            Sum of the squared weights of the beam-grid points of a beam; 1 without a beam grid.
+        """
+        of_samples = terms * self.signal_model.crest / limit**2 / 6
+        of_weights = n_terms / weight_limit**2 / 6
+        return self._of(taps * (of_samples + of_weights))
+
+    def nodes(self, *, n_mics: int, sum_of_terms: float, taps: float, filled: float) -> float:
+        """Return the error power of rounding beams at beam-grid points to 16 bits.
+
+        The step is 2⁻¹⁵ of the sum of all terms at full scale.
+
+        Parameters
+        ----------
+        n_mics : int
+        sum_of_terms : float
+            Sum of the magnitudes of one microphone's weights; 1 for a single weight.
+        taps : float
+            As for `samples`.
+        filled : float
+            Sum of all terms at full scale, relative to 2³¹; at most 1.
+        """
+        step_2 = self.signal_model.crest * n_mics * (sum_of_terms / filled) ** 2 / 2.0**30
+        return self._of(taps * step_2 / 6)
+
+    def filter(self, taps: NDArray[np.int16] | NDArray[np.int32]) -> float:
+        """Return the error power of noise that the decimation aliases into the band through the filter's stopband.
+
+        The integer taps of the filter are used, so the stopband includes the effect of rounding. Noise covers the whole
+        image. At image points darker than the noise, all of its power changes magnitudes.
+        """
+        settings = self._settings
+        low_hz, high_hz = matched_band_hz(settings)
+        frequency_hz, folded = self._filtered_noise(taps)
+        rate_hz = settings.signal_rate_hz
+        distance_hz = np.abs(frequency_hz - rate_hz * np.rint(frequency_hz / rate_hz))
+        outside = (frequency_hz > rate_hz / 2) & (distance_hz > low_hz) & (distance_hz < high_hz)
+        passed = float(folded[outside].sum()) * (frequency_hz[1] - frequency_hz[0]) / (high_hz - low_hz)
+        return self._everywhere(_UNLIKE * passed / self.signal_model.level)
+
+    def window(self, taps: NDArray[np.int16] | NDArray[np.int32], *, guard_s: float, imaged_s: float) -> float:
+        """Return the error power of ringing beyond a time window: it is cut off at each end, and as much wraps around.
+
+        The matched filter h rings before and after the call. At the first and the last range, the window lacks the
+        samples that h beyond the guard weights. Further inside it lacks less: the power of the cut, which extends
+        beyond the band and lets noise through, falls with the sixth power of the time.
+
+        Parameters
+        ----------
+        taps : (tap,) int16 or int32
+            Decimation filter.
+        guard_s : float
+            Time by which the window extends beyond the image and the call, at each end.
+        imaged_s : float
+            Duration of the image.
+        """
+        settings, model = self._settings, self.signal_model
+        rate_hz, call_s = settings.signal_rate_hz, settings.call.end_s
+        n_fft = scipy.fft.next_fast_len(math.ceil((2 * call_s + _GUARDS * guard_s) * rate_hz))
+        matched = matched_filter_spectrum(settings, n_fft=n_fft)
+        spectrum = np.zeros(n_fft, dtype=np.complex128)
+        spectrum[matched.first_bin : matched.first_bin + len(matched.values)] = matched.values
+        response = scipy.fft.ifft(spectrum)
+        time_s = scipy.fft.fftfreq(n_fft, 1 / n_fft) / rate_hz
+        response[(time_s <= guard_s) & (time_s >= -call_s - guard_s)] = 0
+        noise_hz, noise = self._filtered_noise(taps)
+        heard = np.interp(np.abs(scipy.fft.fftfreq(n_fft, 1 / rate_hz)), noise_hz, noise)
+        missed = float(np.abs(scipy.fft.fft(response)) ** 2 @ heard) / float(np.sum(np.abs(matched.values) ** 2))
+        inside = imaged_s / guard_s
+        mean = (1 - (1 + inside) ** -5) / (5 * inside) if inside else 1.0
+        return self._everywhere(2 * mean * missed / model.level)
+
+    def _filtered_noise(
+        self, taps: NDArray[np.int16] | NDArray[np.int32]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the power density of the noise after the decimation filter, relative to white bits, by frequency."""
+        noise = self.signal_model.noise
+        n_fft = 2 * (len(noise) - 1)
+        n_fft *= max(1, -(-8 * len(taps) // n_fft))  # The bins resolve the side lobes of the filter.
+        gain_2 = np.abs(np.fft.rfft(taps / taps.sum(dtype=np.int64), n_fft)) ** 2
+        frequency_hz = np.arange(len(gain_2)) * self._settings.recording.sample_rate_hz / n_fft
+        return frequency_hz, gain_2 * np.interp(frequency_hz, np.linspace(0, frequency_hz[-1], len(noise)), noise)
+
+    def _everywhere(self, power: float) -> float:
+        """Return the error power of independent noise in the whole image, from its power relative to the signals."""
+        power /= self.signal_model.gain
+        # The exponential approximates the mean of a Rice distribution.
+        dark = np.exp(-4 * np.sqrt(self.signal_model.places / max(power, 1e-30)))
+        return float(power * (0.5 + 0.5 * np.mean(dark)))
+
+    def arithmetic(self) -> float:
+        """Return the error power of single precision.
+
+        PCM microphones may receive the same loud sound outside the window. They then round it alike, and their errors
+        add up in a beam. The noise of PDM bits differs between microphones, so that it prevents this.
+        """
+        model = self.signal_model
+        if not self._settings.recording.is_pdm:
+            alike = effective_count(self._weights)
+            of_signals = _ARITHMETIC + _OF_SIGNALS_PCM * model.loudness
+            return of_signals / model.gain + alike * _OF_BAND_PCM * model.record_level
+        if not model.record_level:  # not measured
+            return _ARITHMETIC / model.gain
+        return (_OF_IMAGE + _OF_SIGNALS * model.loudness) / model.gain + _OF_BAND * model.record_level
+
+    def phases(self, n_bins: int) -> float:
+        """Return the error power of rounding the phase steps of a band of ``n_bins`` bins.
+
+        A step is wrong by up to half of 2⁻³² of a turn. This adds up from the middle of the band, where phases are
+        exact, to its edges.
+        """
+        return self._of(_PHASE_STEP**2 * n_bins**2 / 144)
+
+    def _of(self, power: float) -> float:
+        gain = self.signal_model.gain
+        return (0.5 if gain <= 1 else 1 - 0.5 / gain) * power / gain

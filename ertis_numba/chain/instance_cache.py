@@ -1,0 +1,42 @@
+"""Cache of a method's results that lives as long as the instance."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar, TypeVarTuple
+
+__all__ = ["cached_in_instance"]
+
+_Self = TypeVar("_Self")
+_Arguments = TypeVarTuple("_Arguments")
+_Result = TypeVar("_Result")
+
+
+def cached_in_instance(method: Callable[[_Self, *_Arguments], _Result]) -> Callable[[_Self, *_Arguments], _Result]:
+    """Return a method that computes each result once; its arguments are hashable and positional.
+
+    `functools.cache` of a bound method would refer to its instance, which then remains until the garbage collector
+    runs. `functools.cache` of the function would never free an instance.
+
+    Examples
+    --------
+    >>> from ertis_numba.chain.instance_cache import cached_in_instance
+    >>> class Squares:
+    ...     @cached_in_instance
+    ...     def of(self, number):
+    ...         print("computing")
+    ...         return number**2
+    >>> squares = Squares()
+    >>> squares.of(3), squares.of(3)
+    computing
+    (9, 9)
+    """
+    attribute = f"_results_of_{method.__name__}"
+
+    @functools.wraps(method)
+    def call(self: _Self, *arguments: *_Arguments) -> _Result:
+        results: dict[Any, _Result] = vars(self).setdefault(attribute, {})
+        if arguments not in results:
+            results[arguments] = method(self, *arguments)
+        return results[arguments]
+
+    return call

@@ -1,0 +1,97 @@
+"""Matched filter: pulse compression of signals to analytic signals."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.chain.time_window import TimeWindow
+from ertis_numba.geometry.waveform import filter_response, matched_filter_spectrum
+from ertis_numba.kernels import KernelSet, Memory
+from ertis_numba.kernels.fft import Transforms
+from ertis_numba.settings import Settings
+
+__all__ = ["Gain", "MatchedFilter", "flat_spectrum"]
+
+Gain = Callable[[NDArray[np.float64]], NDArray[np.complex128]]
+"""Function of frequencies in hertz, (bin,), that returns gains, (mic, bin) or (1, bin)."""
+
+
+class MatchedFilter:
+    """Matched filter that returns analytic signals, sampled at the output rate in several phases.
+
+    A beam is needed only at the output ranges, but its delays are much finer than their spacing. One inverse transform
+    per phase therefore computes the samples: those of phase p lie ``p / n_phases`` of a step after those of phase 0.
+    The one-sided spectrum makes the signals analytic. The filter also divides by the gain of the decimation filter,
+    which is known exactly within the band. It applies the gains of the delay and beam interpolation as well.
+
+    Parameters
+    ----------
+    settings : Settings
+    window : TimeWindow
+    kernels : KernelSet
+    memory : Memory
+    taps : (tap,) int16 or int32
+        Integer taps of the decimation filter.
+    n_mics : int
+    gain : callable
+        Function of frequencies in hertz, (bin,) float64, that returns gains, (mic, bin) or (1, bin) complex128.
+
+    Attributes
+    ----------
+    shape : (mic, phase, sample)
+        Shape of the analytic signals.
+    first_bin : int
+        First bin of the band.
+    frequency_hz : (bin,) float64
+        Frequencies of the band in hertz.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        window: TimeWindow,
+        kernels: KernelSet,
+        memory: Memory,
+        *,
+        taps: NDArray[np.int16] | NDArray[np.int32],
+        n_mics: int,
+        gain: Gain,
+    ) -> None:
+        rate_hz = settings.signal_rate_hz
+        self.first_bin, self.frequency_hz, flat = flat_spectrum(settings, taps, n_fft=window.n_fft)
+        n_phases = settings.accuracy.oversampling or 1
+        phase_s = np.arange(n_phases)[:, None] / (n_phases * settings.output_rate_hz)
+        lag_s = window.start_s - window.first_sample / rate_hz + phase_s
+        # Neither transform divides by its length. This division by the forward length supplies the missing factor.
+        shifted = flat / window.n_fft * np.exp(2j * math.pi * self.frequency_hz * lag_s)
+        self._responses = memory.table((gain(self.frequency_hz)[:, None, :] * shifted).astype(np.complex64))
+        self._kernel = kernels.multiply_and_fold
+        self.shape = (n_mics, n_phases, window.n_outputs)
+
+    def __call__(self, transforms: Transforms, out: NDArray[np.complex64], *, threads: int) -> None:
+        """Fill ``out``, (mic, phase, sample) complex64, with ``transforms`` that were planned for this array."""
+        self.fill_spectra(transforms, out, threads=threads)
+        transforms.inverse(threads=threads)
+
+    def fill_spectra(self, transforms: Transforms, out: NDArray[np.complex64], *, threads: int) -> None:
+        """Fill ``out``, (mic, phase, k) complex64, with the filtered spectra, as `MultiplyAndFold` folds them."""
+        self._kernel(transforms.forward(threads=threads), self._responses, self.first_bin, out)
+
+
+def flat_spectrum(
+    settings: Settings, taps: NDArray[np.int16] | NDArray[np.int32], *, n_fft: int
+) -> tuple[int, NDArray[np.float64], NDArray[np.complex128]]:
+    """Return the matched filter, divided by the gain of the decimation filter.
+
+    Returns
+    -------
+    first_bin : int
+    frequency_hz : (bin,) float64
+    values : (bin,) complex128
+    """
+    matched = matched_filter_spectrum(settings, n_fft=n_fft)
+    frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * settings.signal_rate_hz / n_fft
+    decimated = filter_response(taps / taps.sum(dtype=np.int64), frequency_hz / settings.recording.sample_rate_hz)
+    return matched.first_bin, frequency_hz, matched.values / decimated

@@ -1,0 +1,466 @@
+"""Predicted error, work and memory of complete plans."""
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.chain.beam_grid import FEWEST_RANGES, Aperture, BeamGrid, require_beam_grid
+from ertis_numba.chain.beamform import whole_limits
+from ertis_numba.chain.costs import Work
+from ertis_numba.chain.error_model import PARTS, ErrorModel, SignalModel
+from ertis_numba.chain.focal_zones import squared_curvature
+from ertis_numba.chain.instance_cache import cached_in_instance
+from ertis_numba.chain.interpolation_fit import DelayFit, Spectrum
+from ertis_numba.chain.phase_shifts import SHIFT_BYTES, SHIFT_TABLE_BYTES, rows_at_a_time
+from ertis_numba.chain.plan_elements import (
+    chain_taps,
+    few_delays,
+    nearest_m_of,
+    ringing_db,
+    spectrum_of,
+    zones_of,
+)
+from ertis_numba.chain.planned_streams import PlannedStreams
+from ertis_numba.chain.sensitivity import Sensitivity
+from ertis_numba.chain.stream_plan import StreamPlanner
+from ertis_numba.chain.stream_recipe import recipe_of, uses_streams
+from ertis_numba.chain.time_window import TimeWindow, time_window
+from ertis_numba.geometry import array_weights, direction_grid, effective_count, microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.waveform import matched_band_hz, matched_guard_s
+from ertis_numba.settings import Accuracy, Settings
+from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS
+
+__all__ = ["MIN_STOPBAND_ATTENUATION_DB", "TABLE_BYTES", "Delays", "ImagePlan", "Nodes", "PlanModel", "plan_of"]
+
+MIN_STOPBAND_ATTENUATION_DB = 40.0
+TABLE_BYTES = 44
+"""Bytes of a delay and a weight, including both the computed form and the form that kernels read."""
+
+_COHERENCE_ERROR = 10**-4.8
+"""Error power of the coherence factor from streams. Finer interpolation hardly reduces it.
+
+Echoes of `data/synthetic/reflectors.h5` had −48.3 to −49.2 dB with plans for budgets from −40 to −68 dB.
+"""
+_MAX_APERTURES = 8  # Arrays with their directions.
+_MAX_FITS = 288  # Four times the number of fits in one search.
+
+
+class ImagePlan(NamedTuple):
+    """Complete plan: a value for every accuracy setting."""
+
+    precision: str
+    n_phases: int
+    delay_taps: int
+    beam_taps: int
+    density: float
+    stopband_attenuation_db: float
+    focal_zones: int
+
+
+@dataclass(frozen=True, slots=True)
+class Nodes:
+    """Predicted properties of a beam grid: its size, its error, and the sum of a beam's squared weights.
+
+    ``grid`` is the estimate from a measured signal model, or None.
+    """
+
+    count: int
+    n_pairs: int
+    error: float
+    squares: float
+    grid: BeamGrid | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Delays:
+    """Predicted properties of a delay interpolation."""
+
+    n_taps: int
+    error: float
+    sum_of_weights: float
+    squares: float
+
+
+class _Beams(NamedTuple):
+    """Determines a beam grid and its errors; equal if its elements are, arrays by identity."""
+
+    aperture: Aperture
+    spectrum: Spectrum
+    n_taps: int
+    density: float
+    high_hz: float
+    sound_speed_m_s: float
+    nearest_m: float
+
+
+class PlanModel:
+    """Predictions about complete plans for one kind of measurement.
+
+    Parameters
+    ----------
+    settings : Settings
+    signal_model : SignalModel or None
+        Measured signal model; None for safe values, as in `ErrorModel`.
+    tile_ranges : int
+        Number of ranges in a tile of 16-bit samples.
+
+    Attributes
+    ----------
+    settings : Settings
+    errors : ErrorModel
+    aperture : Aperture
+    window : TimeWindow
+    n_mics, n_directions : int
+    """
+
+    def __init__(self, settings: Settings, signal_model: SignalModel | None, *, tile_ranges: int) -> None:
+        self.settings = settings
+        self._tile_ranges = tile_ranges
+        self.errors = ErrorModel(settings, signal_model)
+        self._spectrum = spectrum_of(settings)
+        layout, grid = microphones(settings.array), direction_grid(settings.processing)
+        self.n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
+        self._own_s = layout.delay_s[layout.enabled]
+        self.aperture = _aperture_of(
+            layout.enabled_positions_m.tobytes(),
+            unit_vectors(grid.azimuth_rad, grid.elevation_rad).tobytes(),
+            settings.processing.level_directions,
+        )
+        self._weights = array_weights(settings)
+        amplitudes = self._weights / layout.gain[layout.enabled]
+        self._spread = float(np.max(amplitudes**2) / np.mean(amplitudes**2))  # The largest amplitude sets the scale.
+        self._n_effective = effective_count(self._weights)
+        self.n_directions = len(grid)
+        self._speed_m_s = sound_speed_m_s(settings.air)
+        self._nearest_m = nearest_m_of(settings)
+        self.window = time_window(settings, largest_delay_s=self._reach_s(), n_taps=1)
+        if settings.accuracy.beam_taps:
+            require_beam_grid(self.aperture, len(self.window.range_m))
+        recipe = recipe_of(settings.processing)
+        self.has_streams = settings.processing.is_adaptive and recipe is not None
+        self._stream_planner = (
+            StreamPlanner(
+                settings,
+                recipe,
+                self._spectrum,
+                self.aperture,
+                sound_speed_m_s=self._speed_m_s,
+                nearest_m=self._nearest_m,
+            )
+            if recipe is not None
+            else None
+        )
+
+    def parts(self, plan: ImagePlan, *, noise_only: bool = False) -> dict[str, float]:
+        """Return the error power of each step of a plan, relative to the exact image of delay-and-sum.
+
+        Errors of streams are those of the image, divided by the safe sensitivity of the beamformer. They are larger for
+        images of noise only; the other errors are the same.
+        """
+        if self.uses_streams(plan):
+            return self._stream_parts(plan, noise_only=noise_only)
+        parts = self._common_parts(plan)
+        if not plan.delay_taps:
+            parts["arithmetic"] += self.errors.phases(self._n_bins(self._windows(plan.stopband_attenuation_db)))
+            return parts
+        delays = self.delays(plan.n_phases, plan.delay_taps)
+        nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
+        parts["delays"] = delays.error
+        if nodes is not None:
+            parts["beams"] = nodes.error
+            parts["delays"] = self._delays_between(nodes, plan, delays.error)
+        if plan.precision == "int16":
+            parts["samples"] = self._spread * self._whole_numbers(delays, None if nodes is None else nodes.squares)
+        return parts
+
+    def _common_parts(self, plan: ImagePlan) -> dict[str, float]:
+        """Return the error power of the steps that every plan has."""
+        parts = dict.fromkeys(PARTS, 0.0)
+        parts["filter"], parts["window"] = self._band_errors(plan.stopband_attenuation_db)
+        parts["arithmetic"] = self.errors.arithmetic()
+        if self.settings.processing.wavefront == "spherical":
+            parts["zones"] = self.zone_error(plan.focal_zones)
+        return parts
+
+    @cached_in_instance
+    def _band_errors(self, stopband_attenuation_db: float) -> tuple[float, float]:
+        """Return the error powers of the decimation filter and of the ringing that its plan's window cuts off."""
+        taps, filter_error = self.filter(stopband_attenuation_db)
+        guard_s = matched_guard_s(self.settings, down_db=self._ringing_db(stopband_attenuation_db))
+        imaged_s = len(self.window.range_m) / self.settings.output_rate_hz
+        return filter_error, self.errors.window(taps, guard_s=guard_s, imaged_s=imaged_s)
+
+    def uses_streams(self, plan: ImagePlan) -> bool:
+        """Return True if a plan computes an adaptive beamformer from streams."""
+        accuracy = Accuracy(precision=plan.precision, delay_taps=plan.delay_taps, beam_taps=plan.beam_taps)  # type: ignore[arg-type]
+        return uses_streams(self.settings.processing, accuracy)
+
+    def _stream_parts(self, plan: ImagePlan, *, noise_only: bool) -> dict[str, float]:
+        assert self._stream_planner is not None  # noqa: S101
+        planned, kind = self.streams(plan), "noise" if noise_only else "echoes"
+        linear = Sensitivity.of(self.settings.processing, self.n_mics).linear
+        parts = self._common_parts(plan)
+        amplified = 1.0
+        for each in planned.streams:
+            squares = None
+            if each.grid is not None:
+                squares = each.grid.squares
+                parts["beams"] += getattr(each.grid.errors, kind) / linear
+                amplified = max(amplified, squares)
+            if plan.precision == "int16":
+                weights = np.abs(each.fit.weights(each.fit.fractions))
+                delays = Delays(
+                    n_taps=each.fit.n_taps,
+                    error=0.0,
+                    sum_of_weights=float(np.max(weights.sum(axis=1))),
+                    squares=float(np.mean(np.sum(weights**2, axis=1))),
+                )
+                parts["samples"] += each.shares.noise * self._whole_numbers(delays, squares) / linear
+        parts["delays"] = getattr(planned.delays, kind) * amplified / linear
+        if self.settings.processing.weighting != "none":
+            parts["samples"] += _COHERENCE_ERROR / linear
+        return parts
+
+    @cached_in_instance
+    def streams(self, plan: ImagePlan) -> PlannedStreams:
+        """Return the streams of a plan."""
+        assert self._stream_planner is not None  # noqa: S101
+        delays_s = self._few_delays(1 / (self.settings.output_rate_hz * plan.n_phases))
+        return self._stream_planner.plan(plan.n_phases, plan.delay_taps, plan.beam_taps, plan.density, delays_s)
+
+    def _delays_between(self, nodes: Nodes, plan: ImagePlan, error: float) -> float:
+        """Return the error power of delays in beams that are interpolated between beam-grid points.
+
+        The interpolation averages errors that differ between grid points. These are images of the spectrum, waves of
+        other frequencies, which a fine grid suppresses. Without a measurement, the error is assumed to remain. Large
+        weights that nearly cancel each other add up the errors of their grid points.
+        """
+        step_s = 1 / (self.settings.output_rate_hz * plan.n_phases)
+        fit, _ = _fitted(self._spectrum, plan.delay_taps, step_s)
+        if nodes.grid is None or self._few_delays(step_s) is not None:
+            return error * max(1.0, nodes.squares)
+        passed = sum(share * nodes.grid.passed(order / step_s) for order, share in fit.images.items())
+        return self.errors.delays(fit, n_mics=self._n_effective, passed=np.asarray(passed))
+
+    def work(self, plan: ImagePlan) -> Work:
+        """Return the work of a plan, from which its time is predicted."""
+        streamed = self.uses_streams(plan)
+        nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps and not streamed else None
+        n_beams, n_terms = self.n_directions if nodes is None else nodes.count, self.n_mics * plan.delay_taps
+        n_pairs = 0 if nodes is None else nodes.n_pairs
+        if streamed:
+            streams = self.streams(plan).streams
+            n_terms = self.n_mics
+            n_beams = sum(
+                (each.grid.n_points if each.grid else self.n_directions) * each.fit.n_taps for each in streams
+            )
+            n_pairs = sum(each.grid.n_pairs for each in streams if each.grid)
+        taps, _ = self.filter(plan.stopband_attenuation_db)
+        # Phase shifts take a transform per direction, so that its length matters.
+        window = self.window if plan.delay_taps else self._windows(plan.stopband_attenuation_db)
+        tile = self._tile_ranges if plan.precision == "int16" else FEWEST_RANGES
+        return Work(
+            n_mics=self.n_mics,
+            n_words=self._n_words,
+            n_samples=window.n_samples,
+            n_taps=len(taps),
+            tap_bits=8 * taps.dtype.itemsize,
+            n_fft=window.n_fft,
+            n_bins=self._n_bins(window),
+            n_phases=plan.n_phases,
+            n_outputs=window.n_outputs,
+            n_directions=self.n_directions,
+            n_ranges=len(self.window.range_m),
+            n_computed=tile * sum(-(-(stop - first) // tile) for first, stop, _ in self._zones(plan.focal_zones)),
+            n_beams=n_beams,
+            n_terms=n_terms,
+            n_pairs=n_pairs,
+            precision=plan.precision,
+            n_shifted=0 if plan.delay_taps else self.n_directions * len(self._zones(plan.focal_zones)),
+            n_streams=len(self.streams(plan).streams) if streamed else 0,
+            term_cost=1.0 if streamed else self._kernel_cost(),
+        )
+
+    def _kernel_cost(self) -> float:
+        """Return the time of the kernels of all microphones, relative to delay-and-sum in single precision."""
+        processing = self.settings.processing
+        beamformer = BEAMFORMERS[processing.beamformer]
+        return beamformer.cost(*beamformer.values(processing)) + WEIGHTINGS[processing.weighting].cost
+
+    def n_bytes(self, plan: ImagePlan) -> int:
+        """Return the memory of a plan's signals and delays, in bytes."""
+        signals = 16 * self.n_mics * plan.n_phases * self.window.n_outputs
+        if self.uses_streams(plan):
+            streams = self.streams(plan).streams
+            terms = sum((each.grid.n_points if each.grid else self.n_directions) * each.fit.n_taps for each in streams)
+            n_zones = len(self._zones(plan.focal_zones))
+            return TABLE_BYTES * terms * self.n_mics * n_zones + signals * (2 + len(streams)) // 2
+        if not plan.delay_taps:
+            n_delays = self.n_directions * self.n_mics
+            n_rows = rows_at_a_time(self.n_directions, self.window.n_outputs) + self.n_mics
+            n_zones = len(self._zones(plan.focal_zones))
+            return n_delays * (SHIFT_TABLE_BYTES + SHIFT_BYTES * n_zones) + 8 * n_rows * self.window.n_outputs
+        nodes = self.nodes(plan.beam_taps, plan.density) if plan.beam_taps else None
+        n_beams = self.n_directions if nodes is None else nodes.count
+        table = TABLE_BYTES * n_beams * self.n_mics * plan.delay_taps * len(self._zones(plan.focal_zones))
+        return table + signals
+
+    def zone_error(self, count: int) -> float:
+        """Return the error power of a given number of focal zones."""
+        curvature_2 = squared_curvature(self.window.range_m, self._zones(count))
+        return self._zone_scale * curvature_2
+
+    @cached_in_instance
+    def _zones(self, count: int) -> list[tuple[int, int, float]]:
+        return zones_of(self.settings.replace(accuracy=self.settings.accuracy.replace(focal_zones=count)))
+
+    @functools.cached_property
+    def _zone_scale(self) -> float:
+        return self.errors.zones(self.aperture, 1.0, sound_speed_m_s=self._speed_m_s)
+
+    @cached_in_instance
+    def delays(self, n_phases: int, n_taps: int) -> Delays:
+        """Return the prediction for an interpolation of delays."""
+        step_s = 1 / (self.settings.output_rate_hz * n_phases)
+        fit, weights = _fitted(self._spectrum, n_taps, step_s)
+        delays_s = self._few_delays(step_s)
+        fractions = None if delays_s is None else fit.split(delays_s)[1]
+        return Delays(
+            n_taps=fit.n_taps,
+            error=self.errors.delays(fit, n_mics=self._n_effective, fractions=fractions),
+            sum_of_weights=float(np.max(weights.sum(axis=1))),
+            squares=float(np.mean(np.sum(weights**2, axis=1))),
+        )
+
+    def _few_delays(self, step_s: float) -> NDArray[np.float64] | None:
+        return few_delays(self.aperture, self._own_s, self._weights, step_s, sound_speed_m_s=self._speed_m_s)
+
+    def count_grid_points(self, n_taps: int, density: float) -> int:
+        """Return the number of beam-grid points."""
+        return _grid_points(self._beams(n_taps, density))
+
+    def _beams(self, n_taps: int, density: float) -> _Beams:
+        high_hz = self.settings.call.high_frequency_hz
+        return _Beams(self.aperture, self._spectrum, n_taps, density, high_hz, self._speed_m_s, self._nearest_m)
+
+    @cached_in_instance
+    def nodes(self, n_taps: int, density: float) -> Nodes:
+        """Return the prediction for a beam grid."""
+        require_beam_grid(self.aperture, len(self.window.range_m))
+        beams = self._beams(n_taps, density)
+        if self.errors.needs_steering and math.isinf(self._nearest_m):
+            grid = _estimated(beams)
+            error, squares = self.errors.beams(grid), grid.squares
+        else:
+            grid = None
+            power, squares = _estimated_errors(beams)
+            error = self.errors.uniform_beams(power)
+        n_pairs = n_taps**self.aperture.n_axes // 2
+        return Nodes(self.count_grid_points(n_taps, density), n_pairs, error, squares, grid)
+
+    @cached_in_instance
+    def filter(self, stopband_attenuation_db: float) -> tuple[NDArray[Any], float]:
+        """Return the taps of a decimation filter, and their error."""
+        try:
+            taps = chain_taps(self.settings.replace(accuracy=Accuracy(stopband_attenuation_db=stopband_attenuation_db)))
+        except ArgumentError:
+            if (
+                self.settings.accuracy.stopband_attenuation_db is not None
+                or stopband_attenuation_db == MIN_STOPBAND_ATTENUATION_DB
+            ):
+                raise
+            return np.ones(1, dtype=np.int16), math.inf
+        return taps, self.errors.filter(taps)
+
+    def _whole_numbers(self, delays: Delays, node_squares: float | None) -> float:
+        """Return the error power of 16 bits; ``node_squares`` is that of `Nodes`, None without a beam grid."""
+        weight_limit, limit = whole_limits(self.n_mics * delays.sum_of_weights)
+        squares = 1.0 if node_squares is None else node_squares
+        error = self.errors.samples(
+            n_terms=delays.n_taps, terms=delays.squares, limit=limit, weight_limit=weight_limit, taps=squares
+        )
+        if node_squares is not None:
+            filled = limit * weight_limit * self.n_mics * delays.sum_of_weights / 2**31
+            error += self.errors.nodes(
+                n_mics=self.n_mics, sum_of_terms=delays.sum_of_weights, taps=squares, filled=filled
+            )
+        return error
+
+    def _n_bins(self, window: TimeWindow) -> int:
+        low_hz, high_hz = matched_band_hz(self.settings)
+        return math.ceil((high_hz - low_hz) * window.n_fft / self.settings.signal_rate_hz)
+
+    @cached_in_instance
+    def _windows(self, stopband_attenuation_db: float) -> TimeWindow:
+        """Return the window of a plan, whose ringing depends on its stopband attenuation."""
+        ringing = self._ringing_db(stopband_attenuation_db)
+        return time_window(self.settings, largest_delay_s=self._reach_s(), n_taps=1, ringing_db=ringing)
+
+    def _ringing_db(self, stopband_attenuation_db: float) -> float:
+        accuracy = self.settings.accuracy.replace(stopband_attenuation_db=stopband_attenuation_db)
+        return ringing_db(self.settings.replace(accuracy=accuracy))
+
+    def _reach_s(self) -> float:
+        positions_m = self.aperture.square_m2
+        return math.sqrt(float(np.max(positions_m, initial=0.0))) / self._speed_m_s
+
+
+@functools.lru_cache(maxsize=_MAX_FITS)
+def _fitted(spectrum: Spectrum, n_taps: int, step_s: float) -> tuple[DelayFit, NDArray[np.float64]]:
+    """Return a fit and the magnitudes of its weights, cached because fits would dominate the time of a planner."""
+    fit = DelayFit(n_taps, step_s, spectrum)
+    return fit, np.abs(fit.weights(fit.fractions))
+
+
+def plan_of(accuracy: Accuracy) -> ImagePlan:
+    """Return accuracy settings as a plan; missing values get their defaults."""
+    return ImagePlan(
+        accuracy.precision,
+        accuracy.oversampling or 1,
+        1 if accuracy.delay_taps is None else accuracy.delay_taps,
+        accuracy.beam_taps or 0,
+        accuracy.beam_density or 2.0,
+        accuracy.stopband_attenuation_db or 60.0,
+        accuracy.focal_zones or 1,
+    )
+
+
+@functools.lru_cache(maxsize=_MAX_APERTURES)
+def _aperture_of(positions_m: bytes, directions: bytes, is_turned: bool) -> Aperture:  # noqa: FBT001  cached
+    """Return the aperture, as the same object for the same positions and directions, so its errors can be cached."""
+    given = (np.frombuffer(values).reshape(-1, 3) for values in (positions_m, directions))
+    return Aperture.of(*given, is_turned=is_turned)
+
+
+@functools.lru_cache(maxsize=_MAX_FITS)
+def _grid_points(beams: _Beams) -> int:
+    """Return the number of beam-grid points, cached because it is the same for many pipelines."""
+    aperture = beams.aperture
+    spacing = aperture.spacing(beams.density, high_hz=beams.high_hz, sound_speed_m_s=beams.sound_speed_m_s)
+    return aperture.count_grid_points(spacing, beams.n_taps)
+
+
+@functools.lru_cache(maxsize=_MAX_FITS)
+def _estimated_errors(beams: _Beams) -> tuple[NDArray[np.float64], float]:
+    """Return the errors and the squares of a beam grid, cached because they dominate the time of a planner."""
+    nodes = _estimated(beams)
+    return nodes.errors, nodes.squares
+
+
+def _estimated(beams: _Beams) -> BeamGrid:
+    return BeamGrid(
+        beams.aperture,
+        beams.spectrum,
+        n_taps=beams.n_taps,
+        density=beams.density,
+        high_hz=beams.high_hz,
+        sound_speed_m_s=beams.sound_speed_m_s,
+        estimate=True,
+        nearest_m=beams.nearest_m,
+    )

@@ -1,0 +1,7 @@
+"""Capture of measurements from sensors into a journal."""
+
+from ertis_numba.devices.capture.counts import CaptureCounts
+from ertis_numba.devices.capture.session import CaptureSession, SettingsChange
+from ertis_numba.devices.capture.sink import MeasurementSink
+
+__all__ = ["CaptureCounts", "CaptureSession", "MeasurementSink", "SettingsChange"]

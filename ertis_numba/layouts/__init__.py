@@ -1,1 +1,0 @@
-"""Positions of the microphones of known arrays, as data files."""
