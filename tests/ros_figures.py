@@ -19,7 +19,7 @@ import numpy as np
 from ertis_bench import machine, markdown
 
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
-from ertis_numba.interop.ros import Participant, RosPublisher
+from ertis_numba.ros import Participant, RosPublisher
 from ertis_numba.settings import Settings
 from tests.journals import ENVIRONMENT
 

@@ -14,7 +14,7 @@ from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.geometry import Grid
 from ertis_numba.interop import export
-from ertis_numba.interop.ros import RosPublisher
+from ertis_numba.ros import RosPublisher
 from tests.test_export_points import images
 from tests.test_mapping import UNTURNED, views
 

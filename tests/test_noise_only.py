@@ -15,8 +15,8 @@ from ertis_cli.main import cli
 import ertis_numba as ertis
 from ertis_numba.analysis.noise import echo_floor
 from ertis_numba.fusion.rig import Emitters
-from ertis_numba.interop.ros.fused_points import FusedImages
 from ertis_numba.mapping.coverage import heard_m
+from ertis_numba.ros.fused_points import FusedImages
 from ertis_numba.settings import Recording
 from ertis_numba.storage import write_recording
 from tests.small_platforms import HEIGHT_M, RATE_HZ, images_of, mounted, rendered, settings_of

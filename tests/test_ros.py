@@ -16,12 +16,12 @@ from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.devices.emulator import Emulator
 from ertis_numba.frames import Stamp
-from ertis_numba.interop.ros import Participant, PublishingSettings, RosPublisher, interfaces
-from ertis_numba.interop.ros.diagnostics import diagnostics_message
 from ertis_numba.interop.ros_definitions import encoder
 from ertis_numba.interop.ros_messages import MESSAGES, ImageMessages, points_message
 from ertis_numba.interop.scans import scan_message
 from ertis_numba.network.status import SensorStatus, Status
+from ertis_numba.ros import Participant, PublishingSettings, RosPublisher, interfaces
+from ertis_numba.ros.diagnostics import diagnostics_message
 from ertis_numba.storage import open_recording, write_energyscapes, write_recording
 from tests.files import image
 from tests.journals import ENVIRONMENT

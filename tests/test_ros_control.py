@@ -11,9 +11,9 @@ from ertis_cli.main import cli
 
 from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.base.errors import ArgumentError, SettingsError
-from ertis_numba.interop.ros import Participant, PublishingSettings, RosPublisher, WatchedSettings
 from ertis_numba.interop.ros_messages import MESSAGES, points_message
 from ertis_numba.interop.scans import scan_message
+from ertis_numba.ros import Participant, PublishingSettings, RosPublisher, WatchedSettings
 from ertis_numba.storage import write_energyscapes
 from tests.journals import ENVIRONMENT
 from tests.pages import page

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
-from ertis_numba.interop.ros import Participant, PublishingSettings, RosPublisher
 from ertis_numba.network.central_node import Archive
 from ertis_numba.pipeline import Pipeline
+from ertis_numba.ros import Participant, PublishingSettings, RosPublisher
 from ertis_numba.settings import Processing, Settings
 from ertis_numba.simulation import Scene, Sensor, Wall
 from ertis_numba.simulation.render import render

@@ -7,10 +7,10 @@ import pytest
 
 from ertis_numba.frames import PointCloud, Stamp
 from ertis_numba.fusion import Fuser
-from ertis_numba.interop.ros import Participant, PublishingSettings, RosPublisher
-from ertis_numba.interop.ros.fused_points import FusedImages, FusedPoints, joined
 from ertis_numba.interop.ros_messages import MESSAGES, points_message
 from ertis_numba.interop.scans import reflectors_ahead, scan_message
+from ertis_numba.ros import Participant, PublishingSettings, RosPublisher
+from ertis_numba.ros.fused_points import FusedImages, FusedPoints, joined
 from ertis_numba.settings import Settings
 from tests.ros_topics import DOMAIN, await_subscribers, subscribed
 from tests.test_ros import equal, stamped

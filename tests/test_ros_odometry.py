@@ -10,10 +10,10 @@ from ertis_cli.main import cli
 
 from ertis_numba.base.errors import DataError
 from ertis_numba.frames import PointCloud, Stamp
-from ertis_numba.interop.ros import Participant, PublishingSettings, RosPublisher
 from ertis_numba.interop.ros_messages import odometry_message, odometry_transform
 from ertis_numba.motion import EgoVelocity, PlanarPose
 from ertis_numba.motion.live import LiveOdometry
+from ertis_numba.ros import Participant, PublishingSettings, RosPublisher
 from ertis_numba.settings import Settings
 from ertis_numba.storage import write_energyscapes
 from tests.publishing import Publisher, end_when, results_of

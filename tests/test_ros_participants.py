@@ -14,8 +14,8 @@ import pytest
 
 from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.frames import Stamp
-from ertis_numba.interop.ros import Participant, RosPublisher
 from ertis_numba.interop.ros_messages import MESSAGES
+from ertis_numba.ros import Participant, RosPublisher
 from tests.files import image
 from tests.journals import ENVIRONMENT
 from tests.ros_topics import DOMAIN, await_subscribers, subscribed

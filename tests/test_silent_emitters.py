@@ -10,7 +10,7 @@ from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba.fusion.emissions import EmissionCounts, cheapest, doubted, silent_one, suspect
-from ertis_numba.interop.ros.fused_points import FusedImages
+from ertis_numba.ros.fused_points import FusedImages
 from ertis_numba.simulation import load_scene
 from ertis_numba.simulation.render import render
 from ertis_numba.storage import write_recording

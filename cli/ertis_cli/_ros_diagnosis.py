@@ -19,8 +19,8 @@ _CLASSES: Final = Path("/sys/class/net")
 def ros_findings(domain: int | None, interface: str) -> Iterator[InstallationFinding]:
     """Yield findings about packages, environment, interface, and other programs in the domain."""
     from ertis_numba.base.errors import ArgumentError, DeviceError
-    from ertis_numba.interop.ros import Participant
-    from ertis_numba.interop.ros.discovery import discover
+    from ertis_numba.ros import Participant
+    from ertis_numba.ros.discovery import discover
 
     yield from _environment()
     yield from _interface(interface)

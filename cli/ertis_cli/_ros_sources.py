@@ -10,9 +10,9 @@ from ertis_cli._sensors import ConfiguredSensors, named_sensors, opened_sensors,
 from ertis_cli._stop_signals import Signals
 
 if TYPE_CHECKING:
-    from ertis_numba.interop.ros import RosPublisher
     from ertis_numba.journal import JournalEntry
     from ertis_numba.network.keys import ClientKeys
+    from ertis_numba.ros import RosPublisher
     from ertis_numba.settings import Settings
 
 __all__ = ["publish_file", "publish_node", "publish_ports"]

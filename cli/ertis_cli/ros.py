@@ -18,8 +18,8 @@ from ertis_cli._stop_signals import stopped_by_signals
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ertis_numba.interop.ros import RosPublisher
-    from ertis_numba.interop.ros.publishing_settings import PublishingSettings, WatchedSettings
+    from ertis_numba.ros import RosPublisher
+    from ertis_numba.ros.publishing_settings import PublishingSettings, WatchedSettings
 
 __all__ = ["ros"]
 
@@ -209,7 +209,7 @@ def ros(
     watched, publishing = _publishing(
         control, min_level_db=min_level, floor_dbfs=floor_dbfs, max_rate_hz=dict(max_rates), speed=rate
     )
-    from ertis_numba.interop.ros import Participant, RosPublisher
+    from ertis_numba.ros import Participant, RosPublisher
 
     chosen = topics or ("points", "scan")
     end_s = math.inf if duration is None else time.monotonic() + duration
@@ -302,7 +302,7 @@ class _Control:
 
 def _publishing(control: Path | None, **given: Any) -> "tuple[_Control | None, PublishingSettings]":
     """Return the control file and its settings, or those of the options."""
-    from ertis_numba.interop.ros.publishing_settings import PublishingSettings, WatchedSettings
+    from ertis_numba.ros.publishing_settings import PublishingSettings, WatchedSettings
 
     if control is None:
         return None, PublishingSettings(**given)

@@ -8,7 +8,6 @@ HDF5 can crash its process when a disk fails (h5py issue 914); a separate proces
 run again at any time: the recording is the same.
 """
 
-import sys
 from collections.abc import Callable, Container, Iterable, Iterator
 from itertools import zip_longest
 from pathlib import Path
@@ -348,9 +347,3 @@ def _summary(
         n_without_pose,
         pose_damage,
     )
-
-
-if __name__ == "__main__":
-    from ertis_numba.storage.sealing_process import main
-
-    sys.exit(main())

@@ -7,10 +7,10 @@ from typing import Any
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.interop._mountings import Mounting
-from ertis_numba.interop.ros.participant import Topic
 from ertis_numba.interop.ros_messages import odometry_message, odometry_transform
 from ertis_numba.motion.live import LiveOdometry
 from ertis_numba.network.pulse_queue import PulseQueue
+from ertis_numba.ros.participant import Topic
 
 __all__ = ["OdometryPublisher"]
 

@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 from typing import Any, Final
 
-from ertis_numba.interop.ros.participant import Participant
+from ertis_numba.ros.participant import Participant
 
 __all__ = ["FoundSubscriber", "discover"]
 

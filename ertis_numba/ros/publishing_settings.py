@@ -36,7 +36,7 @@ class PublishingSettings(TomlDocument, frozen=True, kw_only=True):
 
     Examples
     --------
-    >>> from ertis_numba.interop.ros import PublishingSettings
+    >>> from ertis_numba.ros import PublishingSettings
     >>> PublishingSettings.from_toml("range_m = [0.5, 3]").range_m
     (0.5, 3.0)
     """

@@ -13,11 +13,6 @@ from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.interop._mountings import PLATFORM, Mounting, validated
-from ertis_numba.interop.ros.diagnostics import diagnostics_message
-from ertis_numba.interop.ros.fused_points import LOCAL_FRAME, FusedImages, FusedPoints
-from ertis_numba.interop.ros.odometry_publisher import OdometryPublisher
-from ertis_numba.interop.ros.participant import Participant, Topic
-from ertis_numba.interop.ros.publishing_settings import PublishingSettings
 from ertis_numba.interop.ros_messages import (
     MESSAGES,
     ImageMessages,
@@ -29,6 +24,11 @@ from ertis_numba.interop.ros_messages import (
 )
 from ertis_numba.interop.scans import reflectors_ahead, scan_message
 from ertis_numba.network.status import Status
+from ertis_numba.ros.diagnostics import diagnostics_message
+from ertis_numba.ros.fused_points import LOCAL_FRAME, FusedImages, FusedPoints
+from ertis_numba.ros.odometry_publisher import OdometryPublisher
+from ertis_numba.ros.participant import Participant, Topic
+from ertis_numba.ros.publishing_settings import PublishingSettings
 
 __all__ = ["RosPublisher"]
 
@@ -89,7 +89,7 @@ class RosPublisher:
     --------
     Publish the points and the scans of a recording, on this machine only::
 
-        from ertis_numba.interop.ros import Participant, RosPublisher
+        from ertis_numba.ros import Participant, RosPublisher
 
         with ertis.open_recording("reflectors.h5") as recording, Participant() as participant:
             pipeline, ros = ertis.Pipeline(recording.settings), RosPublisher(participant)

@@ -1,7 +1,0 @@
-"""Live participant of a ROS 2 system, on machines with and without ROS."""
-
-from ertis_numba.interop.ros.participant import Participant, Topic, interfaces
-from ertis_numba.interop.ros.publisher import RosPublisher
-from ertis_numba.interop.ros.publishing_settings import PublishingSettings, WatchedSettings
-
-__all__ = ["Participant", "PublishingSettings", "RosPublisher", "Topic", "WatchedSettings", "interfaces"]
