@@ -254,7 +254,7 @@ def test_sealing_follows_no_link(tmp_path, name):
 
 def test_sealing_runs_in_its_own_process(tmp_path):
     path, _ = two_sensors(tmp_path)
-    code = "import runpy; runpy.run_module('ertis_numba.storage.sealing', run_name='__main__')"
+    code = "import runpy; runpy.run_module('ertis_numba.storage.sealing_process', run_name='__main__')"
     done = python(code, path, "--json")
     assert (done.returncode, done.stderr) == (0, "")
     *progress, result = map(json.loads, done.stdout.splitlines())
