@@ -12,6 +12,7 @@ from numba import njit
 
 import ertis_numba as ertis
 from ertis_numba.frames import Measurement
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Accuracy, Array, Processing, Recording, Settings
 
 RATE_HZ, N_SAMPLES = 450_000.0, 4_096
@@ -99,7 +100,7 @@ class Draws:
         layout = ertis.geometry.microphones(settings.array)
         self.positions_m, self.enabled = layout.enabled_positions_m, np.asarray(layout.enabled)
         self.extract = ertis.PointExtractor(self.settings, self.pipeline.grid)
-        self.speed_m_s = ertis.air.sound_speed_m_s(settings.air)
+        self.speed_m_s = sound_speed_m_s(settings.air)
         rng = np.random.default_rng(99)
         noise = self.image(rng.standard_normal((len(self.positions_m), self.n_samples)))
         self.noise = math.sqrt(np.mean(noise.amplitude.astype(float) ** 2))

@@ -11,7 +11,7 @@ import ertis_numba as ertis
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import is_passive
 from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
-from ertis_numba.geometry.air import transmission_loss_db
+from ertis_numba.geometry.air import sound_speed_m_s, transmission_loss_db
 from ertis_numba.passive import AcousticCamera, CrossSpectrum, find_bearings, octave_bands
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.methods import METHODS
@@ -54,7 +54,7 @@ def sound(settings, sources, *, noise=0.0, seed=0):
     spectrum = np.zeros((len(layout.enabled_positions_m), n // 2 + 1), complex)
     for azimuth_deg, rms in sources:
         direction = unit_vectors(np.radians([azimuth_deg]), np.zeros(1))
-        speed = ertis.air.sound_speed_m_s(settings.air)
+        speed = sound_speed_m_s(settings.air)
         delay_s = far_field_delays(layout.enabled_positions_m, direction, sound_speed_m_s=speed)[0]
         source = np.fft.rfft(rms * random.standard_normal(n))
         spectrum += source * np.exp(-2j * np.pi * frequency_hz * delay_s[:, None])
@@ -83,7 +83,7 @@ def waves_of(camera):
     settings = camera.settings
     directions = unit_vectors(camera.grid.azimuth_rad, camera.grid.elevation_rad)
     positions_m = microphones(settings.array).enabled_positions_m
-    speed = ertis.air.sound_speed_m_s(settings.air)
+    speed = sound_speed_m_s(settings.air)
     delay_s = far_field_delays(positions_m, directions, sound_speed_m_s=speed)
     return np.exp(-2j * np.pi * camera.frequency_hz[:, None, None] * delay_s.T)
 

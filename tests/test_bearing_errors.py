@@ -6,6 +6,7 @@ import scipy
 
 import ertis_numba as ertis
 from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.passive import AcousticCamera, BearingFinder
 from ertis_numba.passive.likelihood import moved, tangents
 
@@ -37,7 +38,7 @@ def heard(settings, sources, noise, random):
     """
     places_m = microphones(settings.array).enabled_positions_m
     places_m = places_m - places_m.mean(axis=0)
-    n, speed_m_s = 4 * N_SAMPLES, ertis.air.sound_speed_m_s(settings.air)
+    n, speed_m_s = 4 * N_SAMPLES, sound_speed_m_s(settings.air)
     frequency_hz, time_s = np.fft.rfftfreq(n, 1 / RATE_HZ), np.arange(N_SAMPLES) / RATE_HZ
     out = noise * random.standard_normal((len(places_m), N_SAMPLES))
     for direction, rms, (low_hz, high_hz) in sources:

@@ -10,6 +10,7 @@ from ertis_bench.passive import bearings as passive_bearings
 import ertis_numba as ertis
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.geometry import microphones, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.passive import AcousticCamera, BearingFinder, find_bearings
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.detection_law import LAGS, exceedance, independent_samples
@@ -186,7 +187,7 @@ def diffuse_sound(settings, share, seed):
     """Return noise of which a share is a diffuse field, and the rest that of each microphone."""
     recording, places_m = settings.recording, microphones(settings.array).enabled_positions_m
     frequency_hz = np.fft.rfftfreq(recording.n_samples, 1 / recording.sample_rate_hz)[:, None, None]
-    apart_s = np.linalg.norm(places_m[:, None] - places_m, axis=-1) / ertis.air.sound_speed_m_s(settings.air)
+    apart_s = np.linalg.norm(places_m[:, None] - places_m, axis=-1) / sound_speed_m_s(settings.air)
     coherence = share * np.sinc(2 * frequency_hz * apart_s) + (1 - share) * np.eye(len(places_m))
     drawn = np.random.default_rng(seed).standard_normal((*coherence.shape[:2], 2)) @ np.array([1, 1j])
     spectra = (np.linalg.cholesky(coherence) @ drawn[:, :, None])[:, :, 0]

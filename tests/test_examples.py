@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
+from ertis_numba.geometry.air import transmission_loss_db
 from ertis_numba.network.subscriber import Subscriber
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Processing
@@ -310,7 +311,7 @@ def test_leak_example_states_the_level_at_the_array_without_a_distance(leak_reco
         find_a_leak.main(*arguments)
         levels.append(re.fullmatch(r"([\d.]+) (.*) from 40 to 80 kHz", capsys.readouterr().out.splitlines()[-1]))
     assert [level[2] for level in levels] == ["dB re 20 µPa", "dB re 20 µPa at 1 m"]
-    loss_db = ertis.air.transmission_loss_db(ertis.Settings().air, leak.range_m, np.array([np.sqrt(40e3 * 80e3)]))
+    loss_db = transmission_loss_db(ertis.Settings().air, leak.range_m, np.array([np.sqrt(40e3 * 80e3)]))
     assert float(levels[1][1]) - float(levels[0][1]) == pytest.approx(loss_db[0], abs=0.2)
 
 

@@ -8,10 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ertis_numba import pipeline as pipelines
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Stamp
-from ertis_numba.pipeline import Pipeline
+from ertis_numba.pipeline import Pipeline, pipeline as pipelines
 from ertis_numba.settings import Air
 from tests.cases import SHORT, noise
 

@@ -134,7 +134,7 @@ def test_unknown_kinds_of_costs_are_refused():
 
 
 def test_cost_table_equals_the_output_of_the_command():
-    path = ROOT / "ertis_numba" / "stages" / "nominal_costs.py"
+    path = ROOT / "ertis_numba" / "chain" / "nominal_costs.py"
     assert path.read_text("utf-8") == bench_costs.as_python(nominal_costs.NOMINAL_COSTS)
     assert {name.split()[0] for name in nominal_costs.NOMINAL_COSTS} == set(kernels.DEVICES)
     assert f"cpu {CPU.instruction_set}" in nominal_costs.NOMINAL_COSTS
