@@ -12,6 +12,7 @@ from ertis_numba.kernels._contract.points import (
     DARK,
     LEAST_M,
     MAX_DAMPING,
+    MAX_NP,
     MUCH,
     N_ROUNDS,
     N_TRIED,
@@ -134,12 +135,11 @@ class _Fit:
             if tried <= best:
                 best, slopes, rest, now = tried, new_slopes, new_rest, now + step
                 damping *= 0.1
-                if np.max(step**2 * np.diag(normal)) < CONVERGED**2:
-                    break
             else:
                 damping *= 10
-                if damping > MAX_DAMPING:
-                    break
+            size = np.max(step**2 * np.diag(normal))
+            if size < CONVERGED**2 * max(1.0, best / self.freedom) or damping > MAX_DAMPING:
+                break
         covariance = _solved(slopes.T @ slopes + self._prior + np.diag(np.full(4, TINY)), np.eye(4))
         return np.concatenate([now, [best], np.full(16, np.inf) if covariance is None else covariance.ravel()])
 
@@ -153,6 +153,8 @@ class _Fit:
 
     def _misfit(self, at: Doubles, model: float) -> tuple[float, Doubles, Doubles]:
         """Return the misfit, and whitened derivatives and residuals: (sample, 4) and (sample,) float64."""
+        if not abs(at[3]) < MAX_NP:
+            return math.inf, np.zeros((0, 4)), np.zeros(0)
         value, by_place = self._predicted(at)
         value, by_place = value[self.is_used], by_place[self.is_used]
         level, own = math.exp(at[3]), np.maximum(np.abs(value), DARK)

@@ -31,7 +31,9 @@ N_WIDENED: Final = 3
 DAMPING: Final = 1e-3
 MAX_DAMPING: Final = 1e4
 CONVERGED: Final = 1e-2
-"""Last step, in standard deviations."""
+"""Last step, in standard deviations; larger if the misfit shows that these are too small."""
+MAX_NP: Final = 100.0
+"""Logarithm of an amplitude beyond those of single precision, at which a fit has diverged."""
 RICE: Final = 0.5
 """The mean amplitude of an echo a in noise of the power n² is about the root of a² + n² / 2."""
 MUCH: Final = 2.5

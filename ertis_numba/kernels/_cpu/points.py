@@ -21,7 +21,8 @@ def spread_amplitudes(pulse, direction_offset, offset_m, scale, out):
         for mic in range(len(pulse.weights)):
             path_m = _path_m(pulse, direction_offset[place], offset_m[place], scale, mic)
             before, between = place_of(pulse, path_m)
-            total += at_path(pulse.table, before, between, path_m) * carrier_of(pulse, path_m, mic)
+            carrier = pulse.weights[mic] * carrier_of(pulse, path_m)
+            total += at_path(pulse.table, before, between, path_m) * carrier
         out[place] = abs(total) / len(pulse.weights)
 
 
