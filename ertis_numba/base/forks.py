@@ -72,7 +72,7 @@ def _after_fork() -> None:
 def _renew_cached_properties() -> None:
     """Replace the locks of cached properties, which Python 3.12 removed."""
     for name, module in tuple(sys.modules.items()):
-        if name.startswith(f"{__package__}."):
+        if name.startswith("ertis_numba."):
             classes = [each for each in vars(module).values() if isinstance(each, type)]
             for attribute in itertools.chain.from_iterable(vars(each).values() for each in classes):
                 if isinstance(attribute, functools.cached_property):
