@@ -56,6 +56,7 @@ __all__ = [
     "note",
     "note_layout",
     "note_missing_points",
+    "note_noise",
     "note_open_edges",
     "note_unknown_angles",
     "note_unlisted_directions",
@@ -555,6 +556,16 @@ def note_unknown_angles(
     text = direction_note(settings.array, grid, is_passive=is_passive)
     if text is not None:
         note(f"sensor {sensor} {text}")
+
+
+def note_noise(sensor: str, count: int, *, quiet: bool = False) -> None:
+    """Print a note on images whose strongest maximum is noise from its direction, if there are any."""
+    if count:
+        note(
+            f"sensor {sensor}: the strongest maximum of {counted(count, 'image')} left out because a hiss, a tone or a "
+            "click from its direction may have caused it; 'ertis peaks --all' lists it",
+            quiet=quiet,
+        )
 
 
 def note_open_edges(

@@ -96,7 +96,8 @@ def peaks(
 
     There is one entry per reflector, the strongest of each measurement first. level_db is relative to the strongest
     peak, and level_dbfs to a full-scale echo in every microphone. Maxima that noise alone may cause in
-    one of 1000 images are omitted unless --all is given. This limit exists only for delay-and-sum. angle_sd_deg,
+    one of 1000 images are omitted unless --all is given, as are maxima that a hiss, a tone or a click from their
+    direction may cause. Images that are cleaned keep all maxima. angle_sd_deg,
     range_sd_m and level_sd_db are standard deviations of single echoes, if the noise is known. grid_error_deg is the
     part of angle_sd_deg from directions that cannot be interpolated; other directions have 0. It is -, and null in
     JSON, where the source may lie beyond the edge of the grid. No level is more than 1 dB above its image
@@ -286,6 +287,7 @@ def _found(
         by_place = {index: find(images[index]) for index in places}
         found = [(index, peak) for index, peaks in by_place.items() for peak in peaks]
         _note_left_out(sensor, sum(_n_left_out(images[index], peaks, find) for index, peaks in by_place.items()))
+        options.note_noise(sensor, sum(_is_noisy(images[index], find) for index in places))
         clouds = [images[index].points for index in places] if images.has_points else []
         _note_unconfirmed(sensor, sum(int((~each.is_certain).sum()) for each in clouds if each is not None))
         options.note_open_edges(sensor, images, (peak.grid_error_deg for _, peak in found))
@@ -300,6 +302,16 @@ def _n_left_out(image: "Energyscape", peaks: "list[Peak]", find: "Callable[[Ener
         return 0
     limits = {name: find.keywords[name] for name in ("min_level_db", "false_alarm")}
     return left_out_at_edges(image, peaks, **limits)
+
+
+def _is_noisy(image: "Energyscape", find: "Callable[[Energyscape], list[Peak]]") -> bool:
+    """Return True if the finder of `find_peaks` left out the strongest maximum as noise from its direction."""
+    from ertis_numba.analysis.detect import find_peaks, left_out_in_noise
+
+    if not isinstance(find, partial) or find.func is not find_peaks or find.keywords["false_alarm"] is None:
+        return False
+    limits = {name: find.keywords[name] for name in ("min_level_db", "false_alarm")}
+    return left_out_in_noise(image, **limits)
 
 
 def _note_left_out(sensor: str, count: int) -> None:

@@ -286,9 +286,11 @@ def _calibrated(path: Path, sensor: str | None) -> "tuple[Calibration, Settings]
 def _drawn(kind: str, image: "Energyscape", top: int, look: dict[str, Any], *, quiet: bool) -> "Figure":
     """Draw an image with rings around its strongest reflectors, if ``top`` is above 0."""
     from ertis_numba import figures
-    from ertis_numba.analysis.detect import find_peaks
+    from ertis_numba.analysis.detect import find_peaks, left_out_in_noise
 
     peaks = find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else None
+    is_noisy = bool(top) and left_out_in_noise(image, false_alarm=options.FALSE_ALARM)
+    options.note_noise(image.stamp.sensor, int(is_noisy), quiet=quiet)
     errors_deg = (peak.grid_error_deg for peak in peaks or ())
     options.note_open_edges(image.stamp.sensor, image, errors_deg, quiet=quiet)
     draw: dict[str, Callable[..., Figure]]

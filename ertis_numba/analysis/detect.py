@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.directional_noise import pulse_steps, stands_out
 from ertis_numba.analysis.noise import noise_of, threshold_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
@@ -19,7 +20,7 @@ from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak, PointCloud
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
 
-__all__ = ["find_peaks", "left_out_at_edges", "neighbours_of", "peaks_of_grid"]
+__all__ = ["find_peaks", "left_out_at_edges", "left_out_in_noise", "neighbours_of", "peaks_of_grid"]
 
 _SAME_DIGITS = 9  # Decimals in which the unit vectors of equal directions agree.
 _NEIGHBOURS = 8  # Number of directions around each direction of a dense grid.
@@ -57,9 +58,10 @@ def find_peaks(
     where : (direction, range) bool, optional
         True for bins that may be the maximum of a reflector; all bins by default.
     false_alarm : float, optional
-        Probability that noise alone yields a reflector anywhere in the image. Weaker maxima are discarded, except for
-        beamformers whose noise is unknown, and for cleaned images: see `ertis_numba.analysis.noise.threshold_of`. By
-        default, maxima of noise count as reflectors.
+        Probability that noise alone yields a reflector anywhere in the image. Weaker maxima are discarded: see
+        `ertis_numba.analysis.noise.threshold_of`. So are those that a hiss, a tone or a click from their direction
+        explains: see `ertis_numba.analysis.directional_noise.stands_out`. Cleaned images keep all maxima. By default,
+        maxima of noise count as reflectors.
 
     Returns
     -------
@@ -130,6 +132,8 @@ def peaks_of_grid(
             raise ArgumentError(f"where has dtype {where.dtype}; use bool, such as image.amplitude > 0.01")
     edges = EdgeFloor(directions, PointSpread(image.settings))(image)
     places = _local_maxima(image.amplitude, neighbours, np.maximum(floor, edges), where)
+    if false_alarm is not None:
+        places = places[stands_out(image, places[:, 0], places[:, 1], false_alarm, pulse_steps(image))]
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
     order = np.argsort(-levels, kind="stable")
     side_lobes = SideLobes(image, directions, places[order])
@@ -215,6 +219,26 @@ def left_out_at_edges(
         side_lobes.add(unit_vectors(azimuth_rad, elevation_rad)[0], peak.range_m, 10 ** (peak.level_dbfs / 20))
     doubtful = zip(places[is_left], levels[is_left], strict=True)
     return sum(not side_lobes.explain(directions[place[0]], int(place[1]), level) for place, level in doubtful)
+
+
+def left_out_in_noise(image: Energyscape, *, min_level_db: float = -30.0, false_alarm: float) -> bool:
+    """Return True if `find_peaks` left out the strongest maximum because noise from its direction may have caused it.
+
+    Parameters
+    ----------
+    image : Energyscape
+    min_level_db, false_alarm
+        Lowest level relative to the strongest in dB, and the probability of a false alarm, as for `find_peaks`.
+    """
+    if image.points is not None:
+        return False
+    neighbours = neighbours_of(unit_vectors(image.azimuth_rad, image.elevation_rad))
+    floor = np.full(len(image.range_m), _floor(image, min_level_db, false_alarm))
+    row, column = _local_maxima(image.amplitude, neighbours, floor, None).T
+    if not len(row):
+        return False
+    strongest = np.argmax(image.amplitude[row, column], keepdims=True)
+    return not stands_out(image, row[strongest], column[strongest], false_alarm, pulse_steps(image)).all()
 
 
 def _floor(image: Energyscape, min_level_db: float, false_alarm: float | None) -> float:

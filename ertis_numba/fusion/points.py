@@ -8,8 +8,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.directional_noise import is_short, pulse_steps
 from ertis_numba.analysis.noise import EchoFloor, echo_floor
-from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.points import EchoPointExtractor
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.association import Reflectors
@@ -20,7 +20,6 @@ from ertis_numba.fusion.rig import MountedSensor
 from ertis_numba.fusion.sensor_echoes import SensorEchoes
 from ertis_numba.fusion.sight import tangents
 from ertis_numba.geometry import Grid
-from ertis_numba.geometry.air import sound_speed_m_s
 
 __all__ = ["HeardImage", "PointFuser", "joined"]
 
@@ -32,8 +31,6 @@ _MIN_LEVEL_DB: Final = -26.0  # Lowest level of echoes relative to the strongest
 _FAINT: Final = 10 ** (-20.0 / 20)  # Amplitude relative to it, below which echoes only confirm reflectors.
 _FALSE_ALARM: Final = 1e-5  # Probability that noise alone yields a point of an image.
 _CLEAR: Final = 0.8  # Quantile of amplitudes around a lone echo that implies the noise, which the echo must exceed.
-_PULSE: Final = 1.0  # Length beside a maximum relative to the resolution in range.
-_SHORT: Final = 0.75  # Amplitude there relative to the maximum, to which that of a click hardly falls.
 _RANGE_SD_M: Final = 0.5e-3  # Errors that noise does not explain, such as those of the array and of interpolation.
 _ANGLE_SD_RAD: Final = math.radians(0.125)
 _UNKNOWN_RANGE_SD_M: Final = 5e-3
@@ -96,7 +93,7 @@ class PointFuser:
     ) -> None:
         self._number, self._mounting, self._receiver = number, sensors[number], receiver
         self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
-        self._n_pulse = _pulse_steps(image)
+        self._n_pulse = pulse_steps(image)
         self._kept: tuple[tuple[Energyscape, HeardImage], ...] = ()
         self._extract = EchoPointExtractor(
             image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP, min_level_db=_MIN_LEVEL_DB
@@ -159,19 +156,10 @@ class PointFuser:
             angle_sd_rad=np.hypot(uncertainty_m[:, 1] / range_m, _ANGLE_SD_RAD),
             power=cloud.amplitude.astype(np.float64) ** 2,
             is_clear=(shown > floor.at(image.amplitude, row, column, quantile=_CLEAR))
-            & self._is_short(image, row, column, shown),
+            & is_short(image, row, column, shown, self._n_pulse),
             is_faint=~is_free | (cloud.amplitude < _FAINT * cloud.amplitude.max(initial=0.0)),
         )
         return _ImageEchoes._make(each[shown > floor.by_direction[row]] for each in every)
-
-    def _is_short(
-        self, image: Energyscape, row: NDArray[np.int64], column: NDArray[np.int64], top: NDArray[np.float32]
-    ) -> NDArray[np.bool_]:
-        """Return True for maxima as short as the pulse of the call; those of clicks last as long as the click."""
-        beside = np.arange(1, self._n_pulse + 1)
-        columns = column[:, None] + np.concatenate([-beside, beside])
-        around = image.amplitude[row[:, None], columns.clip(0, image.amplitude.shape[1] - 1)]
-        return np.asarray(around.min(axis=1) < _SHORT * top)
 
     def _shares(self, row: NDArray[np.int64], range_m: Floats, shares: Sequence[NDArray[np.float32]]) -> Floats:
         """Return the highest share of each emitter within one step of each echo: (echo, emitter)."""
@@ -182,15 +170,6 @@ class PointFuser:
         for column, share in enumerate(shares):
             found[:, column] = share[near].max(axis=1, initial=0.0)
         return found
-
-
-def _pulse_steps(image: Energyscape) -> int:
-    """Return the number of ranges within which the pulse of an echo falls to a third."""
-    frequency_hz, share = PointSpread(image.settings).spectrum
-    band_hz = math.sqrt(12 * max(float(share @ frequency_hz**2 - (share @ frequency_hz) ** 2), 1.0))
-    step_m = float(image.range_m[-1] - image.range_m[0]) / max(1, len(image.range_m) - 1)
-    length_m = _PULSE * sound_speed_m_s(image.settings.air) / (2 * band_hz)
-    return max(1, min(round(length_m / step_m), len(image.range_m))) if step_m else 1
 
 
 def _floor(image: Energyscape) -> EchoFloor:
