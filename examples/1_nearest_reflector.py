@@ -2,7 +2,7 @@
 
 Run it with the port of a sensor, real or emulated::
 
-    ertis emulate data/synthetic/reflectors.h5 &
+    ertis sensors emulate data/synthetic/reflectors.h5 &
     python examples/1_nearest_reflector.py sensor
 """
 

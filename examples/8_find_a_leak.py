@@ -24,7 +24,7 @@ def require_sound(recording: RecordingReader) -> None:
         sys.exit(f"{recording.path} has measurements with a call; choose a recording of 'ertis capture --passive'")
     health = ertis.health(recording[0])
     if all(channel.faults for channel in health.channels):
-        sys.exit(f"{recording.path}: {health.verdict()}; find the cause with 'ertis check' and record again")
+        sys.exit(f"{recording.path}: {health.verdict()}; find the cause with 'ertis sensors check' and record again")
 
 
 def main(path: str, distance_m: str | None = None) -> None:

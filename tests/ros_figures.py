@@ -80,7 +80,7 @@ def latencies(duration_s, n_sensors, rate_hz, preset):
     topics = [f"/{name}/{topic}" for name in names for topic in ("points", "scan")]
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         for name in names:
-            emulate = [*ERTIS, "emulate", RECORDING, "--link", Path(folder) / name, "--quiet"]
+            emulate = [*ERTIS, "sensors", "emulate", RECORDING, "--link", Path(folder) / name, "--quiet"]
             stack.enter_context(ended(emulate, stdout=subprocess.DEVNULL))
         ports = [str(Path(folder) / name) for name in names]
         await_ports(ports)

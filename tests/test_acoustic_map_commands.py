@@ -255,7 +255,7 @@ def test_images_of_silent_sensors_are_fused_only_if_asked(folder):
 
 def test_check_names_the_kind_of_a_file_of_maps():
     run("process passive.h5 -o maps.h5 --device cpu")
-    assert "maps.h5 is a file of acoustic maps, wanted a recording" in run("check maps.h5", code=1).stderr
+    assert "maps.h5 is a file of acoustic maps, wanted a recording" in run("sensors check maps.h5", code=1).stderr
 
 
 @pytest.mark.parametrize(

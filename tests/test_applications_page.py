@@ -27,7 +27,7 @@ def test_application_loop_of_the_page_runs(tmp_path):
 def test_application_commands_of_the_page_run(place, ports, platform):
     """Nothing is near, so the vehicle may go. On a busy machine images are late, so the example waits longer."""
     lines = re.findall(r"^\$ (.*)$", PAGE, re.MULTILINE)
-    assert [line.split()[1] for line in lines] == ["example", "emulate", "serve", "capture", "2_safety_stop.py"]
+    assert [line.split()[1] for line in lines] == ["example", "sensors", "serve", "capture", "2_safety_stop.py"]
     *commands, example = lines
     with network.Shell(place, ports, platform) as shell:
         for command in commands:

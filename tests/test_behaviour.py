@@ -162,7 +162,7 @@ def test_behaviour_survives_a_killed_capture(tmp_path):
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as process:
         assert all(process.stdout.readline() for _ in range(3))
         process.kill()
-    done = CliRunner().invoke(cli, ["recover", str(tmp_path)])
+    done = CliRunner().invoke(cli, ["import", "journals", str(tmp_path)])
     assert done.exit_code == 0, done.stderr
     found = behaviours(tmp_path / "rec.h5")
     assert len(found) >= 3

@@ -1,4 +1,4 @@
-"""The command `ertis calibrate`, plots of calibrations, and the page docs/how-to/calibrate.md."""
+"""The command `ertis sensors calibrate`, plots of calibrations, and the page docs/how-to/calibrate.md."""
 
 import dataclasses
 import importlib.metadata
@@ -38,7 +38,7 @@ def recordings(tmp_path_factory):
 
 
 def ertis(*arguments):
-    return CliRunner().invoke(cli, ["calibrate", *map(str, arguments)])
+    return CliRunner().invoke(cli, ["sensors", "calibrate", *map(str, arguments)])
 
 
 def test_command_prints_changes_and_writes_a_layout(recordings, tmp_path):
@@ -71,7 +71,17 @@ def test_nothing_is_written_if_images_get_worse(tmp_path):
     source = importlib.metadata.distribution("rtisdev").locate_file("rtisdev/simulate.bin")
     done = CliRunner().invoke(
         cli,
-        ["import", str(source), "-o", str(tmp_path / "real.h5"), "--preset", "default_25_50", "--layout", "eRTIS_v3D1"],
+        [
+            "import",
+            "signals",
+            str(source),
+            "-o",
+            str(tmp_path / "real.h5"),
+            "--preset",
+            "default_25_50",
+            "--layout",
+            "eRTIS_v3D1",
+        ],
     )
     assert done.exit_code == 0, done.output
     done = ertis(tmp_path / "real.h5", "--target", "direct", "-o", tmp_path / "real.toml")

@@ -215,7 +215,7 @@ def test_real_recording_is_reported_and_says_that_it_does_not_suffice():
     made = calibrate([real], target="direct")
     assert not made.findings
     assert made.residuals.before_s > made.residuals.after_s
-    assert made.contrast_db[1] < made.contrast_db[0]  # therefore `ertis calibrate` writes no layout
+    assert made.contrast_db[1] < made.contrast_db[0]  # therefore `ertis sensors calibrate` writes no layout
     with pytest.raises(DataError, match="not a single echo"):
         calibrate([real])
 

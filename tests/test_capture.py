@@ -498,7 +498,7 @@ def test_capture_command_does_not_overwrite_a_leftover_journal(tmp_path, sensor)
     left.write_bytes(b"anything")
     code, _, err = run(tmp_path, "--port", str(sensor.link), "-n", "1", "-o", "rec.h5", "--force")
     assert code == 1
-    assert "ertis recover" in err
+    assert "ertis import journals" in err
     assert left.read_bytes() == b"anything"
 
 

@@ -281,8 +281,8 @@ def test_capture_to_requires_allowed_keys(tmp_path):
 
 
 FOR_APPLICATIONS = (
-    "this address is for applications that receive products; for sensor nodes, poses and 'ertis configure', use the "
-    "first address that 'ertis serve' prints"
+    "this address is for applications that receive products; for sensor nodes, poses and 'ertis sensors configure', "
+    "use the first address that 'ertis serve' prints"
 )
 
 
@@ -371,7 +371,7 @@ def test_sensor_nodes_are_warned_of_a_shared_sensor_name(tmp_path):
         (["--mounting", "none.toml"], "none.toml", 1),
         (
             ["--mounting", "empty.toml"],
-            "empty.toml sets no key; add sensors, reflectors or sources, see 'ertis settings scene'",
+            "empty.toml sets no key; add sensors, reflectors or sources, see 'ertis reference settings scene'",
             1,
         ),
     ],

@@ -1,4 +1,4 @@
-"""``ertis check``: verdict on recordings of healthy and faulty sensors, JSON, exit codes and the HTML page."""
+"""``ertis sensors check``: verdict on recordings of healthy and faulty sensors, JSON, exit codes and the HTML page."""
 
 import dataclasses
 import functools
@@ -33,7 +33,7 @@ from tests.test_sensor_clock import stamp
 
 
 def run(*arguments, code=0):
-    done = CliRunner().invoke(cli, ["check", *(str(argument) for argument in arguments)])
+    done = CliRunner().invoke(cli, ["sensors", "check", *(str(argument) for argument in arguments)])
     assert done.exit_code == code, (done.stdout, done.stderr, done.exception)
     return done
 
@@ -46,7 +46,7 @@ def stored(path, *measurements, **options):
 
 def verdict_of(path):
     """Last line of the command, without the folder; the exit code must agree."""
-    done = CliRunner().invoke(cli, ["check", str(path)])
+    done = CliRunner().invoke(cli, ["sensors", "check", str(path)])
     verdict = done.stdout.splitlines()[-1].replace(f"{path.parent}/", "")
     assert done.exit_code == (0 if ": fit for use" in verdict else 1), (done.stderr, done.exception)
     return verdict

@@ -20,7 +20,7 @@ from ertis_numba.storage import GroundTruth, open_recording, write_energyscapes,
 from tests.files import image, noise
 
 N_BYTES = 4 * 65_536
-RAW = "import {} -o out.h5 --layout eRTIS_v3D1 --preset short_25_50"
+RAW = "import signals {} -o out.h5 --layout eRTIS_v3D1 --preset short_25_50"
 CASES = {
     # raw samples
     "missing raw file": (RAW.format("none.bin"), 1, "none.bin: No such file or directory"),
@@ -30,27 +30,27 @@ CASES = {
     "one good, one bad": (RAW.format("good.bin odd.bin"), 1, "odd.bin has 262143 bytes"),
     "folder for raw file": (RAW.format("folder"), 2, "folder contains no files to import; choose a folder with .wav"),
     "unknown layout": (
-        "import good.bin -o out.h5 --layout eRTIS_v3D --preset short_25_50",
+        "import signals good.bin -o out.h5 --layout eRTIS_v3D --preset short_25_50",
         2,
         "layout 'eRTIS_v3D' is unknown (did you mean 'eRTIS_v3D1'?); known are eRTIS_v2",
     ),
     "missing layout file": (
-        "import good.bin -o out.h5 --layout none.csv --preset short_25_50",
+        "import signals good.bin -o out.h5 --layout none.csv --preset short_25_50",
         1,
         "layout none.csv: No such file or directory",
     ),
     "NaN in layout": (
-        "import good.bin -o out.h5 --layout nan.csv --preset short_25_50",
+        "import signals good.bin -o out.h5 --layout nan.csv --preset short_25_50",
         1,
         "layout nan.csv, line 2: z is nan; use a finite number",
     ),
     "unknown preset": (
-        "import good.bin -o out.h5 --layout eRTIS_v2 --preset short_30_50",
+        "import signals good.bin -o out.h5 --layout eRTIS_v2 --preset short_30_50",
         2,
         "preset 'short_30_50' is unknown (did you mean 'short_25_50'?); known are short_20_80",
     ),
-    "no layout": ("import good.bin -o out.h5 --preset short_25_50", 2, "Missing option '--layout'"),
-    "no raw file": ("import --layout eRTIS_v2 --preset short_25_50", 2, "Missing argument 'FILE...'"),
+    "no layout": ("import signals good.bin -o out.h5 --preset short_25_50", 2, "Missing option '--layout'"),
+    "no raw file": ("import signals --layout eRTIS_v2 --preset short_25_50", 2, "Missing argument 'FILE...'"),
     "temperature": (
         RAW.format("good.bin") + " --temperature nan",
         2,
@@ -340,7 +340,7 @@ from ertis_cli.main import main
 def fail(*_):
     raise KeyError("gain")
 _tables.TextTable.print = fail
-sys.argv[1:] = ["presets"]
+sys.argv[1:] = ["reference", "presets"]
 main()
 """
 
@@ -368,7 +368,7 @@ def test_unexpected_error_is_one_line_that_blames_no_file_and_a_traceback_in_dev
     [
         "info PIPE",
         "verify PIPE",
-        "check PIPE",
+        "sensors check PIPE",
         "peaks PIPE",
         "process PIPE -o out.energy.h5",
         "process rec.h5 --settings PIPE -o out.energy.h5",
@@ -376,7 +376,7 @@ def test_unexpected_error_is_one_line_that_blames_no_file_and_a_traceback_in_dev
         "export PIPE -o out.csv",
         "map rec.h5 --poses PIPE -o out.map.h5",
         "odometry PIPE -o out.tum",
-        "import PIPE -o out.h5 --layout eRTIS_v2 --preset short_25_50",
+        "import signals PIPE -o out.h5 --layout eRTIS_v2 --preset short_25_50",
         "simulate PIPE -o out.h5",
         "view PIPE --save-html out.html",
     ],

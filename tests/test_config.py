@@ -108,7 +108,9 @@ def test_variables_that_are_not_options_cause_no_warning(images):
     ("line", "message"),
     [
         ("proces a.h5", "No such command 'proces' (did you mean 'process'?); see 'ertis --help'"),
-        ("xyz", "No such command 'xyz' (choose one of bench, calibrate, capture, check, "),
+        ("devices", "No such command 'devices' (did you mean 'sensors list'?)"),
+        ("import-poses a.h5 b.tum", "No such command 'import-poses' (did you mean 'import poses'?)"),
+        ("xyz", "No such command 'xyz' (choose one of bench, capture, compare, demo, "),
     ],
 )
 def test_unknown_command_suggests_known_ones(tmp_path, line, message):
@@ -149,7 +151,7 @@ def test_missing_config_file_is_reported(tmp_path):
 
 def test_help_and_completion_work_without_config_file(tmp_path):
     """Every new shell requests completions, and users need help most when something is broken."""
-    for line in ("--help", "completion bash"):
+    for line in ("--help", "reference completion bash"):
         done = ertis(*line.split(), folder=tmp_path, ERTIS_CONFIG="none.toml")
         assert done.exit_code == 0, line
         assert len(done.stdout.splitlines()) > 10
@@ -162,7 +164,7 @@ def test_help_and_completion_work_without_config_file(tmp_path):
 
 def test_inapplicable_option_is_refused_only_if_typed(images, tmp_path):
     folder, _ = images
-    text = "[process]\nworkers = 2\n[export]\ntop = 5\ntopic = ['points']\n[import]\nskip = 0.1\n"
+    text = "[process]\nworkers = 2\n[export]\ntop = 5\ntopic = ['points']\n[import.signals]\nskip = 0.1\n"
     (tmp_path / "mine.toml").write_text(text)
     raw = tmp_path / "a.bin"
     raw.write_bytes(bytes(4 * 65_536))
@@ -178,7 +180,11 @@ def test_inapplicable_option_is_refused_only_if_typed(images, tmp_path):
             ("--topic", "points"),
             "option --topic is given, but format 'csv'",
         ),
-        (("import", raw, "--layout", "eRTIS_v3D1", "--preset", "short_25_50"), ("--skip", 1), "is for PCM (.wav, .h5)"),
+        (
+            ("import", "signals", raw, "--layout", "eRTIS_v3D1", "--preset", "short_25_50"),
+            ("--skip", 1),
+            "is for PCM (.wav, .h5)",
+        ),
     ):
         done = ertis(*given, *typed, folder=tmp_path)
         assert done.exit_code != 0
@@ -208,7 +214,7 @@ def test_command_line_page_runs(tmp_path):
         ("ertis proc", "process"),
         ("ertis process --max", "--max-error"),
         ("ertis keys n", "new"),
-        ("ertis import --preset def", "default_25_50"),
+        ("ertis import signals --preset def", "default_25_50"),
         ("ertis capture --layout uRT", "uRTIS_v1"),
     ],
 )
@@ -219,7 +225,7 @@ def test_bash_completes_commands_options_and_values(tmp_path, line, wanted):
     command.write_text(f"#!/bin/sh\nexec '{sys.executable}' -m ertis_cli \"$@\"\n")
     command.chmod(0o755)
     script = (
-        'eval "$(ertis completion bash)"\n'
+        'eval "$(ertis reference completion bash)"\n'
         f"COMP_WORDS=({words}); COMP_CWORD={len(line.split()) - 1}\n"
         "_ertis_completion ertis; printf '%s\\n' \"${COMPREPLY[@]}\""
     )
@@ -241,7 +247,7 @@ def test_bash_completes_commands_options_and_values(tmp_path, line, wanted):
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion_for_each_shell(tmp_path, shell):
-    done = ertis("completion", shell, folder=tmp_path)
+    done = ertis("reference", "completion", shell, folder=tmp_path)
     assert done.exit_code == 0
     assert "_ERTIS_COMPLETE" in done.stdout
 
@@ -250,7 +256,7 @@ def test_completion_for_each_shell(tmp_path, shell):
 def test_zsh_completion_works_after_lines_of_the_page(tmp_path):
     (before,) = re.findall(r"in ~/.zshrc, after: (.*)", path_of("command-line").read_text("utf-8"))
     printed = tmp_path / "printed"
-    printed.write_text(ertis("completion", "zsh", folder=tmp_path).stdout)
+    printed.write_text(ertis("reference", "completion", "zsh", folder=tmp_path).stdout)
     done = subprocess.run(
         # -u suppresses questions about the owner of the zsh folders.
         ["zsh", "-f", "-c", f'{before} -u; eval "$(<{printed})"; print ${{_comps[ertis]}}'],
@@ -263,4 +269,4 @@ def test_zsh_completion_works_after_lines_of_the_page(tmp_path):
         check=False,
     )
     assert (done.stdout.split(), done.stderr) == (["_ertis_completion"], "")
-    assert before in " ".join(ertis("completion", "--help", folder=tmp_path).stdout.split())
+    assert before in " ".join(ertis("reference", "completion", "--help", folder=tmp_path).stdout.split())

@@ -301,7 +301,7 @@ def capturing(tmp_path, address, *arguments):
 
 def configure(tmp_path, *arguments):
     with contextlib.chdir(tmp_path):
-        done = CliRunner().invoke(cli, ["configure", *map(str, arguments)])
+        done = CliRunner().invoke(cli, ["sensors", "configure", *map(str, arguments)])
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     return done
 

@@ -173,21 +173,21 @@ def run(*arguments):
 
 
 def test_command_line_sends_commands(device):
-    done = run("command", "--port", "mine", "!Y,0,0,0", "!K,0,0,0")
+    done = run("sensors", "send", "--port", "mine", "!Y,0,0,0", "!K,0,0,0")
     assert (done.exit_code, done.stdout) == (0, "65536\n1\n")
-    done = run("command", "--port", "mine", "!Y,0,0,0", "--json")
+    done = run("sensors", "send", "--port", "mine", "!Y,0,0,0", "--json")
     assert json.loads(done.stdout) == {"command": "!Y,0,0,0", "answer": 65536}
-    refused = run("command", "--port", "mine", "!K,1,0,0", "nonsense")
+    refused = run("sensors", "send", "--port", "mine", "!K,1,0,0", "nonsense")
     assert (refused.exit_code, device.registers.amplifier) == (1, 0)
     assert "use '!X,i,j,k'" in refused.stderr
-    refused = run("command", "--port", "mine", f"!B,{2**32},0,0")
+    refused = run("sensors", "send", "--port", "mine", f"!B,{2**32},0,0")
     assert (refused.exit_code, device.registers.counter) == (1, 0)
     assert "whole numbers up to 4294967295" in refused.stderr
 
 
 @pytest.mark.usefixtures("device")
 def test_command_line_resets_a_sensor(tmp_path):
-    done = run("reset", "--port", "mine", "--hook", f"touch '{tmp_path}/pulled'")
+    done = run("sensors", "reset", "--port", "mine", "--hook", f"touch '{tmp_path}/pulled'")
     assert (done.exit_code, (tmp_path / "pulled").exists()) == (0, True)
     assert "answers again: firmware 1.0.0" in done.stderr
     assert "still has its call, so the reset has probably not reached it; check the pin" in done.stderr
@@ -199,11 +199,11 @@ def test_command_line_resets_a_sensor(tmp_path):
         (["--pin", 7], "pin 7 cannot be pulsed"),
         (["--pin", 9], "pin 9 cannot be pulsed"),
     ):
-        refused = run("reset", "--port", "mine", *arguments)
+        refused = run("sensors", "reset", "--port", "mine", *arguments)
         assert refused.exit_code == 1
         assert message in refused.stderr
     for arguments, message in ((["--pin", 9, "--hook", "true"], "choose one of them"), (["--hook", " "], "is empty")):
-        refused = run("reset", "--port", "mine", *arguments)
+        refused = run("sensors", "reset", "--port", "mine", *arguments)
         assert refused.exit_code == 2
         assert message in refused.stderr
 

@@ -189,10 +189,13 @@ def test_process_without_rejects_invalid_channels(recording, tmp_path, channels,
 
 
 def test_layout_command_prints_a_loadable_layout(tmp_path):
-    listed = json.loads(run("layout", "--json").stdout)["layouts"]
+    listed = json.loads(run("reference", "layouts", "--json").stdout)["layouts"]
     assert {"name": "eRTIS_v3D1", "microphones": 32, "word_bits": 32} in listed
-    assert "eRTIS_v3D1" in run("layout").stdout
+    assert "eRTIS_v3D1" in run("reference", "layouts").stdout
     path = tmp_path / "mine.toml"
-    path.write_text(run("layout", "eRTIS_v2").stdout)
+    path.write_text(run("reference", "layouts", "eRTIS_v2").stdout)
     assert_array_equal(load_layout(path).positions_m, load_layout("eRTIS_v2").positions_m)
-    assert "layout 'eRTIS_v9' is unknown (did you mean 'eRTIS_v2'?)" in run("layout", "eRTIS_v9", code=1).stderr
+    assert (
+        "layout 'eRTIS_v9' is unknown (did you mean 'eRTIS_v2'?)"
+        in run("reference", "layouts", "eRTIS_v9", code=1).stderr
+    )

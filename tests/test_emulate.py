@@ -1,4 +1,4 @@
-"""``ertis emulate`` as a separate process: output, measurements of its devices, and cleanup."""
+"""``ertis sensors emulate`` as a separate process: output, measurements of its devices, and cleanup."""
 
 import json
 import os
@@ -33,7 +33,7 @@ from tests.files import noise
 __all__ = ["patient"]  # A fixture, imported for use here.
 
 pytestmark = PATIENT
-MODULE = [sys.executable, "-m", "ertis_cli", "emulate"]
+MODULE = [sys.executable, "-m", "ertis_cli", "sensors", "emulate"]
 SHORT = Settings(recording=Recording(n_samples=N_SAMPLES), processing=Processing(range_m=(0.3, 0.5)))
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
@@ -156,7 +156,7 @@ main()
 
 def test_emulate_reports_a_system_without_pseudo_terminals(recording, tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_PSEUDO_TERMINALS, "emulate", str(recording)],
+        [sys.executable, "-c", WITHOUT_PSEUDO_TERMINALS, "sensors", "emulate", str(recording)],
         capture_output=True,
         text=True,
         check=False,
@@ -200,7 +200,7 @@ range_m = 0.4
 )
 def test_emulate_rejects_invalid_options(recording, tmp_path, monkeypatch, options, code, message):
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(cli, ["emulate", str(recording), *options])
+    done = CliRunner().invoke(cli, ["sensors", "emulate", str(recording), *options])
     assert (done.exit_code, done.stdout) == (code, "")
     assert message in done.stderr
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
@@ -208,7 +208,7 @@ def test_emulate_rejects_invalid_options(recording, tmp_path, monkeypatch, optio
 
 def test_emulate_rejects_unsupported_measurement_length(tmp_path, monkeypatch):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path))
-    done = CliRunner().invoke(cli, ["emulate", str(write_recording(tmp_path / "rec.h5", noise()))])
+    done = CliRunner().invoke(cli, ["sensors", "emulate", str(write_recording(tmp_path / "rec.h5", noise()))])
     assert (done.exit_code, done.stdout) == (1, "")
     assert "recording.n_samples is 40960, but a sensor measures multiples of 32768 up to 16777216" in done.stderr
 
@@ -223,7 +223,7 @@ def captured(port, settings):
 def rejected(process, port, other, settings, message):
     """Check that a device rejects a call twice, although it keeps the call for the second attempt."""
     for _ in range(2):
-        with pytest.raises(SonarError, match="'ertis emulate' prints the reason"):
+        with pytest.raises(SonarError, match="'ertis sensors emulate' prints the reason"):
             captured(port, settings.replace(call=other))
         assert process.stderr.readline().startswith(f"ertis: warning: {message}")
 
@@ -423,14 +423,14 @@ def test_pulse_preparation_survives_a_rendering_error():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--log", "{recording}"], "is no log of 'ertis emulate'; choose another file"),
+        (["--log", "{recording}"], "is no log of 'ertis sensors emulate'; choose another file"),
         (["--sensor", ""], "--sensor is empty; write a value, or leave it out"),
     ],
 )
 def test_foolish_options_are_refused_before_a_device_starts(recording, arguments, message):
     before = recording.read_bytes()
     done = CliRunner().invoke(
-        cli, ["emulate", str(recording), *(each.format(recording=recording) for each in arguments)]
+        cli, ["sensors", "emulate", str(recording), *(each.format(recording=recording) for each in arguments)]
     )
     assert done.exit_code != 0
     assert message in done.stderr

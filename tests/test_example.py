@@ -127,7 +127,7 @@ def test_demo_writes_recording_and_picture_of_four_sensors(tmp_path, monkeypatch
 
     def run_here(command, *, env, **_):
         assert command[:3] == [sys.executable, "-m", "ertis_cli"]
-        ran.append(command[3])
+        ran.append(" ".join(command[3:5]) if command[3] == "sensors" else command[3])
         return SimpleNamespace(returncode=CliRunner(env=env).invoke(cli, command[3:]).exit_code)
 
     scene = tmp_path / "small.toml"
@@ -137,7 +137,7 @@ def test_demo_writes_recording_and_picture_of_four_sensors(tmp_path, monkeypatch
     monkeypatch.setattr(demo, "subprocess", replaced)
     monkeypatch.setenv("ERTIS_SERVE_WORKERS", "1")
     run("demo", "-n", "2", "--quiet")
-    assert ran == ["devices", "capture", "status", "verify", "process", "peaks", "plot"]
+    assert ran == ["sensors list", "capture", "sensors status", "verify", "process", "peaks", "plot"]
     (recording,) = Path("demo/recordings").glob("*.h5")
     assert 1 <= len(open_recording(recording, sensor="front")) <= 2
     assert Path("demo/image.png").stat().st_size > 10_000

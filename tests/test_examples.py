@@ -330,7 +330,9 @@ def test_leak_example_explains_unusable_input_in_one_line(leak_recording, tmp_pa
         ("none.h5",): "none.h5: No such file or directory",
         ("maps.h5",): "maps.h5 is a file of acoustic maps, wanted a recording",
         ("call.h5",): "call.h5 has measurements with a call; choose a recording of 'ertis capture --passive'",
-        ("stuck.h5",): "stuck.h5: stuck at 0: every channel; find the cause with 'ertis check' and record again",
+        (
+            "stuck.h5",
+        ): "stuck.h5: stuck at 0: every channel; find the cause with 'ertis sensors check' and record again",
         (str(path), "near"): "could not convert string to float: 'near'",
     }.items():
         done = subprocess.run(

@@ -111,7 +111,7 @@ def test_a_configuration_sets_one_list_or_several(recording, tmp_path, value, wa
 def test_check_excludes_channels_of_one_sensor_and_names_it_in_remedies(recording):
     checked = check_recording(recording, without=ExcludedChannels(of_sensor={"right": (4,)}))
     assert {each.sensor: each.n_microphones for each in checked.sensors} == {"left": 32, "right": 31}
-    done = run("check", recording, "--without", "right:4", "--json", code=1)
+    done = run("sensors", "check", recording, "--without", "right:4", "--json", code=1)
     assert [each["microphones"] for each in json.loads(done.stdout)["sensors"]] == [32, 31]
     with pytest.raises(ArgumentError, match="known are left, right"):
         check_recording(recording, without=ExcludedChannels(of_sensor={"labB": (4,)}))

@@ -22,7 +22,7 @@ NEEDED_BY = {
     "cu13": ["process a.h5 -o a.energy.h5 --device cuda"],
     "metrics": ["serve --listen tcp://127.0.0.1:0 --publish tcp://127.0.0.1:0 --metrics 127.0.0.1:0"],
     "ros": ["export a.h5 -o a.mcap", "map a.h5 -o a.mcap", "ros a.h5"],
-    "rtisdev": ["rtisdev {root}/tests/xarray_script.py"],
+    "rtisdev": ["sensors rtisdev {root}/tests/xarray_script.py"],
     "xarray": ["{root}/tests/xarray_script.py"],
     "view": ["view a.h5 --no-open --port 0", "view a.h5 --save-html a.html", "view tcp://127.0.0.1:1 --no-open"],
 }

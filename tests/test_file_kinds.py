@@ -141,7 +141,7 @@ def test_kind_of_names_databases(tmp_path):
         database.execute("create table a (b)")
     database.close()
     assert problem_of(tmp_path / "a.db").startswith(
-        "is an SQLite database; if it is a journal, seal it with 'ertis rec"
+        "is an SQLite database; if it is a journal, seal it with 'ertis imp"
     )
 
 
@@ -201,7 +201,7 @@ def raw_settings(tmp_path):
 @pytest.mark.parametrize("name", ["take.flac", "take.bin", "take.wav", "take"])
 def test_import_refuses_other_formats_under_any_name(tmp_path, raw_settings, name, more):
     (tmp_path / name).write_bytes(b"fLaC" + words()[4:])
-    done = invoke("import", tmp_path / name, *raw_settings, *more)
+    done = invoke("import", "signals", tmp_path / name, *raw_settings, *more)
     assert done.exit_code == 1
     assert f"{name} is a FLAC file; convert it with 'ffmpeg -i {tmp_path / name} -c:a pcm_f32le" in done.stderr
     assert not (tmp_path / "out.h5").exists()
@@ -212,7 +212,9 @@ def test_import_reads_wav_by_its_content(tmp_path, name):
     wavfile.write(tmp_path / "a", 96_000, np.tile(VALUES, (4, 1)))
     (tmp_path / "a").rename(tmp_path / name)
     (tmp_path / "pair.csv").write_text("0,0,0\n0,20,0\n")
-    done = invoke("import", tmp_path / name, "--layout", tmp_path / "pair.csv", "--passive", "-o", tmp_path / "out.h5")
+    done = invoke(
+        "import", "signals", tmp_path / name, "--layout", tmp_path / "pair.csv", "--passive", "-o", tmp_path / "out.h5"
+    )
     assert done.exit_code == 0, done.stderr
     with ertis.open_recording(tmp_path / "out.h5") as recording:
         assert np.array_equal(recording[0].data, np.tile(VALUES, (4, 1)))
@@ -221,34 +223,37 @@ def test_import_reads_wav_by_its_content(tmp_path, name):
 @pytest.mark.parametrize("name", ["take.xyz", "take", "take.bin.part"])
 def test_import_of_unknown_endings_needs_raw(tmp_path, raw_settings, name):
     (tmp_path / name).write_bytes(words())
-    done = invoke("import", tmp_path / name, *raw_settings)
+    done = invoke("import", "signals", tmp_path / name, *raw_settings)
     assert done.exit_code == 2
     assert (
         f"{name} has unknown content and an unknown ending; use --raw if the file contains raw eRTIS words"
         in done.stderr
     )
-    assert invoke("import", tmp_path / name, *raw_settings, "--raw").exit_code == 0
+    assert invoke("import", "signals", tmp_path / name, *raw_settings, "--raw").exit_code == 0
 
 
 @pytest.mark.parametrize("name", ["take.bin", "take.RAW", "take.dat", "take.pdm"])
 def test_import_reads_raw_words_of_known_endings(tmp_path, raw_settings, name):
     (tmp_path / name).write_bytes(words())
-    done = invoke("import", tmp_path / name, *raw_settings)
+    done = invoke("import", "signals", tmp_path / name, *raw_settings)
     assert done.exit_code == 0, done.stderr
-    passive = invoke("import", tmp_path / name, *raw_settings, "--force", "--passive")
+    passive = invoke("import", "signals", tmp_path / name, *raw_settings, "--force", "--passive")
     assert (
         f"--passive is for PCM (.wav, .h5), but {tmp_path / name} contains raw words; remove --passive"
         in passive.stderr
     )
 
 
-@pytest.mark.parametrize("command", ["info", "process", "verify", "check", "export"])
+@pytest.mark.parametrize("command", ["info", "process", "verify", "sensors check", "export"])
 def test_commands_name_a_wav_file_and_its_import(tmp_path, command):
     wavfile.write(tmp_path / "take.wav", 96_000, VALUES)
     target = ["-o", tmp_path / "out.csv"] if command == "export" else []
-    done = invoke(command, tmp_path / "take.wav", *target)
+    done = invoke(*command.split(), tmp_path / "take.wav", *target)
     assert done.exit_code == 1
-    assert f"take.wav is a WAV file; import it with 'ertis import {tmp_path}/take.wav --settings FILE" in done.stderr
+    assert (
+        f"take.wav is a WAV file; import it with 'ertis import signals {tmp_path}/take.wav --settings FILE"
+        in done.stderr
+    )
 
 
 IMAGES = "choose an energyscape file"
@@ -265,13 +270,13 @@ def test_recordings_are_not_written_under_names_of_other_formats(tmp_path, endin
 
 
 OVERWRITING = (
-    "import-poses rec.h5 poses.tum -o poses.tum",
-    "import-poses rec.h5 poses.tum --times times.txt -o times.txt",
+    "import poses rec.h5 poses.tum -o poses.tum",
+    "import poses rec.h5 poses.tum --times times.txt -o times.txt",
     "map rec.h5 --poses poses.tum -o poses.tum",
     "odometry rec.h5 --mounting poses.tum -o poses.tum",
-    "calibrate rec.h5 --layout mine.toml -o mine.toml",
+    "sensors calibrate rec.h5 --layout mine.toml -o mine.toml",
     "process rec.h5 --settings mine.toml -o mine.toml",
-    "import times.txt --raw --settings mine.toml -o mine.toml",
+    "import signals times.txt --raw --settings mine.toml -o mine.toml",
     "export rec.h5 --mounting mine.toml -o mine.toml",
     "view rec.h5 --mounting mine.toml --save-html ./mine.toml",
 )
@@ -293,7 +298,7 @@ WANTED = {
     "compare": IMAGES,
     "map -o map.h5": "choose a recording, or save its signals as WAV",
     "odometry": "choose a recording, or save its signals as WAV",
-    "calibrate": "choose a recording, or save its signals as WAV",
+    "sensors calibrate": "choose a recording, or save its signals as WAV",
     "odometry REC --mounting": "choose a scene or mounting file (.toml), or a file of ertis that contains mountings",
     "map REC -o map.h5 --poses": "the first line names the columns some, words",
 }

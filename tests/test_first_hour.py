@@ -60,8 +60,10 @@ def test_commands_of_pages_need_no_source_file():
 def test_first_hour_page_runs(tmp_path, monkeypatch):
     monkeypatch.setenv("ERTIS_EMULATED_DIR", str(tmp_path / "emulated"))
     """The emulator replays the recording of its scene, which starts sooner."""
-    text = page("first-hour").replace("$ ertis emulate reflectors.toml", "$ ertis emulate reflectors.h5")
-    assert "$ ertis emulate reflectors.h5" in text
+    text = page("first-hour").replace(
+        "$ ertis sensors emulate reflectors.toml", "$ ertis sensors emulate reflectors.h5"
+    )
+    assert "$ ertis sensors emulate reflectors.h5" in text
     steps = re.findall(r"```console\n(.*?)```", text, re.DOTALL)
     assert all(len(step.splitlines()) <= 3 for step in steps)
     for name, content in re.findall(r"`([\w.]+)`:\n\n```\w+\n(.*?)```", text, re.DOTALL):

@@ -107,33 +107,33 @@ simulate scene.toml -o s.h5 --count 99999999999
 simulate scene.toml -o s.h5 --sensor unknown
 simulate scene.toml -o s.h5 --tolerance-db -3
 simulate scene.toml -o no/s.h5
-import odd.bin -o o.h5 --layout eRTIS_v3D1 --preset default_25_50
-import odd.bin -o o.h5 --layout eRTIS_v4 --preset default_25_50
-import odd.bin -o o.h5
-import nope.bin -o o.h5 --layout eRTIS_v3D1 --preset default_25_50
-import rec.h5 -o o.h5 --layout eRTIS_v3D1 --preset default_25_50
-import odd.bin -o o.h5 --layout eRTIS_v3D1 --preset quick
+import signals odd.bin -o o.h5 --layout eRTIS_v3D1 --preset default_25_50
+import signals odd.bin -o o.h5 --layout eRTIS_v4 --preset default_25_50
+import signals odd.bin -o o.h5
+import signals nope.bin -o o.h5 --layout eRTIS_v3D1 --preset default_25_50
+import signals rec.h5 -o o.h5 --layout eRTIS_v3D1 --preset default_25_50
+import signals odd.bin -o o.h5 --layout eRTIS_v3D1 --preset quick
 export img.h5 -o a.xyz
 export nope.h5 -o a.ply
 export img.h5 -o img.h5
 export img.h5 -o a.ply --mounting nope.toml
 export img.h5
-layouts nope
-layouts nope.csv
-layouts text.toml
-import odd.bin -o o.h5 --layout m.csv --preset default_25_50
-import odd.bin -o o.h5 --layout other.toml --preset default_25_50
-import text.txt -o o.h5 --layout eRTIS_v3D1
-import dir -o o.h5 --layout eRTIS_v3D1
-import rec.wav -o o.h5
-import rec.wav -o o.h5 --passive
-import rec.wav -o o.h5 --layout m.csv --preset default_25_50 --passive
-check nope.h5
-check text.h5
-calibrate rec.h5
-calibrate rec.h5 -o l.toml --layout m.csv
-calibrate rec.h5 -o l.toml --layout eRTIS_v4
-calibrate img.h5 -o l.toml
+reference layouts nope
+reference layouts nope.csv
+reference layouts text.toml
+import signals odd.bin -o o.h5 --layout m.csv --preset default_25_50
+import signals odd.bin -o o.h5 --layout other.toml --preset default_25_50
+import signals text.txt -o o.h5 --layout eRTIS_v3D1
+import signals dir -o o.h5 --layout eRTIS_v3D1
+import signals rec.wav -o o.h5
+import signals rec.wav -o o.h5 --passive
+import signals rec.wav -o o.h5 --layout m.csv --preset default_25_50 --passive
+sensors check nope.h5
+sensors check text.h5
+sensors calibrate rec.h5
+sensors calibrate rec.h5 -o l.toml --layout m.csv
+sensors calibrate rec.h5 -o l.toml --layout eRTIS_v4
+sensors calibrate img.h5 -o l.toml
 map rec.h5 -o m.h5
 map img.h5 -o m.h5 --poses nope.csv
 odometry rec.h5 -o p.csv
@@ -143,7 +143,7 @@ process rec.h5 -o y.h5 --level
 process rec.h5 -o y.h5 --fuse
 process rec.h5 -o y.h5 --bands 0:1
 process rec.h5 -o y.h5 --layout eRTIS_v2
-settings nope
+reference settings nope
 example nope
 capture
 capture --port /dev/nope -o c.h5
@@ -152,15 +152,15 @@ capture --port /dev/nope
 capture --port /dev/nope -o c.h5 -n 0
 capture --port /dev/nope -o c.h5 --rate 0
 capture --port /dev/nope --to localhost
-emulate nope.h5
-emulate dir
-emulate img.h5
-emulate scene.toml --count 0
+sensors emulate nope.h5
+sensors emulate dir
+sensors emulate img.h5
+sensors emulate scene.toml --count 0
 listen localhost
 listen tcp://127.0.0.1:99999
 listen tcp://127.0.0.1:9 --product images
 listen
-status localhost
+sensors status localhost
 serve --listen localhost
 serve --listen tcp://127.0.0.1:0 --range 5:1
 serve --listen tcp://127.0.0.1:0 --key nope
@@ -168,8 +168,8 @@ record --listen tcp://127.0.0.1:0
 record --listen tcp://nohost.invalid:1 -o r
 record --listen tcp://127.0.0.1:0 -o rec.h5
 record --listen tcp://127.0.0.1:0 -o r --rotate-size 0
-recover nope
-recover rec.h5
+import journals nope
+import journals rec.h5
 keys new ../x --dir k
 keys new
 keys show nope --dir k
@@ -185,8 +185,8 @@ bench nope
 bench paper --count 0
 bench paper --update nope.md
 bench network --only nope
-completion tcsh
-devices --port x
+reference completion tcsh
+sensors list --port x
 doctor now
 """
 

@@ -130,8 +130,10 @@ def test_tests_of_a_page_name_it(about):
 
 def test_quickstart_page_runs(place):
     """The emulator replays the recording of its scene, which starts sooner."""
-    text = page("quickstart").replace("$ ertis emulate reflectors.toml", "$ ertis emulate reflectors.h5")
-    assert "$ ertis emulate reflectors.h5" in text
+    text = page("quickstart").replace(
+        "$ ertis sensors emulate reflectors.toml", "$ ertis sensors emulate reflectors.h5"
+    )
+    assert "$ ertis sensors emulate reflectors.h5" in text
     with contextlib.ExitStack() as background:
         for command in commands_in(text):
             if command.endswith("&"):

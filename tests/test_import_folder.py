@@ -325,7 +325,9 @@ def test_unstorable_sequence_numbers_are_refused(tmp_path, name):
 
 def test_import_command_accepts_a_folder(tmp_path):
     folder = folder_of(tmp_path, names=("m_5.bin", "m_7.bin"))
-    done = CliRunner().invoke(cli, ["import", str(folder), "--temperature", "12.5", "--sensor", "left", "--json"])
+    done = CliRunner().invoke(
+        cli, ["import", "signals", str(folder), "--temperature", "12.5", "--sensor", "left", "--json"]
+    )
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout) == {"output": str(tmp_path / "run.1.h5"), "measurements": 2, "notes": []}
     with open_recording(tmp_path / "run.1.h5") as recording:
@@ -341,6 +343,6 @@ def test_import_of_files_needs_settings(tmp_path, option):
     (tmp_path / "a.bin").write_bytes(words(1).tobytes())
     given = {"--layout": "eRTIS_v3D1", "--preset": "short_25_50"}
     del given[option]
-    done = CliRunner().invoke(cli, ["import", str(tmp_path / "a.bin"), *sum(given.items(), ())])
+    done = CliRunner().invoke(cli, ["import", "signals", str(tmp_path / "a.bin"), *sum(given.items(), ())])
     assert done.exit_code == 2
     assert f"Missing option '{option}'" in done.stderr

@@ -155,7 +155,7 @@ def test_recording_without_a_call_needs_no_fitting_call(tmp_path):
     """The default call of 25 to 50 kHz does not fit 44.1 kHz, but nothing was emitted."""
     path = write_wav(tmp_path / "a.wav", numbers(9_000), 44_100)
     (tmp_path / "ring.toml").write_text(PCM.replace(**{"passive.bands_hz": ((2e3, 4e3),)}).to_toml())
-    command = ["import", str(path), "--settings", str(tmp_path / "ring.toml"), "--length", "0.1"]
+    command = ["import", "signals", str(path), "--settings", str(tmp_path / "ring.toml"), "--length", "0.1"]
     refused = CliRunner().invoke(cli, [*command, "-o", str(tmp_path / "refused.h5")])
     assert refused.exit_code == 1
     assert "or --passive if no call was emitted" in refused.stderr
@@ -168,7 +168,7 @@ def test_recording_without_a_call_needs_no_fitting_call(tmp_path):
             found = camera.process(recording[1])
     assert found.band_hz.tolist() == [[2000.0, 4000.0]]
     assert check_recording(tmp_path / "rec.h5").is_fit
-    for line in ("process rec.h5 -o maps.h5", "plot rec.h5 -o a.png", "info rec.h5 --health", "check rec.h5"):
+    for line in ("process rec.h5 -o maps.h5", "plot rec.h5 -o a.png", "info rec.h5 --health", "sensors check rec.h5"):
         arguments = [str(tmp_path / each) if "." in each else each for each in line.split()]
         done = CliRunner().invoke(cli, arguments)
         assert done.exit_code == 0, (line, done.stderr, done.exception)
@@ -481,7 +481,9 @@ def command(*arguments):
 def test_wav_file_is_processed_to_reflectors(tmp_path, measurement):
     write_wav(tmp_path / "echoes.wav", measurement.data)
     (tmp_path / "ring.toml").write_text(PCM.replace(recording=Recording()).to_toml())
-    command("import", tmp_path / "echoes.wav", "--settings", tmp_path / "ring.toml", "-o", tmp_path / "rec.h5")
+    command(
+        "import", "signals", tmp_path / "echoes.wav", "--settings", tmp_path / "ring.toml", "-o", tmp_path / "rec.h5"
+    )
     command("process", tmp_path / "rec.h5", "-o", tmp_path / "img.h5")
     first, second = json.loads(command("peaks", tmp_path / "img.h5", "--top", "2", "--json"))["peaks"]
     assert first["azimuth_deg"] == pytest.approx(24.0, abs=0.2)
@@ -490,7 +492,7 @@ def test_wav_file_is_processed_to_reflectors(tmp_path, measurement):
 
 def test_given_air_overrides_that_of_the_signals(tmp_path, measurement):
     ertis.export(tmp_path / "a.h5", [measurement], file_format="acoular")
-    command("import", tmp_path / "a.h5", "--temperature", 3, "-o", tmp_path / "rec.h5")
+    command("import", "signals", tmp_path / "a.h5", "--temperature", 3, "-o", tmp_path / "rec.h5")
     with open_recording(tmp_path / "rec.h5") as recording:
         assert recording.settings.air == PCM.air.replace(temperature_c=3.0)
         assert recording[0].settings.air == recording.settings.air
@@ -502,7 +504,15 @@ def test_import_reports_times_and_problems(tmp_path):
     (tmp_path / "ring.toml").write_text(
         PCM.replace(recording=Recording(), processing=PCM.processing.replace(range_m=(0.5, 50.0))).to_toml()
     )
-    arguments = ("import", tmp_path / "a.wav", "--settings", tmp_path / "ring.toml", "-o", tmp_path / "rec.h5")
+    arguments = (
+        "import",
+        "signals",
+        tmp_path / "a.wav",
+        "--settings",
+        tmp_path / "ring.toml",
+        "-o",
+        tmp_path / "rec.h5",
+    )
     more = ("--length", 0.015625, "--start", "2026-05-04T14:30:00.5+0200")
     done = CliRunner().invoke(cli, [str(argument) for argument in (*arguments, *more)])
     assert done.exit_code == 0, done.output
@@ -527,7 +537,7 @@ STARTS = {
 def test_start_time_accepts_minutes_or_finer(tmp_path, start):
     write_wav(tmp_path / "a.wav", numbers().astype(np.float32))
     (tmp_path / "ring.toml").write_text(PCM.replace(recording=Recording()).to_toml())
-    command("import", tmp_path / "a.wav", "--settings", tmp_path / "ring.toml", "--start", start)
+    command("import", "signals", tmp_path / "a.wav", "--settings", tmp_path / "ring.toml", "--start", start)
     with open_recording(tmp_path / "a.h5") as recording:
         assert recording[0].stamp.timestamp_ns == 10**9 * STARTS[start]
 
@@ -536,7 +546,15 @@ def test_start_time_accepts_minutes_or_finer(tmp_path, start):
 def test_unstorable_start_times_are_refused(tmp_path, start):
     write_wav(tmp_path / "a.wav", numbers().astype(np.float32))
     (tmp_path / "ring.toml").write_text(PCM.replace(recording=Recording()).to_toml())
-    arguments = ["import", str(tmp_path / "a.wav"), "--settings", str(tmp_path / "ring.toml"), "--start", start]
+    arguments = [
+        "import",
+        "signals",
+        str(tmp_path / "a.wav"),
+        "--settings",
+        str(tmp_path / "ring.toml"),
+        "--start",
+        start,
+    ]
     done = CliRunner().invoke(cli, arguments)
     assert done.exit_code == 2
     assert f"'--start': {start[:16]}" in done.stderr
@@ -545,7 +563,7 @@ def test_unstorable_start_times_are_refused(tmp_path, start):
 
 def test_recording_needs_another_name_than_its_source(tmp_path):
     path = write_acoular(tmp_path / "ac.h5", numbers().astype(np.float32), RATE_HZ)
-    done = CliRunner().invoke(cli, ["import", str(path)])
+    done = CliRunner().invoke(cli, ["import", "signals", str(path)])
     assert done.exit_code == 2
     assert f"{path} cannot become a recording of the same name; choose another name with --output" in done.stderr
 
@@ -553,6 +571,6 @@ def test_recording_needs_another_name_than_its_source(tmp_path):
 def test_pcm_options_are_refused_for_pdm(tmp_path):
     (tmp_path / "a.bin").write_bytes(bytes(4 * 65_536))
     for option, value in (("--skip", "1"), ("--length", "1"), ("--start", "2026-05-04T12:30:00")):
-        done = CliRunner().invoke(cli, ["import", str(tmp_path / "a.bin"), option, value])
+        done = CliRunner().invoke(cli, ["import", "signals", str(tmp_path / "a.bin"), option, value])
         assert done.exit_code == 2
         assert f"{option} is for PCM (.wav, .h5), but {tmp_path / 'a.bin'} contains raw words" in done.stderr

@@ -33,7 +33,7 @@ def write(path, samples, rate_hz=RATE_HZ):
 
 
 def imported(*arguments):
-    done = CliRunner().invoke(cli, ["import", *map(str, arguments)])
+    done = CliRunner().invoke(cli, ["import", "signals", *map(str, arguments)])
     assert done.exit_code == 0, done.stderr
     return done.stderr
 
@@ -121,7 +121,7 @@ def test_join_command_combines_files(tmp_path):
         write(tmp_path / f"m{place}.wav", noise(seed=place)[:, 0])
     (tmp_path / "line.csv").write_text("0, 0\n10, 0\n20, 0\n30, 0\n")
     arguments = (tmp_path, "--layout", tmp_path / "line.csv", "--passive", "-o", tmp_path / "rec.h5")
-    refused = CliRunner().invoke(cli, ["import", *map(str, arguments)])
+    refused = CliRunner().invoke(cli, ["import", "signals", *map(str, arguments)])
     assert refused.exit_code == 1
     assert "use --join" in refused.stderr
     imported(*arguments, "--join")

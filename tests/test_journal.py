@@ -302,7 +302,9 @@ def test_recording_of_a_renamed_journal_stays_in_its_folder(tmp_path, target):
 
 def test_existing_journal_is_never_overwritten(tmp_path):
     create(tmp_path).close()
-    with pytest.raises(ArgumentError, match=r"rec.h5.journal exists from an interrupted capture; run 'ertis recover"):
+    with pytest.raises(
+        ArgumentError, match=r"rec.h5.journal exists from an interrupted capture; run 'ertis import journals"
+    ):
         create(tmp_path)
     with Journal.open(tmp_path / "rec.h5.journal") as journal:
         assert len(journal) == 3

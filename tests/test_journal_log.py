@@ -66,7 +66,7 @@ def test_flipped_bit_in_samples_is_reported_by_recover_and_verify(tmp_path, coun
         tally_of(path).unlink()
     words = given[4].measurement.data.tobytes()
     flip(log_of(path), log_of(path).read_bytes().rindex(words[-64:]))
-    done = CliRunner().invoke(cli, ["recover", str(path)])
+    done = CliRunner().invoke(cli, ["import", "journals", str(path)])
     assert done.exit_code == 3, done.stderr
     assert "11 measurements, 1 missing, up to 1 of them stored, then lost in the journal's damaged log" in done.stderr
     checked = CliRunner().invoke(cli, ["verify", str(tmp_path / "rec.h5")])
@@ -94,7 +94,7 @@ def test_numbers_that_a_sensor_skips_are_not_reported_as_stored(tmp_path, damage
         flip(log_of(path), log_of(path).read_bytes().rindex(given[-1].measurement.data.tobytes()[-64:]))
     else:
         flip(log_of(path), n_bytes - FRAME_BYTES + 20)
-    done = CliRunner().invoke(cli, ["recover", str(path)])
+    done = CliRunner().invoke(cli, ["import", "journals", str(path)])
     assert done.exit_code == code
     ending = " in the journal's damaged log" if code else ""
     assert f"rec.h5: {reported}{ending}\n" in done.stderr

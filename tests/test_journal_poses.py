@@ -67,7 +67,7 @@ def test_poses_that_cannot_be_used_are_reported(tmp_path):
 def test_recover_reports_damaged_poses(tmp_path):
     path, _ = journal_with_poses(tmp_path)
     spoil(path, "UPDATE poses SET x_m = 7 WHERE id = 2")
-    done = CliRunner().invoke(cli, ["recover", str(path), "--json"])
+    done = CliRunner().invoke(cli, ["import", "journals", str(path), "--json"])
     assert done.exit_code == 3
     assert f"4 measurements, 0 missing, 1 pose is damaged; the journal is kept as {path}.damaged" in done.stderr
     (report,) = json.loads(done.stdout)["journals"]
@@ -83,7 +83,7 @@ def test_recover_counts_measurements_without_a_pose(tmp_path, offset_s, count):
     poses = [replace(pose, timestamp_ns=pose.timestamp_ns + offset_s * step_ns) for pose in poses_at(given)]
     with create(tmp_path, given) as journal:
         journal.append_poses(poses)
-    done = CliRunner().invoke(cli, ["recover", str(journal.path), "--json"])
+    done = CliRunner().invoke(cli, ["import", "journals", str(journal.path), "--json"])
     assert done.exit_code == 0
     without = f", {count} without a pose" if count else ""
     assert done.stderr == f"{tmp_path / 'rec.h5'}: 4 measurements{without}, 0 missing\n"

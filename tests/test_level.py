@@ -429,8 +429,8 @@ def test_command_names_measurements_without_pose_once(recording, tmp_path):
         none = write_recording(tmp_path / "none.h5", list(reader), mounting=place)
         unmounted = write_recording(tmp_path / "unmounted.h5", list(reader), poses=reader.trajectory)
     for path, message in (
-        (part, "part.h5: sensor front has no pose at 1 of 3 measurements; add poses with 'ertis import-poses'"),
-        (none, "none.h5: sensor front has no pose at 3 of 3 measurements; add poses with 'ertis import-poses'"),
+        (part, "part.h5: sensor front has no pose at 1 of 3 measurements; add poses with 'ertis import poses'"),
+        (none, "none.h5: sensor front has no pose at 3 of 3 measurements; add poses with 'ertis import poses'"),
         (
             unmounted,
             "unmounted.h5: sensor front has no mounting, so its attitude is unknown; add its mounting (--mounting)",

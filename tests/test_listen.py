@@ -164,9 +164,8 @@ def test_listen_without_images_writes_no_file(tmp_path, monkeypatch, product):
         )
     assert done.exit_code == 1
     received = {"raw": "measurement", "energyscape": "image"}[product]
-    reason = (
-        f"none.h5 is not written, because no {received} was received; check 'ertis status', or run the command longer"
-    )
+    reason = f"none.h5 is not written, because no {received} was received; check 'ertis sensors status', or run "
+    reason += "the command longer"
     assert reason in done.stderr or reason in str(done.exception)
     last = json.loads(done.stdout.splitlines()[-1])
     assert (last["event"], last["received"], last["output"]) == ("listened", 0, None)

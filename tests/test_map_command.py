@@ -295,7 +295,7 @@ def test_map_notes_poses_of_a_camera_and_converts_them(folder):
         add_poses(folder / "both.h5", of_camera(poses()), output=folder / "of_camera.h5")
     note = (
         "its −y axis points up, as that of a camera does (z forward, y down); convert them with --pose-axes camera "
-        "(ertis import-poses, ertis map)"
+        "(ertis import poses, ertis map)"
     )
     run(folder, "both.h5 --poses poses.tum -q -o level.h5")
     for number, line in enumerate(("both.h5 --poses camera.tum", "of_camera.h5")):
@@ -307,7 +307,13 @@ def test_map_notes_poses_of_a_camera_and_converts_them(folder):
         maps = [ertis.read_map(folder / name) for name in ("level.h5", f"converted{number}.h5")]
         assert maps[0].log_odds.shape == maps[1].log_odds.shape
         assert maps[0].log_odds == pytest.approx(maps[1].log_odds, abs=1e-4)
-    imported = ["import-poses", *(str(folder / each) for each in ("both.h5", "camera.tum")), "-o", str(folder / "i.h5")]
+    imported = [
+        "import",
+        "poses",
+        *(str(folder / each) for each in ("both.h5", "camera.tum")),
+        "-o",
+        str(folder / "i.h5"),
+    ]
     for turn, wanted in (([], 1), (["--pose-axes", "camera", "--force"], 0)):
         done = CliRunner().invoke(cli, [*imported, *turn])
         assert (done.exit_code, done.stderr.count(note), "PoseWarning" in done.stderr) == (0, wanted, False)

@@ -27,7 +27,7 @@ from tests.ports import reserved_address
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text("utf-8")
 PAGE = page("network")
-READY = {"emulate": "/dev/", "serve": '"listening"', "record": '"listening"', "capture": '"kept"'}
+READY = {"sensors emulate": "/dev/", "serve": '"listening"', "record": '"listening"', "capture": '"kept"'}
 SENSORS = ("front", "left")
 """The sensors of the platform from which the commands capture."""
 
@@ -101,16 +101,18 @@ class Shell:
     def run(self, line):
         for before, port in self.ports.items():
             line = line.replace(before, port)
-        name, *arguments = line.removesuffix("&").split()
+        words = line.removesuffix("&").split()
+        name = " ".join(words[: 1 + (words[0] == "sensors")])
+        arguments = words[len(name.split()) :]
         if name == "serve" and "--listen" not in arguments:
             arguments += ["--listen", f"tcp://127.0.0.1:{self.ports['5601']}"]
             arguments += ["--publish", f"tcp://127.0.0.1:{self.ports['5602']}"]
-        if name == "emulate":
+        if name == "sensors emulate":
             arguments[0] = str(self.platform)
         if not line.endswith("&"):
-            return run_here(self.place, shlex.join([name, *arguments]))
-        command = [sys.executable, "-m", "ertis_cli", name, *arguments]
-        as_json = [] if name == "emulate" else ["--json"]
+            return run_here(self.place, shlex.join([*name.split(), *arguments]))
+        command = [sys.executable, "-m", "ertis_cli", *name.split(), *arguments]
+        as_json = [] if name == "sensors emulate" else ["--json"]
         process = subprocess.Popen([*command, *as_json], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         self.running.append(process)
         while READY[name] not in (reported := process.stdout.readline()):
@@ -134,7 +136,7 @@ def test_network_commands_of_the_readme_are_those_of_the_page():
 
 def test_network_page_on_one_machine_runs(place, ports, platform):
     lines = on_one_machine(PAGE)
-    assert [line.split()[0] for line in lines] == ["example", "emulate", "serve", "capture", "listen", "status"]
+    assert [line.split()[0] for line in lines] == ["example", "sensors", "serve", "capture", "listen", "sensors"]
     with Shell(place, ports, platform) as shell:
         *_, heard, status = [shell.run(line) for line in lines]
     assert len([line for line in heard.splitlines() if re.match(r"(front|left) ", line)]) == 10

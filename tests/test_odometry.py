@@ -249,7 +249,7 @@ def test_path_of_odometry_serves_maps_and_recordings(tmp_path, monkeypatch):
     for command in (
         ["simulate", str(scene), "-o", "drive.h5", "--count", "3"],
         ["odometry", "drive.h5", "-o", "path.tum"],
-        ["import-poses", "drive.h5", "path.tum", "-o", "posed.h5", "--force"],
+        ["import", "poses", "drive.h5", "path.tum", "-o", "posed.h5", "--force"],
         ["map", "drive.h5", "--poses", "path.tum", "-o", "place.h5"],
     ):
         done = CliRunner().invoke(cli, command)

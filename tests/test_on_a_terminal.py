@@ -258,7 +258,7 @@ def test_help_describes_json_output():
     assert all("JSON" in text and "stdout" in text for text in about.values())
     for name in ("capture", "listen"):
         assert "one object per line for each" in about[f"{name} {name}"]
-    assert "with --watch one per line" in about["status status"]
+    assert "with --watch one per line" in about["sensors status"]
     assert "one per line if there are several" in about["process process"]
     assert "one per line if there are several" in about["info info"]
 

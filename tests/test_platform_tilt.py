@@ -63,11 +63,11 @@ def in_world_of_camera(place_m, rotation):
         ),
         (
             of_camera(*drive(pitch_deg=20.0)),
-            "convert them with --pose-axes camera (ertis import-poses, ertis map) or Trajectory.converted('camera')",
+            "convert them with --pose-axes camera (ertis import poses, ertis map) or Trajectory.converted('camera')",
         ),
         (
             in_world_of_camera(*drive()),
-            "turns about the y axis of the world; convert them with --pose-axes camera-world (ertis import-poses, ",
+            "turns about the y axis of the world; convert them with --pose-axes camera-world (ertis import poses, ",
         ),
         (in_world_of_camera(*(each[:4] for each in drive(90))), None),
         (drive(climb_m=0.1), None),

@@ -124,7 +124,7 @@ def test_several_ports_of_one_serial_number_are_refused(monkeypatch):
 
 def test_missing_port_is_refused(monkeypatch):
     with pytest.raises(
-        SonarError, match=r"serial port 'SN7' does not exist; no port exists: .* 'ertis emulate'"
+        SonarError, match=r"serial port 'SN7' does not exist; no port exists: .* 'ertis sensors emulate'"
     ) as caught:
         resolve("SN7")
     assert caught.value.errno == errno.ENOENT
@@ -226,6 +226,6 @@ def test_devices_command_prints_nothing_without_devices(monkeypatch):
     done = listed()
     assert (done.stdout, done.stderr) == (
         "",
-        "no eRTIS found; plug one in, or start an emulated one with 'ertis emulate'\n",
+        "no eRTIS found; plug one in, or start an emulated one with 'ertis sensors emulate'\n",
     )
     assert json.loads(listed("--json").stdout) == {"devices": []}

@@ -378,12 +378,12 @@ def test_numbers_of_small_and_of_large_arrays_are_questioned(tmp_path, size):
 def test_layouts_prints_files_in_millimetres(tmp_path):
     (tmp_path / "a.csv").write_text("x_m,y_m,z_m\n0,0,0\n0,6,0\n0,0,-3\n")
     (tmp_path / "small.csv").write_text("0,0\n0,20\n20,0\n")
-    done = CliRunner().invoke(cli, ["layouts", str(tmp_path / "a.csv")])
+    done = CliRunner().invoke(cli, ["reference", "layouts", str(tmp_path / "a.csv")])
     assert (done.exit_code, done.stderr) == (0, "")
     (tmp_path / "a.toml").write_text(done.stdout)
     assert tomllib.loads(done.stdout)["positions_mm"][1] == [0.0, 4000.0, 1000.0]
     assert np.array_equal(load_layout(tmp_path / "a.toml").positions_m, load_layout(tmp_path / "a.csv").positions_m)
-    done = CliRunner().invoke(cli, ["layouts", str(tmp_path / "small.csv")])
+    done = CliRunner().invoke(cli, ["reference", "layouts", str(tmp_path / "small.csv")])
     assert done.stderr.startswith("note: layout ")
     assert done.stderr.count("states no unit") == 1
     assert tomllib.loads(done.stdout)["name"] == "small"
@@ -402,7 +402,7 @@ def test_notes_of_a_layout_appear_when_a_recording_is_made(tmp_path, monkeypatch
         )
     wavfile.write("a.wav", 192000, np.random.default_rng(0).integers(-99, 99, (3000, 3)).astype(np.int16))
     for line, count in {
-        "import a.wav -o a.h5 --settings a.toml": 1,
+        "import signals a.wav -o a.h5 --settings a.toml": 1,
         "process a.h5 --settings a.toml --force": 0,
         "process a.h5 --settings b.toml --force": 1,
     }.items():
@@ -467,17 +467,17 @@ def test_commands_name_an_own_array_by_its_file(tmp_path, monkeypatch):
     wavfile.write("a.wav", 192_000, rng.normal(0, 900, (19_200, 4)).astype("<i2"))
     wavfile.write("five.wav", 192_000, np.zeros((19_200, 5), "<i2"))
     (tmp_path / "mine.toml").write_text(f"[array]\npositions_m = {(0.04 * PLACES).tolist()}\n")
-    done = run("import a.wav --settings mine.toml --passive -o a.h5")
+    done = run("import signals a.wav --settings mine.toml --passive -o a.h5")
     assert done.exit_code == 0, done.stderr
     assert "mine.toml" in run("info a.h5").stdout
-    refused = run("import five.wav --settings mine.toml --passive -o b.h5")
+    refused = run("import signals five.wav --settings mine.toml --passive -o b.h5")
     assert "array 'mine.toml' has 4; write one row for each of 5 channels in array.positions_m" in refused.stderr
     assert "--layout" not in refused.stderr
     (tmp_path / "mics.csv").write_text(lines("{x},{y},{z}", 42))
-    noted = run("import a.wav --layout mics.csv --passive -o c.h5")
+    noted = run("import signals a.wav --layout mics.csv --passive -o c.h5")
     assert noted.exit_code == 0
     assert "note: layout mics.csv states no unit; millimetres are assumed" in noted.stderr
-    assert not run("import a.wav --layout mics.csv --passive -o c.h5 --force --quiet").stderr
+    assert not run("import signals a.wav --layout mics.csv --passive -o c.h5 --force --quiet").stderr
 
 
 def run(command):

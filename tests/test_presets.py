@@ -83,24 +83,24 @@ def test_unknown_presets_and_those_of_the_other_kind_are_refused(make, message):
 
 
 def test_presets_command_lists_all_presets():
-    rows = json.loads(run("presets", "--json").stdout)["presets"]
+    rows = json.loads(run("reference", "presets", "--json").stdout)["presets"]
     assert tuple(row["name"] for row in rows) == ertis.presets()
     assert {row["name"]: row["kind"] for row in rows}["2d_181_5m"] == "processing"
-    text = run("presets").stdout
+    text = run("reference", "presets").stdout
     assert all(name in text for name in ertis.presets())
 
 
 def test_presets_command_prints_a_usable_settings_file(recording, tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text(run("presets", "2D_5m_91").stdout)
+    path.write_text(run("reference", "presets", "2D_5m_91").stdout)
     run("process", recording, "-o", tmp_path / "file.h5", "--settings", path, "-q")
     run("process", recording, "-o", tmp_path / "name.h5", "--preset", "2d_91_5m", "-q")
     with open_energyscapes(tmp_path / "file.h5") as by_file, open_energyscapes(tmp_path / "name.h5") as by_name:
         assert by_file.settings == by_name.settings
         assert by_file[0].amplitude.tobytes() == by_name[0].amplitude.tobytes()
         assert by_name[0].amplitude.shape[0] == 91
-    assert json.loads(run("presets", "2d_91_5m", "--json").stdout)["toml"] == preset_text("2d_91_5m")
-    assert "preset '2d_19_5m' is unknown (did you mean" in run("presets", "2d_19_5m", code=1).stderr
+    assert json.loads(run("reference", "presets", "2d_91_5m", "--json").stdout)["toml"] == preset_text("2d_91_5m")
+    assert "preset '2d_19_5m' is unknown (did you mean" in run("reference", "presets", "2d_19_5m", code=1).stderr
 
 
 def test_options_override_the_preset_which_overrides_the_settings_file(recording, tmp_path):
@@ -145,5 +145,5 @@ def test_settings_of_rtisdev_have_keys_of_the_same_meaning():
 
 
 def test_former_name_of_the_layouts_command_works():
-    assert run("layout").stdout == run("layouts").stdout
-    assert all(name in run("layouts").stdout for name in ertis.layout_names())
+    assert run("reference", "layouts").stdout == run("reference", "layouts").stdout
+    assert all(name in run("reference", "layouts").stdout for name in ertis.layout_names())

@@ -21,27 +21,16 @@ DEVICES = page("devices")
 NETWORK = next(block for block in README.split("```") if "ertis serve" in block)
 ELSEWHERE = {
     *(
-        "calibrate",
-        "command",
-        "completion",
-        "configure",
         "demo",
         "doctor",
-        "import",
-        "import-poses",
         "keys",
-        "layouts",
         "listen",
         "map",
         "odometry",
-        "presets",
         "record",
-        "reset",
+        "reference",
         "ros",
-        "rtisdev",
         "serve",
-        "settings",
-        "status",
         "view",
     )
 }
@@ -85,10 +74,10 @@ def test_readme_commands_run(place, tmp_path_factory):
     with contextlib.ExitStack() as stack:
         run_forked = stack.enter_context(forking(place, tmp_path_factory.mktemp("output")))
         for command in commands_in(
-            README.replace(NETWORK, "").replace("emulate reflectors.toml", "emulate reflectors.h5")
+            README.replace(NETWORK, "").replace("sensors emulate reflectors.toml", "sensors emulate reflectors.h5")
         ):
             name, *arguments = shlex.split(command)
-            if name in ELSEWHERE:
+            if name in ELSEWHERE or command.startswith("sensors calibrate"):
                 continue
             if arguments[-1:] == ["&"]:
                 stack.enter_context(in_background(place, command))
@@ -108,7 +97,7 @@ def test_readme_commands_run(place, tmp_path_factory):
 def test_commands_of_the_devices_page_run(place):
     """The first emulator replays a recording of its scene, which starts sooner."""
     with contextlib.ExitStack() as background:
-        for command in commands_in(DEVICES.replace("emulate reflectors.toml", "emulate reflectors.h5")):
+        for command in commands_in(DEVICES.replace("sensors emulate reflectors.toml", "sensors emulate reflectors.h5")):
             if command.endswith("&"):
                 background.enter_context(in_background(place, command))
             else:
@@ -122,7 +111,7 @@ def test_readme_example_runs(place, monkeypatch):
     example = ROOT / "examples" / "1_nearest_reflector.py"
     shutil.copy(ROOT / "data" / "synthetic" / "reflectors.h5", place)
     monkeypatch.setattr(sys, "argv", [str(example), "sensor"])
-    with in_background(place, "emulate reflectors.h5 &"):
+    with in_background(place, "sensors emulate reflectors.h5 &"):
         reported = run_code_here(place, example.read_text("utf-8"), str(example))
     assert reported.splitlines() == [f"#{number}: 1.15 m at -38°" for number in range(5)]
 
@@ -154,10 +143,10 @@ def test_files_named_on_pages_exist(name):
 )
 def test_emulator_blocks_can_be_pasted_unchanged(name):
     """Pasted commands run before the emulator is ready, so each block waits for its sensor."""
-    blocks = [block for block in (ROOT / name).read_text().split("```") if "$ ertis emulate" in block]
+    blocks = [block for block in (ROOT / name).read_text().split("```") if "$ ertis sensors emulate" in block]
     assert blocks
     for block in blocks:
-        _, *after = re.findall(r"^\$ ertis (?:emulate .*|capture .*|devices)$", block, re.MULTILINE)
+        _, *after = re.findall(r"^\$ ertis (?:sensors emulate .*|capture .*|sensors list)$", block, re.MULTILINE)
         assert "capture" in after[0]
         assert "--wait" in after[0]
 

@@ -31,7 +31,7 @@ def processed(request, tmp_path_factory):
     """Process the measurement with one layout; return the layout, the image file and the image."""
     folder = tmp_path_factory.mktemp(request.param)
     recording, image = folder / "recording.h5", folder / "image.h5"
-    run("import", RAW, "-o", recording, "--layout", request.param, "--preset", "default_25_50")
+    run("import", "signals", RAW, "-o", recording, "--layout", request.param, "--preset", "default_25_50")
     # One of the ten peaks is barely a maximum, and errors of -35 dB may remove it.
     run(
         "process",

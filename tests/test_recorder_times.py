@@ -421,7 +421,7 @@ def test_folder_is_imported_in_the_order_of_times(tmp_path):
     for name in ("B_20240518_042537.WAV", "A_20240518_042637.wav", "._B_20240518_042537.WAV", "CONFIG.TXT"):
         write(card / name)
     (tmp_path / "one.csv").write_text("0, 0\n")
-    done = command("import", card, "--layout", tmp_path / "one.csv", "--passive")
+    done = command("import", "signals", card, "--layout", tmp_path / "one.csv", "--passive")
     assert done.exit_code == 0, done.stderr
     with ertis.open_recording(tmp_path / "card.h5") as recording:
         times = [stamp.timestamp_ns / 1e9 for stamp in recording.stamps()]
@@ -455,7 +455,7 @@ def test_files_of_other_rates_name_the_expansion(tmp_path):
 
 def test_import_asks_for_the_call(tmp_path):
     (tmp_path / "one.csv").write_text("0, 0\n")
-    arguments = ("import", write(tmp_path / "a.wav"), "--layout", tmp_path / "one.csv")
+    arguments = ("import", "signals", write(tmp_path / "a.wav"), "--layout", tmp_path / "one.csv")
     done = command(*arguments)
     assert done.exit_code == 2
     assert "a.wav is unknown; use --passive if none was emitted, otherwise --settings with the call or" in done.stderr
@@ -491,7 +491,7 @@ def test_folders_without_files_are_refused(tmp_path, made, named, message):
     (tmp_path / "card" / "Data").mkdir(parents=True)
     for name in made:
         write(tmp_path / "card" / name)
-    done = command("import", *(tmp_path / name for name in named), "--layout", "one.csv", "--passive")
+    done = command("import", "signals", *(tmp_path / name for name in named), "--layout", "one.csv", "--passive")
     assert done.exit_code == 2
     assert message in done.stderr
 
@@ -500,7 +500,7 @@ def test_start_may_be_repeated(tmp_path):
     paths = [write(tmp_path / f"{name}.wav") for name in "ab"]
     (tmp_path / "one.csv").write_text("0, 0\n")
     starts = ("--start", "2024-05-18T04:25", "--start", "2024-05-18T04:26")
-    done = command("import", *paths, "--layout", tmp_path / "one.csv", "--passive", *starts, "--json")
+    done = command("import", "signals", *paths, "--layout", tmp_path / "one.csv", "--passive", *starts, "--json")
     assert done.exit_code == 0, done.stderr
     with ertis.open_recording(tmp_path / "a.h5") as recording:
         first, second = (stamp.timestamp_ns / 1e9 for stamp in recording.stamps())

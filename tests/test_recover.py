@@ -1,4 +1,4 @@
-"""``ertis recover`` and ``ertis capture`` seal journals in a separate process and report the result."""
+"""``ertis import journals`` and ``ertis capture`` seal journals in a separate process and report the result."""
 
 import json
 import shutil
@@ -136,13 +136,13 @@ def test_sealing_process_can_be_interrupted(tmp_path, fake_python, late):
 
     with pytest.raises(KeyboardInterrupt) as error:
         seal_in_subprocess(path, progress=interrupt)
-    safe = f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+    safe = f"the measurements are safe in {path}; recover them with 'ertis import journals {path}'"
     assert str(error.value) == (f"the measurements are in {tmp_path / 'rec.h5'}" if late else safe)
     assert (path.exists(), (tmp_path / "rec.h5").exists()) == (not late, late)
     assert seal(path).measurements == 3
 
 
-# The command `ertis recover`.
+# The command `ertis import journals`.
 
 
 def test_recover_seals_a_folder(tmp_path):
@@ -151,7 +151,7 @@ def test_recover_seals_a_folder(tmp_path):
     crashed(tmp_path, entries(1), name="b.h5")
     (tmp_path / "c.h5.journal").touch()
     with create(tmp_path, name="used.h5"):
-        done = run("recover", tmp_path)
+        done = run("import", "journals", tmp_path)
     assert sorted(done.stderr.splitlines()) == [
         f"{tmp_path}/b.h5: 1 measurement, 0 missing",
         f"{tmp_path}/c.h5.journal: no measurement was captured; removed",
@@ -168,13 +168,13 @@ def test_recover_reports_unsealable_journals(tmp_path):
     path = crashed(tmp_path)
     (tmp_path / "rec.h5").write_text("mine")
     crashed(tmp_path, name="b.h5")
-    done = run("recover", tmp_path, "--json", "--quiet", code=1)
+    done = run("import", "journals", tmp_path, "--json", "--quiet", code=1)
     assert done.stderr == (
         f"ertis: error: {tmp_path}/rec.h5 exists with other content than {path}; move it, or replace it (--force)\n"
     )
     reported = json.loads(done.stdout)["journals"]
     assert [(report.get("measurements"), "error" in report) for report in reported] == [(3, False), (None, True)]
-    assert run("recover", path, "--force", "--quiet").stderr == ""
+    assert run("import", "journals", path, "--force", "--quiet").stderr == ""
     assert verify(tmp_path / "rec.h5")[0].is_intact
 
 
@@ -184,21 +184,23 @@ def test_recover_reports_damaged_measurements(tmp_path):
     path = tmp_path / "rec.h5.journal"
     spoil(path, "UPDATE measurements SET words = x'00' WHERE id = 1")
     reported = f"2 measurements, 1 missing, of which 1 damaged; the journal is kept as {path}.damaged"
-    assert reported in run("recover", path, code=3).stderr
+    assert reported in run("import", "journals", path, code=3).stderr
 
 
 def test_recover_reports_a_folder_without_journals(tmp_path):
-    assert run("recover", tmp_path).stderr == f"no journal in {tmp_path}\n"
-    assert run("recover", tmp_path, "--quiet").stderr == ""
-    assert json.loads(run("recover", tmp_path, "--json").stdout) == {"journals": []}
-    assert "none.journal: No such file or directory" in run("recover", tmp_path / "none.journal", code=1).stderr
+    assert run("import", "journals", tmp_path).stderr == f"no journal in {tmp_path}\n"
+    assert run("import", "journals", tmp_path, "--quiet").stderr == ""
+    assert json.loads(run("import", "journals", tmp_path, "--json").stdout) == {"journals": []}
+    assert (
+        "none.journal: No such file or directory" in run("import", "journals", tmp_path / "none.journal", code=1).stderr
+    )
 
 
 def test_recover_ignores_modules_in_the_folder(tmp_path, monkeypatch):
     crashed(tmp_path)
     (tmp_path / "h5py.py").write_text("raise SystemExit('the wrong one')")
     monkeypatch.chdir(tmp_path)
-    assert run("recover", ".").stderr == "rec.h5: 3 measurements, 0 missing\n"
+    assert run("import", "journals", ".").stderr == "rec.h5: 3 measurements, 0 missing\n"
 
 
 def interrupted(*_, **__):
@@ -208,12 +210,13 @@ def interrupted(*_, **__):
 def test_recover_can_be_interrupted(tmp_path, monkeypatch):
     path = crashed(tmp_path)
     monkeypatch.setattr(child.subprocess, "Popen", interrupted)
-    done = run("recover", path, code=130)
+    done = run("import", "journals", path, code=130)
     assert (
-        done.stderr.splitlines()[0] == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+        done.stderr.splitlines()[0]
+        == f"the measurements are safe in {path}; recover them with 'ertis import journals {path}'"
     )
     monkeypatch.undo()
-    assert run("recover", path).stderr == f"{tmp_path}/rec.h5: 3 measurements, 0 missing\n"
+    assert run("import", "journals", path).stderr == f"{tmp_path}/rec.h5: 3 measurements, 0 missing\n"
 
 
 # Sealing at the end of a capture.
@@ -238,7 +241,7 @@ def test_failed_capture_that_cannot_be_sealed_is_reported(tmp_path, capsys):
     (tmp_path / "rec.h5").write_text("mine")
     reported = (
         f"{tmp_path}/rec.h5 exists with other content than {path}; move it, or replace it (overwrite=True); "
-        f"the measurements are safe in {path}; recover them with 'ertis recover {path}'"
+        f"the measurements are safe in {path}; recover them with 'ertis import journals {path}'"
     )
     with pytest.raises(SonarError, match="left: it was unplugged"):
         _seal(path, LOST, overwrite=False)
@@ -266,4 +269,7 @@ def test_capture_with_interrupted_sealing_keeps_its_journal(tmp_path, monkeypatc
     monkeypatch.setattr(child.subprocess, "Popen", interrupted)
     with pytest.raises(KeyboardInterrupt if failure is None else SonarError):
         _seal(path, failure, overwrite=False)
-    assert capsys.readouterr().err == f"the measurements are safe in {path}; recover them with 'ertis recover {path}'\n"
+    assert (
+        capsys.readouterr().err
+        == f"the measurements are safe in {path}; recover them with 'ertis import journals {path}'\n"
+    )

@@ -351,7 +351,7 @@ if __name__ == "__main__":
 def emulated(folder):
     """An emulated sensor, and the name of its port."""
     link = folder / "sensor"
-    command = [sys.executable, "-m", "ertis_cli", "emulate", SCENE, "--sensor", "west", "--link", link]
+    command = [sys.executable, "-m", "ertis_cli", "sensors", "emulate", SCENE, "--sensor", "west", "--link", link]
     environment = ENVIRONMENT | {"ERTIS_EMULATED_DIR": str(folder)}
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -362,9 +362,9 @@ def emulated(folder):
 
 
 def run_script(script, *arguments):
-    """Run ``ertis rtisdev`` in the folder of the package's tests, as these need it."""
+    """Run ``ertis sensors rtisdev`` in the folder of the package's tests, as these need it."""
     return subprocess.run(
-        [sys.executable, "-m", "ertis_cli", "rtisdev", *arguments, script],
+        [sys.executable, "-m", "ertis_cli", "sensors", "rtisdev", *arguments, script],
         cwd=own_tests(),
         env=ENVIRONMENT | {"MPLBACKEND": "agg"},
         capture_output=True,
@@ -676,7 +676,7 @@ def test_modules_of_a_foreign_name_appear_only_on_request():
 def test_rtisdev_command_needs_the_package(monkeypatch, tmp_path):
     (tmp_path / "script.py").write_text("print('ran')")
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    refused = CliRunner().invoke(cli, ["rtisdev", str(tmp_path / "script.py")])
+    refused = CliRunner().invoke(cli, ["sensors", "rtisdev", str(tmp_path / "script.py")])
     assert refused.exit_code == 1
     assert "rtisdev" in refused.stderr
 

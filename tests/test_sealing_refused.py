@@ -83,7 +83,7 @@ def test_seal_survives_any_error_in_laying_out_a_sensor(tmp_path, monkeypatch):
 
 def test_recover_reports_a_sensor_that_cannot_be_sealed(tmp_path, left):
     create(tmp_path, entries(2), name="other.h5").close()
-    done = CliRunner().invoke(cli, ["recover", "--json", str(tmp_path)])
+    done = CliRunner().invoke(cli, ["import", "journals", "--json", str(tmp_path)])
     assert done.exit_code == 1
     assert "ertis: error: " in done.stderr
     assert "no recording can hold sensor bad" in done.stderr

@@ -60,7 +60,7 @@ def test_file_of_examples_is_accepted(document):
 @pytest.mark.parametrize("document", DOCUMENTS)
 def test_unchanged_template_gives_the_defaults(document):
     """Every line of the template is a comment until a user removes the comment mark."""
-    text = CliRunner().invoke(cli, ["settings", document]).stdout
+    text = CliRunner().invoke(cli, ["reference", "settings", document]).stdout
     assert tomllib.loads(text) == {}
     for section in reference(document):
         assert not section.header or f"# {section.header}\n" in text
@@ -69,14 +69,14 @@ def test_unchanged_template_gives_the_defaults(document):
 
 
 def test_template_with_a_changed_key_is_accepted(tmp_path):
-    text = CliRunner().invoke(cli, ["settings"]).stdout
+    text = CliRunner().invoke(cli, ["reference", "settings"]).stdout
     path = tmp_path / "mine.toml"
     path.write_text(text.replace("# [air]", "[air]").replace("# temperature_c", "temperature_c"))
     assert Settings.load(path).air.temperature_c == 24.5
 
 
 def test_settings_reference_is_printed_as_json():
-    reported = json.loads(CliRunner().invoke(cli, ["settings", "layout", "--json"]).stdout)
+    reported = json.loads(CliRunner().invoke(cli, ["reference", "settings", "layout", "--json"]).stdout)
     (table,) = reported["tables"]
     (found,) = (key for key in table["keys"] if key["name"] == "positions_mm")
     assert (found["unit"], found["default"]) == ("mm", "none")

@@ -172,7 +172,7 @@ def test_status_of_another_machine_needs_keys():
 
 def test_command_prints_one_table_without_a_terminal():
     with central_node() as address:
-        result = CliRunner().invoke(cli, ["status", address], catch_exceptions=False)
+        result = CliRunner().invoke(cli, ["sensors", "status", address], catch_exceptions=False)
     assert result.exit_code == 0
     assert result.stdout.startswith(f"{address} on ")
     assert "storage" in result.stdout
@@ -183,7 +183,7 @@ def test_command_prints_one_json_object(keys, tmp_path):
     with central_node(keys) as address:
         result = CliRunner().invoke(
             cli,
-            ["status", address, "--json", "--key", str(secret), "--server-key", CENTRAL.public],
+            ["sensors", "status", address, "--json", "--key", str(secret), "--server-key", CENTRAL.public],
             catch_exceptions=False,
         )
     assert result.exit_code == 0
@@ -194,7 +194,7 @@ def test_command_prints_one_json_object(keys, tmp_path):
 
 
 def test_command_without_an_answer_fails_with_one_line():
-    result = CliRunner().invoke(cli, ["status", "tcp://127.0.0.1:1", "--patience", "0.1"])
+    result = CliRunner().invoke(cli, ["sensors", "status", "tcp://127.0.0.1:1", "--patience", "0.1"])
     assert result.exit_code == 1
     assert len(result.stderr.splitlines()) == 1
 
@@ -228,7 +228,7 @@ class _Asked:
 def test_command_waits_for_a_central_node_that_disappears(monkeypatch, as_json):
     monkeypatch.setattr("ertis_numba.network.central_client.CentralClient", lambda *_, **__: _Asked())
     monkeypatch.setattr("ertis_cli.status._REFRESH_S", 0.0)
-    result = CliRunner().invoke(cli, ["status", BUSY.address, "--watch", *(["--json"] if as_json else [])])
+    result = CliRunner().invoke(cli, ["sensors", "status", BUSY.address, "--watch", *(["--json"] if as_json else [])])
     if as_json:
         events = [json.loads(line) for line in result.stdout.splitlines()]
         assert [each["event"] for each in events] == ["status", "away", "away", "status"]

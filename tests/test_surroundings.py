@@ -93,7 +93,7 @@ SHELL = pytest.mark.skipif(sys.platform == "win32", reason="the test needs a POS
 @SHELL
 @pytest.mark.parametrize("encoding", ["cp932", "gbk", "koi8_r", "utf_16"])
 def test_command_prints_in_an_encoding_without_its_characters(encoding):
-    done = run("check", "--help", PYTHONIOENCODING=encoding)
+    done = run("sensors", "check", "--help", PYTHONIOENCODING=encoding)
     assert (done.returncode, done.stderr) == (0, b"")
     assert "Usage: " in done.stdout.decode(encoding)
 

@@ -246,7 +246,15 @@ def test_loopback_without_complete_emissions_is_refused(tmp_path, name):
 def test_sync_channel_command_corrects_the_ranges(tmp_path):
     write(tmp_path / "a.wav", record([1.37e-3], 0.02))
     (tmp_path / "ring.toml").write_text(SETTINGS.to_toml())
-    arguments = ["import", str(tmp_path / "a.wav"), "--settings", str(tmp_path / "ring.toml"), "--sync-channel", "8"]
+    arguments = [
+        "import",
+        "signals",
+        str(tmp_path / "a.wav"),
+        "--settings",
+        str(tmp_path / "ring.toml"),
+        "--sync-channel",
+        "8",
+    ]
     done = CliRunner().invoke(cli, arguments)
     assert done.exit_code == 0, done.stderr
     assert "note: 1 emission found in channel 8, which is not imported; rounding" in done.stderr

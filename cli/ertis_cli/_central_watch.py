@@ -248,7 +248,8 @@ def report(status: "Status", watch: CentralWatch, *, event: str) -> None:
         options.say(f"{sensor}: {', '.join(parts)}", quiet=quiet)
     if archive is not None and left:
         click.echo(
-            f"{options.counted(left, 'journal')} not sealed; seal with 'ertis recover {archive.folder}'", err=True
+            f"{options.counted(left, 'journal')} not sealed; seal with 'ertis import journals {archive.folder}'",
+            err=True,
         )
         click.get_current_context().exit(1)
 

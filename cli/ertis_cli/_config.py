@@ -25,13 +25,17 @@ _GENERAL = frozenset({"device", "quiet", "threads"})
 """Options with the same meaning in every command, such as ``ERTIS_THREADS``."""
 
 _NO_OPTIONS = frozenset(
-    f"ERTIS_{name}" for name in ("BENCH_MARK", "CACHE_DIR", "CONFIG", "EMULATED_DIR", "KEYS_DIR", "TRACE")
+    f"ERTIS_{name}"
+    for name in (
+        *("BENCH_MARK", "CACHE_DIR", "CONFIG", "EMULATED_DIR", "KEYS_DIR", "TRACE"),
+        *("RTISDEV_DEVICE", "RTISDEV_METHOD", "RTISDEV_PORT"),
+    )
 )
 """Variables that are not options: other parts of the package read them, and benchmarks mark their processes."""
 
 _FILE, _BROKEN = "ertis_cli.config_file", "ertis_cli.config_error"  # keys of click's `Context.meta`
-_WITHOUT = frozenset({"completion", "doctor"})
-"""Commands that run despite an invalid configuration: new shells run ``completion``, ``doctor`` finds faults."""
+_WITHOUT = frozenset({"doctor", "reference"})
+"""Commands that run despite an invalid configuration: new shells run one of them, and ``doctor`` finds faults."""
 
 
 def variable(path: Iterable[str], option: str) -> str:

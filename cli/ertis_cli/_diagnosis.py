@@ -193,7 +193,7 @@ def _serial(_folder: Path) -> Iterator[InstallationFinding]:
             "sensors",
             "note",
             "none plugged in",
-            "plug one in, or run 'ertis example platform' and 'ertis emulate platform.toml'",
+            "plug one in, or run 'ertis example platform' and 'ertis sensors emulate platform.toml'",
         )
     for port in ports:
         if os.access(port.path, os.R_OK | os.W_OK):

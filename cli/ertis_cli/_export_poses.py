@@ -38,7 +38,7 @@ def export_poses(path: Path, target: Path, sensor: str | None, *, force: bool, q
     check_target(target, overwrite=force, sources=[path])
     poses = recorded_trajectory(path, sensor=sensor)
     if poses is None:
-        raise DataError(f"{path} has no poses; add them to its recording with 'ertis import-poses RECORDING TRAJ.tum'")
+        raise DataError(f"{path} has no poses; add them to its recording with 'ertis import poses RECORDING TRAJ.tum'")
     write_tum(target, poses, overwrite=force)
     options.say(f"{target}: {options.counted(len(poses), 'pose')}, {poses.length_m:.2f} m", quiet=quiet)
     if as_json:

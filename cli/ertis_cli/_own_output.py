@@ -14,6 +14,8 @@ _OUTPUTS = {"--output", "--save", "--save-html"}
 
 def protect_inputs(command: click.Command) -> None:
     """Let a command refuse an output that is the same file as another parameter, even with --force."""
+    for each in command.commands.values() if isinstance(command, click.Group) else ():
+        protect_inputs(each)
     run = command.callback
     if run is None or hasattr(run, "protects_inputs") or not any(map(_is_output, command.params)):
         return

@@ -26,5 +26,5 @@ processing_preset: Callable[[Callable[..., Any]], Callable[..., Any]] = click.op
     "--preset",
     metavar="NAME",
     shell_complete=completion("processing"),
-    help="Preset of directions and ranges, such as 2d_181_5m; 'ertis presets' lists all.",
+    help="Preset of directions and ranges, such as 2d_181_5m; 'ertis reference presets' lists all.",
 )

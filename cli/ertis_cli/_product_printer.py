@@ -75,7 +75,7 @@ class MicrophoneTable:
         with_call = " without --passive" if _MADE.issuperset(products) else ""
         text = (
             f"no {' and no '.join(products)}{self._of_sensors} received from {address} yet; is 'ertis capture --to' "
-            f"running{with_call}? Check with 'ertis status'"
+            f"running{with_call}? Check with 'ertis sensors status'"
         )
         if self._as_json:
             options.print_json({"event": "waiting", "address": address, "text": text})

@@ -26,7 +26,7 @@ _OPTIONS = (
         metavar="NAME",
         shell_complete=_presets.completion("recording"),
         help="Record length (short_, default_, long_) and band (20_80, 25_50); default_25_50 by default, except for "
-        "'ertis configure'.",
+        "'ertis sensors configure'.",
     ),
     click.option(
         "--layout",

@@ -68,7 +68,7 @@ def saving(target: Path | None, product: str, *, overwrite: bool) -> Iterator[Wr
             yield write
             if not mounted:
                 raise DataError(
-                    f"{target} is not written, because no image was received; check 'ertis status', or run the "
+                    f"{target} is not written, because no image was received; check 'ertis sensors status', or run the "
                     "command longer"
                 )
         return
@@ -119,7 +119,8 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
         except BaseException:
             if len(journal):
                 click.echo(
-                    f"the received measurements are safe in {path}; recover them with 'ertis recover {path}'", err=True
+                    f"the received measurements are safe in {path}; recover them with 'ertis import journals {path}'",
+                    err=True,
                 )
             else:
                 journal.remove()
@@ -127,8 +128,8 @@ def _recording(target: Path, *, overwrite: bool) -> Iterator[Write]:
         if not len(journal):
             journal.remove()
             raise DataError(
-                f"{target} is not written, because no measurement was received; check 'ertis status', or run the "
-                "command longer"
+                f"{target} is not written, because no measurement was received; check 'ertis sensors status', or run "
+                "the command longer"
             )
     sealed = seal_in_subprocess(path, overwrite=overwrite)
     if sealed.recording is None:

@@ -169,6 +169,6 @@ def end_with(parent: int, number: signal.Signals) -> None:
 
 
 def _fail(text: str) -> NoReturn:
-    remedy = "all acknowledged measurements are stored; run 'ertis recover' to seal them into recordings"
+    remedy = "all acknowledged measurements are stored; run 'ertis import journals' to seal them into recordings"
     click.echo(f"ertis: error: {text}; {remedy}", err=True)
     sys.exit(1)

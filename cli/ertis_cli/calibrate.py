@@ -1,4 +1,4 @@
-"""``ertis calibrate``: calibration of an array."""
+"""``ertis sensors calibrate``: calibration of an array."""
 
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
@@ -178,7 +178,7 @@ def calibrate(
     is_better = after_db > before_db - _MAX_LOSS_DB
     if target is not None and is_better:
         count = options.counted(len(made.source_m), "measurement")
-        text = f"ertis calibrate, {count} of a {source}, from layout {made.former.name}"
+        text = f"ertis sensors calibrate, {count} of a {source}, from layout {made.former.name}"
         content = layout_file(made.layout, name=target.stem, source=text).to_toml()
         with atomic_write(target, overwrite=force) as partial:
             partial.write_text(content, "utf-8")

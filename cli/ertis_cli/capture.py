@@ -59,7 +59,9 @@ __all__ = ["capture"]
     metavar="MB",
     help="With --to: memory for measurements; 64 by default. When full without --spool, the oldest are overwritten.",
 )
-@click.option("--fixed-settings", is_flag=True, help="With --to: refuse new settings from admins ('ertis configure').")
+@click.option(
+    "--fixed-settings", is_flag=True, help="With --to: refuse new settings from admins ('ertis sensors configure')."
+)
 @_network.key
 @_network.server_key
 @_mountings.mounting
@@ -155,8 +157,8 @@ def capture(
     """Record measurements, or send them to a central node.
 
     Each measurement is written durably to a journal beside the recording before it is reported. The complete recording
-    appears at the end. Ctrl-C ends a capture after the current measurement. After a crash, 'ertis recover' seals the
-    journal. With --json, each measurement is reported in one line.
+    appears at the end. Ctrl-C ends a capture after the current measurement. After a crash, 'ertis import journals'
+    seals the journal. With --json, each measurement is reported in one line.
 
     With --to, measurements are sent to a central node ('ertis record' or 'ertis serve') and kept until it acknowledges
     them. With --spool, they are durable before they are reported. After a crash, the next capture sends the remaining
@@ -249,7 +251,7 @@ def _record(
     )
     if journal.remark:
         options.warn(journal.remark)
-    where = f"the measurements so far are safe in {path}; recover them with 'ertis recover {path}'"
+    where = f"the measurements so far are safe in {path}; recover them with 'ertis import journals {path}'"
     failure = watch.run(session, journal, checks, where=where)
     if signals.came and not len(journal):
         journal.remove()
@@ -267,9 +269,8 @@ def _seal(path: Path, failure: Exception | None, *, overwrite: bool) -> None:
     try:
         sealed = seal_in_subprocess(path, overwrite=overwrite)
     except (OSError, ValueError) as error:
-        reported = (
-            f"{with_options(str(error))}; the measurements are safe in {path}; recover them with 'ertis recover {path}'"
-        )
+        where = f"the measurements are safe in {path}; recover them with 'ertis import journals {path}'"
+        reported = f"{with_options(str(error))}; {where}"
         if failure is None:
             raise DataError(reported) from error
         click.echo(f"ertis: error: {reported}", err=True)

@@ -1,4 +1,4 @@
-"""``ertis check``: fitness of sensors for use, from their recordings."""
+"""``ertis sensors check``: fitness of sensors for use, from their recordings."""
 
 import functools
 from dataclasses import asdict

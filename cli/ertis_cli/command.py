@@ -1,4 +1,4 @@
-"""``ertis command``: send commands to a sensor."""
+"""``ertis sensors send``: send commands to a sensor."""
 
 import click
 
@@ -7,7 +7,7 @@ from ertis_cli import options
 __all__ = ["command"]
 
 
-@click.command()
+@click.command("send")
 @click.option("--port", "-p", required=True, metavar="PORT", help="Path, serial number or name of the sensor.")
 @click.argument("texts", nargs=-1, required=True, metavar="TEXT...")
 @options.as_json
@@ -16,7 +16,7 @@ def command(*, port: str, texts: tuple[str, ...], as_json: bool) -> None:
 
     A command is a line such as '!Y,0,0,0'. The documentation of the serial protocol lists the known commands. The
     command that starts a measurement is refused; use 'ertis capture' instead. 'ertis capture' configures the sensor
-    again, so it replaces settings that you changed with 'ertis command'.
+    again, so it replaces settings that you changed with 'ertis sensors send'.
     """
     from ertis_numba.devices.commands import CustomCommand
     from ertis_numba.devices.driver import SonarDriver

@@ -1,4 +1,4 @@
-"""``ertis completion``: shell completion of commands and options."""
+"""``ertis reference completion``: shell completion of commands and options."""
 
 import click
 
@@ -11,8 +11,9 @@ __all__ = ["completion"]
 def completion(ctx: click.Context, *, shell: str) -> None:
     """Print a script that completes commands and options in a shell.
 
-    For bash, add eval "$(ertis completion bash)" to ~/.bashrc. For zsh, add eval "$(ertis completion zsh)" to ~/.zshrc,
-    after 'autoload -U compinit; compinit'. For fish, save the output as ~/.config/fish/completions/ertis.fish.
+    For bash, add eval "$(ertis reference completion bash)" to ~/.bashrc. For zsh, add eval "$(ertis reference
+    completion zsh)" to ~/.zshrc, after 'autoload -U compinit; compinit'. For fish, save the output as
+    ~/.config/fish/completions/ertis.fish.
     """
     from click.shell_completion import BashComplete, FishComplete, ZshComplete
 

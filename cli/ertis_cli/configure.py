@@ -1,4 +1,4 @@
-"""``ertis configure``: change the settings of a sensor in a network."""
+"""``ertis sensors configure``: change the settings of a sensor in a network."""
 
 from typing import Any
 

@@ -81,7 +81,7 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     run = _DemoRun(os.environ | sensors, quiet=quiet)
     ports = [word for name in _SENSORS for word in ("--port", name)]
     with ExitStack() as nodes:
-        emulating = ("emulate", scene, "--sync-rate", "10", "--json")  # its progress is shown
+        emulating = ("sensors", "emulate", scene, "--sync-rate", "10", "--json")  # its progress is shown
         nodes.enter_context(run.node(*emulating, output=folder / "emulate.jsonl"))
         serving = ("serve", "--listen", _ANY_PORT, "--publish", _ANY_PORT, "--record", folder / "recordings")
         central = nodes.enter_context(run.node(*serving, "--json", "--quiet", output=folder / "serve.jsonl"))
@@ -89,10 +89,10 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
         _await_worker(central["address"])
         listening = ("listen", central["publish"], "--json", "--quiet")
         nodes.enter_context(run.node(*listening, output=folder / "heard.jsonl"))
-        run("devices")
+        run("sensors", "list")
         to = ("--trigger", "sync", "-n", str(count), "--to", central["address"], "--mounting", scene)
         run("capture", *ports, *to)
-        run("status", central["address"], "--once")
+        run("sensors", "status", central["address"], "--once")
     image = folder / "image.h5"
     recordings = sorted((folder / "recordings").glob("*.h5"))
     run("verify", *recordings, allowed=(_GAPS,))  # a busy machine may miss a pulse

@@ -1,4 +1,4 @@
-"""``ertis devices``: list plugged-in and emulated sensors."""
+"""``ertis sensors list``: list plugged-in and emulated sensors."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ _COLUMNS: dict[str, _tables.Side] = dict.fromkeys(
 )
 
 
-@click.command()
+@click.command("list")
 @click.option("--port", "-p", "names", multiple=True, metavar="PORT", help="Query this port only; repeatable.")
 @options.as_json
 def devices(*, names: tuple[str, ...], as_json: bool) -> None:
@@ -42,7 +42,7 @@ def devices(*, names: tuple[str, ...], as_json: bool) -> None:
         if not names and answer.error is not None and answer.state != "in use":
             click.echo(str(answer.error), err=True)
     if not listed:
-        click.echo("no eRTIS found; plug one in, or start an emulated one with 'ertis emulate'", err=True)
+        click.echo("no eRTIS found; plug one in, or start an emulated one with 'ertis sensors emulate'", err=True)
     for answer in answers:
         if names and answer.error is not None and answer.state != "in use":
             raise answer.error

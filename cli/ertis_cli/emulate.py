@@ -1,4 +1,4 @@
-"""``ertis emulate``: emulated devices on pseudo terminals."""
+"""``ertis sensors emulate``: emulated devices on pseudo terminals."""
 
 import json
 import math
@@ -74,7 +74,7 @@ class _Absence(click.ParamType):  # type: ignore[type-arg]  # as above
     "--link",
     type=options.FILE,
     metavar="PATH",
-    help="Symbolic link to the port of a single device; by default, 'ertis devices' finds it by the sensor's name.",
+    help="Symbolic link to the port of one device; by default, 'ertis sensors list' finds it by the sensor's name.",
 )
 @click.option(
     "--fault",
@@ -200,7 +200,9 @@ def _require_log(path: Path | None) -> None:
     if path is not None and path.is_file():
         with path.open("rb") as file:
             if file.read(1) not in {b"", b"{"}:
-                raise ArgumentError(f"log {path} exists, and is no log of 'ertis emulate'; choose another file (--log)")
+                raise ArgumentError(
+                    f"log {path} exists, and is no log of 'ertis sensors emulate'; choose another file (--log)"
+                )
 
 
 def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:

@@ -1,4 +1,4 @@
-"""``ertis import-poses``: add the poses of a platform to recordings."""
+"""``ertis import poses``: add the poses of a platform to recordings."""
 
 import warnings
 from pathlib import Path
@@ -17,7 +17,7 @@ _NS_PER_S = 1e9
 _MAX_OFFSET_S = 4e9  # Covers clocks that count from another year; times remain within 64 bits.
 
 
-@click.command("import-poses")
+@click.command("poses")
 @options.input_file("REC.h5|FOLDER")
 @click.argument("trajectory_file", metavar="TRAJ", type=options.FILE)
 @click.option(
@@ -108,7 +108,7 @@ def _require_order(path: Path, trajectory_file: Path) -> None:
 
     first, second = kind_of(path), kind_of(trajectory_file)
     if second is not None and second.is_hdf5 and not (path.is_dir() or (first is not None and first.is_hdf5)):
-        order = f"'ertis import-poses {quoted(trajectory_file)} {quoted(path)}'"
+        order = f"'ertis import poses {quoted(trajectory_file)} {quoted(path)}'"
         raise click.UsageError(f"the recording comes before the poses; use {order}", click.get_current_context())
 
 

@@ -1,4 +1,4 @@
-"""``ertis import``: import raw PDM data or PCM into a recording."""
+"""``ertis import signals``: import raw PDM data or PCM into a recording."""
 
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -31,7 +31,7 @@ class _Time(click.DateTime):
             self.fail(f"{value!r} is not a date with a time; write {example}", param, ctx)
 
 
-@click.command("import")
+@click.command("signals")
 @options.input_files("FILE...", name="raw")
 @options.output("Recording to write; FILE.h5 beside the first file or the folder by default.")
 @click.option(

@@ -1,4 +1,4 @@
-"""``ertis layouts``: shipped array layouts, and layout files as TOML in millimetres."""
+"""``ertis reference layouts``: shipped array layouts, and layout files as TOML in millimetres."""
 
 from pathlib import Path
 

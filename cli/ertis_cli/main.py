@@ -17,54 +17,66 @@ from ertis_cli._stop_signals import interruption, obey_signals
 
 __all__ = ["COMMANDS", "cli", "main"]
 
-COMMANDS = {
-    "bench": ("ertis_cli.bench:bench", "Run benchmarks of speed and accuracy."),
-    "calibrate": ("ertis_cli.calibrate:calibrate", "Calibrate the microphones of an array from recordings."),
-    "capture": ("ertis_cli.capture:capture", "Record measurements, or send them to a central node."),
-    "check": ("ertis_cli.check:check", "Check whether sensors are fit for use."),
-    "command": ("ertis_cli.command:command", "Send commands to a sensor and print its answers."),
-    "compare": ("ertis_cli.compare:compare", "Compare an energyscape file or a map with the ground truth."),
-    "completion": ("ertis_cli.completion:completion", "Print a script that completes commands and options in a shell."),
-    "configure": ("ertis_cli.configure:configure", "Change the settings of a sensor that sends to a central node."),
-    "demo": ("ertis_cli.demo:demo", "Run four emulated sensors, a central node and an application."),
-    "devices": ("ertis_cli.devices:devices", "List plugged-in and emulated eRTIS devices."),
-    "doctor": ("ertis_cli.doctor:doctor", "Check this installation and suggest fixes."),
-    "emulate": (
-        "ertis_cli.emulate:emulate",
-        "Emulate the sensors of a scene or a recording.",
-    ),
-    "example": ("ertis_cli.example:example", "List or write example scenes, recordings and scripts."),
-    "export": ("ertis_cli.export:export", "Export images or signals for other programs."),
-    "import": ("ertis_cli.import_raw:import_raw", "Import raw eRTIS data or PCM into a recording."),
-    "import-poses": ("ertis_cli.import_poses:import_poses", "Add the poses of a platform to recordings."),
-    "info": (
-        "ertis_cli.info:info",
-        "Show the contents of recordings, image files or maps.",
-    ),
-    "keys": ("ertis_cli.keys:keys", "Create keys and manage the list of allowed keys."),
-    "layouts": ("ertis_cli.layouts:layouts", "List the shipped layouts, or print one as TOML."),
-    "listen": ("ertis_cli.listen:listen", "Show or save the products that a central node publishes."),
-    "map": ("ertis_cli.mapping:mapping", "Compute an occupancy map from recordings and poses."),
-    "odometry": ("ertis_cli.odometry:odometry", "Compute the trajectory of a platform from its echoes."),
-    "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
-    "plot": ("ertis_cli.plot:plot", "Plot a measurement or an array."),
-    "presets": ("ertis_cli.presets:presets", "List the shipped presets, or print one as TOML."),
-    "process": ("ertis_cli.process:process", "Process recordings into energyscapes."),
-    "record": ("ertis_cli.record:record", "Run a central node that stores measurements."),
-    "recover": ("ertis_cli.recover:recover", "Recover recordings from journals left by a crash."),
-    "reset": ("ertis_cli.reset:reset", "Reset a sensor and wait until it answers again."),
-    "ros": ("ertis_cli.ros:ros", "Publish images and points as live ROS 2 topics."),
-    "rtisdev": ("ertis_cli.rtisdev:rtisdev", "Run a script for RTIS Dev."),
-    "serve": ("ertis_cli.serve:serve", "Run a central node that computes and publishes images."),
-    "settings": ("ertis_cli.settings:settings", "Print every key of a settings, scene, layout or mounting file."),
-    "simulate": ("ertis_cli.simulate:simulate", "Simulate a scene and write a recording."),
-    "status": ("ertis_cli.status:status", "Show the status of a central node."),
-    "verify": ("ertis_cli.verify:verify", "Check the measurements of a file, and list gaps and damage."),
-    "view": ("ertis_cli.view:view", "Show live or recorded images in a browser."),
+_SECTIONS = {
+    "Start": {
+        "demo": ("ertis_cli.demo:demo", "Run four emulated sensors, a central node and an application."),
+        "doctor": ("ertis_cli.doctor:doctor", "Check this installation and suggest fixes."),
+        "example": ("ertis_cli.example:example", "List or write example scenes, recordings and scripts."),
+        "simulate": ("ertis_cli.simulate:simulate", "Simulate a scene and write a recording."),
+    },
+    "Sensors": {
+        "sensors": ("ertis_cli.sensors:sensors", "List, check, calibrate, control and emulate sensors."),
+        "capture": ("ertis_cli.capture:capture", "Record measurements, or send them to a central node."),
+    },
+    "Files": {
+        "info": ("ertis_cli.info:info", "Show the contents of recordings, image files or maps."),
+        "verify": ("ertis_cli.verify:verify", "Check the measurements of a file, and list gaps and damage."),
+        "import": ("ertis_cli.imports:imports", "Import signals, journals left by a crash, or poses into recordings."),
+        "export": ("ertis_cli.export:export", "Export images or signals for other programs."),
+    },
+    "Results": {
+        "process": ("ertis_cli.process:process", "Process recordings into energyscapes."),
+        "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
+        "plot": ("ertis_cli.plot:plot", "Plot a measurement or an array."),
+        "view": ("ertis_cli.view:view", "Show live or recorded images in a browser."),
+        "compare": ("ertis_cli.compare:compare", "Compare an energyscape file or a map with the ground truth."),
+    },
+    "Several sensors": {
+        "map": ("ertis_cli.mapping:mapping", "Compute an occupancy map from recordings and poses."),
+        "odometry": ("ertis_cli.odometry:odometry", "Compute the trajectory of a platform from its echoes."),
+    },
+    "Network": {
+        "record": ("ertis_cli.record:record", "Run a central node that stores measurements."),
+        "serve": ("ertis_cli.serve:serve", "Run a central node that computes and publishes images."),
+        "listen": ("ertis_cli.listen:listen", "Show or save the products that a central node publishes."),
+        "ros": ("ertis_cli.ros:ros", "Publish images and points as live ROS 2 topics."),
+        "keys": ("ertis_cli.keys:keys", "Create keys and manage the list of allowed keys."),
+    },
+    "Reference": {
+        "reference": (
+            "ertis_cli.reference:reference",
+            "Print layouts, presets, the keys of settings, or a completion script.",
+        ),
+        "bench": ("ertis_cli.bench:bench", "Run benchmarks of speed and accuracy."),
+    },
 }
-"""Module and summary of each command. A command is imported only when it runs."""
+"""Commands in the order of the help: module and summary of each. A command is imported only when it runs."""
 
-_FORMER_NAMES = {"layout": "layouts"}
+COMMANDS = dict(sorted(command for section in _SECTIONS.values() for command in section.items()))
+"""Module and summary of each command, in alphabetical order."""
+
+_ELSEWHERE = {
+    **dict.fromkeys(("command", "send"), "sensors send"),
+    **dict.fromkeys(("devices", "list"), "sensors list"),
+    **{
+        name: f"sensors {name}" for name in ("calibrate", "check", "configure", "emulate", "reset", "rtisdev", "status")
+    },
+    **{name: f"reference {name}" for name in ("completion", "layouts", "presets", "settings")},
+    "import-poses": "import poses",
+    "recover": "import journals",
+}
+"""Commands that a user may look for at the top, and the group that has them."""
+
 _FAILED, _USAGE, _INTERRUPTED = 1, 2, 130
 
 
@@ -73,7 +85,6 @@ class _Commands(click.Group):
         return sorted(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
-        cmd_name = _FORMER_NAMES.get(cmd_name, cmd_name)
         if cmd_name not in COMMANDS:
             return None
         module, _, attribute = COMMANDS[cmd_name][0].partition(":")
@@ -86,14 +97,18 @@ class _Commands(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        name = _FORMER_NAMES.get(args[0], args[0])
+        name = args[0]
         if not name.startswith("-") and name not in COMMANDS and not ctx.resilient_parsing:
-            ctx.fail(f"No such command {name!r} ({_config.instead(name, COMMANDS)})")
+            group = _ELSEWHERE.get(name)
+            remedy = f"did you mean {group!r}?" if group else _config.instead(name, COMMANDS)
+            ctx.fail(f"No such command {name!r} ({remedy})")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, COMMANDS[name][1]) for name in sorted(COMMANDS)])
+        width = max(map(len, COMMANDS))
+        for title, section in _SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name.ljust(width), about) for name, (_, about) in section.items()])
 
     def main(
         self,

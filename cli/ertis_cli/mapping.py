@@ -201,7 +201,7 @@ def _trajectory(
     found = platform_trajectory(paths)
     if found is None:
         raise click.UsageError(
-            f"{paths[0]} contains no poses of the platform; add --poses FILE, or store poses with 'ertis import-poses'",
+            f"{paths[0]} contains no poses of the platform; add --poses FILE, or store poses with 'ertis import poses'",
             click.get_current_context(),
         )
     found = found.converted(pose_axes)

@@ -1,4 +1,4 @@
-"""``ertis presets``: shipped presets."""
+"""``ertis reference presets``: shipped presets."""
 
 from typing import TYPE_CHECKING
 
@@ -19,8 +19,9 @@ def presets(*, name: str | None, as_json: bool) -> None:
     """List the shipped presets, or print one as TOML.
 
     Recording presets define the record length and the call. Pass their names with --preset to 'ertis capture' and
-    'ertis import'. Processing presets define directions and ranges. Pass their names with --preset to 'ertis process'
-    and 'ertis serve'. To make your own preset, save the output to a file, edit it, and pass it with --settings.
+    'ertis import signals'. Processing presets define directions and ranges. Pass their names with --preset to 'ertis
+    process' and 'ertis serve'. To make your own preset, save the output to a file, edit it, and pass it with
+    --settings.
     """
     from ertis_numba.settings import preset_text
 

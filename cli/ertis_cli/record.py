@@ -46,8 +46,8 @@ def record(
 
     Sensors send to it with 'ertis capture --to ADDRESS'. The central node acknowledges a measurement once a journal in
     DIR contains it durably. Complete recordings appear in DIR one after the other, the last one at the end. After a
-    crash, the next start or 'ertis recover' seals the journals. Ctrl-C ends the node. With --json, there is one line
-    per event.
+    crash, the next start or 'ertis import journals' seals the journals. Ctrl-C ends the node. With --json, there is one
+    line per event.
     """
     _central_watch.require_use(stores=True, as_json=as_json)
     life = _supervisor.supervised()

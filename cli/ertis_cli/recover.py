@@ -1,4 +1,4 @@
-"""``ertis recover``: recover recordings from journals of interrupted captures."""
+"""``ertis import journals``: recover recordings from journals of interrupted captures."""
 
 from dataclasses import asdict
 from itertools import islice
@@ -16,7 +16,7 @@ _STEPS = 100  # of progress
 _FAILED, _INCOMPLETE = 1, 3
 
 
-@click.command()
+@click.command("journals")
 @options.input_files("DIR|JOURNAL...", name="places")
 @options.force
 @options.quiet

@@ -1,4 +1,4 @@
-"""``ertis reset``: reset the hardware of a sensor."""
+"""``ertis sensors reset``: reset the hardware of a sensor."""
 
 import shlex
 import subprocess

@@ -1,4 +1,4 @@
-"""``ertis rtisdev``: run an unchanged script for RTIS Dev."""
+"""``ertis sensors rtisdev``: run an unchanged script for RTIS Dev."""
 
 import os
 import runpy

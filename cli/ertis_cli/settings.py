@@ -1,4 +1,4 @@
-"""``ertis settings``: keys of TOML files."""
+"""``ertis reference settings``: keys of TOML files."""
 
 import textwrap
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""``ertis status``: show the status of a central node."""
+"""``ertis sensors status``: show the status of a central node."""
 
 import sys
 import time

@@ -25,7 +25,7 @@ _NUMPY = (
 )
 _UNPACK = "unpack it with '{}', and import its files"
 _NO_SIGNALS = "choose the file of the recording"
-_IMPORT = "import it with 'ertis import {file} --settings FILE.toml'"
+_IMPORT = "import it with 'ertis import signals {file} --settings FILE.toml'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ _MATLAB = FileKind(
 _HDF5 = FileKind("an HDF5 file", _IMPORT, is_hdf5=True)
 _TEXTS: Final = {
     ".toml": "simulate a scene with 'ertis simulate {file}', and use settings with --settings",
-    ".tum": "add these poses to a recording with 'ertis import-poses REC.h5 {file}'",
+    ".tum": "add these poses to a recording with 'ertis import poses REC.h5 {file}'",
 }
 """Remedies for text files by their endings."""
 _TEXT = FileKind("a text file", f"choose a recording, or {_SAVE}", is_text=True)
@@ -137,7 +137,7 @@ _MAGICS: Final[tuple[tuple[FileKind, tuple[tuple[int, bytes], ...]], ...]] = (
     (FileKind("a ROS 1 bag", _SAVE), ((0, b"#ROSBAG"),)),
     (FileKind("an MCAP file", _SAVE), ((0, b"\x89MCAP0\r\n"),)),
     (
-        FileKind("an SQLite database", "if it is a journal, seal it with 'ertis recover {file}'"),
+        FileKind("an SQLite database", "if it is a journal, seal it with 'ertis import journals {file}'"),
         ((0, b"SQLite format 3\0"),),
     ),
     (FileKind("a PNG image", _NO_SIGNALS), ((0, b"\x89PNG\r\n\x1a\n"),)),

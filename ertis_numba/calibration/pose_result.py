@@ -116,7 +116,10 @@ class PoseCalibration:
     def to_toml(self) -> str:
         """Return the poses as the ``[[sensors]]`` of a scene, which ``ertis capture --mounting`` reads."""
         found = f"from {len(self.reflectors_m)} reflectors; ± is half of a 95 % interval."
-        lines = [f"# Mountings of sensors relative to {self.reference}, by 'ertis calibrate --poses',", f"# {found}"]
+        lines = [
+            f"# Mountings of sensors relative to {self.reference}, by 'ertis sensors calibrate --poses',",
+            f"# {found}",
+        ]
         for name, pose in self.poses.items():
             angles = zip(("yaw", "pitch", "roll"), pose.yaw_pitch_roll_deg, strict=True)
             places = ", ".join(f"{value:.6f}" for value in pose.translation_m)

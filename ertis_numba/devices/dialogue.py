@@ -115,7 +115,7 @@ class Dialogue(SerialLine):
             if held != wanted:
                 raise SonarError(
                     f"{self.path} was sent a call with hash {wanted:#06x} but has one with {held:#06x}; unplug "
-                    "it, plug it in again and retry (for an emulated one, 'ertis emulate' prints the reason)"
+                    "it, plug it in again and retry (for an emulated one, 'ertis sensors emulate' prints the reason)"
                 )
             _log.info("%s: a call of %d samples was sent", self.path, len(setup.codes))
         for command in (*setup.after_call(), Command("B", counter)):

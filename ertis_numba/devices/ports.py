@@ -76,7 +76,7 @@ def resolve(port: str) -> Port:
     there_are = (
         f"choose one of {_listed(found)}"
         if found
-        else "no port exists: check the cable, or start an emulated one with 'ertis emulate'"
+        else "no port exists: check the cable, or start an emulated one with 'ertis sensors emulate'"
     )
     raise sonar_error(f"serial port {port!r} does not exist; {there_are}", errno.ENOENT)
 

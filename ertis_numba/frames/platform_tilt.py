@@ -20,7 +20,7 @@ _TURN_DEG: Final = 20.0  # Change of tilt that is no ramp.
 _AXIS: Final = 0.6  # Mean vertical share of an axis that points up or down.
 _STEEP: Final = float(np.tan(np.radians(30.0)))
 _SHORT_M: Final = 0.5  # Path whose slope says nothing.
-_USE: Final = "convert them with --pose-axes {0} (ertis import-poses, ertis map) or Trajectory.converted('{0}')"
+_USE: Final = "convert them with --pose-axes {0} (ertis import poses, ertis map) or Trajectory.converted('{0}')"
 
 
 def tilt_note(rotation_xyzw: Floats, position_m: Floats) -> str | None:

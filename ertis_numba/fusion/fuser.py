@@ -341,7 +341,7 @@ class Fuser:
             if not np.isfinite(image.amplitude).all():
                 raise DataError(
                     f"the image of sensor {image.stamp.sensor!r} contains NaN or infinity; leave it out, or check its "
-                    "samples with 'ertis check'"
+                    "samples with 'ertis sensors check'"
                 )
             found[number] = image
         if not found:

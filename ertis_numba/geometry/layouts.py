@@ -126,7 +126,7 @@ def load_layout(name: str | Path) -> Layout:
 
     - ``.csv``, ``.tsv``, ``.txt``: ``y, z`` or ``x, y, z``, in millimetres unless a header states another unit, as in
       ``y_m,z_m``. A header may also name the axes in another order.
-    - ``.toml``: the keys of `ertis settings layout`.
+    - ``.toml``: the keys of `ertis reference settings layout`.
     - ``.npy``: numbers of shape (channels, 2) or (channels, 3), in millimetres.
     - ``.xml``: an array of Acoular, in metres, which is turned into the sensor frame; see `Layout.notes`.
 

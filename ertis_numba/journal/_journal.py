@@ -51,7 +51,7 @@ class Journal(WritableJournal):
             os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         except FileExistsError as error:
             raise ArgumentError(
-                f"{path} exists from an interrupted capture; run 'ertis recover {path}', or choose another name"
+                f"{path} exists from an interrupted capture; run 'ertis import journals {path}', or choose another name"
             ) from error
         except OSError as error:
             raise DataError(f"{path}: {error.strerror}; choose a writable folder") from error

@@ -182,7 +182,7 @@ def _interrupt_message(journal: Path, replies: list[Sealed | StorageFailed]) -> 
     match replies:
         case [Sealed(result=sealed)]:
             return sealed.remark or f"the measurements are in {sealed.recording}"
-    return f"the measurements are safe in {journal}; recover them with 'ertis recover {journal}'"
+    return f"the measurements are safe in {journal}; recover them with 'ertis import journals {journal}'"
 
 
 def sessions_in_recordings(recordings: Iterable[Path]) -> list[tuple[str, int, int]]:

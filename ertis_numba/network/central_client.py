@@ -153,7 +153,7 @@ class CentralClient:
         frames = [messages.encode(Configure(sensor=sensor, request_id=request_id)), text]
         silent = (
             f"the sensor node of {sensor} did not answer within {patience_s:g} s, and may still apply the settings; "
-            "check with 'ertis status' that it still sends, or allow more time"
+            "check with 'ertis sensors status' that it still sends, or allow more time"
         )
         return self._exchange(frames, sensors_of, patience_s, silent=silent)
 

@@ -172,7 +172,7 @@ class PulseReceiver:
             )
             return None
         if not np.isfinite(image.amplitude).all():
-            self._leave_out(sensor, "its images contain NaN or infinity; check its samples with 'ertis check'")
+            self._leave_out(sensor, "its images contain NaN or infinity; check its samples with 'ertis sensors check'")
             return None
         self._left_out.discard(sensor)
         return _Received(image, mounting, arrival.header.monotonic_ns)  # type: ignore[union-attr]  # of an image

@@ -1,4 +1,4 @@
-"""Status of a central node, for `ertis status`, applications and metrics."""
+"""Status of a central node, for `ertis sensors status`, applications and metrics."""
 
 from collections import deque
 from typing import Annotated, Any, Final, Literal, Self

@@ -67,7 +67,7 @@ OTHER_CALL: Final = "another call was emitted"
 
 _DEVIATIONS: Final = 4.0
 _WORTH_S: Final = 1e-6  # 18 degrees of a period at 50 kHz.
-_CALIBRATE: Final = "calibrate the array (ertis calibrate), or check it with its own layout (--settings)"
+_CALIBRATE: Final = "calibrate the array (ertis sensors calibrate), or check it with its own layout (--settings)"
 
 
 class CheckResult(NamedTuple):
@@ -241,7 +241,7 @@ def of_calibration(residuals: CalibrationResiduals | OtherLayoutError | str, rep
         faults.append(CheckFault(check=CALIBRATION, text=text, remedy=_CALIBRATE))
     detail = f"{1e6 * residuals.rms_s:.2g} µs RMS from the layout; {_worst(residuals, every)}"
     if residuals.rms_s > _WORTH_S:
-        detail += "; 'ertis calibrate' reduces this"
+        detail += "; 'ertis sensors calibrate' reduces this"
     return _result_of(faults, detail)
 
 

@@ -89,7 +89,9 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
         """Return the scene and the tables of a file, which sets at least one key."""
         scene, tables = super()._load(path)
         if not tables:
-            raise SettingsError(f"{path} sets no key; add sensors, reflectors or sources, see 'ertis settings scene'")
+            raise SettingsError(
+                f"{path} sets no key; add sensors, reflectors or sources, see 'ertis reference settings scene'"
+            )
         return scene, tables
 
     def __post_init__(self) -> None:

@@ -251,7 +251,7 @@ def _problem(file: h5py.File, path: Path, wanted: str) -> str:
     remedy = f"choose {wanted}"
     if "time_data" in file and "recording" in wanted:
         name = quoted(path)
-        remedy = f"import its signals with 'ertis import {name} --settings FILE.toml --output FILE.h5'"
+        remedy = f"import its signals with 'ertis import signals {name} --settings FILE.toml --output FILE.h5'"
     return f"is HDF5, but not of this package; {remedy}"
 
 

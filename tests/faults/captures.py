@@ -172,7 +172,7 @@ def disk_full(source: Path, folder: Path, disk: Path) -> Line:
         done = ask("capture", *_ports(ports), "-o", str(target), "--rate", "20", "--duration", "60", "--json")
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     stored = [line for line in lines if line["event"] == "stored"]
-    ask("recover", str(disk), "--quiet")
+    ask("import", "journals", str(disk), "--quiet")
     found = _compare(target, stored, sent_by_emulators(folder))
     return {
         "exit code": done.returncode,
@@ -197,7 +197,7 @@ def emulated(source: Path, folder: Path, *options: str, pulses_hz: float | None 
         return
     if pulses_hz is not None:
         options += ("--sync-rate", f"{pulses_hz:g}")
-    command = [*_ERTIS, "emulate", str(source), "--quiet", "--json", "--log", str(log), *options]
+    command = [*_ERTIS, "sensors", "emulate", str(source), "--quiet", "--json", "--log", str(log), *options]
     environment = os.environ | {"ERTIS_EMULATED_DIR": str(folder / "emulated")}
     n_sensors = len(Scene.load(source).sensors) if source.suffix == ".toml" else len(sensor_names(source))
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
@@ -205,7 +205,9 @@ def emulated(source: Path, folder: Path, *options: str, pulses_hz: float | None 
             assert process.stdout is not None
             lines = [process.stdout.readline() for _ in range(n_sensors)]
             if not all(lines):
-                raise DataError(f"ertis emulate {source} ended with {process.wait(_WAIT_S)}; see its output above")
+                raise DataError(
+                    f"ertis sensors emulate {source} ended with {process.wait(_WAIT_S)}; see its output above"
+                )
             yield [json.loads(line)["link"] for line in lines]
         finally:
             process.send_signal(signal.SIGTERM)
@@ -264,7 +266,7 @@ def _recover(folder: Path) -> None:
     """
     end_s = time.monotonic() + _WAIT_S
     while list(folder.glob("*.journal")) and time.monotonic() < end_s:
-        ask("recover", str(folder), "--quiet")
+        ask("import", "journals", str(folder), "--quiet")
 
 
 def sent_by_emulators(folder: Path) -> dict[tuple[str, int], int]:

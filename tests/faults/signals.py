@@ -35,46 +35,46 @@ _MAX_TRIES = 10  # Tries per signal. Only signals that reach a running process c
 _UNDISTURBED_S = 4.0
 _TIMEOUT_S = 120.0
 _FAULTS = ("late", "codes", "tracebacks")
-_WAITING_S: Final = {"configure": 2.5, "status": 2.5}
+_WAITING_S: Final = {"sensors configure": 2.5, "sensors status": 2.5}
 """Time in which a command waits for an answer; it fails some time later without one."""
 _UNCAUGHT = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
 
 COMMANDS: Final[dict[str, Sequence[str]]] = {
     "bench": ("scaling", "--count", "1", "--quiet"),
-    "calibrate": ("{recording}",),
     "capture": ("--port", "{port}", "-o", "{out}/captured.h5"),
-    "check": ("{recording}", "--report", "{out}/report.html"),
-    "command": ("--port", "{port}", "!Y,0,0,0"),
     "compare": ("{images}",),
-    "completion": ("bash",),
-    "configure": ("tcp://127.0.0.1:1", "front", "--preset", "short_25_50"),
     "demo": ("-o", "{out}/demo"),
-    "devices": (),
     "doctor": (),
-    "emulate": ("{recording}",),
     "example": ("reflectors", "-o", "{out}", "--force"),
     "export": ("{images}", "-o", "{out}/cloud.ply"),
-    "import": ("{raw}", "-o", "{out}/imported.h5", "--layout", "eRTIS_v3D1", "--preset", "default_25_50"),
-    "import-poses": ("{recording}", "{trajectory}", "-o", "{out}/posed.h5", "--force"),
+    "import journals": ("{out}/crashed",),
+    "import poses": ("{recording}", "{trajectory}", "-o", "{out}/posed.h5", "--force"),
+    "import signals": ("{raw}", "-o", "{out}/imported.h5", "--layout", "eRTIS_v3D1", "--preset", "default_25_50"),
     "info": ("--health", "{recording}"),
     "keys": ("new", "fresh", "--dir", "{out}/keys"),
-    "layouts": ("eRTIS_v3D1",),
     "listen": ("tcp://127.0.0.1:1",),
     "map": ("{recording}", "--poses", "{trajectory}", "--mounting", "{mounting}", "-o", "{out}/place.pgm"),
     "odometry": ("{drive}", "-o", "{out}/path.tum"),
     "peaks": ("{images}",),
     "plot": ("{recording}", "-o", "{out}/picture.png"),
-    "presets": ("2d_181_5m",),
     "process": ("{recording}", "-o", "{out}/images.h5"),
     "record": ("--listen", "tcp://127.0.0.1:0", "-o", "{out}/recordings"),
-    "recover": ("{out}/crashed",),
-    "reset": ("--port", "{port}", "--hook", "true"),
+    "reference completion": ("bash",),
+    "reference layouts": ("eRTIS_v3D1",),
+    "reference presets": ("2d_181_5m",),
+    "reference settings": ("scene",),
     "ros": ("{recording}", "--duration", "2"),
-    "rtisdev": ("{script}",),
+    "sensors calibrate": ("{recording}",),
+    "sensors check": ("{recording}", "--report", "{out}/report.html"),
+    "sensors configure": ("tcp://127.0.0.1:1", "front", "--preset", "short_25_50"),
+    "sensors emulate": ("{recording}",),
+    "sensors list": (),
+    "sensors reset": ("--port", "{port}", "--hook", "true"),
+    "sensors rtisdev": ("{script}",),
+    "sensors send": ("--port", "{port}", "!Y,0,0,0"),
+    "sensors status": ("tcp://127.0.0.1:1",),
     "serve": ("--listen", "tcp://127.0.0.1:0", "--publish", "tcp://127.0.0.1:0", "--record", "{out}/recordings"),
-    "settings": ("scene",),
     "simulate": ("{scene}", "-o", "{out}/simulated.h5"),
-    "status": ("tcp://127.0.0.1:1",),
     "verify": ("{recording}",),
     "view": ("{recording}", "--port", "0", "--no-open"),
 }
@@ -232,7 +232,7 @@ def _run_command(
     arguments = [each.format(out=out, **paths) for each in COMMANDS[command]]
     begin_s = time.monotonic()
     with subprocess.Popen(
-        [sys.executable, "-m", "ertis_cli", command, *arguments],
+        [sys.executable, "-m", "ertis_cli", *command.split(), *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""Emulated sensors on pseudo terminals, with a SYNC line and with faults, for tests and ``ertis emulate``."""
+"""Emulated sensors on pseudo terminals, with a SYNC line and with faults, for tests and ``ertis sensors emulate``."""
 
 from ertis_numba.devices.emulator.device import Emulator
 from ertis_numba.devices.emulator.mainboard import Quirks

@@ -45,7 +45,7 @@ class Archive:
 
     Only one archive can use ``folder`` at a time. ``name`` is the prefix of recording names, before the time. A
     recording is full after ``rotate_bytes`` of data and poses, or after ``rotate_s``. Without ``seal``, journals are
-    left to ``ertis recover``.
+    left to ``ertis import journals``.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ _CLOSED_S: Final = 2.0
 class DeadLetterQueue:
     """Writer of measurements into a journal, in a separate thread, so that a slow disk delays nothing.
 
-    ``ertis recover`` makes a recording of the journal.
+    ``ertis import journals`` makes a recording of the journal.
     """
 
     def __init__(self, folder: Path, log: EventLog) -> None:
@@ -80,7 +80,9 @@ class DeadLetterQueue:
         target = self._folder / f"quarantine_{datetime.now(UTC):%Y%m%dT%H%M%S_%fZ}.h5"
         self._journal = Journal.create(target.with_name(target.name + SUFFIX), target=target.name, source="quarantine")
         self._append(self._journal, measurement, entry)
-        self._log.warning("quarantine", text=f"recover the kept measurements with 'ertis recover {self._journal.path}'")
+        self._log.warning(
+            "quarantine", text=f"recover the kept measurements with 'ertis import journals {self._journal.path}'"
+        )
 
     @staticmethod
     def _append(journal: Journal, measurement: Measurement, entry: JournalEntry) -> None:

@@ -52,8 +52,8 @@ _REPORT_INTERVAL_S: Final = 1.0
 # address send settings.
 _HEARD_BYTES: Final = Settings.max_bytes
 _SENSORS_ELSEWHERE: Final = (
-    "this address is for applications that receive products; for sensor nodes, poses and 'ertis configure', use the "
-    "first address that 'ertis serve' prints"
+    "this address is for applications that receive products; for sensor nodes, poses and 'ertis sensors configure', "
+    "use the first address that 'ertis serve' prints"
 )
 
 

@@ -90,7 +90,8 @@ class DiskSpool(Spool):
         for first, last, reason, name, session_id in sorted(found):
             if last > MAX_SEQUENCE:
                 raise DataError(
-                    f"sequence number {last} is above {MAX_SEQUENCE}; recover it with 'ertis recover {journal.path}'"
+                    f"sequence number {last} is above {MAX_SEQUENCE}; recover it with 'ertis import journals "
+                    f"{journal.path}'"
                 )
             run = runs.setdefault((name, session_id), OutgoingSession(journal.sensors[name], session_id, journal))
             if reason:

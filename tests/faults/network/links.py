@@ -35,16 +35,16 @@ Found = dict[str, Any]
 
 
 def state_of(address: str, *keys: str) -> dict[str, Any]:
-    """Return the status of a central node, as ``ertis status --json`` prints it.
+    """Return the status of a central node, as ``ertis sensors status --json`` prints it.
 
     Raises
     ------
     DataError
         The node does not answer.
     """
-    done = CliRunner().invoke(cli, ["status", address, "--json", "--once", *keys])
+    done = CliRunner().invoke(cli, ["sensors", "status", address, "--json", "--once", *keys])
     if done.exit_code:
-        raise DataError(f"ertis status ended with {done.exit_code}: {done.stderr.strip()}")
+        raise DataError(f"ertis sensors status ended with {done.exit_code}: {done.stderr.strip()}")
     status: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return status
 

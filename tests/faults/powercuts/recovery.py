@@ -27,7 +27,7 @@ _SPOOL_RING_BYTES = 1  # Almost no memory, so that all measurements are read fro
 
 
 def recover_capture(disk: Path, sent: Sent, sent_crc32: AbstractSet[int] | None, *, by_command: bool) -> Found:
-    """Recover a capture as ``ertis recover`` does."""
+    """Recover a capture as ``ertis import journals`` does."""
     failed = _recover(disk, by_command=by_command)
     archived = _read(disk)
     found = compare(sent, archived, sent.kept)
@@ -38,7 +38,7 @@ def recover_capture(disk: Path, sent: Sent, sent_crc32: AbstractSet[int] | None,
 
 
 def recover_archive(disk: Path, sent: Sent, rng: random.Random, *, by_command: bool) -> Found:
-    """Recover the recordings of a central node, by starting the node or by ``ertis recover``."""
+    """Recover the recordings of a central node, by starting the node or by ``ertis import journals``."""
     folder = disk / "recordings"
     if not folder.is_dir():
         return _found(compare(sent, Archived(), sent.acked()), failed=0)
@@ -82,7 +82,7 @@ def _open_archive(folder: Path) -> tuple[int, dict[SensorSession, int]]:
 def _recover(folder: Path, *, by_command: bool) -> int:
     """Seal all journals of a folder, and return the number of errors."""
     if by_command:
-        return int(ask("recover", str(folder), "--quiet").returncode != 0)
+        return int(ask("import", "journals", str(folder), "--quiet").returncode != 0)
     return sum(_fails(seal, path) for path in sorted(folder.glob(f"*{SUFFIX}")))
 
 
