@@ -7,11 +7,10 @@ GPU ?= cu12
 WORKERS ?= 3
 unexport PYTHONDONTWRITEBYTECODE  # otherwise, each of hundreds of processes compiles every module again
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
-KERNELS := $(patsubst %,tests/test_%.py,kernels passive_kernels fusion_kernels interpolated_beams phase_shifts beamformers modulator)
-COMPILED := $(KERNELS) tests/test_streams.py tests/test_steering_kernels.py
-ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx
+ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx --ignore=tests/kernels
+CORE := base settings geometry frames chain analysis pipeline
 
-.PHONY: demo test test-kernels test-host test-simulator test-ptx test-arm check docs reference data pictures bench peers soak gpu clean
+.PHONY: demo test test-core test-kernels test-host test-simulator test-ptx test-arm check docs reference data pictures bench peers soak gpu clean
 
 $(VENV)/ready: setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -25,19 +24,26 @@ $(VENV)/ready-to-test: $(VENV)/ready  # packages for tests and checks, of which 
 demo: $(VENV)/ready
 	$(BIN)/ertis demo --force
 
-# Two groups run at a time, and each prints its result when it ends. Tests that measure times run last, alone.
+ifdef ROOM  # make test ROOM=figures: the tests of one room
+test: $(VENV)/ready-to-test
+	$(PYTEST) -m "not alone" --numprocesses $(WORKERS) --dist worksteal tests/$(ROOM)
+else  # Two groups run at a time, and each prints its result when it ends. Tests that measure times run last, alone.
 test: $(VENV)/ready-to-test
 	$(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync=target test-kernels test-ptx test-host test-simulator
 	$(PYTEST) -m alone $(ELSEWHERE)
+endif
+
+test-core: $(VENV)/ready-to-test  ## test the rooms from bits to images, but for the kernels
+	$(PYTEST) -m "not alone" --numprocesses $(WORKERS) --dist worksteal $(CORE:%=tests/%)
 
 test-kernels: $(VENV)/ready-to-test  # compile all kernels in one process, because parallel processes could corrupt the cache
-	$(PYTEST) -m "not alone" $(COMPILED)
+	$(PYTEST) -m "not alone" tests/kernels
 
 test-host: test-kernels  # one worker more than two cores, because some tests wait for sockets and disks
-	$(PYTEST) -m "not alone" --numprocesses $(WORKERS) --dist worksteal $(COMPILED:%=--ignore=%) $(ELSEWHERE)
+	$(PYTEST) -m "not alone" --numprocesses $(WORKERS) --dist worksteal $(ELSEWHERE)
 
 test-simulator: test-kernels
-	NUMBA_ENABLE_CUDASIM=1 $(PYTEST) tests/cuda $(KERNELS) -k cuda
+	NUMBA_ENABLE_CUDASIM=1 $(PYTEST) tests/cuda tests/kernels -k cuda
 
 test-ptx: $(VENV)/ready-to-test
 	$(PYTEST) tests/ptx
@@ -50,7 +56,7 @@ check: $(VENV)/ready-to-test
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(PYTEST) -q tests/test_plain_english.py tests/test_docstring_examples.py
+	$(PYTEST) -q tests/cli/test_plain_english.py tests/cli/test_docstring_examples.py
 	$(BIN)/python -m sphinx -q -W --keep-going docs site
 
 docs: $(VENV)/ready-to-test  ## build the documentation; open site/index.html

@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 UNCERTAINTY_DB: Final = 1.0
-"""Largest amount by which the prediction for a large image may be too low: see tests/test_accuracy.py."""
+"""Largest amount by which the prediction for a large image may be too low: see tests/chain/test_accuracy.py."""
 ADAPTIVE_UNCERTAINTY_DB: Final = 2.0
 """The same for adaptive beamformers, whose error is measured in a sample of the directions.
 

@@ -21,9 +21,9 @@ CPUS = ("cortex-a72", "cortex-a76", "cortex-a78ae")
 """Processors of Raspberry Pi 4 and 5, and Jetson Orin."""
 
 TESTS = (
-    ("tests/test_interpolated_beams.py", "cpu and (int16 or equal_their_reference)"),
-    ("tests/test_kernels.py", "cpu and (envelope_int16 or quantise)"),
-    ("tests/test_pipeline.py", "test_pipeline_image_is_exact and cpu and (default or disabled)"),
+    ("tests/kernels/test_interpolated_beams.py", "cpu and (int16 or equal_their_reference)"),
+    ("tests/kernels/test_kernels.py", "cpu and (envelope_int16 or quantise)"),
+    ("tests/pipeline/test_pipeline.py", "test_pipeline_image_is_exact and cpu and (default or disabled)"),
 )
 MAX_DIFFERENCE_DB = -90.0
 

@@ -171,7 +171,7 @@ def test_workqueue_threading_layer_gives_the_same_bits(usual, workqueue):
 def test_compiled_and_cached_kernels_give_the_same_bits(workqueue, tmp_path):
     """Numba optimises a cached kernel once more, which could change the order of sums.
 
-    The first run of a command compiles the kernels of the default chain, see tests/test_figures_to_reach.py.
+    The first run of a command compiles the kernels of the default chain, see tests/figures/test_figures_to_reach.py.
     """
     compiled = digests("delay_and_sum", "combined", NUMBA_CACHE_DIR=str(tmp_path))
     for name in ("delay_and_sum", "combined"):

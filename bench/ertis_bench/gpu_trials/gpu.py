@@ -57,12 +57,12 @@ BUDGETS_S = {
 
 _ROOT = Path(__file__).parents[3]
 _TESTED = (
-    "tests/test_kernels.py",
-    "tests/test_interpolated_beams.py",
-    "tests/test_phase_shifts.py",
-    "tests/test_beamformers.py",
-    "tests/test_modulator.py",
-    "tests/test_passive_kernels.py",
+    "tests/kernels/test_kernels.py",
+    "tests/kernels/test_interpolated_beams.py",
+    "tests/kernels/test_phase_shifts.py",
+    "tests/kernels/test_beamformers.py",
+    "tests/kernels/test_modulator.py",
+    "tests/kernels/test_passive_kernels.py",
     "tests/cuda",
 )
 _SANITIZED_TESTS = (

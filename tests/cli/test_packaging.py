@@ -1,0 +1,130 @@
+"""The installed package is complete."""
+
+import ast
+import configparser
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from ertis_cli import _examples
+from ertis_cli.bench import bench
+from ertis_cli.main import cli
+
+ROOT = Path(__file__).parents[2]
+IN_THE_REPOSITORY_ONLY = {
+    f"ertis_bench.{name}"
+    for name in (
+        "cpu_times",
+        "error_trials",
+        "gpu_trials",
+        "health_trials",
+        "network",
+        "network_trials",
+        "passive",
+        "peers",
+        "platform_trials",
+        "simulation_trials",
+    )
+}
+IN_THE_WHEEL = {"accuracy", "paper"}
+
+
+def test_every_package_is_listed():
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    listed = set(config["options"]["packages"].split())
+    places = {
+        "ertis_numba": "ertis_numba",
+        "ertis_cli": "cli/ertis_cli",
+        "ertis_bench": "bench/ertis_bench",
+        "ertis_examples": "examples",
+        "ertis_examples.synthetic": "data/synthetic",
+    }
+    found = {
+        ".".join((name, *init.parent.relative_to(ROOT / place).parts))
+        for name, place in places.items()
+        for init in (ROOT / place).rglob("__init__.py")
+    }
+    assert found - listed == IN_THE_REPOSITORY_ONLY
+    assert listed <= found
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """The wheel as `pip install .` builds it, without a network, and without files that an earlier build has left."""
+    folder = tmp_path_factory.mktemp("wheel")
+    (folder / "build.cfg").write_text(f"[build]\nbuild_base = {folder / 'build'}\n")
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-build-isolation", "--no-deps", "--no-index"]
+    environment = os.environ | {"DIST_EXTRA_CONFIG": str(folder / "build.cfg")}
+    subprocess.run([*command, "--wheel-dir", folder, ROOT], env=environment, check=True, timeout=240)
+    (path,) = folder.glob("*.whl")
+    return path
+
+
+def test_wheel_contains_every_example(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        sizes = {Path(each.filename).name: each.file_size for each in archive.infolist() if "examples" in each.filename}
+        layouts = {Path(name).name for name in archive.namelist() if "/layouts/" in name}
+    examples = _examples.examples()
+    assert {"reflectors.h5", "reflectors.toml", "platform.toml", "corridor.toml", "1_nearest_reflector.py"} <= set(
+        examples
+    )
+    assert {item.name: len(item.read_bytes()) for item in examples.values()}.items() <= sizes.items()
+    assert {f"{Path(name).stem}.json" for name in examples if name.endswith(".h5")} <= set(sizes)
+    assert {path.name for path in (ROOT / "ertis_numba" / "layouts").glob("*.toml")} <= layouts
+
+
+def lacks(module):
+    """Return True for modules that the wheel lacks."""
+    return ".".join(module.split(".")[:2]) in IN_THE_REPOSITORY_ONLY
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [*([name] for name in sorted(bench.commands.keys() - IN_THE_WHEEL)), ["simulation", "--verdicts", "1"]],
+    ids=" ".join,
+)
+def test_benchmark_that_the_wheel_lacks_names_the_source_folder(monkeypatch, arguments):
+    for module in [*IN_THE_REPOSITORY_ONLY, *filter(lacks, sys.modules)]:
+        monkeypatch.setitem(sys.modules, module, None)
+    done = CliRunner().invoke(cli, ["bench", *arguments])
+    name = arguments[0]
+    assert done.exit_code == 1
+    assert (
+        done.stderr
+        == f"ertis: error: 'ertis bench {name}' exists only in the source folder; run 'pip install --editable .' in "
+        "that folder\n"
+    )
+
+
+def test_benchmarks_in_the_wheel_need_nothing_that_it_lacks(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        sources = {name: archive.read(name).decode() for name in archive.namelist() if name.startswith("ertis_bench/")}
+    assert {"ertis_bench/paper.py", "ertis_bench/accuracy.py"} <= sources.keys()
+    for name, source in sources.items():
+        used = {word for node in ast.walk(ast.parse(source)) for word in _modules(node)}
+        assert not set(filter(lacks, used)), name
+
+
+def _modules(node):
+    """Return the modules that a node may import, and texts, which may be modules that a process runs."""
+    if isinstance(node, ast.Import):
+        return [each.name for each in node.names]
+    if isinstance(node, ast.ImportFrom):
+        return [f"{node.module}.{each.name}" for each in node.names]
+    return [node.value] if isinstance(node, ast.Constant) and isinstance(node.value, str) else []
+
+
+def test_wheel_is_small_and_contains_no_recording_and_no_test(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        names = [name for name in archive.namelist() if ".dist-info/" not in name]
+        sizes = {each.filename: each.compress_size for each in archive.infolist()}
+    assert {name.partition("/")[0] for name in names} == {"ertis_bench", "ertis_cli", "ertis_examples", "ertis_numba"}
+    assert {Path(name).suffix for name in names} <= {".json", ".py", ".pyi", ".rviz", ".toml", ".typed", ".yaml", ""}
+    # A recording has a megabyte. Code grows with each feature, so that data are limited by themselves.
+    assert sum(sizes[name] for name in names if Path(name).suffix not in {".py", ".pyi"}) <= 30e3
+    assert wheel.stat().st_size <= 2e6
