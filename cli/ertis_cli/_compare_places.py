@@ -24,7 +24,7 @@ def compare_fused(path: Path, min_level_db: float, *, as_json: bool) -> None:
         truth = images.truth
         if truth is None or not truth.frames:
             raise DataError(
-                f"{path} contains no ground truth; fuse simulated recordings of one scene with 'ertis process --fuse'"
+                f"{path} contains no ground truth; fuse simulated recordings of one scene with 'ertis fuse'"
             )
         if images.points_note is not None:
             raise DataError(images.points_note)

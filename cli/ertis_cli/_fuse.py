@@ -19,7 +19,10 @@ if TYPE_CHECKING:
     from ertis_numba.settings import ExcludedChannels, Settings
     from ertis_numba.storage import RecordingReader
 
-__all__ = ["write_fused"]
+__all__ = ["OTHER_FORMATS", "write_fused"]
+
+OTHER_FORMATS = {".npz", ".png", ".jpg", ".jpeg", ".pdf", ".svg"}
+"""Endings of signals, beams and pictures."""
 
 _CHECKED_PULSES = 8
 
@@ -145,8 +148,8 @@ def _unheard(sensor: str, count: int, n_pulses: int) -> str:
 def _require_several(readers: "Sequence[RecordingReader]") -> None:
     if len(readers) < 2:
         raise click.UsageError(
-            f"--fuse needs at least two sensors, but there is only {', '.join(each.sensor for each in readers)}; add "
-            "more recordings, or remove --fuse",
+            f"fusion needs at least two sensors, but there is only {', '.join(each.sensor for each in readers)}; add "
+            "more recordings, or use 'ertis process'",
             click.get_current_context(),
         )
 

@@ -96,7 +96,7 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     image = folder / "image.h5"
     recordings = sorted((folder / "recordings").glob("*.h5"))
     run("verify", *recordings, allowed=(_GAPS,))  # a busy machine may miss a pulse
-    run("process", recordings[0], "--fuse", "--output", image, "--directions", "2d:181")
+    run("fuse", recordings[0], "--output", image, "--directions", "2d:181")
     run("peaks", image, "--measurement", "0")
     run("plot", image, "--output", folder / "image.png")
 

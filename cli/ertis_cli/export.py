@@ -167,7 +167,7 @@ def export(
     if name == "mcap" and sum(len(sensor_names(path)) for path in paths) > 1 and "scan" in (topics or TOPICS):
         options.note(
             "scans of single sensors contain echoes of the other sensors' calls; for /fused/scan, export the file that "
-            "'ertis process --fuse' writes",
+            "'ertis fuse' writes",
             quiet=quiet,
         )
     measurements, sensors = options.counted(len(items), "measurement"), options.counted(len(readers), "sensor")

@@ -42,6 +42,7 @@ _SECTIONS = {
         "compare": ("ertis_cli.compare:compare", "Compare an energyscape file or a map with the ground truth."),
     },
     "Several sensors": {
+        "fuse": ("ertis_cli.fuse:fuse", "Fuse recordings of several sensors into one image per SYNC pulse."),
         "map": ("ertis_cli.mapping:mapping", "Compute an occupancy map from recordings and poses."),
         "odometry": ("ertis_cli.odometry:odometry", "Compute the trajectory of a platform from its echoes."),
     },

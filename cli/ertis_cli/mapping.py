@@ -95,7 +95,7 @@ def mapping(
     """Compute an occupancy map from recordings and poses.
 
     All sensors of the recordings belong to one platform. Their measurements are grouped by SYNC pulse and fused, as by
-    'ertis process --fuse'. Images of 'ertis process' are used as they are. Cells with echoes become occupied, and cells
+    'ertis fuse'. Images of 'ertis process' are used as they are. Cells with echoes become occupied, and cells
     in front of the first clear echo of a direction become free. Pulses outside of the time of the poses are left out.
     """
     from ertis_numba.base.errors import PoseWarning

@@ -108,7 +108,7 @@ def peaks(
     strongest echo at its range. The noise is estimated from 32 bins of the same direction (OS-CFAR), so that
     --false-alarm is the probability per bin that noise alone is listed.
 
-    For fused images, the reflectors are the points that 'ertis process --fuse' has located from the images of all
+    For fused images, the reflectors are the points that 'ertis fuse' has located from the images of all
     sensors, not maxima of the image.
 
     With --truth, each true reflector comes first, with the errors of its matched peak or as missed. Then come peaks

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _acoustic_maps, _fuse, _mountings, _plans, _presets, _process_many, _results, options
+from ertis_cli import _acoustic_maps, _image_options, _mountings, _plans, _presets, _process_many, _results, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -36,42 +36,17 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 @options.sensor("Process this sensor only; all sensors by default.")
 @options.without("Channels to exclude, such as those of faulty microphones")
 @_presets.processing_preset
-@click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N, 3d:N, or a CSV of azimuth, elevation in °.")
-@click.option("--azimuth", type=options.INTERVAL, help="Azimuth limits of 2d:N and 3d:N in °.")
-@click.option("--elevation", type=options.ELEVATION, help="Elevation limits A:B of 3d:N, or elevation E of 2d:N, in °.")
+@_image_options.image_options
 @click.option(
     "--level/--no-level",
     default=None,
     help="Turn directions by the roll and pitch of the poses, so that they refer to the horizontal plane; the "
     "recording's own by default.",
 )
-@click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
-@click.option(
-    "--method", type=click.Choice(["fast", "paper"]), help="Processing method; the recording's own by default."
-)
-@options.beamforming("the recording's own")
-@options.cleaning("the recording's own")
 @click.option(
     "--last-stage",
     type=click.Choice(["demodulation", "matched_filter", "beams", "envelope"]),
     help="Last step of processing; all but envelope need -o FILE.npz; the recording's own by default.",
-)
-@click.option(
-    "--array-weights",
-    metavar="WINDOW",
-    help="Window for the microphone weights, such as uniform, hann or taylor:35; the recording's own by default.",
-)
-@click.option(
-    "--wavefront",
-    type=click.Choice(["plane", "spherical", "auto"]),
-    help="Wavefront model of echoes; the recording's own by default.",
-)
-@click.option(
-    "--max-error",
-    "max_error_db",
-    type=options.ERROR_BUDGET,
-    metavar="DB|PRESET",
-    help="Error budget of images, as in -40, or draft, standard, fine, exact; the settings' own by default.",
 )
 @_acoustic_maps.map_options
 @options.plan
@@ -90,12 +65,6 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     help="Data type of images. float16 halves the file; it keeps three digits down to -84 dBFS and fewer below, and "
     "netCDF programs cannot read it.",
 )
-@click.option(
-    "--fuse",
-    is_flag=True,
-    help="Fuse the images of all sensors of the recordings; write REC.fused.h5 by default.",
-)
-@options.emitter_diameter("Diameter of emitters for --fuse,")
 @click.option("--strict", is_flag=True, help="Refuse recordings with faulty microphones instead of warning.")
 @options.device
 @options.threads
@@ -129,22 +98,11 @@ def process(
     sensor: str | None,
     without: "ExcludedChannels",
     preset: str | None,
-    directions: str | None,
-    azimuth: tuple[float, float] | None,
-    elevation: tuple[float, float] | float | None,
-    level: bool | None,
-    range_m: tuple[float, float] | None,
-    method: str | None,
-    array_weights: str | None,
-    wavefront: str | None,
-    max_error_db: float | None,
     plan: Literal["nominal", "measured"],
     explain: bool,
     verify: bool,
     settings_file: Path | None,
     dtype: Literal["float32", "float16"],
-    fuse: bool,
-    emitter_diameter_m: float | None,
     strict: bool,
     device: str,
     threads: int | None,
@@ -165,9 +123,6 @@ def process(
     frequencies. If only some measurements of a recording are passive, they are left out, and the others become images.
     With --mode passive, all become maps, without the time of the call.
 
-    With --fuse, all sensors of the recordings belong to one platform, and there is one image around it per SYNC pulse.
-    Echoes of a sensor's call that another sensor received appear where their reflector is.
-
     The settings file overrides the settings of the recording, the preset overrides both, and other options override
     all of them. The same recording gives the same amplitudes, bit by bit, for any number of threads and any batch. All
     sensors of a recording go into one file, each with its own settings.
@@ -180,49 +135,17 @@ def process(
     image, over all directions and ranges.
     """
     keys = {name: other.pop(name) for name in [*other] if name.startswith("passive_")}
+    level = other.pop("level")
 
     def changed(recorded: "Settings") -> "Settings":
-        settings = options.settings_with(
-            recorded,
-            settings_file=settings_file,
-            preset=preset,
-            directions=directions,
-            azimuth_limits_deg=azimuth,
-            elevation=elevation,
-            level_directions=level,
-            range_m=range_m,
-            method=method,
-            **other,
-            array_weights=array_weights,
-            wavefront=wavefront,
-            max_error_db=max_error_db,
-        )
+        given = {**other, "level_directions": level}
+        settings = _image_options.with_given(recorded, settings_file=settings_file, preset=preset, given=given)
         settings = _acoustic_maps.with_map_options(settings, keys)
-        if fuse:
-            _results.require_image(settings, "--fuse needs images; use --last-stage envelope")
-        elif not _results.is_results_file(target):
+        if not _results.is_results_file(target):
             _results.require_image(settings)
-        _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=max_error_db)
+        _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=other["max_error_db"])
         return settings
 
-    _require_options_of(fuse=fuse, target=target)
-    if fuse:
-        _acoustic_maps.require_none("--fuse makes images; leave out --fuse")
-        _fuse.write_fused(
-            [Path(each) for each in paths],
-            Path(target) if target else Path(paths[0]).with_suffix(".fused.h5"),
-            changed,
-            without=without,
-            mounting=mounting,
-            emitter_diameter_m=emitter_diameter_m,
-            force=force,
-            quiet=quiet,
-            as_json=as_json,
-            device=device,
-            threads=threads,
-            plan=plan,
-        )
-        return
     from ertis_numba.campaign import CampaignOptions
 
     wanted = CampaignOptions(
@@ -284,18 +207,6 @@ def process(
         options.say(line, quiet=quiet)
     if as_json:
         options.print_json(report)
-
-
-def _require_options_of(*, fuse: bool, target: str | None) -> None:
-    """Refuse options that apply only with or only without --fuse."""
-    context = click.get_current_context()
-    for name in ("sensor", "level", "dtype", "verify", "explain", "workers", "scheduler") if fuse else ():
-        if typed(name):
-            raise click.UsageError(f"--{name} does not apply to --fuse; leave it out", context)
-    if not fuse and typed("emitter_diameter_m"):
-        raise click.UsageError("--emitter-diameter requires --fuse; add --fuse, or remove it", context)
-    if fuse and target is not None and (_results.is_results_file(target) or Path(target).suffix in _PICTURES):
-        raise click.UsageError(f"-o {target} is not an energyscape file; choose a .h5 file for --fuse", context)
 
 
 def _require_options_of_one(target: str | None) -> None:

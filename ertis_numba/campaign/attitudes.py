@@ -42,7 +42,7 @@ class Attitudes:
         if recording.trajectory is None or n_missing:
             raise DataError(
                 f"{name} has no pose at {n_missing} of {len(stamps)} measurements; add poses with 'ertis "
-                "import-poses', or process without levelled directions (level_directions)"
+                "import poses', or process without levelled directions (level_directions)"
             )
         poses = recording.trajectory.at(times_ns)
         self.note = "; ".join(pose_doubts(poses)) or None

@@ -267,7 +267,7 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
             return None
         return (
             f"{self.path} has fused images without the points of the fusion, so maxima of the images are shown, some "
-            "of which may be ghosts; fuse the recordings again with 'ertis process --fuse'"
+            "of which may be ghosts; fuse the recordings again with 'ertis fuse'"
         )
 
     def _item(self, index: int) -> Energyscape:

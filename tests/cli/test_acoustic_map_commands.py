@@ -247,10 +247,11 @@ def test_progress_of_maps_counts_measurements():
 
 
 def test_images_of_silent_sensors_are_fused_only_if_asked(folder):
-    done = run("process silent.h5 --fuse --device cpu", code=1)
+    done = run("fuse silent.h5 --device cpu", code=1)
     assert "silent.h5: all measurements are passive and have no echoes; use recordings of emitted calls" in done.stderr
     assert not (folder / "silent.fused.h5").exists()
-    run("process silent.h5 --fuse --mode active --device cpu")
+    (folder / "active.toml").write_text('processing.mode = "active"')
+    run("fuse silent.h5 --settings active.toml --device cpu")
 
 
 def test_check_names_the_kind_of_a_file_of_maps():
@@ -274,7 +275,6 @@ def test_check_names_the_kind_of_a_file_of_maps():
         ("passive.h5 active.h5 -o out/ --focus 2 --mode active", "--focus is for acoustic maps, but --mode active"),
         ("passive.h5 active.h5 -o out/ --range 1:2 --mode passive", "--range is for images, but --mode passive"),
         ("passive.h5 -o s.npz --last-stage demodulation --bands octaves", "--bands is for acoustic maps, but s.npz"),
-        ("both.h5 --fuse --map-method capon", "--map-method is for acoustic maps, but --fuse makes images"),
     ],
 )
 def test_options_without_effect_are_refused(folder, line, message):

@@ -137,7 +137,7 @@ def test_demo_writes_recording_and_picture_of_four_sensors(tmp_path, monkeypatch
     monkeypatch.setattr(demo, "subprocess", replaced)
     monkeypatch.setenv("ERTIS_SERVE_WORKERS", "1")
     run("demo", "-n", "2", "--quiet")
-    assert ran == ["sensors list", "capture", "sensors status", "verify", "process", "peaks", "plot"]
+    assert ran == ["sensors list", "capture", "sensors status", "verify", "fuse", "peaks", "plot"]
     (recording,) = Path("demo/recordings").glob("*.h5")
     assert 1 <= len(open_recording(recording, sensor="front")) <= 2
     assert Path("demo/image.png").stat().st_size > 10_000

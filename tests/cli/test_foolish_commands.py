@@ -140,7 +140,7 @@ odometry rec.h5 -o p.csv
 process rec.h5 -o y.h5 --settings wide.toml
 process rec.h5 -o y.h5 --mode passive --range 1:2
 process rec.h5 -o y.h5 --level
-process rec.h5 -o y.h5 --fuse
+fuse rec.h5 -o y.h5
 process rec.h5 -o y.h5 --bands 0:1
 process rec.h5 -o y.h5 --layout eRTIS_v2
 reference settings nope

@@ -85,7 +85,7 @@ CASES = {  # command: exit code and message
         2,
         "-o o.h5 names a file, but several recordings need a folder; use -o o/",
     ),
-    "process rec.h5 --emitter-diameter 0.01": (2, "--emitter-diameter requires --fuse; add --fuse"),
+    "process rec.h5 --emitter-diameter 0.01": (2, "No such option '--emitter-diameter'"),
     "plot rec.h5 -o recs": (1, "picture recs is a folder; name a file in it that ends in"),
     "plot rec.h5 -o name": (1, "picture name has no ending; choose a name that ends in"),
     "export rec.h5 -o name.xyz": (1, "export name.xyz ends in '.xyz'; choose a name that ends in"),

@@ -23,6 +23,7 @@ ELSEWHERE = {
     *(
         "demo",
         "doctor",
+        "fuse",
         "keys",
         "listen",
         "map",

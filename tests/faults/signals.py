@@ -47,6 +47,7 @@ COMMANDS: Final[dict[str, Sequence[str]]] = {
     "doctor": (),
     "example": ("reflectors", "-o", "{out}", "--force"),
     "export": ("{images}", "-o", "{out}/cloud.ply"),
+    "fuse": ("{pair}", "-o", "{out}/fused.h5"),
     "import journals": ("{out}/crashed",),
     "import poses": ("{recording}", "{trajectory}", "-o", "{out}/posed.h5", "--force"),
     "import signals": ("{raw}", "-o", "{out}/imported.h5", "--layout", "eRTIS_v3D1", "--preset", "default_25_50"),
@@ -133,17 +134,20 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
     """Create the files that commands read, and return the names by which `COMMANDS` refers to them."""
     raw, images, crashed = folder / "raw.bin", folder / "images.h5", folder / "crashed"
     script, trajectory, drive = folder / "script.py", folder / "trajectory.tum", folder / "drive.h5"
-    mounting = folder / "mounting.toml"
+    mounting, pair = folder / "mounting.toml", folder / "pair.h5"
     script.write_text("import rtisdev\nrtisdev.open_connection('/dev/no-such-port', allowDebugMode=True)\n")
     with open_recording(source) as recording:
         measurement = recording[0]
         mounting.write_text(f'[[sensors]]\nname = "{recording.sensor}"\nposition_m = [0.0, 0.0, 0.0]\n')
+        ahead = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
         later = replace(measurement.stamp, timestamp_ns=measurement.stamp.timestamp_ns + 10**8)
         write_recording(
             drive,
             [measurement, replace(measurement, stamp=replace(later, sequence=1, sync_count=1))],
-            mounting={later.sensor: ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))},
+            mounting={later.sensor: ahead},
         )
+        other = replace(measurement, stamp=replace(measurement.stamp, sensor="other"))
+        write_recording(pair, [measurement, other], mounting={later.sensor: ahead, "other": ahead})
         raw.write_bytes(measurement.data.tobytes())
         times_s = [stamp.timestamp_ns // 10**9 + later for stamp in recording.stamps() for later in (0, 1)]
         trajectory.write_text("".join(f"{time_s} 0 0 0 0 0 0 1\n" for time_s in sorted({*times_s})))
@@ -158,6 +162,7 @@ def _files(folder: Path, source: Path) -> dict[str, str]:
     return {
         "recording": str(source),
         "drive": str(drive),
+        "pair": str(pair),
         "scene": str(_SCENE),
         "raw": str(raw),
         "images": str(images),

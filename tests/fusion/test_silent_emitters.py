@@ -85,9 +85,7 @@ def test_sector_that_no_emission_reaches_is_stated_and_not_free():
         assert mapper.map.log_odds_at((0.8, 0.05)) < 0.0
 
 
-@pytest.mark.parametrize(
-    "line", ["process FILE --fuse --json -o fused.h5", "map FILE --poses still.tum --json -o map.h5"]
-)
+@pytest.mark.parametrize("line", ["fuse FILE --json -o fused.h5", "map FILE --poses still.tum --json -o map.h5"])
 def test_commands_state_sensors_without_an_echo_of_their_own(tmp_path, monkeypatch, line):
     """There is nothing on the left."""
     monkeypatch.chdir(tmp_path)

@@ -78,7 +78,7 @@ def test_process_warns_of_wrong_emitters_and_of_a_dead_one(tmp_path):
         for name, signal in signals.items()
     ]
     write_recording(tmp_path / "rec.h5", measurements, mounting=mounted())
-    line = ["process", str(tmp_path / "rec.h5"), "--fuse", "--json", "-o", str(tmp_path / "fused.h5")]
+    line = ["fuse", str(tmp_path / "rec.h5"), "--json", "-o", str(tmp_path / "fused.h5")]
     dead = json.loads(CliRunner().invoke(cli, [*line, "--emitter-diameter", "0"]).stdout)
     assert dead["unheard"] == {"front": 1}
     assert "no sensor hears the call of front in 1 of 1 pulses; check its emitter and its SYNC line" in dead["warnings"]

@@ -104,8 +104,8 @@ def test_sensors_of_the_mounting_file_without_a_recording_are_noted(folder):
     note = "all.toml contains front, without a recording here; echoes may be of such a sensor's call"
     done = run(folder, f"both.h5 --poses poses.tum -o three.h5 --mounting {folder / 'all.toml'}")
     assert done.stderr.count(note) == 1
-    line = f"{folder / 'both.h5'} --fuse --mounting {folder / 'all.toml'} -o {folder / 'fused3.h5'}"
-    done = CliRunner().invoke(cli, ["process", *line.split()])
+    line = f"{folder / 'both.h5'} --mounting {folder / 'all.toml'} -o {folder / 'fused3.h5'}"
+    done = CliRunner().invoke(cli, ["fuse", *line.split()])
     assert done.exit_code == 0, done.output
     assert done.stderr.count(note) == 1
     assert "has no image" not in done.stderr

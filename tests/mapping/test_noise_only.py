@@ -135,7 +135,7 @@ def test_commands_say_how_many_pulses_carried_nothing(tmp_path):
     ]
     write_recording(tmp_path / "noise.h5", measurements, mounting=mounted(2))
     (tmp_path / "still.tum").write_text("999999999.9 0 0 0 0 0 0 1\n1000000000.5 0 0 0 0 0 0 1\n")
-    for line in ("map FILE --poses still.tum --json -o map.h5", "process FILE --fuse --json -o fused.h5"):
+    for line in ("map FILE --poses still.tum --json -o map.h5", "fuse FILE --json -o fused.h5"):
         arguments = [
             str(tmp_path / re.sub("FILE", "noise.h5", each)) if "." in each or each == "FILE" else each
             for each in line.split()

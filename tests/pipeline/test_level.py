@@ -399,8 +399,9 @@ def test_picture_states_that_directions_are_level():
 
 
 def test_fused_images_cannot_be_levelled(recording, tmp_path):
-    done = process(recording, "--level", "--fuse", "-o", str(tmp_path / "fused.h5"), code=2)
-    assert "--level does not apply to --fuse; leave it out" in done.stderr
+    done = CliRunner().invoke(cli, ["fuse", str(recording), "--level", "-o", str(tmp_path / "fused.h5")])
+    assert done.exit_code == 2
+    assert "No such option '--level'" in done.stderr
 
 
 def test_setting_of_the_recording_levels_its_images(recording, tmp_path):

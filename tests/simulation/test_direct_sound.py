@@ -240,7 +240,7 @@ def test_process_reports_direct_sound_and_warns(tmp_path):
     for each, measurement in zip(made.sensors, heard(made, LATE), strict=True):
         paths.append(tmp_path / f"{each.name}.h5")
         write_recording(paths[-1], [measurement], mounting={each.name: (each.position_m, each.quaternion())})
-    line = ["process", *map(str, paths), "--fuse", "--directions", "2d:9", "-o", str(tmp_path / "f.h5"), "--json"]
+    line = ["fuse", *map(str, paths), "--directions", "2d:9", "-o", str(tmp_path / "f.h5"), "--json"]
     done = CliRunner().invoke(cli, line)
     assert done.exit_code == 0, done.output
     report = json.loads(done.stdout.splitlines()[-1])

@@ -74,7 +74,7 @@ def folder(tmp_path_factory):
     assert other != truth
     write_recording(made / "other_right.h5", rows, truth={"right": other}, **placed)
     write_recording(made / "real_right.h5", rows, **placed)
-    run(f"process {made}/scene.h5 --fuse -q -o {made}/fused.h5")
+    run(f"fuse {made}/scene.h5 -q -o {made}/fused.h5")
     run(f"map {made}/scene.h5 -q -o {made}/place.h5")
     return made
 
@@ -160,7 +160,7 @@ def write_mountings(path, *, x_m, left_m):
 def test_fusion_with_another_mounting_file_moves_the_truth(folder, tmp_path):
     """The platform's origin lies half a metre behind, so that all places move by the same amount."""
     write_mountings(tmp_path / "other.toml", x_m=0.65, left_m=0.15)
-    done = run(f"process {folder}/scene.h5 --fuse --mounting {tmp_path}/other.toml -o {tmp_path}/other.h5")
+    done = run(f"fuse {folder}/scene.h5 --mounting {tmp_path}/other.toml -o {tmp_path}/other.h5")
     assert "mountings are not those" not in done.stderr
     found = report(f"compare {tmp_path}/other.h5")
     assert (found["matched"], found["missed"], found["spurious"]) == (6, 0, 0)
@@ -173,14 +173,14 @@ def test_map_with_wrong_mountings_has_a_note(folder, tmp_path):
 
 
 def test_recordings_of_single_sensors_have_the_truth_of_their_platform(folder, tmp_path):
-    run(f"process {folder}/left.h5 {folder}/right.h5 --fuse -q -o {tmp_path}/two.h5")
+    run(f"fuse {folder}/left.h5 {folder}/right.h5 -q -o {tmp_path}/two.h5")
     assert report(f"compare {tmp_path}/two.h5") == report(f"compare {folder}/fused.h5")
 
 
 def test_truth_of_some_sensors_is_left_out_of_fused_images(folder, tmp_path):
-    done = run(f"process {folder}/left.h5 {folder}/real_right.h5 --fuse -o {tmp_path}/two.h5")
+    done = run(f"fuse {folder}/left.h5 {folder}/real_right.h5 -o {tmp_path}/two.h5")
     assert f"no ground truth is stored, because sensor right of {folder}/real_right.h5 has none" in done.stderr
-    message = "two.h5 contains no ground truth; fuse simulated recordings of one scene with 'ertis process --fuse'"
+    message = "two.h5 contains no ground truth; fuse simulated recordings of one scene with 'ertis fuse'"
     assert message in run(f"compare {tmp_path}/two.h5", code=1).stderr
 
 
