@@ -56,6 +56,8 @@ def check(
 ) -> None:
     """Check whether sensors are fit for use.
 
+    'ertis verify' examines the file of a recording instead, and 'ertis info --health' lists single microphones.
+
     The command examines recordings of new, moved or repaired sensors: microphones, noise, losses, timing, call and
     calibration. At most 8 measurements of each sensor, evenly spaced, are examined. Measurements without a call show
     neither call nor calibration, and are examined only if there are no others. The last line for each file has the

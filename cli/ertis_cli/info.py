@@ -51,7 +51,8 @@ def info(ctx: click.Context, *, paths: tuple[Path, ...], of_health: bool, as_jso
     properties. For several files, "files" lists one report per file.
 
     With --health, show the state of each microphone of a recording: ok, dead, stuck, saturated, or with an offset or an
-    idle tone. At most 8 measurements, evenly spaced, are examined. The exit code is 0 even if faults are found.
+    idle tone. At most 8 measurements, evenly spaced, are examined. The exit code is 0 even if faults are found;
+    'ertis sensors check' states whether the sensor is fit for use.
     """
     path, *others = paths
     if of_health and (others or path.is_dir()):

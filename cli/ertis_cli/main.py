@@ -30,7 +30,7 @@ _SECTIONS = {
     },
     "Files": {
         "info": ("ertis_cli.info:info", "Show the contents of recordings, image files or maps."),
-        "verify": ("ertis_cli.verify:verify", "Check the measurements of a file, and list gaps and damage."),
+        "verify": ("ertis_cli.verify:verify", "Verify that files are intact, and list gaps and damage."),
         "import": ("ertis_cli.imports:imports", "Import signals, journals left by a crash, or poses into recordings."),
         "export": ("ertis_cli.export:export", "Export images or signals for other programs."),
     },

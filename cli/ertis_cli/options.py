@@ -6,7 +6,7 @@ import math
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,7 +15,17 @@ from click.shell_completion import CompletionItem
 
 from ertis_cli import _progress
 from ertis_cli._naming import with_options
-from ertis_numba.base.constants import MAX_MICROPHONES
+from ertis_cli._parameter_types import (
+    CHANNELS,
+    DIRECTION,
+    ELEVATION,
+    ERROR_BUDGET,
+    FILE,
+    FOLDER,
+    INTERVAL,
+    NAMES,
+    TEXT_PATH,
+)
 from ertis_numba.base.units import counted
 from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerOption
 
@@ -81,48 +91,8 @@ __all__ = [
     "without",
 ]
 
-_MAX_DEG = 90.0  # limit of azimuth and elevation in front of an array
 Item = TypeVar("Item")
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
-
-
-class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
-    name = "A:B"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        first, colon, last = str(value).partition(":")
-        if colon:
-            with suppress(ValueError):
-                return float(first), float(last)
-        return self.fail(f"{value!r} is not an interval; use two numbers, as in 0.5:5", param, ctx)
-
-
-class _Elevation(_Interval):
-    name = "A:B|E"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        with suppress(ValueError):
-            return float(value)
-        return super().convert(value, param, ctx)
-
-
-class _Channels(click.ParamType):  # type: ignore[type-arg]  # as above
-    """Channels of a sensor, or of all sensors if there is no name."""
-
-    name = "[NAME:]N,..."
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, tuple[int, ...]]:
-        from ertis_numba.base.checks import sensor_name
-
-        name, _, numbers = str(value).rpartition(":")
-        with suppress(ValueError):  # also of names that no sensor can have
-            channels = tuple(int(channel) for channel in numbers.split(","))
-            if all(0 <= channel < MAX_MICROPHONES for channel in channels):
-                return (sensor_name(name) if ":" in str(value) else ""), channels
-        wanted = f"integers from 0 to {MAX_MICROPHONES - 1}, as in 5,12, or those of one sensor, as in left:5,12"
-        return self.fail(f"{value!r} is not a list of channels; use {wanted}", param, ctx)
 
 
 def _excluded_channels(
@@ -136,68 +106,6 @@ def _excluded_channels(
     return ExcludedChannels(channels.pop("", ()), channels)
 
 
-class _Names(click.ParamType):  # type: ignore[type-arg]  # as above
-    name = "NAME,..."
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
-        names = tuple(str(value).split(","))
-        if all(names):
-            return names
-        return self.fail(f"{value!r} is not a list of names; write them as in front,left", param, ctx)
-
-
-class _Direction(click.ParamType):  # type: ignore[type-arg]  # as above
-    name = "AZ:EL"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        azimuth, colon, elevation = str(value).replace(",", ":").partition(":")
-        if colon:
-            with suppress(ValueError):
-                angles_deg = float(azimuth), float(elevation)
-                if all(-_MAX_DEG <= angle_deg <= _MAX_DEG for angle_deg in angles_deg):
-                    return angles_deg
-        wanted = f"azimuth and elevation, each from -{_MAX_DEG:g} to {_MAX_DEG:g}, as in 30:0"
-        return self.fail(f"{value!r} is not a direction; use {wanted}", param, ctx)
-
-
-class _ErrorBudget(click.ParamType):  # type: ignore[type-arg]  # as above
-    name = "DB"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        from ertis_numba.settings import ERROR_PRESETS_DB
-
-        if value in ERROR_PRESETS_DB:
-            return ERROR_PRESETS_DB[value]
-        with suppress(ValueError):
-            return float(value)
-        return self.fail(
-            f"{value!r} is not an error budget; use dB, as in -40, or {', '.join(ERROR_PRESETS_DB)}", param, ctx
-        )
-
-
-class _File(click.Path):
-    noun = "file"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        return (
-            super().convert(value, param, ctx)
-            if str(value)
-            else self.fail(f"the path is empty; name a {self.noun}", param, ctx)
-        )
-
-
-class _Folder(_File):
-    noun = "folder"
-
-
-DIRECTION = _Direction()
-ELEVATION = _Elevation()
-ERROR_BUDGET = _ErrorBudget()
-FILE = _File(path_type=Path)
-FOLDER = _Folder(path_type=Path)
-INTERVAL = _Interval()
-NAMES = _Names()
-TEXT_PATH = _File()
 FALSE_ALARM = 1e-3
 """Probability that noise alone causes a reflector in one image."""
 PREPARING = "preparing ..."
@@ -309,7 +217,7 @@ def without(text: str) -> Decorator:
     """Return the option that excludes channels; ``text`` is the beginning of its help."""
     return click.option(
         "--without",
-        type=_Channels(),
+        type=CHANNELS,
         multiple=True,
         callback=_excluded_channels,
         help=f"{text}, counted from 0, as in 5,12; or of one sensor, as in left:5,12. Repeat the option for others.",

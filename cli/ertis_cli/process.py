@@ -171,33 +171,31 @@ def process(
         )
         return
     _require_options_of_one(target)
-    path = Path(paths[0])
+    _write_one(Path(paths[0]), target, wanted, quiet=quiet, as_json=as_json)
+
+
+def _write_one(path: Path, target: str | None, wanted: "CampaignOptions", *, quiet: bool, as_json: bool) -> None:
+    """Write the signals, acoustic maps or images of one recording."""
     if target is not None and _results.is_results_file(target):
         _acoustic_maps.require_none(f"{target} contains signals or beams; choose a .h5 file")
         _results.write_results(
             path,
             Path(target),
-            changed,
-            without=without,
-            sensor=sensor,
-            force=force,
+            wanted.settings,
+            without=wanted.without,
+            sensor=wanted.sensor,
+            force=wanted.overwrite,
             quiet=quiet,
             as_json=as_json,
-            device=device,
-            threads=threads,
-            plan=plan,
+            device=wanted.device,
+            threads=wanted.threads,
+            plan=wanted.plan,
         )
         return
-    sensors = options.sensors_of(path, sensor, "a recording")
-    if _acoustic_maps.are_wanted(path, sensors, changed):
-        _acoustic_maps.write_maps(
-            path,
-            Path(target) if target else path.with_suffix(".acoustic.h5"),
-            wanted,
-            sensors=sensors,
-            quiet=quiet,
-            as_json=as_json,
-        )
+    sensors = options.sensors_of(path, wanted.sensor, "a recording")
+    if _acoustic_maps.are_wanted(path, sensors, wanted.settings):
+        maps_file = Path(target) if target else path.with_suffix(".acoustic.h5")
+        _acoustic_maps.write_maps(path, maps_file, wanted, sensors=sensors, quiet=quiet, as_json=as_json)
         return
     _acoustic_maps.require_none("measurements with a call become images; use --mode passive")
     target_file = Path(target) if target else path.with_suffix(".energy.h5")

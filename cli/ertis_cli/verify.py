@@ -24,7 +24,9 @@ _FAILED, _INCOMPLETE = 1, 3
 @options.as_json
 @click.pass_context
 def verify(ctx: click.Context, *, paths: tuple[Path, ...], quiet: bool, as_json: bool) -> None:
-    """Check the measurements of a file, and list gaps and damage.
+    """Verify that files are intact, and list gaps and damage.
+
+    'ertis sensors check' examines the sensor of a recording instead, and 'ertis import journals' recovers journals.
 
     The command compares each measurement of recordings and journals, and each pose of journals, with its checksum. The
     exit code is 0 if all measurements are present, and all measurements and poses are intact. It is 3 if measurements
