@@ -4,6 +4,8 @@ import numpy as np
 
 from ertis_numba.frames import Energyscape, Measurement, Stamp
 from ertis_numba.settings import Array, Processing, Recording, Settings
+from ertis_numba.simulation import Point, Scene, Sensor
+from ertis_numba.simulation.render import Simulator
 
 SMALL = Settings(
     recording=Recording(n_samples=40_960),
@@ -15,6 +17,22 @@ def line(n_channels, word_bits):
     """Settings with a line array."""
     positions_m = tuple((0.0, 0.004 * channel, 0.0) for channel in range(n_channels))
     return SMALL.replace(array=Array(layout="line", positions_m=positions_m, word_bits=word_bits))
+
+
+def echoes(settings=SMALL, count=3, places=((0.0, 0.55), (30.0, 0.65), (-30.0, 0.8))):
+    """Measurements of reflectors at azimuths in degrees and ranges in metres."""
+    sensor = Sensor(array=settings.array, recording=settings.recording, processing=settings.processing)
+    points = tuple(Point(position_m=point_m(*place)) for place in places)
+    simulator = Simulator(Scene(sensors=(sensor,), points=points))
+    return [
+        Measurement(simulator.render(index).data, settings, each.stamp)
+        for index, each in enumerate(noise(settings, count))
+    ]
+
+
+def point_m(azimuth_deg, range_m):
+    angle = np.radians(azimuth_deg)
+    return range_m * np.cos(angle), range_m * np.sin(angle), 0.0
 
 
 def noise(settings=SMALL, count=3, seed=1):
@@ -48,6 +66,15 @@ def image(azimuth_deg=None, elevation_deg=None, *, range_m=None, seed=1, setting
     amplitude = (0.002 * rng.rayleigh(size=(len(azimuth_deg), len(range_m)))).astype(np.float32)
     amplitude[len(azimuth_deg) // 2, len(range_m) // 2] = 0.5
     return Energyscape(amplitude, np.radians(azimuth_deg), np.radians(elevation_deg), range_m, settings)
+
+
+def with_echoes(made):
+    """An image with one more bright point per direction."""
+    amplitude = made.amplitude.copy()
+    n_directions, n_ranges = amplitude.shape
+    places = np.random.default_rng(7).integers(2, n_ranges - 2, n_directions)
+    amplitude[np.arange(n_directions), places] = np.linspace(0.1, 0.4, n_directions)
+    return made.replace(amplitude=amplitude)
 
 
 def open_dataset(path, **options):

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.detect import neighbours_of
+from ertis_numba.analysis.directional_noise import pulse_steps, stands_out
 from ertis_numba.analysis.noise import noise_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
@@ -18,12 +19,15 @@ from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import Grid, direction_grid, observable_angles, unit_vectors
 from ertis_numba.settings import Settings
 
-__all__ = ["MIN_LEVEL_DB", "TOP", "EchoPointExtractor", "PointExtractor"]
+__all__ = ["FALSE_ALARM", "MIN_LEVEL_DB", "TOP", "EchoPointExtractor", "PointExtractor"]
 
 TOP: Final = 256
 """Default of the largest number of points per image."""
 MIN_LEVEL_DB: Final = -20.0
 """Default of the lowest level of points, relative to the strongest of the image."""
+
+FALSE_ALARM: Final = 1e-3
+"""Default of the probability that noise alone yields a point of an image."""
 
 _BINS_OF_POINT = 64
 """Maximum number of bins to examine per point; in noise, a third of the image would be candidates otherwise."""
@@ -34,9 +38,10 @@ class PointExtractor:
     """Extractor of the local maxima of images as points, with tables computed once for a grid.
 
     A point is a local maximum over directions and ranges that exceeds the possible side lobes of the strongest
-    reflector at about the same range. Position and amplitude are interpolated as in `ertis_numba.find_peaks`. The
-    latter is slower and predicts side lobes from the array. It finds weak reflectors beside strong ones at the same
-    range, which this class discards.
+    reflector at about the same range, and that noise from its direction does not explain: see
+    `ertis_numba.analysis.directional_noise.stands_out`. Position and amplitude are interpolated as in
+    `ertis_numba.find_peaks`. The latter is slower and predicts side lobes from the array. It finds weak reflectors
+    beside strong ones at the same range, which this class discards.
 
     Each point has standard deviations of its position: see
     `ertis_numba.analysis.uncertainty.PositionUncertainty`. Microphones in one place observe no directions, and hence
@@ -53,11 +58,15 @@ class PointExtractor:
         Maximum number of points per image; the strongest 256 by default.
     min_level_db : float
         Minimum level relative to the strongest point of the image; -20 dB by default.
+    false_alarm : float or None
+        Probability that noise alone yields a point of an image, approximately; 0.001 by default. None keeps the maxima
+        of noise, too.
 
     Raises
     ------
     ArgumentError
-        ``top`` is below 1, ``min_level_db`` is above 0, or the directions of the settings are not available.
+        ``top`` is below 1, ``min_level_db`` is above 0, ``false_alarm`` is not between 1e-12 and 1, or the directions
+        of the settings are not available.
 
     Examples
     --------
@@ -72,12 +81,21 @@ class PointExtractor:
     _noise_only = False
 
     def __init__(
-        self, settings: Settings, grid: Grid | None = None, *, top: int = TOP, min_level_db: float = MIN_LEVEL_DB
+        self,
+        settings: Settings,
+        grid: Grid | None = None,
+        *,
+        top: int = TOP,
+        min_level_db: float = MIN_LEVEL_DB,
+        false_alarm: float | None = FALSE_ALARM,
     ) -> None:
         checks.instance("settings", settings, Settings, "an image or a recording contains")
         self._has_directions = any(observable_angles(settings.array)[:2])
         self._top = checks.integer("top", top, 1)
         self._smallest = 10 ** (checks.between("min_level_db", min_level_db, -1000.0, 0.0) / 20)
+        if false_alarm is not None:
+            checks.between("false_alarm", false_alarm, 1e-12, 1.0)
+        self._false_alarm = None if self._noise_only else false_alarm
         grid = grid or direction_grid(settings.processing)
         self._directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         self._neighbours = neighbours_of(self._directions)
@@ -154,7 +172,11 @@ class PointExtractor:
         beaten = (there > here) | ((there == here) & (around < directions[:, None]))
         points = np.flatnonzero(~beaten.any(axis=1))
         strongest = points[np.argsort(-here[points, 0], kind="stable")[: self._top]]
-        return directions[strongest], ranges[strongest]
+        directions, ranges = directions[strongest], ranges[strongest]
+        if self._false_alarm is None:
+            return directions, ranges
+        stays = stands_out(image, directions, ranges, self._false_alarm, pulse_steps(image))
+        return directions[stays], ranges[stays]
 
     def _raised(self, amplitude: NDArray[np.float32]) -> np.float32:
         """Return an amplitude threshold that leaves about the intended number of bins to examine."""
@@ -167,7 +189,7 @@ class EchoPointExtractor(PointExtractor):
     """Extractor for fusion and odometry, whose uncertainties are those of noise only.
 
     Both model the interference of echoes themselves. With the misfit to a single echo as well, they would accept echoes
-    of other reflectors as those of one.
+    of other reflectors as those of one. Both also compare all maxima with the noise.
     """
 
     _noise_only = True

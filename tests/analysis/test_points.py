@@ -76,7 +76,7 @@ def reference(image, *, top, min_level_db):
 def test_point_extractor_equals_the_reference(directions, min_level_db):
     image = noise(directions, method="paper")
     expected = reference(image, top=80, min_level_db=min_level_db)
-    cloud = PointExtractor(image.settings, top=80, min_level_db=min_level_db)(image)
+    cloud = PointExtractor(image.settings, top=80, min_level_db=min_level_db, false_alarm=None)(image)
     assert len(expected) > 2
     np.testing.assert_allclose(cloud.position_m, expected[:, :3], atol=1e-5)
     np.testing.assert_allclose(cloud.amplitude, expected[:, 3], rtol=1e-5)
@@ -89,7 +89,7 @@ def test_point_extractor_equals_the_reference(directions, min_level_db):
 
 def test_strongest_peaks_of_noise_are_found():
     image = noise("3d:800", method="paper")
-    cloud = PointExtractor(image.settings, top=10)(image)
+    cloud = PointExtractor(image.settings, top=10, false_alarm=None)(image)
     assert np.count_nonzero(image.amplitude > image.amplitude.max() / 10) > 640  # Only some are examined.
     expected = reference(image, top=10, min_level_db=-20.0)
     np.testing.assert_allclose(cloud.position_m, expected[:, :3], atol=1e-5)
@@ -247,7 +247,7 @@ def test_noise_is_estimated_by_the_median_for_delay_and_sum_only(method, beamfor
     ratio = np.median(image.amplitude) / np.sqrt(np.mean(np.square(image.amplitude, dtype=float)))
     is_rayleigh = not settings.processing.is_adaptive
     assert (ratio == pytest.approx(np.sqrt(np.log(2)), rel=0.02)) == is_rayleigh
-    uncertainty_m = PointExtractor(settings)(image).uncertainty_m
+    uncertainty_m = PointExtractor(settings, false_alarm=None)(image).uncertainty_m
     assert len(uncertainty_m) > 3
     assert (np.isnan(uncertainty_m) != (is_rayleigh and method == "fast")).all()
 
@@ -271,7 +271,7 @@ def test_uncertainty_is_nan_without_noise():
 def test_uncertainty_is_infinite_along_unresolved_angles(positions_m, directions, is_finite):
     image = noise(directions)
     settings = image.settings.replace(array=Array(layout="few", positions_m=positions_m, word_bits=8))
-    cloud = PointExtractor(settings)(image.replace(settings=settings))
+    cloud = PointExtractor(settings, false_alarm=None)(image.replace(settings=settings))
     uncertainty_m = cloud.uncertainty_m[cloud.position_m[:, 0] > 0.1]  # An array seen from the side has no aperture.
     assert len(uncertainty_m) > 2
     assert np.isfinite(uncertainty_m[:, 0]).all()

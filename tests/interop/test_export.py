@@ -18,7 +18,7 @@ from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.interop import FORMATS, TOPICS, Drive, choose_format, export, output_files
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_energyscapes, write_recording
-from tests.files import SMALL, image, noise
+from tests.files import SMALL, echoes, image, noise
 from tests.pages import page, run_code_here
 
 ROOT = Path(__file__).parents[2]
@@ -39,7 +39,7 @@ def files(tmp_path_factory):
     both = [
         Measurement(given.data, SMALL, Stamp(sensor=sensor, sequence=number))
         for sensor in ("left", "right")
-        for number, given in enumerate(noise())
+        for number, given in enumerate(echoes())
     ]
     write_recording(folder / "both.h5", both, mounting=MOUNTED)
     write_recording(folder / "rec.h5", noise())
@@ -128,7 +128,7 @@ def test_export_format_follows_suffix_or_option(files, tmp_path):
 
 def test_export_accepts_changing_air_except_in_npz(tmp_path):
     """Each image uses the air of its measurement, but an NPZ file has only one range axis."""
-    words = noise(count=1)[0].data
+    words = echoes(count=1)[0].data
     warm = SMALL.replace(air=Air(temperature_c=35.0))
     given = [Measurement(words, settings, Stamp(sequence=n)) for n, settings in enumerate((SMALL, warm, warm))]
     write_recording(tmp_path / "rec.h5", given)

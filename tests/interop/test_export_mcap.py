@@ -18,7 +18,7 @@ from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.interop import TOPICS, export
 from ertis_numba.interop.ros_definitions import DEFINITIONS, schema
 from ertis_numba.settings import Processing, Settings
-from tests.files import SMALL, image
+from tests.files import SMALL, image, with_echoes
 
 TIME_NS = 1_700_000_000_123_456_789
 MOUNTING = {"eRTIS-7": ((1.0, -2.0, 0.5), (0.0, 0.0, 0.6, 0.8)), "2.right": ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))}
@@ -35,9 +35,9 @@ def stamped(given, sensor, sequence, time_ns):
 
 
 GIVEN = [
-    stamped(image(seed=1), "eRTIS-7", 10, TIME_NS),
-    stamped(image(seed=2), "eRTIS-7", 2**40 + 11, TIME_NS + 50_000_000),
-    stamped(spatial(), "2.right", 10, TIME_NS + 1),
+    stamped(with_echoes(image(seed=1)), "eRTIS-7", 10, TIME_NS),
+    stamped(with_echoes(image(seed=2)), "eRTIS-7", 2**40 + 11, TIME_NS + 50_000_000),
+    stamped(with_echoes(spatial()), "2.right", 10, TIME_NS + 1),
 ]
 KINDS = {
     "points": "sensor_msgs/msg/PointCloud2",

@@ -13,7 +13,7 @@ from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import Grid
 from ertis_numba.interop import FORMATS, export
-from tests.files import image
+from tests.files import image, with_echoes
 
 REFLECTORS = Path(__file__).parents[2] / "data" / "synthetic" / "reflectors.h5"
 TURNED = ((1.0, 2.0, 3.0), (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)))  # a quarter turn to the left
@@ -63,7 +63,7 @@ def read_pcd(path):
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
 @pytest.mark.parametrize(("kind", "read"), [("ply", read_ply), ("pcd", read_pcd)])
 def test_clouds_come_back_bit_by_bit(tmp_path, kind, read, text):
-    given = [*images("left"), *images("right", 1, sequence=7)]
+    given = [with_echoes(each) for each in (*images("left"), *images("right", 1, sequence=7))]
     (path,) = export(
         tmp_path / f"a.{kind}", given, text=text, mounting=dict.fromkeys(("left", "right"), TURNED), **FINDING
     )

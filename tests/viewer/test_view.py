@@ -213,7 +213,9 @@ def test_saved_points_are_the_drawn_points():
     """This includes maxima beyond the window and between directions."""
     rng = np.random.default_rng(5)
     noisy = image(np.linspace(-90, 90, 91))
-    amplitude = rng.rayleigh(0.05, noisy.amplitude.shape).astype(np.float32) + spot(11.3, 1.507).amplitude
+    places = (11.3, 1.507), (-41.7, 2.263), (37.2, 3.11), (-15.5, 3.737), (63.9, 1.222)
+    amplitude = rng.rayleigh(0.005, noisy.amplitude.shape) + sum(spot(*place).amplitude for place in places)
+    amplitude = amplitude.astype(np.float32)
     scene = ViewedScene()
     scene.take(taken(noisy.replace(amplitude=amplitude), TURNED))
     for choices in (Choices(threshold_db=-12), Choices(threshold_db=-18, range_m=(1.5, 4.0))):
