@@ -353,8 +353,7 @@ def _compared(place: dict[str, Any], comparison: "Comparison") -> Iterator[dict[
 def _beside_the_truth(place: dict[str, Any], comparison: "Comparison") -> Iterator[tuple[str, ...]]:
     """Yield the cells of each true reflector of a measurement, then of the other peaks."""
     for match in comparison.matched:
-        error = _error(match)
-        reported = (f"{error[name]:{form}}" for name, form in _ERROR.items())
+        reported = _formatted(_error(match), _ERROR)
         yield (*_cells(place, _rounded(match.reflector)), *reported, match.reflector.name)
     for reflector in comparison.missed:
         yield (*_cells(place, _rounded(reflector)), "missed", "-", "-", reflector.name)
@@ -374,11 +373,11 @@ def _formatted(row: dict[str, Any], forms: dict[str, str]) -> tuple[str, ...]:
 
 
 def _dash(name: str) -> str:
-    return "–" if name in ("azimuth_deg", "elevation_deg") else "-"
+    return "–" if name in ("azimuth_deg", "elevation_deg", "angle_deg") else "-"
 
 
-def _error(match: "Match") -> dict[str, float]:
-    return {name: round(getattr(match, name), _DIGITS[name]) for name in ("angle_deg", "range_m", "level_db")}
+def _error(match: "Match") -> dict[str, float | None]:
+    return {name: _number(getattr(match, name), _DIGITS[name]) for name in ("angle_deg", "range_m", "level_db")}
 
 
 def _rounded(item: Any) -> dict[str, Any]:

@@ -9,10 +9,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.detect import peaks_of_grid
+from ertis_numba.analysis.detect import observed, peaks_of_grid
 from ertis_numba.base import checks
 from ertis_numba.frames import Energyscape, Peak, Reflector
-from ertis_numba.geometry import array_weights, microphones, unit_vectors
+from ertis_numba.geometry import array_weights, microphones, observable_angles, unit_vectors
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.geometry.waveform import matched_filter_spectrum
 from ertis_numba.settings import Settings
@@ -36,7 +36,8 @@ class Match:
     reflector : Reflector
     peak : Peak
     angle_deg : float
-        Angle between the two directions in degrees; in a planar image, the angle between the two azimuths.
+        Angle between the two directions in degrees; in a planar image, the angle between the two azimuths. For
+        microphones on a line, the difference of the angles to this line. NaN if the array observes no direction.
     range_m : float
         Range of the peak minus that of the reflector, in metres.
     level_db : float
@@ -82,7 +83,8 @@ class Errors:
     measurements, matched, missed, spurious : int
         Numbers of images, of reflectors found, of missed reflectors, and of spurious peaks.
     angle_rms_deg, range_bias_m, range_rms_m, level_rms_db : float or None
-        Errors of the matched reflectors, None if there are none. The bias is positive if peaks are too far away.
+        Errors of the matched reflectors, None if there are none. The bias is positive if peaks are too far away. The
+        error of the angle is None if no array observes a direction.
     """
 
     measurements: int
@@ -167,8 +169,8 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     return Comparison(
         matched=tuple(_match(image, reflector, peak, step_db) for reflector, peak in pairs),
         missed=tuple(reflector for reflector in counted if not any(reflector is found for found, _ in pairs)),
-        spurious=tuple(peak for peak, due in zip(left, is_due, strict=True) if not due),
-        explained=tuple(peak for peak, due in zip(left, is_due, strict=True) if due),
+        spurious=tuple(observed(image, [peak for peak, due in zip(left, is_due, strict=True) if not due])),
+        explained=tuple(observed(image, [peak for peak, due in zip(left, is_due, strict=True) if due])),
     )
 
 
@@ -194,7 +196,7 @@ def errors_of(comparisons: Iterable[Comparison]) -> Errors:
     ranges_m = [match.range_m for match in matches]
     return Errors(
         measurements=len(given),
-        angle_rms_deg=_rms(match.angle_deg for match in matches),
+        angle_rms_deg=_rms(match.angle_deg for match in matches if not math.isnan(match.angle_deg)),
         range_bias_m=math.fsum(ranges_m) / len(ranges_m) if ranges_m else None,
         range_rms_m=_rms(ranges_m),
         level_rms_db=_rms(match.level_db for match in matches),
@@ -293,10 +295,11 @@ def _step_db(pairs: Sequence[tuple[Reflector, Peak]], strongest_db: float) -> fl
 
 
 def _match(image: Energyscape, reflector: Reflector, peak: Peak, step_db: float) -> Match:
+    has_direction = observable_angles(image.settings.array).has_direction(is_planar=image.is_planar)
     return Match(
         reflector=reflector,
-        peak=peak,
-        angle_deg=float(_angles_deg(image, [reflector], [peak])[0, 0]),
+        peak=observed(image, [peak])[0],
+        angle_deg=float(_angles_deg(image, [reflector], [peak])[0, 0]) if has_direction else math.nan,
         range_m=peak.range_m - reflector.range_m,
         level_db=peak.level_db + step_db - reflector.level_db,
     )
@@ -342,7 +345,11 @@ def _degrees_between(chords: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _angles_deg(image: Energyscape, reflectors: Sequence[Reflector], peaks: Sequence[Peak]) -> NDArray[np.float64]:
-    """Return the angles between reflectors and peaks: (reflector, peak) float64."""
+    """Return the angles between reflectors and peaks that the array can observe: (reflector, peak) float64."""
+    line = observable_angles(image.settings.array).line
+    if line is not None:
+        cones = (np.degrees(np.arccos(np.clip(_units(places) @ line, -1, 1))) for places in (reflectors, peaks))
+        return np.asarray(np.abs(np.subtract.outer(*cones)))
     if image.is_planar:
         azimuths = ([place.azimuth_deg for place in places] for places in (reflectors, peaks))
         difference = np.subtract.outer(*azimuths)

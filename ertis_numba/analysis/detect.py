@@ -20,7 +20,7 @@ from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak, PointCloud
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
 
-__all__ = ["find_peaks", "left_out_at_edges", "left_out_in_noise", "neighbours_of", "peaks_of_grid"]
+__all__ = ["find_peaks", "left_out_at_edges", "left_out_in_noise", "neighbours_of", "observed", "peaks_of_grid"]
 
 _SAME_DIGITS = 9  # Decimals in which the unit vectors of equal directions agree.
 _NEIGHBOURS = 8  # Number of directions around each direction of a dense grid.
@@ -84,6 +84,11 @@ def find_peaks(
             print(f"{peak.range_m:.2f} m at {peak.azimuth_deg:.0f}°, {peak.level_db:.1f} dB")
     """
     peaks = peaks_of_grid(image, top=top, min_level_db=min_level_db, where=where, false_alarm=false_alarm)
+    return observed(image, peaks)
+
+
+def observed(image: Energyscape, peaks: list[Peak]) -> list[Peak]:
+    """Return the peaks of an image without the angles that the array cannot observe."""
     if image.points is not None:
         return peaks  # The array of the settings is that of one sensor only.
     seen = observable_angles(image.settings.array)

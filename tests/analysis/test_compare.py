@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ertis_cli.peaks import _compared
 
 from ertis_numba.analysis.compare import Comparison, Match, compare, errors_of
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Peak, Reflector
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Array
+from ertis_numba.settings import Array, Settings
 from ertis_numba.simulation import Scene
 from ertis_numba.simulation.effect_plan import EffectPlan, Verdict
 from ertis_numba.simulation.render import Simulator
@@ -243,6 +244,40 @@ def test_compare_explains_cross_echoes_of_two_simulated_sensors():
         )
         assert (len(comparison.matched), len(comparison.missed), len(comparison.spurious)) == (1, 0, 0)
         assert comparison.explained
+
+
+def one_line(axis):
+    return Settings(array=Array(positions_m=tuple(tuple(0.004 * k * a for a in axis) for k in range(16))))
+
+
+@pytest.mark.parametrize(
+    ("settings", "directions"),
+    [
+        (Settings(array=Array(positions_m=((0, 0, 0),))), "2d:31"),
+        (Settings(array=Array(positions_m=((0, 0, 0),))), "3d:60"),
+        (one_line((0, 0, 1)), "2d:31"),
+    ],
+)
+def test_compare_states_no_angle_without_a_direction(settings, directions):
+    """Of a reflector at 40°, one microphone, or a vertical line in a horizontal plane, shows only the range."""
+    comparison = compare(ideal(true(40, 1.2), settings=settings, directions=directions), [true(40, 1.2)])
+    (match,) = comparison.matched
+    assert math.isnan(match.angle_deg)
+    assert abs(match.range_m) < 1e-3
+    errors = errors_of([comparison])
+    assert errors.angle_rms_deg is None
+    assert errors.range_rms_m < 1e-3
+    (row,) = (row for row in _compared({}, comparison) if row["truth"])
+    assert row["error"]["angle_deg"] is None
+
+
+def test_compare_measures_the_angle_to_a_line_of_microphones():
+    """A reflector above the horizontal plane sounds like one in the plane with the same y, which is no error."""
+    reflector = true(30, 1.2, elevation_deg=40)
+    image = ideal(reflector, settings=one_line((0, 1, 0)), directions="3d:600")
+    (match,) = compare(image, [reflector]).matched
+    assert match.angle_deg < 1.0
+    assert math.isnan(match.peak.elevation_deg)
 
 
 NEEDED = ("propagation", "spreading", "cross_emission", "modulation")
