@@ -5,7 +5,7 @@ through these slopes compresses the sound over its whole band, and is then refin
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -245,12 +245,19 @@ def arrival_of(
 
 
 def refined(arrival: GatedArrival, curve: Curve) -> tuple[Curve, float]:
-    """Return the curve of any modulation with the highest peak at an arrival, and the ratio of both peak powers."""
+    """Return the curve of any modulation with the highest peak at an arrival, and the ratio of both peak powers.
+
+    Both powers are compared by microphone. Silent ones, such as dead channels, do not count.
+    """
     at_hz = arrival.frequency_hz
     before_rad = curve.phase_rad(at_hz)
     n_fft = scipy.fft.next_fast_len(2 * len(at_hz))
     given = _peaks(arrival, np.zeros((1, len(at_hz))), n_fft)[0]
     best = (1.0, curve)
+    is_heard = given > 0
+    if not is_heard.any():
+        return curve, 1.0
+    given, arrival = given[is_heard], replace(arrival, spectra=arrival.spectra[is_heard])
     bandwidth_hz = at_hz[-1] - at_hz[0]
     for modulation in MODULATIONS:
         unit = Curve(modulation, 1.0, curve.pivot_hz)

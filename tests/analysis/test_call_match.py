@@ -225,3 +225,16 @@ def test_pipelines_warn_once_of_another_call():
 def test_pipelines_without_prediction_do_not_compare_calls():
     with Pipeline(SETTINGS, "cpu", 1, predict=False) as pipeline:
         pipeline.process(heard(REVERSED))
+
+
+@pytest.mark.parametrize("n_dead", [1, 12])
+@pytest.mark.parametrize("emitted", [CALL, REVERSED, CALL.replace(duration_s=0.7 * CALL.duration_s)])
+def test_call_match_ignores_dead_channels(emitted, n_dead):
+    measurement = heard(emitted, noise=0.05)
+    data = measurement.data.copy()
+    data[:, :n_dead] = 0
+    match, intact = call_match(Measurement(data, SETTINGS)), call_match(measurement)
+    assert match.verdict == intact.verdict
+    if emitted is not CALL:
+        assert match.sweep.low_hz == pytest.approx(intact.sweep.low_hz, rel=0.02)
+        assert match.sweep.duration_s == pytest.approx(intact.sweep.duration_s, rel=0.02)
