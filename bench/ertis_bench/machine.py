@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from ertis_numba.base.cpu_cores import usable_cores
+from ertis_numba.base.forks import usable_cores
 
 __all__ = ["describe", "sentence"]
 

@@ -100,7 +100,7 @@ def _versions(_folder: Path) -> Iterator[InstallationFinding]:
 
 def _processor(_folder: Path) -> Iterator[InstallationFinding]:
     from ertis_numba import kernels
-    from ertis_numba.base.cpu_cores import usable_cores
+    from ertis_numba.base.forks import usable_cores
     from ertis_numba.frames import Measurement
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Settings

@@ -41,7 +41,6 @@ class KeyReference:
 
     Attributes
     ----------
-    name : str
     about : str
         Meaning of the key.
     shape : str
@@ -70,8 +69,6 @@ class TableReference:
     ----------
     header : str
         Header of the table as in a file, such as ``[array]`` or ``[[points]]``; empty for keys before any table.
-    about : str
-    keys : tuple of KeyReference
     """
 
     header: str

@@ -9,9 +9,21 @@ from ertis_cli.recover import recover
 __all__ = ["imports"]
 
 
-@click.group("import")
+class _Imports(click.Group):
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Import signals if the first argument is no command, as of ``ertis import FILE.wav``."""
+        is_command = args[0] in self.commands or args[0] in ctx.help_option_names
+        return super().resolve_command(ctx, args if is_command else ["signals", *args])
+
+
+@click.group("import", cls=_Imports, context_settings={"ignore_unknown_options": True})
 def imports() -> None:
-    """Import signals, journals left by a crash, or poses into recordings."""
+    """Import signals, journals left by a crash, or poses into recordings.
+
+    Without one of these commands, `ertis import FILES` imports signals.
+    """
 
 
 for each in (import_raw, import_poses, recover):

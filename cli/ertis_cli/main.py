@@ -66,17 +66,18 @@ _SECTIONS = {
 COMMANDS = dict(sorted(command for section in _SECTIONS.values() for command in section.items()))
 """Module and summary of each command, in alphabetical order."""
 
+_GROUP_OF = {
+    **dict.fromkeys(("calibrate", "check", "configure", "emulate", "reset", "rtisdev", "send", "status"), "sensors"),
+    **dict.fromkeys(("completion", "layouts", "presets", "settings"), "reference"),
+}
+"""Commands that may be typed without their group."""
 _ELSEWHERE = {
-    **dict.fromkeys(("command", "send"), "sensors send"),
     **dict.fromkeys(("devices", "list"), "sensors list"),
-    **{
-        name: f"sensors {name}" for name in ("calibrate", "check", "configure", "emulate", "reset", "rtisdev", "status")
-    },
-    **{name: f"reference {name}" for name in ("completion", "layouts", "presets", "settings")},
+    "command": "sensors send",
     "import-poses": "import poses",
     "recover": "import journals",
 }
-"""Commands that a user may look for at the top, and the group that has them."""
+"""Commands that a user may look for at the top, and those that do the same."""
 
 _FAILED, _USAGE, _INTERRUPTED = 1, 2, 130
 
@@ -99,6 +100,8 @@ class _Commands(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         name = args[0]
+        if name in _GROUP_OF:
+            name, args = _GROUP_OF[name], [_GROUP_OF[name], *args]
         if not name.startswith("-") and name not in COMMANDS and not ctx.resilient_parsing:
             group = _ELSEWHERE.get(name)
             remedy = f"did you mean {group!r}?" if group else _config.instead(name, COMMANDS)

@@ -46,7 +46,6 @@ class ArrayAxes:
 
     Parameters
     ----------
-    settings : Settings
     weights : (mic,) float64
 
     Attributes
@@ -77,8 +76,6 @@ class ToneResponse:
 
     Parameters
     ----------
-    settings : Settings
-    frequency_hz : float
     delays : callable
         Returns the delays in seconds, (n, mic), of unit vectors, (n, axis).
     """
@@ -109,12 +106,7 @@ class ToneResponse:
 
 
 class CallResponse:
-    """Response to an echo of the call, at its range.
-
-    Parameters
-    ----------
-    settings : Settings
-    """
+    """Response to an echo of the call, at its range."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings

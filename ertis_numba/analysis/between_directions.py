@@ -89,7 +89,6 @@ def farthest_places(between: Between, distance: Callable[[Floats], Floats]) -> F
 
     Parameters
     ----------
-    between : Between
     distance : callable
         Returns the distances of places, (place,), from (place, axis).
     """

@@ -95,7 +95,6 @@ def first_call_match(measurements: Iterable[Measurement], *, best: bool = False)
 
     Parameters
     ----------
-    measurements : iterable of Measurement
     best : bool
         Prefer a later match to a mismatch, because another sonar may be louder at times; False by default.
     """
@@ -114,10 +113,6 @@ def call_match(measurement: Measurement) -> CallMatch:
     If the call's filter compresses part of the sound, and no similar sweep compresses that part better, the call
     matches, because another sensor may be louder. Its emission must begin at the first frequency of the call, because
     ranges are wrong otherwise.
-
-    Parameters
-    ----------
-    measurement : Measurement
 
     Returns
     -------

@@ -50,7 +50,6 @@ def start_match(sound: SoundSpectra, call: Call, curves: tuple[Curve, Curve], ar
 
     Parameters
     ----------
-    sound : SoundSpectra
     call : Call
         Call with a curve near that of the sound.
     curves : (Curve, Curve)

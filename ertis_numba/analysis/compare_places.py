@@ -92,7 +92,6 @@ def compare_points(
 
     Parameters
     ----------
-    points : PointCloud
     reflectors : sequence of Reflector
         Reflectors that the images of the pulse can show, in the frame of the points.
     surfaces : Surfaces
@@ -133,7 +132,6 @@ def compare_map(
 
     Parameters
     ----------
-    occupancy : OccupancyMap
     reflectors : sequence of Reflector
         Reflectors that the images can show, in the frame of the map; `joined` merges those of several pulses.
     surfaces : Surfaces

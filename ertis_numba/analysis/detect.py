@@ -204,7 +204,6 @@ def left_out_at_edges(
 
     Parameters
     ----------
-    image : Energyscape
     peaks : sequence of Peak
         Reflectors of the image, from `find_peaks` with the same arguments.
     min_level_db, false_alarm
@@ -231,7 +230,6 @@ def left_out_in_noise(image: Energyscape, *, min_level_db: float = -30.0, false_
 
     Parameters
     ----------
-    image : Energyscape
     min_level_db, false_alarm
         Lowest level relative to the strongest in dB, and the probability of a false alarm, as for `find_peaks`.
     """

@@ -87,7 +87,6 @@ class GridCheck:
 
     Parameters
     ----------
-    grid : Grid, or a result with directions
     processing : Processing
         Source of the grid's name and limits.
     side_lobes : dict of Response to float, optional

@@ -33,7 +33,6 @@ def stands_out(
 
     Parameters
     ----------
-    image : Energyscape
     row, column : (maximum,) int64
         Direction and range of local maxima.
     false_alarm : float
@@ -57,7 +56,6 @@ def is_short(
 
     Parameters
     ----------
-    image : Energyscape
     row, column : (maximum,) int64
         Direction and range of the maxima.
     top : (maximum,) float32

@@ -56,10 +56,8 @@ class EchoFits:
 
     Parameters
     ----------
-    settings : Settings
     directions : (direction, axis) float64
         Unit vectors.
-    spread : PointSpread
     """
 
     def __init__(self, settings: Settings, directions: Floats, spread: PointSpread) -> None:
@@ -81,7 +79,6 @@ class EchoFits:
 
         Parameters
         ----------
-        image : Energyscape
         rows, columns : (place, sample) int64
             Directions and ranges of the samples. The second one is the maximum, the first and third ones are those
             beside it in range, and its neighbours follow.

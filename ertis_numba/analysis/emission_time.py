@@ -47,10 +47,6 @@ def emissions_of(measurement: Measurement) -> EmissionTimes | None:
     The emitter is at the array's centre. The result is None if the strongest arrival may be an echo, and for arrays
     such as rings, at which direct sound equals an echo from ahead. Saturated direct sound has a result, too.
 
-    Parameters
-    ----------
-    measurement : Measurement
-
     Raises
     ------
     DataError
@@ -101,7 +97,6 @@ def describe_start(
     ----------
     emissions : iterable of EmissionTimes or None
         Result of `emissions_of` for each record.
-    speed_m_s : float
     delay_s : float
         Setting ``call.delay_s``, for which the remedy names another value.
     """

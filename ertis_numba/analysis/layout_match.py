@@ -67,10 +67,6 @@ def first_layout_match(measurements: Iterable[Measurement]) -> LayoutMatch | Non
 def layout_match(measurement: Measurement) -> LayoutMatch | None:
     """Compare the strongest arrival with the layout, and with other orders, sizes and timings of its channels.
 
-    Parameters
-    ----------
-    measurement : Measurement
-
     Returns
     -------
     LayoutMatch or None

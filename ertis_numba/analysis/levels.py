@@ -13,7 +13,6 @@ def below_strongest_db(amplitude: NDArray[np.float32], dynamic_range_db: float) 
 
     Parameters
     ----------
-    amplitude : float32 of any shape
     dynamic_range_db : float
         Dynamic range, above 0.
 

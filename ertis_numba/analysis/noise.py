@@ -157,7 +157,6 @@ def threshold_of(image: Energyscape, false_alarm: float) -> float:
 
     Parameters
     ----------
-    image : Energyscape
     false_alarm : float
         Probability that at least one bin of the image exceeds the threshold, 1e-12 to 1.
 
@@ -181,7 +180,6 @@ def echo_floor(image: Energyscape, false_alarm: float) -> EchoFloor:
 
     Parameters
     ----------
-    image : Energyscape
     false_alarm : float
         Probability that at least one bin of the image exceeds the floor, approximately.
     """

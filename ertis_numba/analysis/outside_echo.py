@@ -24,7 +24,6 @@ def has_outside(settings: Settings, directions: NDArray[np.float64]) -> bool:
 
     Parameters
     ----------
-    settings : Settings
     directions : (direction, axis) float64
         Unit vectors of the grid.
     """
@@ -39,10 +38,8 @@ def outside_of(image: Energyscape, directions: NDArray[np.float64], range_m: flo
 
     Parameters
     ----------
-    image : Energyscape
     directions : (direction, axis) float64
         Unit vectors.
-    range_m : float
     """
     patterns = _patterns(image.settings, directions.tobytes())
     if patterns is None:

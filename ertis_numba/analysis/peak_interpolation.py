@@ -55,7 +55,6 @@ def listed(amplitude: NDArray[np.float64], image: Energyscape) -> NDArray[np.flo
     ----------
     amplitude : (place,) float64
         Interpolated amplitudes, which are higher if the grid is coarser than half of the main lobe.
-    image : Energyscape
     """
     return np.minimum(amplitude, float(image.amplitude.max(initial=0.0)) * 10 ** (MAX_RISE_DB / 20))
 
@@ -73,7 +72,6 @@ class PeakInterpolator:
 
     Parameters
     ----------
-    settings : Settings
     directions : (direction, axis) float64
         Unit vectors.
     neighbours : (direction, neighbour) int64
@@ -107,7 +105,6 @@ class PeakInterpolator:
 
         Parameters
         ----------
-        image : Energyscape
         directions, ranges : (place,) int64
             Indices of the bins. Maxima at the first and the last range are not interpolated along the range.
         noise : float

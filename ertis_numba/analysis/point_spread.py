@@ -32,10 +32,6 @@ class PointSpread:
 
     where P is the power spectrum of the call, and w are the array weights, whose mean is 1.
 
-    Parameters
-    ----------
-    settings : Settings
-
     Attributes
     ----------
     reach_m : float
@@ -110,7 +106,6 @@ class PointSpread:
         Parameters
         ----------
         directions : (direction, axis) float64
-        deviation : Deviation, optional
         """
         if deviation is None:
             none = np.empty((0, len(self._weights)), np.complex64)

@@ -40,7 +40,6 @@ class QuadricFits:
 
     Attributes
     ----------
-    quadrics : Quadrics
     width_rad : (direction,) float64
         Distance of the nearest other direction, which is the width of a cell; infinite if there is none.
     wanted : (direction,) int64

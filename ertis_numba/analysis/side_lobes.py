@@ -57,7 +57,6 @@ class SideLobes:
 
     Parameters
     ----------
-    image : Energyscape
     directions : (direction, axis) float64
         Unit vectors of the image's directions.
     candidates : (candidate, [direction, range]) int64
@@ -94,7 +93,6 @@ class SideLobes:
             Unit vector.
         range_m : float
             Range in metres.
-        amplitude : float
         """
         if not self._sources:
             self._mean = self._mean_around(direction)
@@ -193,7 +191,6 @@ class EdgeFloor:
     ----------
     directions : (direction, axis) float64
         Unit vectors of the image's directions.
-    spread : PointSpread
     """
 
     def __init__(self, directions: NDArray[np.float64], spread: PointSpread) -> None:

@@ -87,13 +87,7 @@ class GatedArrival:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundSweep:
-    """Sweep that the strongest sound of a record contains.
-
-    Attributes
-    ----------
-    curve : Curve
-    sweep : Sweep
-    """
+    """Sweep that the strongest sound of a record contains."""
 
     curve: Curve
     sweep: Sweep

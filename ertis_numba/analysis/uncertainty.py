@@ -93,7 +93,6 @@ class PositionUncertainty:
 
         Parameters
         ----------
-        image : Energyscape
         tops : Tops
             Points. Widths of π or infinity mark unknown directions.
         noise : float

@@ -50,8 +50,6 @@ def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -
 
     Parameters
     ----------
-    path : Path
-    overwrite : bool
     sources : iterable of Path
         Input files, which are never overwritten.
 
@@ -75,10 +73,6 @@ def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -
 
 def require_writable(folder: Path) -> None:
     """Create a file in a folder, and remove it.
-
-    Parameters
-    ----------
-    folder : Path
 
     Raises
     ------
@@ -107,8 +101,6 @@ def require_free_space(folder: Path, n_bytes: int, *, purpose: str = "the next d
 
     Parameters
     ----------
-    folder : Path
-    n_bytes : int
     purpose : str
         Purpose of the bytes, for the error.
 
@@ -139,8 +131,6 @@ def atomic_write(path: Path, *, overwrite: bool = False, token: str | None = Non
 
     Parameters
     ----------
-    path : Path
-    overwrite : bool
     token : str, optional
         Unique part of the temporary name; random digits by default.
 
@@ -177,7 +167,6 @@ def make_folder(path: Path, *, parents: bool = False) -> None:
 
     Parameters
     ----------
-    path : Path
     parents : bool
         Create missing parents, too.
 

@@ -1,4 +1,4 @@
-"""Objects in forked processes, in which only the thread exists that called the fork.
+"""Cores of this process, and objects in forked processes, in which only the thread exists that called the fork.
 
 A lock that another thread held stays locked in the fork for ever, and a thread pool waits for threads that are gone.
 """
@@ -12,9 +12,14 @@ import weakref
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["ForkSafeLock", "call_in_forks"]
+__all__ = ["ForkSafeLock", "call_in_forks", "usable_cores"]
 
 _methods: set["weakref.WeakMethod[Callable[[], None]]"] = set()
+
+
+def usable_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def call_in_forks(method: Callable[[], None]) -> None:

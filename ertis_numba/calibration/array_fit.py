@@ -64,7 +64,6 @@ def fit_array(
 
     Parameters
     ----------
-    seen : Observations
     delay_s : (mic,) float64
         Delays of the layout.
     positions_m : (mic, axis) float64
@@ -73,7 +72,6 @@ def fit_array(
         First approximation of the sources.
     speed_m_s : (record,) float64
     target : {"reflector", "wall", "direct", "beacon"}
-    expected : Tolerances
     """
     problem = SeparableProblem(seen, delay_s, positions_m, source_m, speed_m_s, target, expected)
     source_mm = problem.start_mm
@@ -162,13 +160,11 @@ def fit_gains(
 
     Parameters
     ----------
-    seen : Observations
     former_np : (mic,) float64
         Gains of the layout in nepers.
     distance_m : (record, mic) float64
     absorption_1_m : float
         Absorption in nepers per metre.
-    expected : Tolerances
 
     Returns
     -------

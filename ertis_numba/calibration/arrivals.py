@@ -71,8 +71,6 @@ def measure_arrival(pulses: Compressed, call: Call, at_s: NDArray[np.float64], u
 
     Parameters
     ----------
-    pulses : Compressed
-    call : Call
     at_s : (mic,) float64
         Times to within a few microseconds, in seconds.
     used : (mic,) bool

@@ -27,10 +27,8 @@ def image_contrast_db(sounds: Iterable[Sound], channels: NDArray[np.intp], layou
 
     Parameters
     ----------
-    sounds : iterable of Sound
     channels : (mic,) intp
         Channels of the sounds.
-    layout : Layout
     """
     azimuth_rad, elevation_rad = (
         grid.ravel() for grid in np.radians(np.meshgrid(_AZIMUTH_DEG, _ELEVATION_DEG, indexing="ij"))

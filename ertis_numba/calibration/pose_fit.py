@@ -99,7 +99,6 @@ class PoseProblem:
 
     Parameters
     ----------
-    waves : WaveTable
     rotation : (sensor, axis, axis) float64
         Rotations of the start.
     translation_m : (sensor, axis) float64
@@ -227,11 +226,6 @@ def fit_poses(problem: PoseProblem, *, max_steps: int = 30) -> PoseFit:
     The loss is quadratic for small residuals and linear for large ones (``soft_l1`` of `scipy.optimize.least_squares`).
     The covariance is the inverse of the Fisher information ``Jᵀ J`` with the reflectors eliminated, times the robust
     mean square of the residuals (B. Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 6).
-
-    Parameters
-    ----------
-    problem : PoseProblem
-    max_steps : int
     """
     found = scipy.optimize.least_squares(
         problem.residuals,

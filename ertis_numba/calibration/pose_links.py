@@ -98,7 +98,6 @@ def candidate_links(first: WavesOfSensor, second: WavesOfSensor, seed: int = 0) 
 
     Parameters
     ----------
-    first, second : WavesOfSensor
     seed : int
         Seed of the random choice of pairs.
     """

@@ -32,7 +32,6 @@ class Matched(NamedTuple):
 
     Attributes
     ----------
-    waves : WaveTable
     reflectors_m : (reflector, axis) float64
         Approximate positions.
     pulse : tuple of (int, int)
@@ -83,8 +82,6 @@ def match_waves(
         Sensors in the order of the SYNC chain.
     rotation : (sensor, axis, axis) float64
     translation_m : (sensor, axis) float64
-    speed_m_s : float
-    gates : Gates
     """
     poses = _Poses(rotation, translation_m, speed_m_s)
     sensors = list(waves.values())
@@ -113,7 +110,6 @@ def without_outliers(
 
     Parameters
     ----------
-    matched : Matched
     reflectors_m : (reflector, axis) float64
         Reflectors after the fit.
     residual_m : (wave,) float64

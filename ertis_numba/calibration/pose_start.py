@@ -36,12 +36,6 @@ def place_sensors(
     A link between two sensors is confirmed by reflectors whose echoes of both calls arrive when they should. Sensors
     are placed one after the other by the link with most such echoes to one that has its place.
 
-    Parameters
-    ----------
-    waves : mapping of str to WavesOfSensor
-    reference : str
-    speed_m_s : float
-
     Returns
     -------
     rotation : (sensor, axis, axis) float64

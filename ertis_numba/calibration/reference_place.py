@@ -26,13 +26,7 @@ _DISTANCE_SD_M: Final = 2e-3  # of a tape measure
 
 
 class ReflectorPlace(NamedTuple):
-    """Place of a reflector, as seen from the sensor.
-
-    Attributes
-    ----------
-    azimuth_deg, elevation_deg : float
-    range_m : float
-    """
+    """Place of a reflector, as seen from the sensor."""
 
     azimuth_deg: float
     elevation_deg: float

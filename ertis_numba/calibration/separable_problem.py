@@ -43,7 +43,6 @@ class SeparableProblem:
 
     Parameters
     ----------
-    seen : Observations
     delay_s : (mic,) float64
         Delays of the layout.
     positions_m : (mic, axis) float64
@@ -52,7 +51,6 @@ class SeparableProblem:
         First approximation of the sources.
     speed_m_s : (record,) float64
     target : {"reflector", "wall", "direct", "beacon"}
-    expected : Tolerances
     """
 
     def __init__(

@@ -57,7 +57,6 @@ class Sound:
 
     Attributes
     ----------
-    settings : Settings
     pulses : Compressed
         Signals after the matched filter, without their envelopes.
     arrival : SoundArrival
@@ -86,7 +85,6 @@ def hear(
 
     Parameters
     ----------
-    measurement : Measurement
     channels : (mic,) intp
         Channels with a microphone.
     positions_m : (mic, axis) float64
@@ -173,7 +171,6 @@ def find_source(
 
     Parameters
     ----------
-    sound : Sound
     used : (mic,) bool
     positions_m : (mic, axis) float64
         Positions of all microphones.

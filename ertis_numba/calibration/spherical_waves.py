@@ -75,7 +75,6 @@ def fit_wave(
         Path to the origin in metres, direction, and curvature in 1/m.
     scale_m : float
         Residual beyond which a microphone loses weight.
-    n_rounds : int
 
     Returns
     -------

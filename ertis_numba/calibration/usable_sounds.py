@@ -141,7 +141,6 @@ def unclear_channels(sounds: dict[int, Sound], max_level_db: float) -> NDArray[n
 
     Parameters
     ----------
-    sounds : dict of int to Sound
     max_level_db : float
         Largest plausible level relative to the median microphone.
     """

@@ -71,10 +71,6 @@ def find_waves(measurement: Measurement) -> list[Wave]:
     and a robust fit yields the wave. The mean pulse is subtracted, and the search goes on with the rest (Högbom,
     Astron. Astrophys. Suppl. 15, 1974, 417, applied to wavefronts).
 
-    Parameters
-    ----------
-    measurement : Measurement
-
     Raises
     ------
     DataError

@@ -99,10 +99,6 @@ def _receivers(array: Array, faulty: tuple[int, ...] = ()) -> WorkingMicrophones
 def wave_record(measurement: Measurement) -> tuple[WaveRecord, WorkingMicrophones]:
     """Return the signals of one measurement, and the microphones that work.
 
-    Parameters
-    ----------
-    measurement : Measurement
-
     Raises
     ------
     DataError

@@ -88,7 +88,6 @@ def locate_source(
     positions_m : (mic, axis) float64
     start_m : (axis,) float64
         First approximation.
-    speed_m_s : float
     target : {"reflector", "wall", "direct", "beacon"}
     scale_s : float
         Residual beyond which a microphone loses weight, in seconds.

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba.base import checks
-from ertis_numba.base.cpu_cores import usable_cores
 from ertis_numba.base.errors import ArgumentError, ErtisError
+from ertis_numba.base.forks import usable_cores
 from ertis_numba.campaign.echo_measurements import count_images, passive_note
 from ertis_numba.campaign.events import Event, Outcome, RecordingEnded, RecordingProgress, RecordingStarted
 from ertis_numba.campaign.existing_output import difference

@@ -25,8 +25,6 @@ class AdaptiveBeamform:
     ----------
     processing : Processing
         Settings with an adaptive beamformer or a weighting.
-    kernels : KernelSet
-    memory : Memory
     offsets : (direction, mic) int32
         Index of each microphone's first sample in a flattened array of (mic, phase, sample).
     weights : (direction, mic) complex64

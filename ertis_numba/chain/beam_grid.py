@@ -87,7 +87,6 @@ class Aperture:
             Distance in the array's plane, relative to the unit circle; at least 1.
         own_s : (mic,) float64
             Delay of each microphone, in seconds.
-        sound_speed_m_s : float
         """
         # The difference of distances, r − √(r² − 2 r u·p + p²), is largest where the root vanishes. For directions,
         # whose magnitude u is 1, it is at most p.
@@ -288,7 +287,6 @@ class BeamGrid:
         ----------
         directions : (direction, axis) float64
             As those of `Aperture`.
-        kernels : SteeringKernels
         """
         other = copy.copy(self)
         other._coefficients = self._short_coefficients  # noqa: SLF001

@@ -41,7 +41,6 @@ class BeamTables:
 
     Parameters
     ----------
-    settings : Settings
     grid : Grid
         Directions.
     threads : int

@@ -85,9 +85,6 @@ class BeamformFloat32:
 
     Parameters
     ----------
-    kernels : KernelSet
-    memory : Memory
-    window : TimeWindow
     zones : sequence of Zone
         Focal zones that together cover the range axis. Their beams are those of all directions, or of the beam-grid
         points if there are any.
@@ -170,7 +167,6 @@ class WholeWeights:
     ----------
     tables : sequence of DelayTable
         One for each focal zone.
-    nodes : BeamGrid or None
 
     Attributes
     ----------

@@ -248,8 +248,6 @@ def measure(kernels: KernelSet, threads: int, units: Collection[str] = UNITS) ->
 
     Parameters
     ----------
-    kernels : KernelSet
-    threads : int
     units : collection of str
         Units to measure; all by default.
     """

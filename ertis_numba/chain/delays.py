@@ -96,7 +96,6 @@ class Zone:
     ----------
     first, stop : int
         Index of the first range, and index after the last range.
-    table : DelayTable
     """
 
     first: int

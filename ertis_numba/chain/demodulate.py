@@ -67,9 +67,6 @@ class DemodulatePdm:
     ----------
     channels : (mic,) int32
         Channels of the microphones.
-    window : TimeWindow
-    kernels : KernelSet
-    memory : Memory
     taps : (tap,) int16 or int32
         Integer taps of the low-pass filter; their sum corresponds to a gain of 1.
     factor : int

@@ -133,7 +133,6 @@ class ErrorModel:
 
     Parameters
     ----------
-    settings : Settings
     signal_model : SignalModel, optional
         Measured signal model; by default, `SignalModel.unknown`.
     """
@@ -160,7 +159,6 @@ class ErrorModel:
 
         Parameters
         ----------
-        fit : DelayFit
         n_mics : float
             Effective number of microphones: see `ertis_numba.geometry.effective_count`.
         fractions : (delay,) float64, optional
@@ -225,11 +223,9 @@ class ErrorModel:
 
         Parameters
         ----------
-        aperture : Aperture
         curvature_2 : float
             Mean squared deviation of the curvature from that of its focal zone, in 1/m²: see
             `focal_zones.squared_curvature`.
-        sound_speed_m_s : float
         """
         along_m = aperture.directions @ aperture.positions_m.T
         across_m2 = np.maximum(aperture.square_m2 - along_m**2, 0.0)
@@ -276,7 +272,6 @@ class ErrorModel:
 
         Parameters
         ----------
-        n_mics : int
         sum_of_terms : float
             Sum of the magnitudes of one microphone's weights; 1 for a single weight.
         taps : float

@@ -196,9 +196,6 @@ class DelayFit:
 
     Attributes
     ----------
-    n_taps : int
-    step_s : float
-    spectrum : Spectrum
     fractions : (target,) float64
         Delays spread evenly over one step, as `split` returns them.
     errors : (wave,) float64

@@ -48,8 +48,6 @@ class KernelChain(ABC):
 
     Parameters
     ----------
-    settings : Settings
-    kernels : KernelSet
     threads : int
         Default number of threads.
     graphs : bool, optional

@@ -28,13 +28,8 @@ class MatchedFilter:
 
     Parameters
     ----------
-    settings : Settings
-    window : TimeWindow
-    kernels : KernelSet
-    memory : Memory
     taps : (tap,) int16 or int32
         Integer taps of the decimation filter.
-    n_mics : int
     gain : callable
         Function of frequencies in hertz, (bin,) float64, that returns gains, (mic, bin) or (1, bin) complex128.
 

@@ -31,10 +31,6 @@ _DIRECTIONS = 16  # Number of directions in a block, which stays in the caches.
 class ScipyPaperChain:
     """Signal chain of the paper, with tables computed once; implements `Chain`.
 
-    Parameters
-    ----------
-    settings : Settings
-
     Attributes
     ----------
     grid : Grid

@@ -38,12 +38,8 @@ class PhaseShifts:
 
     Parameters
     ----------
-    kernels : KernelSet
-    memory : Memory
-    window : TimeWindow
     matched_filter : MatchedFilter
         Filter whose gains include the weights of the microphones.
-    n_directions : int
     zones : iterable of (first, stop, delays)
         Focal zones that together cover the range axis: ranges ``first … stop - 1`` of each zone, and its delays in
         seconds, (direction, mic) float64.
@@ -108,7 +104,6 @@ class PhaseShifts:
         buffers : tuple
             Result of `new_buffers`.
         out : (direction, range) float32
-        threads : int
         """
         for part, (first, stop), rows in self._parts(transforms, beams, buffers, threads=threads):
             self._kernels.envelope_rows(part, self._lead, first, stop, out[rows])

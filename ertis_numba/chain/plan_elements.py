@@ -89,12 +89,10 @@ def few_delays(
 
     Parameters
     ----------
-    aperture : Aperture
     own_s, weights : (mic,) float64
         Delay and array weight of each microphone.
     step_s : float
         Time between samples in seconds.
-    sound_speed_m_s : float
     """
     reach_s = math.sqrt(float(np.max(aperture.square_m2, initial=0.0))) / sound_speed_m_s
     if aperture.is_turned or len(weights) * (1 + 2 * reach_s / step_s) > _MANY_FRACTIONS:

@@ -104,19 +104,10 @@ class PlanModel:
 
     Parameters
     ----------
-    settings : Settings
     signal_model : SignalModel or None
         Measured signal model; None for safe values, as in `ErrorModel`.
     tile_ranges : int
         Number of ranges in a tile of 16-bit samples.
-
-    Attributes
-    ----------
-    settings : Settings
-    errors : ErrorModel
-    aperture : Aperture
-    window : TimeWindow
-    n_mics, n_directions : int
     """
 
     def __init__(self, settings: Settings, signal_model: SignalModel | None, *, tile_ranges: int) -> None:

@@ -45,7 +45,6 @@ def deviation_of(settings: Settings, directions: NDArray[np.float64]) -> Deviati
 
     Parameters
     ----------
-    settings : Settings
     directions : (direction, axis) float64
         Unit vectors of the whole grid.
     """

@@ -24,7 +24,6 @@ def open_plans(model: PlanModel, budget: float) -> list[ImagePlan]:
 
     Parameters
     ----------
-    model : PlanModel
     budget : float
         Largest error power of a plan, relative to the exact image.
     """

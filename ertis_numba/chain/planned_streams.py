@@ -62,11 +62,8 @@ class StreamGrid:
 
     Attributes
     ----------
-    n_taps : int
-    density : float
     n_points, n_pairs : int
         Points of the grid, and pairs of points for each direction.
-    errors : ImageErrors
     squares : float
         Sum of a beam's squared weights.
     """
@@ -85,14 +82,10 @@ class PlannedStream:
 
     Attributes
     ----------
-    stream : SignalStream
-    spectrum : StreamSpectrum
-    fit : DelayFit
     high_hz : float
         Frequency to which the density of its beam grid is relative.
     grid : StreamGrid or None
         Beam grid; None if every direction is summed itself.
-    shares : ErrorShares
     """
 
     stream: SignalStream

@@ -105,8 +105,6 @@ class Planner:
     ----------
     settings : Settings
         Values that their accuracy fixes are kept.
-    kernels : KernelSet
-    threads : int
     signal_model : SignalModel, optional
         Signal model of a measurement; a safe one for any sound by default.
     max_bytes : int, optional

@@ -45,10 +45,8 @@ def signal_model_of(
 
     Parameters
     ----------
-    measurement : Measurement
     settings : Settings
         Settings of the image.
-    kernels : KernelSet
     threads : int
         Number of threads; 1 by default.
     amplitude : (direction, range) float32, optional

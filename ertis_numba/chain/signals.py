@@ -31,7 +31,6 @@ def signals_of(
 
     Parameters
     ----------
-    measurement : Measurement
     settings : Settings, optional
         Settings with the decimation and the stopband attenuation; by default, those of the measurement.
     window : TimeWindow, optional

@@ -51,10 +51,6 @@ class StreamBeamform:
 
     Parameters
     ----------
-    kernels : KernelSet
-    memory : Memory
-    recipe : Recipe
-    planned : PlannedStreams
     tables : sequence of StreamTables
         One for each stream. Tables without a beam grid have the directions in the order of ``rows``.
     rows : (direction,) int32

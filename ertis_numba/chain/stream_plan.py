@@ -60,11 +60,8 @@ class StreamPlanner:
 
     Parameters
     ----------
-    settings : Settings
-    recipe : Recipe
     spectrum : Spectrum
         Spectrum of the output of the matched filter.
-    aperture : Aperture
     sound_speed_m_s, nearest_m : float
         Speed of sound, and the smallest distance of a reflector.
     """
@@ -92,7 +89,6 @@ class StreamPlanner:
 
         Parameters
         ----------
-        n_phases, n_taps, beam_taps : int
         density : float
             As in `ImagePlan`.
         delays_s : (delay,) float64, optional

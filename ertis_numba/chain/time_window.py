@@ -67,7 +67,6 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ring
 
     Parameters
     ----------
-    settings : Settings
     largest_delay_s : float
         Largest magnitude of a beam's delays, in seconds.
     n_taps : int

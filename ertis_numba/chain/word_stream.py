@@ -78,10 +78,8 @@ class StreamedImage:
 
     Parameters
     ----------
-    demodulate : DemodulatePdm
     image : callable
         Function that computes an image from the signals in buffers: buffers, array for the image, and threads.
-    kernels : KernelSet
     buffers : MeasurementBuffers
         Buffers that nothing else uses.
     words : (sample, word) unsigned integers

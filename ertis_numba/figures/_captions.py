@@ -11,7 +11,8 @@ from ertis_numba.figures.style import angle, minus
 from ertis_numba.frames import AcousticMap, Energyscape, Stamp
 from ertis_numba.geometry import microphones, observable_angles
 from ertis_numba.settings import Settings
-from ertis_numba.settings.method_titles import METHOD_TITLES
+from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS
+from ertis_numba.settings.passive import MAP_METHOD_TITLES
 
 __all__ = [
     "Heading",
@@ -53,8 +54,8 @@ def of_image(image: Energyscape) -> Heading:
     else:
         directions = f"{len(image.azimuth_rad)} directions"
     level = ("directions relative to the horizontal",) if processing.level_directions else ()
-    parts = (processing.beamformer, "delay_and_sum"), (processing.weighting, "none")
-    adaptive = "".join(f", {METHOD_TITLES[name]}" for name, usual in parts if name != usual)
+    adaptive = f", {BEAMFORMERS[processing.beamformer].title}" if processing.beamformer != "delay_and_sum" else ""
+    adaptive += f", {WEIGHTINGS[processing.weighting].title}" if processing.weighting != "none" else ""
     budget_db = settings.accuracy.max_error_db
     taken = "measurement" if image.points is None else "pulse"  # A fused image has measurements of several sensors.
     return Heading(
@@ -114,7 +115,7 @@ def of_acoustic_map(title: str, found: AcousticMap, *parts: str) -> Heading:
         (
             settings.array.layout,
             *parts,
-            f"method {METHOD_TITLES[passive.method]}",
+            f"method {MAP_METHOD_TITLES[passive.method]}",
             *((f"mean of {count} measurements",) if count > 1 else ()),
             *(() if passive.focus_m is None else (f"focus at {passive.focus_m:g} m",)),
             *left_out(found.masked_s),

@@ -62,10 +62,8 @@ class SoundDirection(NamedTuple):
 
         Parameters
         ----------
-        found : AcousticMap
         band : int
             Index of the band.
-        azimuth_rad, elevation_rad : float
         power : float
             Mean square of the sound at the array.
         grid_error_rad : float

@@ -34,7 +34,6 @@ def level_offset_db(
 
     Parameters
     ----------
-    settings : Settings
     frequency_hz : (frequency,) float64
     unit : {"dBFS", "dB re 20 µPa", "dB re 20 µPa at 1 m"}
     """

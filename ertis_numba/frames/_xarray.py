@@ -30,9 +30,6 @@ def data_array(
 
     Parameters
     ----------
-    name : str
-    values : array
-    dims : tuple of str
     coords : mapping of str to (dimension, values, description, unit)
     about : str
         Description of the values.

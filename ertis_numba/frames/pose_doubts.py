@@ -31,10 +31,6 @@ _NEAR: Final = float(np.radians(10.0))
 def pose_doubts(poses: Trajectory) -> tuple[str, ...]:
     """Return notes on poses that are hardly those of a platform.
 
-    Parameters
-    ----------
-    poses : Trajectory
-
     Returns
     -------
     tuple of str

@@ -40,17 +40,13 @@ class Reflectors:
     ----------
     echoes : sequence of SensorEchoes
         Echoes of each receiver.
-    sensors : sequence of MountedSensor
-    receivers : mapping of int to Receiver
     emitters : mapping of int to Emitters
         Model of the emitters in the air of each receiver.
-    grid : PolarGrid
     bound : (cell,) float32
         Highest reflectivity of each cell of the grid that the images allow.
 
     Attributes
     ----------
-    located : tuple of LocatedReflector
     position_m : (reflector, axis) float64
     covariance_m2 : (reflector, axis, axis) float64
     reflectivity : (reflector,) float64
@@ -139,12 +135,7 @@ class Reflectors:
         return np.asarray(self.confirmed | np.array(several, np.bool_))
 
     def known_echoes(self, receiver: int) -> KnownEchoes:
-        """Return the echoes of the reflectors in the image of a receiver: those that locate them, and predicted ones.
-
-        Parameters
-        ----------
-        receiver : int
-        """
+        """Return the echoes of the reflectors in the image of a receiver: located and predicted ones."""
         sight = self._viewers.sight(self.position_m)
         heard = self._echoes
         is_heard = np.isfinite(heard.path_m[heard.receiver == receiver]).any(axis=0)

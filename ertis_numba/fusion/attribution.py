@@ -44,14 +44,12 @@ class Attributed(NamedTuple):
     ----------
     reflectivity : (cell,) float32
         Power of the echo of each cell's reflector at 1 m.
-    shares : Shares
     suspects : frozenset of int
         Emitters whose calls no other sensor seems to hear, although it should. Ghosts may pretend this.
     bound : (cell,) float32
         Highest reflectivity that all pairs allow; infinite where none can see the cell.
     unheard : frozenset of int
         Emitters of which no echoes were expected at other sensors.
-    evidence : sequence of _Evidence
     """
 
     reflectivity: Singles
@@ -67,7 +65,6 @@ class _Evidence(NamedTuple):
 
     Attributes
     ----------
-    pair : Pair
     values : (3, entry) float32
         Power that noise and side lobes may reach; highest power near each cell, with noise and side lobes; weight in
         means over pairs.
@@ -108,11 +105,8 @@ class Attribution:
 
     Parameters
     ----------
-    grid : PolarGrid
-    pairs : sequence of Pair
     hypotheses : mapping of int to sequence of Hypothesis
         Hypotheses of each receiver.
-    receivers : mapping of int to Receiver
     unheard : frozenset of int
         Emitters whose calls only they themselves receive. Their missing echoes show nothing.
     rivalries : dict, optional
@@ -176,20 +170,13 @@ class Attribution:
 
         Parameters
         ----------
-        images : mapping of int to CoarseImage
         found : Attributed
             Result of the attribution.
-        shares : Shares
         """
         return np.asarray(np.minimum(self._mean(found.evidence, images, shares), found.bound))
 
     def single(self, images: Mapping[int, CoarseImage]) -> Singles:
-        """Return the mean reflectivity if each sensor takes all echoes for its own: (cell,) float32.
-
-        Parameters
-        ----------
-        images : mapping of int to CoarseImage
-        """
+        """Return the mean reflectivity if each sensor takes all echoes for its own: (cell,) float32."""
         own = [pair for pair in self._pairs if pair.emitter == pair.receiver]
         return self._mean([self._evidence(pair, images[pair.receiver]) for pair in own], images, None)
 

@@ -69,7 +69,6 @@ def confirmation(
 
     Parameters
     ----------
-    heard : EchoPaths
     place_m : (reflector, axis) float64
     gain : (reflector, receiver, emitter) float64
         Power of its echoes relative to that ahead.
@@ -213,7 +212,6 @@ def _confirming(heard: EchoPaths, origin_m: Floats, sent_m: Floats, counts: Flag
 
     Parameters
     ----------
-    heard : EchoPaths
     origin_m : (reflector, emitter, axis) float64
         Place from which the sound of each emitter arrives: that of the reflector, or the mirror image of the emitter.
     sent_m : (reflector, emitter) float64

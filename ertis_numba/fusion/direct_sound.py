@@ -44,7 +44,6 @@ class DirectSound(NamedTuple):
 
     Attributes
     ----------
-    emitter, receiver : str
     difference_s : float
         Measured minus predicted arrival, as a median over the pulses in which it is audible.
     noise_s : float
@@ -111,10 +110,6 @@ class DirectSoundCheck:
 
     def add(self, measurements: Iterable[Measurement]) -> None:
         """Add the measurements of one SYNC pulse, at most one of each sensor.
-
-        Parameters
-        ----------
-        measurements : iterable of Measurement
 
         Raises
         ------

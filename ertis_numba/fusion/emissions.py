@@ -84,8 +84,6 @@ class EmissionCounts(NamedTuple):
 
         Parameters
         ----------
-        expected : ExpectedEchoes
-        reflectors : Reflectors
         judged : collection of int
             Emitters to judge: those whose own sensors have an image.
         """
@@ -207,12 +205,10 @@ def expected_echoes(
 
     Parameters
     ----------
-    reflectors : Reflectors
     images : mapping of int to Energyscape
         Images by receiver.
     floors : mapping of int to EchoFloor
         Detection thresholds.
-    receivers : mapping of int to Receiver
     late_m : mapping of int to mapping of int to float
         Path of sound between the emissions of each receiver and of each emitter that it may hear.
     deaf : mapping of int to (step,) bool

@@ -64,16 +64,11 @@ class Search:
 
     Parameters
     ----------
-    echoes : PulseEchoes
-    viewers : Viewers
-    locator : Locator
-    grid : PolarGrid
     bound : (cell,) float32
         Highest reflectivity of each cell of the grid that the images allow.
 
     Attributes
     ----------
-    found : list of LocatedReflector
     is_free : (echo,) bool
         Echoes that no reflector explains together with others, except faint ones.
     """

@@ -28,9 +28,7 @@ def over_hidden_walls(
 
     Parameters
     ----------
-    heard : EchoPaths
     place_m : (reflector, axis) float64
-    walls : Walls
     confirming : (reflector, echo, emitter) bool
     hidden : (sensor,) int64
         Sensors that emit, but have no image.

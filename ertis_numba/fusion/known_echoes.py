@@ -56,7 +56,6 @@ class KnownEchoes(NamedTuple):
 
         Parameters
         ----------
-        receiver : Receiver
         late_m : mapping of int to float
             Path of sound between the emission of the receiver and that of each emitter.
         """
@@ -89,8 +88,6 @@ def explained_shares(
         Result of the attribution.
     number : int
         Index of the receiver.
-    image : CoarseImage
-    echoes : KnownEchoes
     factors : tuple of (echo, direction) and (echo, step) float32
         Amplitudes of the echoes, `KnownEchoes.amplitudes`.
     is_sure : (reflector,) bool
@@ -125,7 +122,6 @@ def levelled(reflectivity: Singles, grid: PolarGrid, place_m: Floats, power: Flo
     Parameters
     ----------
     reflectivity : (cell,) float32
-    grid : PolarGrid
     place_m : (reflector, axis) float64
     power : (reflector,) float64
         Power of the echo of each reflector at 1 m.

@@ -37,7 +37,6 @@ class LocatedReflector(NamedTuple):
     ----------
     place_m : (axis,) float64
     covariance_m2 : (axis, axis) float64
-    reflectivity : float
     echo, emitter : (member,) int64
         Echoes that locate it, and the emitters of their calls.
     """
@@ -54,8 +53,6 @@ class Locator:
 
     Parameters
     ----------
-    echoes : PulseEchoes
-    viewers : Viewers
     pulse_m, beam : (sensor,) float64
         Widths of the compressed pulses and of the main lobes, as in `overlap`.
     """

@@ -74,7 +74,6 @@ def overlap(
 
     Parameters
     ----------
-    predicted : PredictedEchoes
     receiver : (echo,) int64
     path_m : (echo, emitter) float64
         Length of the path if the emitter's call caused the echo; NaN for silent ones.

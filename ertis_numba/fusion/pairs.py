@@ -32,7 +32,6 @@ class Pair(NamedTuple):
 
     Attributes
     ----------
-    emitter, receiver : int
     cell : (entry,) uint32
         Cells that are seen.
     step : (entry,) uint32
@@ -70,7 +69,6 @@ class Hypothesis(NamedTuple):
 
     Attributes
     ----------
-    emitter : int
     is_mirrored : bool
         True for reflectors behind a flat array, which the array cannot distinguish from those in front.
     begin : (direction,) uint32
@@ -117,9 +115,6 @@ def pair_of(
     ----------
     positions_m : (cell, axis) float64
         Centres of the cells.
-    sensors : tuple of MountedSensor
-    emitters : Emitters
-    receiver : Receiver
     emitter, number : int
         Indices of the emitting and of the receiving sensor in ``sensors``.
     late_m : float
@@ -186,7 +181,6 @@ def hypothesis(
 
     Parameters
     ----------
-    grid : PolarGrid
     sensors, emitters, receiver, emitter, late_m
         As in `pair_of`.
     is_mirrored : bool

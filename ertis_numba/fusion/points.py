@@ -75,8 +75,6 @@ class PointFuser:
     ----------
     number : int
         Index of the sensor in ``sensors``.
-    sensors : tuple of MountedSensor
-    receiver : Receiver
     image : Energyscape
         Any image of the sensor.
     deaf : (step,) bool
@@ -114,8 +112,6 @@ class PointFuser:
 
         Parameters
         ----------
-        image : Energyscape
-        shares : Shares
         late_m : mapping of int to float
             Path of sound between the emission of this sensor and that of each emitter.
         """
@@ -185,7 +181,6 @@ def joined(reflectors: Reflectors, image: Energyscape, grid: PolarGrid) -> Point
 
     Parameters
     ----------
-    reflectors : Reflectors
     image : Energyscape
         Fused image, which limits the amplitudes of reflectors that are not confirmed.
     grid : PolarGrid

@@ -30,7 +30,6 @@ class PolarGrid:
         Azimuths of each row; the first one is −180° and half a step.
     elevation_rad : (row,) float64
         Elevations of the rows, increasing and equally spaced; one row is a planar image.
-    n_ranges : int
     step_m : float
         Spacing of the ranges. The first one is half a step.
     height_m : float

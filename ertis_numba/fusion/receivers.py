@@ -70,7 +70,6 @@ class Receiver:
 
     Parameters
     ----------
-    mounting : MountedSensor
     image : Energyscape
         Any image of the sensor; others must have the same directions and ranges.
     step_m : float
@@ -114,7 +113,6 @@ class Receiver:
 
         Parameters
         ----------
-        image : Energyscape
         deaf : (step,) bool
             Steps at which direct sound hides echoes.
         """

@@ -102,9 +102,7 @@ def reflected_twice(
 
     Parameters
     ----------
-    heard : EchoPaths
     place_m : (reflector, axis) float64
-    walls : Walls
     reflectivity : (reflector,) float64
         Power of an echo at 1 m.
     members : sequence of (member,) int64

@@ -37,7 +37,6 @@ class MountedSensor(NamedTuple):
 
     Attributes
     ----------
-    name : str
     translation_m : (axis,) float64
     rotation : (axis, axis) float64
         Rotation from the sensor frame to the platform frame.

@@ -25,7 +25,6 @@ class SensorEchoes(NamedTuple):
 
     Attributes
     ----------
-    receiver : int
     emitters : (emitter,) int64
         Sensors whose calls may have caused the echoes.
     direction : (echo, axis) float64

@@ -22,7 +22,6 @@ class Viewers:
 
     Parameters
     ----------
-    sensors : sequence of MountedSensor
     emitters : mapping of int to Emitters
         Model of the emitters in the air of each receiver.
     flat : collection of int

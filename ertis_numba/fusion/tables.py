@@ -47,8 +47,6 @@ class PulseReflectors(NamedTuple):
 
     Attributes
     ----------
-    attributed : Attributed
-    reflectors : Reflectors
     floor : dict of int to EchoFloor
         Detection thresholds of each sensor, `HeardImage.floor`.
     without_echo : list of int
@@ -94,7 +92,6 @@ class FusionTables:
     ----------
     grid : PolarGrid
         Cells of fused images.
-    sensors : tuple of MountedSensor
     emitting : list of int
         Indices of the sensors that emit.
     start_s : sequence of float
@@ -132,7 +129,6 @@ class FusionTables:
 
         Parameters
         ----------
-        group : mapping of int to Energyscape
         diameters_m : mapping of int to float
             Diameters of emitters.
         """
@@ -209,7 +205,6 @@ class FusionTables:
 
         Parameters
         ----------
-        group : mapping of int to Energyscape
         attributed : Attributed
             Attribution without the emitters that the pulses before have not heard.
         unheard : frozenset of int
@@ -284,7 +279,6 @@ class FusionTables:
 
         Parameters
         ----------
-        group : mapping of int to Energyscape
         found : PulseReflectors
             Reflectors of the group.
         """
@@ -317,8 +311,6 @@ class FusionTables:
 
         Parameters
         ----------
-        found : PulseReflectors
-        group : mapping of int to Energyscape
         coarse : mapping of int to CoarseImage
             Powers of the images.
         """

@@ -28,10 +28,6 @@ def sound_speed_m_s(air: Air) -> float:
     capacity of the mixture and the saturation pressure of ISO 9613-1, annex B. Dry air at 0 °C gives 331.3 m/s;
     humidity adds up to about 0.4 % at room temperature.
 
-    Parameters
-    ----------
-    air : Air
-
     Returns
     -------
     float
@@ -53,7 +49,6 @@ def absorption_db_m(air: Air, frequency_hz: NDArray[np.float64]) -> NDArray[np.f
 
     Parameters
     ----------
-    air : Air
     frequency_hz : (frequency,) float64
 
     Returns
@@ -82,8 +77,6 @@ def transmission_loss_db(air: Air, distance_m: float, frequency_hz: NDArray[np.f
 
     Parameters
     ----------
-    air : Air
-    distance_m : float
     frequency_hz : (frequency,) float64
 
     Returns

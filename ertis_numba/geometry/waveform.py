@@ -48,7 +48,6 @@ def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.floa
 
     Parameters
     ----------
-    call : Call
     rate_hz : float, optional
         Sample rate in hertz; that of the call by default.
     """
@@ -115,7 +114,6 @@ def call_spectrum(
 
     Parameters
     ----------
-    call : Call
     settings : Settings
         Settings of the record.
     n_fft : int

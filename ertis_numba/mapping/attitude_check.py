@@ -26,7 +26,6 @@ class AttitudeCheck:
 
         Parameters
         ----------
-        pose : Trajectory or a position and a quaternion
         translation_m : (3,) float64
         rotation : (3, 3) float64
             Both are the pose of the pulse.

@@ -110,7 +110,6 @@ class CellGrid:
         Parameters
         ----------
         centre_m : (3,) float64
-        radius_m : float
 
         Raises
         ------

@@ -34,7 +34,6 @@ def heard_m(emitters: Emitters, clear: float, floor: float, last_m: float) -> fl
 
     Parameters
     ----------
-    emitters : Emitters
     clear : float
         Amplitude of a clear echo at 1 m.
     floor : float
@@ -90,14 +89,12 @@ class Coverage(NamedTuple):
 
         Parameters
         ----------
-        sensors : sequence of MountedSensor
         limits_m : sequence of (first, last)
             Ranges of their images.
         settings : Settings
             Settings with the call and the air.
         diameters_m : sequence of float
             Diameter of each sensor's emitter.
-        step_m : float
         heard_m : sequence of float
             Distance from each sensor up to which a clear echo exceeds the noise of its image.
         height_m : float, optional

@@ -118,9 +118,6 @@ def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Co
     ----------
     window : Window
         Part of the map around the platform, which changes.
-    view : View
-    echoes : LocatedEchoes
-    coverage : Coverage
     near_m : float
         Radius of the platform, whose own place is free.
     """
@@ -204,7 +201,6 @@ def _visible(echoes: LocatedEchoes, cosine: Floats, weight: Floats, hiding_m: Fl
 
     Parameters
     ----------
-    echoes : LocatedEchoes
     cosine : (point, direction) float64
         Cosines between echoes and directions.
     weight : (direction,) float64

@@ -202,13 +202,10 @@ def _foreign(
 
     Parameters
     ----------
-    echoes : GroupEchoes
     number : int
         Index of the sensor.
-    sensors : tuple of MountedSensor
     calls : mapping of int to Call
         Calls of the sensors with echoes.
-    is_flat : bool
 
     Returns
     -------

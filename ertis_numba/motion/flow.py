@@ -106,8 +106,6 @@ def fit_flow(
 
     Parameters
     ----------
-    before, after : GroupEchoes
-    sensors : tuple of MountedSensor
     time_s : float
         Time between both groups.
     start, reach : (3,) float64, optional

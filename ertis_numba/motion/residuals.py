@@ -33,7 +33,6 @@ def twist_of(displacement: Floats, time_s: float) -> Floats:
     ----------
     displacement : (..., 3) float64
         x, y and yaw.
-    time_s : float
 
     Returns
     -------
@@ -59,7 +58,6 @@ def _predicted(
     Parameters
     ----------
     displacement : (trial, 3) float64
-    before : GroupEchoes
     offset_m : (echo, axis) float64
         Positions of the sensors on the platform.
     first, second : (trial, 3) or (1, 3) float64

@@ -52,12 +52,8 @@ def worst_rival(
 
     Parameters
     ----------
-    flow : EchoFlow
-    pairs : EchoPairs
-    best : MotionHypothesis
     found : sequence of MotionHypothesis
         Other hypotheses.
-    sensors : tuple of MountedSensor
     by_accident : float
         Expected number of matches of one displacement by accident.
     expected : ((3,) float64, (3,) float64), optional

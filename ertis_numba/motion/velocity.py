@@ -204,7 +204,6 @@ def time_after_ns(group: Mapping[str, Item], before: Mapping[str, int], before_n
 
     Parameters
     ----------
-    group : mapping of str to Energyscape or PointCloud
     before : mapping of str to int
         Times of the group before, by sensor.
     before_ns : int

@@ -50,7 +50,6 @@ def band_edges(passive: Passive, recording: Recording) -> NDArray[np.float64]:
 
     Parameters
     ----------
-    passive : Passive
     recording : Recording
         Named bands beyond 0.8 of half of its sample rate are left out.
 
@@ -97,7 +96,6 @@ def shaped_noise_warning(settings: Settings, bands_hz: NDArray[np.float64]) -> s
 
     Parameters
     ----------
-    settings : Settings
     bands_hz : (band, 2) float64
     """
     limit_hz = SHAPED_NOISE_SHARE * settings.recording.sample_rate_hz

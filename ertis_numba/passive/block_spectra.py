@@ -30,7 +30,6 @@ class Products(NamedTuple):
         Products of the spectra under the slope of the window with those under the window, of some channels.
     squares : (bin,) float64
         Mean power of these channels under the slope of the window.
-    n_blocks : int
     """
 
     matrix: NDArray[np.complex64]
@@ -41,12 +40,6 @@ class Products(NamedTuple):
 
 class BlockSpectra:
     """Sums of the products of spectra over the blocks of measurements.
-
-    Parameters
-    ----------
-    settings : Settings
-    kernels : KernelSet
-    threads : int
 
     Attributes
     ----------
@@ -97,7 +90,6 @@ class BlockSpectra:
 
         Parameters
         ----------
-        measurement : Measurement
         masked : bool
             Leave out the time of the call.
 

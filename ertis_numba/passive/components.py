@@ -22,10 +22,6 @@ def gathered(found: AcousticMap) -> AcousticMap:
     direction of a band on, the components of a direction and its neighbours are summed there. The power of a source in
     the map is therefore its level, and the sum over all directions remains.
 
-    Parameters
-    ----------
-    found : AcousticMap
-
     Returns
     -------
     AcousticMap

@@ -62,7 +62,6 @@ def covariance_of(likelihood: BandLikelihood, places: Floats, k: int, band: Hear
         Directions of all sources.
     k : int
         Number of the source.
-    band : HeardBand
     level : bool
         The elevation is given.
     """

@@ -41,7 +41,6 @@ class HeardBand(NamedTuple):
         Mean angular frequencies of the sound of each source.
     width : (bin,) float64
         Standard deviations of the angular frequency.
-    n_blocks : int
     is_beyond : bool
         The mean frequency of the sound of the last source lies beyond the band.
     """

@@ -62,7 +62,6 @@ class HighResolutionClean:
     ----------
     matrices : (bin, mic, mic) complex
         Cross-spectral matrices.
-    waves : Waves
     hollow : bool
         Leave out the diagonal of the matrices.
     """

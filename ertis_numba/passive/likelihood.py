@@ -85,7 +85,6 @@ class BandLikelihood:
         Trace of the matrix outside of the other sources.
     dimensions : int
         Number of dimensions outside of the other sources.
-    is_whitened : bool
     omega : (bin,) float64
         Angular frequencies.
     """

@@ -37,7 +37,6 @@ class NoiseModel:
     frequency_hz : (bin,) float64
     spacing_hz : float
         Spacing of the bins of the blocks.
-    sound_speed_m_s : float
     """
 
     def __init__(

@@ -32,7 +32,6 @@ class OutsideBands:
 
     Parameters
     ----------
-    settings : Settings
     bands_hz : (band, 2) float64
     """
 
@@ -51,12 +50,7 @@ class OutsideBands:
         self._count = 0
 
     def add(self, measurement: Measurement) -> None:
-        """Add the spectra of a measurement, unless it is left out.
-
-        Parameters
-        ----------
-        measurement : Measurement
-        """
+        """Add the spectra of a measurement, unless it is left out."""
         has_call = measurement.stamp.behaviour == "active"
         if self._is_left_out or has_call or len(measurement.data) < self._size:
             return

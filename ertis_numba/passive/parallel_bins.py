@@ -24,7 +24,6 @@ def in_parts(function: Callable[..., NDArray[Number]], *of_bins: NDArray[Any], t
     function : callable
         Accepts a part of each array, and returns an array with one row for each bin of the part.
     of_bins : (bin, …) arrays
-    threads : int
     """
     n_bins = len(of_bins[0])
     count = max(1, min(threads, n_bins // _MIN_BINS))

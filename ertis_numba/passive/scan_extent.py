@@ -79,7 +79,6 @@ class ScanMesh:
 
         Parameters
         ----------
-        omega_rad_s : float
         whitening : (mode, mic) float64
             None if noise is white.
 
@@ -107,8 +106,6 @@ class ScanMesh:
         ----------
         omega_rad_s : float
             First angular frequency.
-        spacing_rad_s : float
-        n : int
         whitening : (mode, mic) float64
             None if noise is white.
         """

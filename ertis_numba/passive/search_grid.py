@@ -111,10 +111,6 @@ def _coarse(
 def search_changes(settings: Settings) -> dict[str, object]:
     """Return the changes of settings with which directions suit the search for bearings.
 
-    Parameters
-    ----------
-    settings : Settings
-
     Returns
     -------
     dict of str to value

@@ -38,7 +38,6 @@ class Scan(NamedTuple):
     ----------
     directions : (direction, axis) float64
         Unit vectors.
-    mesh : ScanMesh
     reach_rad : float
         Largest distance from one of the directions to a maximum.
     level : bool
@@ -80,7 +79,6 @@ class BandSearch:
 
     Parameters
     ----------
-    scan : Scan
     frequency_hz, shares : (bin,) float64
         Frequencies of the band's bins, and the share of each that lies within the band.
     noise : NoiseModel

@@ -25,9 +25,6 @@ class Waves:
         Delays of the sound from each direction.
     numbers : (bin,) uint32
         Frequencies relative to the spacing of bins.
-    spacing_hz : float
-    kernels : KernelSet
-    threads : int
 
     Attributes
     ----------

@@ -19,14 +19,6 @@ _REMEDY: Final = "process it with its own settings (measurement.settings)"
 class AcceptedWords:
     """Reader of measurements of the sensor that settings describe.
 
-    Parameters
-    ----------
-    settings : Settings
-
-    Attributes
-    ----------
-    format : SampleFormat
-
     Raises
     ------
     ArgumentError

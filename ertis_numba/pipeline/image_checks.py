@@ -41,7 +41,6 @@ class ImageChecks:
     ----------
     settings : Settings
         Settings with the complete plan.
-    kernel_set : KernelSet
     threads : int
         Number of threads for predictions.
     """

@@ -552,7 +552,6 @@ class _Heard(NamedTuple):
 
     Attributes
     ----------
-    grid : Grid
     is_ahead : (direction,) bool
         False for directions behind the sensor, whose amplitude is 0.
     """

@@ -6,7 +6,7 @@ from typing import Final, TypedDict
 
 import numpy as np
 
-from ertis_numba.analysis.detect import find_peaks
+from ertis_numba.analysis.noise import threshold_of
 from ertis_numba.base.errors import DataError
 from ertis_numba.base.forks import ForkSafeLock
 from ertis_numba.chain.plan_model import TABLE_BYTES
@@ -128,9 +128,6 @@ def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet,
     ----------
     image : Energyscape
         Image of ``measurement`` with a complete plan.
-    measurement : Measurement
-    kernels : KernelSet
-    threads : int
     """
     settings = image.settings
     adaptive = settings.processing.is_adaptive
@@ -173,7 +170,7 @@ def predict(planner: Planner, image: Energyscape | None = None) -> Prediction:
     )
     if image is None or not found.warning:
         return found
-    return replace(found, has_echoes=bool(find_peaks(image, top=1, false_alarm=_FALSE_ALARM)))
+    return replace(found, has_echoes=bool(image.amplitude.max(initial=0.0) > threshold_of(image, _FALSE_ALARM)))
 
 
 def memory_bytes(image: Energyscape) -> int:
@@ -190,11 +187,6 @@ class BudgetMonitor:
     """Prediction for the first image, and for each that is 10 dB fainter than all images predicted before.
 
     Relative errors grow as images become fainter. Several threads may use one monitor.
-
-    Parameters
-    ----------
-    kernels : KernelSet
-    threads : int
 
     Attributes
     ----------

@@ -49,7 +49,6 @@ def calibration_residuals(measurements: Sequence[Measurement], faulty: Collectio
 
     Parameters
     ----------
-    measurements : sequence of Measurement
     faulty : collection of int
         Channels without usable sound, which are left out.
 

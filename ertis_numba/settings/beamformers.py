@@ -60,10 +60,11 @@ class Beamformer:
 
     Attributes
     ----------
+    title : str
+        Name in publications, for captions.
     kernel : str
         Kernel that computes ``out`` from ``(analytic, offsets, weights, *options, out)``. Empty for delay-and-sum,
         whose kernels depend on the plan.
-    options : tuple of BeamformerOption
     weights : callable
         Returns the weights for the kernel, (direction, mic) complex64, from weights whose magnitudes add up to about 1
         in each direction. By default, multiplies them by the number of microphones.
@@ -82,6 +83,7 @@ class Beamformer:
         Raises `ArgumentError` if the beamformer does not support the number of microphones.
     """
 
+    title: str
     kernel: str
     options: tuple[BeamformerOption, ...] = ()
     weights: Callable[..., "NDArray[np.complex64]"] = _amplitudes
@@ -102,6 +104,8 @@ class Weighting:
 
     Attributes
     ----------
+    title : str
+        Name in publications, for captions.
     kernel : str
         Kernel that multiplies ``out`` by the factor, from ``(analytic, offsets, weights, out)``. Empty for none.
     sensitivity : float
@@ -113,6 +117,7 @@ class Weighting:
         Time of ``kernel`` relative to delay-and-sum in single precision.
     """
 
+    title: str
     kernel: str
     sensitivity: float = 0.0
     streams: tuple[()] | tuple[SignalStream, SignalStream] = ()
@@ -155,8 +160,9 @@ _BEAM: Final = SignalStream(1.0, 1)
 
 BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
     {
-        "delay_and_sum": Beamformer(kernel="", streams=lambda: (_BEAM,)),
+        "delay_and_sum": Beamformer(title="delay-and-sum", kernel="", streams=lambda: (_BEAM,)),
         "dmas": Beamformer(
+            title="DMAS",
             kernel="combine_dmas",
             options=(BeamformerOption("dmas_order", 2, 8, "Microphone signals that dmas multiplies at a time"),),
             weights=_dmas_roots,
@@ -167,6 +173,7 @@ BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
             check=_require_order,
         ),
         "capon": Beamformer(
+            title="Capon",
             kernel="combine_capon",
             options=(
                 BeamformerOption("snapshots", 1, 32, "Ranges from which capon estimates its covariance matrix"),
@@ -181,11 +188,15 @@ BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
 
 WEIGHTINGS: Final[Mapping[WeightingName, Weighting]] = MappingProxyType(
     {
-        "none": Weighting(kernel=""),
+        "none": Weighting(title="no weighting", kernel=""),
         # Delay-and-sum with this weighting has the third power of the beam where microphones agree, and three times
         # the error power in noise.
         "coherence_factor": Weighting(
-            kernel="weight_coherence", sensitivity=math.sqrt(3) - 1, streams=(_BEAM, SignalStream(2.0, 0)), cost=1.5
+            title="coherence factor",
+            kernel="weight_coherence",
+            sensitivity=math.sqrt(3) - 1,
+            streams=(_BEAM, SignalStream(2.0, 0)),
+            cost=1.5,
         ),
     }
 )

@@ -184,7 +184,6 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
 
         Parameters
         ----------
-        text : str
         source : str, optional
             Name of the document in errors, such as its path.
         find_line : bool
@@ -232,10 +231,6 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read a file.
-
-        Parameters
-        ----------
-        path : str or Path
 
         Raises
         ------

@@ -1,6 +1,8 @@
 """Passive listening: maps of sound that the sensor did not emit."""
 
 import itertools
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final, Literal
 
 from ertis_numba.base import checks
@@ -8,11 +10,22 @@ from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings.documents import TomlTable
 from ertis_numba.settings.recording import Recording
 
-__all__ = ["HIGHEST_SHARE", "MAP_METHODS", "MAX_BANDS", "MapMethod", "Passive"]
+__all__ = ["HIGHEST_SHARE", "MAP_METHODS", "MAP_METHOD_TITLES", "MAX_BANDS", "MapMethod", "Passive"]
 
 MapMethod = Literal["delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc"]
 
-MAP_METHODS: Final[tuple[MapMethod, ...]] = ("delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc")
+MAP_METHOD_TITLES: Final[Mapping[MapMethod, str]] = MappingProxyType(
+    {
+        "delay_and_sum": "delay-and-sum",
+        "functional": "functional beamforming",
+        "capon": "Capon",
+        "music": "MUSIC",
+        "clean_sc": "CLEAN-SC",
+        "hr_clean_sc": "HR-CLEAN-SC",
+    }
+)
+"""Methods of acoustic maps, with their names in publications."""
+MAP_METHODS: Final = tuple(MAP_METHOD_TITLES)
 """Methods of acoustic maps; ``docs/explanation/acoustic-maps.md`` has their equations."""
 
 MAX_BANDS: Final = 100

@@ -28,12 +28,6 @@ def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Proc
     gives fewer than 1.8 ranges per second and hertz of bandwidth is reduced. With the default spacing of 3.8 mm, a
     pulse of 60 kHz bandwidth could lie between two ranges and lose 2 dB.
 
-    Parameters
-    ----------
-    processing : Processing
-    recording : Recording
-    call : Call
-
     Returns
     -------
     Processing

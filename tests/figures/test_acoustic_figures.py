@@ -19,9 +19,7 @@ from ertis_numba.figures.style import angle
 from ertis_numba.frames import Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.geometry.air import absorption_db_m, transmission_loss_db
-from ertis_numba.settings import MAP_METHODS, Settings
-from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS
-from ertis_numba.settings.method_titles import METHOD_TITLES
+from ertis_numba.settings import Settings
 from tests.passive.test_acoustic_camera import settings_of, sound
 from tests.publishing import image
 
@@ -351,10 +349,6 @@ def test_captions_of_images_name_beamformers_as_the_field_does(changes, name):
     found = image(1)
     processing = found.settings.processing.replace(**changes)
     assert name in texts(figures.polar(found.replace(settings=found.settings.replace(processing=processing))))
-
-
-def test_every_method_has_a_title():
-    assert METHOD_TITLES.keys() == {*BEAMFORMERS, *WEIGHTINGS, *MAP_METHODS}
 
 
 @pytest.mark.parametrize(("behaviour", "is_named"), [("passive", False), ("active", True), ("unknown", True)])

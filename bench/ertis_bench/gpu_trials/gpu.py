@@ -72,7 +72,16 @@ _SUMMARIES = {
     "memcheck": r"ERROR SUMMARY: (\d+) error",
     "racecheck": r"RACECHECK SUMMARY: (\d+) hazard",
 }
-_PYTEST = (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "ertis_bench.own_kernel_cache")
+_PYTEST = (
+    sys.executable,
+    "-m",
+    "pytest",
+    "-q",
+    "-p",
+    "no:cacheprovider",
+    "-p",
+    "ertis_bench.gpu_trials.own_kernel_cache",
+)
 _MAX_WORKERS = 8  # Processes of tests, which mostly compile kernels.
 _MAX_REPORTED = 20  # names of failed tests
 

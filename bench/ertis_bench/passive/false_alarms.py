@@ -14,7 +14,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_bench.passive.bearings import BAND_HZ, NOISE_BAND_HZ, plane_wave_settings
-from ertis_numba.base.cpu_cores import usable_cores
+from ertis_numba.base.forks import usable_cores
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.geometry import microphones
 from ertis_numba.geometry.air import sound_speed_m_s

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ertis_bench.peers.problem import Implementation, Problem
-from ertis_numba.base.cpu_cores import usable_cores
+from ertis_numba.base.forks import usable_cores
 
 __all__ = ["make"]
 

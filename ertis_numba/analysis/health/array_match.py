@@ -88,7 +88,6 @@ def unobservable(
     positions_m : (mic, 3) float64
     path_m : float
         Way of the sound since the emission.
-    speed_m_s : float
     is_direct : bool
         True for direct sound, whose curvature shows the size of the array; False by default.
     """
@@ -151,10 +150,8 @@ def find_other_array(
         Times of arrival as the layout expects them.
     channels : sequence of int
         Channels of the microphones.
-    layout : Layout
     path_m : float
         Way of the sound since the emission.
-    speed_m_s : float
     is_near : bool
         True for sound so soon after the emission that its curvature is unknown; False by default.
     """

@@ -91,8 +91,6 @@ def compress(
     ----------
     signals : callable
         Function that returns the samples of a channel.
-    channels : sequence of int
-    call : Call
     rate_hz : float
         Sample rate.
     first, last : int
@@ -122,7 +120,6 @@ def strongest(found: Compressed, width_s: float) -> tuple[NDArray[np.float64], f
 
     Parameters
     ----------
-    found : Compressed
     width_s : float
         Largest difference between the times of two microphones, in seconds.
 

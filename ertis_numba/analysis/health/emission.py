@@ -32,7 +32,6 @@ def fit_emission(times_s: NDArray[np.float64], positions_m: NDArray[np.float64],
         Times of arrival since the start of the record, in seconds.
     positions_m : (mic, 3) float64
         Positions relative to the emitter, in metres.
-    speed_m_s : float
     """
     _, extent, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=False)
     plane_s = positions_m @ axes[extent > 1e-3 * max(float(extent[0]), 1e-9)].T / speed_m_s
@@ -62,7 +61,6 @@ def describe_shift(late_s: Sequence[float], speed_m_s: float, *, delay_s: float 
     ----------
     late_s : sequence of float
         Times of the emissions since the starts of their records, in seconds.
-    speed_m_s : float
     delay_s : float
         Setting ``call.delay_s``, for which the remedy names another value.
     """

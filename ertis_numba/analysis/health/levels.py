@@ -41,7 +41,6 @@ def gain_findings(channels: Sequence[int], level_db: NDArray[np.float64]) -> lis
 
     Parameters
     ----------
-    channels : sequence of int
     level_db : (channel,) float64
         Level of the arrival in dB; NaN if its waveform differs from that of the other channels.
     """
@@ -63,7 +62,6 @@ def noise_findings(
 
     Parameters
     ----------
-    channels : sequence of ChannelHealth
     quiet_db : (channel,) float64
         Noise in the call's band, in dB relative to a full scale of 1.
     white_db : float or None
@@ -95,7 +93,6 @@ def flip_findings(channels: Sequence[ChannelHealth], floor_db: NDArray[np.float6
 
     Parameters
     ----------
-    channels : sequence of ChannelHealth
     floor_db : (channel,) float64
         Power density of the quietest lines, in dB relative to white bits.
     """

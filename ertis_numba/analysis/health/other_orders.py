@@ -41,7 +41,6 @@ def spreads_s(
     positions_m : (mic, 3) float64
     path_m : float
         Way of the sound since the emission.
-    speed_m_s : float
     """
     places_m = places_of(positions_m)
     matrix = np.column_stack([np.ones(len(places_m)), places_m])

@@ -40,10 +40,8 @@ def by_spectra(
     ----------
     signal_of : callable
         Function that returns the samples of a channel.
-    n_samples : int
     found : sequence of ChannelHealth
         Channels that are not stuck.
-    settings : Settings
     band_hz : (float, float)
         Band of the sound.
     """

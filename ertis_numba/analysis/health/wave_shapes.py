@@ -45,7 +45,6 @@ def fit_curved(
     positions_m : (mic, 3) float64
     curvature : float
         Reciprocal of the distance of the source, in 1/m.
-    speed_m_s : float
     slopes_of : callable
         Function that fits a plane wave to times, (..., mic), and returns its delay per metre along each axis of
         `places_of`, (..., used axis).

@@ -128,7 +128,6 @@ def by_wavefront(
         Function that returns the samples of a channel.
     channels : sequence of int
         Channels that carry sound.
-    settings : Settings
     n_samples : int
         Number of samples of the record.
     """

@@ -44,7 +44,6 @@ class Envelope(Protocol):
     Parameters
     ----------
     beams : (direction, sample) complex64
-    step : int
     out : (direction, range) float32
     """
 
@@ -123,7 +122,6 @@ class QuantiseTiles(Protocol):
     ----------
     signals : (mic, phase, sample) complex64
     starts : (tile,) int32
-    limit : float32
     tiles : (tile, mic, phase, k, 2) int16
     scales : (tile,) float32
     """
@@ -183,7 +181,6 @@ class InterpolatedBeamsEnvelopeInt16(Protocol):
     rows : (direction,) int32
     weight_scale : float32
         Value of 1 in the interpolated sums, in units of the tile's scale.
-    n_blocks : int
     out : (direction, range) float32
     """
 
@@ -221,7 +218,6 @@ class CombineDelayed(Protocol):
     order : int
         1 to 5.
     coherent : {0, 1}
-    first : int
     out : (direction, n) float32
     """
 
@@ -261,8 +257,6 @@ class RectifyAndDecimate(Protocol):
     taps : (tap,) int16
         Their pairs have four classes: the number of a pair modulo 4. In each, the sum of the magnitudes is at most
         65,535, so that sums of products fit into 32 bits on every processor.
-    scale : float
-    factor, first : int
     out : (direction, r) float32
     """
 

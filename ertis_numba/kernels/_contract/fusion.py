@@ -432,8 +432,6 @@ class MatchEchoes(Protocol):
 
     Parameters
     ----------
-    places : PredictedPlaces
-    echoes : HeardEchoes
     chosen : (some,) int64
         Echoes to match.
     gate : float
@@ -529,8 +527,6 @@ class SeePlaces(Protocol):
     Parameters
     ----------
     place_m : (place, axis) float64
-    sensors : ViewingSensors
-    out : SeenPlaces
     """
 
     def __call__(self, place_m: Doubles, sensors: ViewingSensors, out: SeenPlaces) -> None: ...

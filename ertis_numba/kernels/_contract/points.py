@@ -123,7 +123,6 @@ class SpreadAmplitudes(Protocol):
 
     Parameters
     ----------
-    pulse : Pulse
     direction_offset : (place, axis) float64
         Differences of unit vectors.
     offset_m : (place,) float64
@@ -143,7 +142,6 @@ class FindTops(Protocol):
 
     Parameters
     ----------
-    quadrics : Quadrics
     fit : (place,) int64
         Quadric of each place.
     rises : (place, neighbour) float64
@@ -160,7 +158,6 @@ class InterpolateTops(Protocol):
 
     Parameters
     ----------
-    quadrics : Quadrics
     fit : (place,) int64
         Quadric of each place.
     logs : (place, sample) float64
@@ -210,8 +207,6 @@ class FitEchoes(Protocol):
     ----------
     pulse : Pulse
         With the tilted table.
-    beams : BeamErrors
-    samples : EchoSamples
     starts : (place, start, 4) float64
         Range offset in metres, offsets of the direction along both axes, and logarithm of the amplitude. The first one
         serves alone, unless the grid is coarse or the misfit is large.

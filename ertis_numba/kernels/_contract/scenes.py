@@ -24,7 +24,6 @@ class AddPaths(Protocol):
         Delay in cycles per bin: seconds times the spacing of the bins in hertz.
     amplitude : (path, mic, frequency) float64
         The last amplitude also applies above its frequency.
-    first_bin : int
     nodes_per_bin : float
         Spacing of the bins / spacing of the frequencies of ``amplitude``.
     out : (mic, bin) complex128

@@ -44,7 +44,6 @@ class UnpackPcm(Protocol):
     words : (sample, channel) int16 or float32
     channels : (mic,) int32
         Channel of each microphone.
-    scale, silence : float32
     first : int
         First sample of the record to convert; may be negative.
     out : (mic, sample) float32
@@ -101,8 +100,6 @@ class DemodulateWords(Protocol):
         As in `UnpackBits`.
     taps : (tap,) int16 or int32
         Symmetric filter taps, an odd number. The sum of their magnitudes must not exceed the maximum of their type.
-    scale : float32
-    factor, first, n_outputs : int
     out : (mic, sample) float32
     """
 
@@ -147,7 +144,6 @@ class MultiplyAndFold(Protocol):
     spectra : (mic, bin) complex64
     responses : (mic, phase, b) or (1, phase, b) complex64
         One filter per microphone, or one for all.
-    first_bin : int
     out : (mic, phase, k) complex64
     """
 
@@ -168,7 +164,6 @@ class SumSpectra(Protocol):
         without a bin hold 0.
     starts, steps : (direction, mic) uint32
         Phase at the first bin, and its change from bin to bin, in 2⁻³² of a turn.
-    first_bin, n_bins : int
     out : (direction, 1, k) complex64
     """
 

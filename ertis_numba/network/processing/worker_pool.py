@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from ertis_numba.base.cpu_cores import usable_cores
+from ertis_numba.base.forks import usable_cores
 from ertis_numba.network.log import EventLog
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.parallelism import Choice, Load

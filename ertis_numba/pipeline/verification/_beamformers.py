@@ -23,7 +23,6 @@ def combine(y: Delayed, processing: Processing) -> NDArray[np.float64]:
     y : (mic, range) complex128
         Analytic signals delayed for the direction, multiplied by the array weights and divided by the gains of their
         microphones.
-    processing : Processing
     """
     amplitude, factor = _BEAMFORMERS[processing.beamformer](y, processing), _WEIGHTINGS[processing.weighting](y)
     found: NDArray[np.float64] = amplitude * factor

@@ -48,7 +48,6 @@ def measure(image: Energyscape, measurement: Measurement) -> Measured:
 
     Parameters
     ----------
-    image : Energyscape
     measurement : Measurement
         Measurement that the image was computed from.
 
@@ -80,7 +79,6 @@ def sampled_error_db(image: Energyscape, measurement: Measurement, *, max_direct
 
     Parameters
     ----------
-    image : Energyscape
     measurement : Measurement
         Measurement that the image was computed from.
     max_directions : int
