@@ -41,8 +41,8 @@ def wavefront_note(whose: str, error_db: float, range_m: float) -> str:
     ``whose`` is a sensor, or a number of recordings.
     """
     return (
-        f"{whose}: the error of plane wavefronts is up to {error_db:.1f} dB at {range_m:g} m, in addition to the error "
-        "budget; use --wavefront auto (capon supports only plane wavefronts), or a larger first range"
+        f"{whose}: the error of plane wavefronts is up to {error_db:.1f} dB at {range_m:g} m, in addition to other "
+        "errors; use --wavefront auto (capon and method paper support only plane wavefronts), or a larger first range"
     )
 
 

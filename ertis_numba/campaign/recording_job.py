@@ -260,10 +260,14 @@ def _check_sensor(
     for text in (*_call_notes(run, recording), *_grid_notes(run.pipeline)):
         warn(f"{place}{text}")
     heard = None
-    if run.pipeline.settings.processing.method != "paper":
-        kernel_set = kernels.load(run.pipeline.device)
-        threads = kernel_set.max_threads if options.threads is None else options.threads
-        image = unlevelled_image(run.pipeline, first)
+    kernel_set = kernels.load(run.pipeline.device)
+    threads = kernel_set.max_threads if options.threads is None else options.threads
+    image = unlevelled_image(run.pipeline, first)
+    if image.settings.processing.method == "paper":  # It has no plan, but its wavefronts have the same error.
+        alike = image.settings.processing.replace(method="fast")
+        image = image.replace(settings=image.settings.replace(processing=alike))
+        run.reported |= _wavefront(planner_of(image, first, kernel_set, threads=threads), recording, show)
+    else:
         heard = planner_of(image, first, kernel_set, threads=threads)
         run.prediction = predict(heard, image)
         run.reported |= _wavefront(heard, recording, show)

@@ -84,6 +84,11 @@ def test_process_prints_and_stores_the_error_of_plane_wavefronts(tmp_path):
     assert "the error of plane wavefronts is up to" in done.stderr
     with open_energyscapes(tmp_path / "image.h5") as images:
         assert images.wavefront_error_db > images.max_error_db
+        error_db = images.wavefront_error_db
+    done = CliRunner().invoke(cli, [*arguments, "--method", "paper"])
+    assert "the error of plane wavefronts is up to" in done.stderr
+    with open_energyscapes(tmp_path / "image.h5") as images:
+        assert images.wavefront_error_db == pytest.approx(error_db, abs=0.5)
     done = CliRunner().invoke(cli, [*arguments, "--wavefront", "auto"])
     assert done.exit_code == 0, done.stderr
     assert "plane wavefronts" not in done.stderr
