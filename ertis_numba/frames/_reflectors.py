@@ -68,7 +68,8 @@ class Peak(RadiansFromDegrees):
         reflector may lie beyond the grid, and NaN if it is unknown.
     angle_sd_deg : float, default NaN
         Standard deviation of the direction along its least certain axis in degrees, from noise, plan and grid.
-        Infinite where ``grid_error_deg`` is, and NaN if the noise is unknown, like the following ones.
+        Infinite where ``grid_error_deg`` is. Like the following ones, NaN if the noise is unknown, or if the image is
+        one of the method ``paper``.
     range_sd_m : float, default NaN
         Standard deviation of the range in metres.
     level_sd_db : float, default NaN
