@@ -44,7 +44,8 @@ class BearingFinder:
         or below a grid in one plane, yield wrong bearings and levels. So do grids coarser than the beam; see `warning`.
         The method of its maps has no influence.
     false_alarm : float
-        Probability that noise alone yields any bearing, 1e-9 to 0.5; 0.001 by default.
+        Probability that noise alone yields any bearing, 1e-9 to 0.5; 0.001 by default. It does not hold for tones with
+        phases at random, as of electronics, at twelve microphones or fewer: they resemble a wave by chance.
     top : int
         Largest number of bearings in a band; 8 by default.
     min_level_db : float
