@@ -159,7 +159,8 @@ def test_combined_streams_equal_the_sum_of_all_products(kernel_set, order, weigh
 
 def test_weightings_without_streams_leave_images_to_their_kernel(monkeypatch):
     """A new weighting is not ignored if only its kernel is declared."""
-    monkeypatch.setattr(stream_recipe, "WEIGHTINGS", {**WEIGHTINGS, "half": Weighting(kernel="weight_half")})
+    half = Weighting(title="half", kernel="weight_half")
+    monkeypatch.setattr(stream_recipe, "WEIGHTINGS", {**WEIGHTINGS, "half": half})
     for beamformer in ("delay_and_sum", "dmas"):
         processing = Processing(beamformer=beamformer)
         assert stream_recipe.recipe_of(processing) is not None
