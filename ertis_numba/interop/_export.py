@@ -269,10 +269,10 @@ def _energyscapes(items: Iterable[Exported]) -> Iterator[Energyscape]:
 
 
 def _located(items: Iterable[Exported], name: str) -> Iterator[Energyscape]:
-    """Yield energyscapes; refuse those of an array that observes no directions."""
+    """Yield energyscapes; refuse those of an array that observes no directions, such as one on an inclined line."""
     for image in _energyscapes(items):
         seen = observable_angles(image.settings.array)
-        if not seen.has_direction(is_planar=image.is_planar):
+        if not (seen.azimuth or seen.elevation) or not seen.has_direction(is_planar=image.is_planar):
             raise ArgumentError(
                 f"sensor {image.stamp.sensor} {seen.note}, so format {name!r} cannot place points; write npz"
             )

@@ -16,6 +16,7 @@ from ertis_numba.interop import export
 from ertis_numba.settings import Array, Processing
 from ertis_numba.storage import write_energyscapes
 from tests.analysis.test_detect import image_of
+from tests.files import SMALL, image
 
 MM = 1e-3
 LINES = {
@@ -155,6 +156,15 @@ def test_points_of_one_microphone_are_refused(one, tmp_path, ending):
         export(target, [image])
     assert not target.exists()
     assert len(ertis.PointExtractor(image.settings)(image)) == 0
+
+
+@pytest.mark.parametrize("ending", ["csv", "ply", "pcd"])
+def test_points_of_an_inclined_line_are_refused(tmp_path, ending):
+    positions_m = tuple((0.0, 0.004 * mic, 0.004 * mic) for mic in range(8))
+    inclined = image(settings=SMALL.replace(array=Array(layout="inclined", positions_m=positions_m, word_bits=8)))
+    with pytest.raises(ArgumentError, match=rf"on an inclined line; .* so format '{ending}' cannot place points"):
+        export(tmp_path / f"points.{ending}", [inclined])
+    assert not (tmp_path / f"points.{ending}").exists()
 
 
 def test_angles_of_one_microphone_are_nan_in_npz(one, tmp_path):
