@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ertis_numba.analysis.health.repeats import repeated_blocks
+from ertis_numba.analysis.health.repeats import duplicates, repeated_blocks
 
 CHANNELS = tuple(range(32))
 
@@ -35,3 +35,10 @@ def test_repeated_blocks_reports_a_buffer_sent_again(length, copies):
     [finding] = repeated_blocks(words[:, None], CHANNELS)
     assert finding.measured == length * copies
     assert f"again {length} samples later" in finding.detail
+
+
+@pytest.mark.parametrize("is_pdm", [False, True])
+def test_one_signal_in_all_channels_is_a_duplicate(is_pdm):
+    words = noise() % 2 == 1 if is_pdm else noise()
+    found = duplicates([(channel, words) for channel in CHANNELS], is_pdm=is_pdm)
+    assert [finding.channels for finding in found] == [(channel,) for channel in CHANNELS]

@@ -33,7 +33,7 @@ def duplicates(columns: Sequence[tuple[int, NDArray[Any]]], *, is_pdm: bool) -> 
         content = np.packbits(column) if is_pdm else np.ascontiguousarray(column)
         groups.setdefault(content.tobytes(), []).append(channel)
     twins = [tuple(group) for group in groups.values() if len(group) > 1]
-    if not is_pdm and sum(map(len, twins)) > _SHARE_OF_TWINS * len(columns):
+    if not is_pdm and len(groups) > 1 and sum(map(len, twins)) > _SHARE_OF_TWINS * len(columns):
         return []
     return [
         Finding(
