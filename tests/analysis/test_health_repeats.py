@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ertis_numba.analysis.health.pcm_samples import swapped_bytes
 from ertis_numba.analysis.health.repeats import duplicates, repeated_blocks
 
 CHANNELS = tuple(range(32))
@@ -42,3 +43,9 @@ def test_one_signal_in_all_channels_is_a_duplicate(is_pdm):
     words = noise() % 2 == 1 if is_pdm else noise()
     found = duplicates([(channel, words) for channel in CHANNELS], is_pdm=is_pdm)
     assert [finding.channels for finding in found] == [(channel,) for channel in CHANNELS]
+
+
+def test_samples_of_eight_bits_are_not_swapped():
+    numbers = np.round(3 * np.random.default_rng(1).standard_normal((4000, 4))).astype(np.int16)
+    assert swapped_bytes(numbers * np.int16(256), (0, 1, 2, 3)) == []
+    assert len(swapped_bytes(numbers.byteswap(), (0, 1, 2, 3))) == 1

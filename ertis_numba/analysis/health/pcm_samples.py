@@ -45,6 +45,8 @@ def by_numbers(channel: int, signal: NDArray[np.float32], *, is_float: bool) -> 
 
 def swapped_bytes(words: NDArray[np.int16], channels: tuple[int, ...]) -> list[Finding]:
     """Return a finding if consecutive 16-bit samples differ less after a swap of their bytes."""
+    if not (words & 0xFF).any():  # Samples of 8 bits, as of WAV files.
+        return []
     roughness = []
     for numbers in (words, words.byteswap()):
         steps = np.diff(numbers[:, list(channels)].astype(np.float64), axis=0)
