@@ -22,7 +22,7 @@ class _Imports(click.Group):
 def imports() -> None:
     """Import signals, journals left by a crash, or poses into recordings.
 
-    Without one of these commands, `ertis import FILES` imports signals.
+    If the first argument is none of these commands, it is a file of signals.
     """
 
 

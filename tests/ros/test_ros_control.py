@@ -15,6 +15,7 @@ from ertis_numba.interop.ros_messages import MESSAGES, points_message
 from ertis_numba.interop.scans import scan_message
 from ertis_numba.ros import Participant, PublishingSettings, RosPublisher, WatchedSettings
 from ertis_numba.storage import write_energyscapes
+from tests.files import with_echoes
 from tests.journals import ENVIRONMENT
 from tests.network.test_capture_to import ERTIS
 from tests.pages import page
@@ -75,7 +76,7 @@ def test_file_is_read_again_once_it_is_complete(tmp_path):
 
 
 def test_ranges_and_levels_limit_points_and_echoes():
-    given = stamped(1)
+    given = with_echoes(stamped(1))
     cloud = PointFinder(min_level_db=-40.0)(given)
     middle_m = float(np.median(cloud.range_m))
     limits = PublishingSettings(range_m=(middle_m, 100.0), min_level_db=-40.0)

@@ -19,7 +19,7 @@ from ertis_numba.storage import open_energyscapes, open_recording, write_energys
 from ertis_numba.storage.sealing import seal
 from ertis_numba.storage.truth import GroundTruth
 from tests.campaigns import InlinePool
-from tests.files import SMALL, image, noise
+from tests.files import SMALL, echoes, image, noise
 from tests.storage.test_storage_sensors import TURNED, of
 
 PLACES = {"left": ((0.1, 0.3, -0.2), TURNED), "right": ((0.1, -0.3, 0.4), (0.0, 0.0, 0.0, 1.0))}
@@ -42,7 +42,7 @@ def place_of(path, sensor):
 @pytest.fixture
 def recorded(tmp_path):
     """Recording of a platform with two sensors."""
-    both = [*of("left", noise(SMALL, 2)), *of("right", noise(SMALL, 2, seed=2))]
+    both = [*of("left", echoes(SMALL, 2)), *of("right", echoes(SMALL, 2, [(15.0, 0.7)]))]
     return write_recording(tmp_path / "rec.h5", both, mounting=PLACES)
 
 
