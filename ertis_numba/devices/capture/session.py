@@ -10,7 +10,6 @@ from functools import partial
 
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, SonarDisconnectedError, SonarError
-from ertis_numba.devices.capture.counts import CaptureCounts
 from ertis_numba.devices.capture.gap_reasons import gap_reason
 from ertis_numba.devices.capture.readers import (
     BlockArrived,
@@ -23,7 +22,7 @@ from ertis_numba.devices.capture.readers import (
     SensorReconnected,
     TriggerClock,
 )
-from ertis_numba.devices.capture.sink import MeasurementSink
+from ertis_numba.devices.capture.sink import CaptureCounts, MeasurementSink
 from ertis_numba.devices.capture.sync_counts import PulseAligner
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.frames import Measurement, Stamp

@@ -1,12 +1,15 @@
-"""Destination of the measurements of a capture session."""
+"""Destination and counts of the measurements of a capture session."""
 
+import time
+from collections import Counter, deque
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from ertis_numba.journal import JournalEntry
 from ertis_numba.settings import Settings
 
-__all__ = ["MeasurementSink"]
+__all__ = ["CaptureCounts", "MeasurementSink"]
 
 
 class MeasurementSink(Protocol):
@@ -31,3 +34,33 @@ class MeasurementSink(Protocol):
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
         """Store why numbers of a sensor are missing, ``first`` and ``last`` included."""
+
+
+_RECENT_S = 3.0  # Interval of the reported rate.
+
+
+@dataclass(slots=True)
+class CaptureCounts:
+    """Counts of one sensor's measurements.
+
+    ``missing`` counts by reason, and ``skipped`` the commands that were skipped because the sensor was still busy.
+    """
+
+    stored: int = 0
+    missing: Counter[str] = field(default_factory=Counter)
+    unplugged: int = 0
+    skipped: int = 0
+    times_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
+    """Times of the latest stored measurements by `time.monotonic`, in seconds."""
+
+    @property
+    def lost(self) -> int:
+        """Number of all missing measurements."""
+        return sum(self.missing.values())
+
+    @property
+    def rate_hz(self) -> float:
+        """Recent rate of stored measurements, in Hz."""
+        now_s = time.monotonic()
+        recent_s = [time_s for time_s in self.times_s if now_s - time_s < _RECENT_S]
+        return (len(recent_s) - 1) / max(recent_s[-1] - recent_s[0], 1e-9) if len(recent_s) > 1 else 0.0
