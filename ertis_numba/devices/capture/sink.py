@@ -30,7 +30,7 @@ class MeasurementSink(Protocol):
         """
 
     def append(self, entries: Sequence[JournalEntry]) -> Sequence[JournalEntry] | None:
-        """Store measurements; None means that all of them are stored, otherwise return the stored ones."""
+        """Store measurements, and return those that were stored, or None for all."""
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
         """Store why numbers of a sensor are missing, ``first`` and ``last`` included."""
