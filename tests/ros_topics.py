@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from contextlib import contextmanager
 from pathlib import Path
@@ -47,17 +48,26 @@ class Subscriber:
 
     def take_after(self, time_ns):
         """Return the bytes of the next message that arrives after a time."""
-        while (line := json.loads(self._process.stdout.readline()))["received_ns"] < time_ns:
+        while (line := self._line())["received_ns"] < time_ns:
             pass
         return base64.b64decode(line["cdr"])
 
     def take(self, count):
         """Next messages, as a dict of topic to a list of their bytes."""
         taken = {}
-        for _ in range(count):
-            line = json.loads(self._process.stdout.readline())
+        for number in range(count):
+            line = self._line()
+            assert line, f"{number} of {count} messages arrived: { {name: len(each) for name, each in taken.items()} }"
             taken.setdefault(line["topic"], []).append(base64.b64decode(line["cdr"]))
         return taken
+
+    def _line(self):
+        """Return what the process prints next; {} if it prints nothing for a minute, which ends it."""
+        timer = threading.Timer(WAIT_S, self._process.kill)
+        timer.start()
+        line = self._process.stdout.readline()
+        timer.cancel()
+        return json.loads(line or "{}")
 
 
 @contextmanager

@@ -34,6 +34,7 @@ pytest.importorskip("cyclonedds")
 
 ROOT = Path(__file__).parents[2]
 TIME_NS = 1_700_000_000_123_456_789
+DEPTH = 100  # A subscriber that has not caught up misses messages older than the newest of this number.
 PLACE = ((1.0, 2.0, 0.5), (0.0, 0.0, 0.6, 0.8))
 
 
@@ -57,7 +58,7 @@ def test_topics_arrive_in_rclpy():
         "image": [picture(each) for each in given],
     }
     kinds = {names[topic]: MESSAGES[topic] for topic in names}
-    with Participant(domain=DOMAIN) as participant:
+    with Participant(domain=DOMAIN, depth=DEPTH) as participant:
         ros = RosPublisher(participant, topics=names, namespace="robot1")
         ros.publish(given[0], PLACE)  # creates the topics, before there are subscribers that could receive this image
         with subscribed(kinds) as subscriber:
@@ -128,7 +129,11 @@ def test_other_domains_receive_nothing():
 
 def test_subscriber_that_was_stopped_does_not_block_the_publisher():
     kinds = {"/front/points": MESSAGES["points"]}
-    with subscribed(kinds) as good, subscribed(kinds) as stopped, Participant(domain=DOMAIN) as participant:
+    with (
+        subscribed(kinds) as good,
+        subscribed(kinds) as stopped,
+        Participant(domain=DOMAIN, depth=DEPTH) as participant,
+    ):
         ros = RosPublisher(participant)
         ros.publish(stamped(1))
         await_subscribers([ros.topics["/front/points"]], 2)
