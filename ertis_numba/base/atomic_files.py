@@ -46,19 +46,7 @@ _REMEDIES = {
 
 
 def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
-    """Refuse a path to which no file can be written.
-
-    Parameters
-    ----------
-    sources : iterable of Path
-        Input files, which are never overwritten.
-
-    Raises
-    ------
-    ArgumentError
-        The folder is missing, the path is a folder, a link, a device or a source, or the file exists and
-        ``overwrite`` is False.
-    """
+    """Refuse a path that cannot be written, is one of the input files ``sources``, or exists without ``overwrite``."""
     if path.is_dir():
         raise ArgumentError(f"output {path} is a folder; choose the name of a file")
     if path.is_symlink() or (path.exists() and not path.is_file()):
@@ -72,13 +60,7 @@ def check_target(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -
 
 
 def require_writable(folder: Path) -> None:
-    """Create a file in a folder, and remove it.
-
-    Raises
-    ------
-    OSError
-        No file can be created.
-    """
+    """Create a file in a folder and remove it; raise OSError if that fails."""
     with tempfile.TemporaryFile(dir=folder):
         pass
 
@@ -97,18 +79,7 @@ def remedy(error: Exception) -> str:
 
 
 def require_free_space(folder: Path, n_bytes: int, *, purpose: str = "the next data") -> None:
-    """Refuse to write to a disk on which less than `RESERVED_BYTES` would remain.
-
-    Parameters
-    ----------
-    purpose : str
-        Purpose of the bytes, for the error.
-
-    Raises
-    ------
-    DataError
-        The disk is full, or nearly full.
-    """
+    """Raise DataError if less than `RESERVED_BYTES` would remain on the disk; ``purpose`` is named in the error."""
     free, wanted = shutil.disk_usage(folder).free, n_bytes + RESERVED_BYTES
     if free < wanted:
         raise DataError(
@@ -124,22 +95,10 @@ def temporary_path(path: Path, token: str) -> Path:
 
 @contextmanager
 def atomic_write(path: Path, *, overwrite: bool = False, token: str | None = None) -> Iterator[Path]:
-    """Yield a temporary name to write to; when the block succeeds, that file is renamed to ``path``.
+    """Yield a temporary name to write to; when the block succeeds, that file is synchronised and renamed to ``path``.
 
-    The temporary name is unique and ends in ``.part``. The file is synchronised with the disk before it is renamed.
-    If the block fails, the temporary file is removed.
-
-    Parameters
-    ----------
-    token : str, optional
-        Unique part of the temporary name; random digits by default.
-
-    Raises
-    ------
-    ArgumentError
-        As for `check_target`, before the block and again before the file is renamed.
-    OSError
-        The file cannot be written; its ``filename`` is ``path``.
+    The name is unique by ``token``, or by random digits, and ends in ``.part``. If the block fails, the file is
+    removed. The checks of `check_target` run before the block and again before the file is renamed.
     """
     check_target(path, overwrite=overwrite)
     part = temporary_path(path, token or secrets.token_hex(4))
@@ -163,18 +122,7 @@ def _lacks_filename(error: OSError) -> bool:
 
 
 def make_folder(path: Path, *, parents: bool = False) -> None:
-    """Create a folder, and synchronise its name with the disk even if it exists already.
-
-    Parameters
-    ----------
-    parents : bool
-        Create missing parents, too.
-
-    Raises
-    ------
-    OSError
-        The folder cannot be created.
-    """
+    """Create a folder, and synchronise its name with the disk even if it exists already."""
     missing = [each for each in path.parents if not each.exists()] if parents else []
     for each in (*reversed(missing), path):
         was_there = each.is_dir()

@@ -160,9 +160,6 @@ def sensor_name(name: str) -> str:
 def reason_unreadable(error: OSError | UnicodeDecodeError) -> str:
     """Return why a text file cannot be read, in words.
 
-    Examples
-    --------
-    >>> from ertis_numba.base.checks import reason_unreadable
     >>> reason_unreadable(FileNotFoundError(2, "No such file or directory"))
     'No such file or directory'
     """

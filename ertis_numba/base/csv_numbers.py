@@ -12,15 +12,7 @@ __all__ = ["csv_rows", "npy_content"]
 
 
 def csv_rows(source: str, text: str) -> list[list[float]]:
-    """Return rows of comma-separated numbers; ``source`` is their name in errors.
-
-    A row may be empty, and a comment follows #.
-
-    Raises
-    ------
-    ArgumentError
-        A cell is not a number.
-    """
+    """Return rows of comma-separated numbers, which may be empty; ``source`` is their name in errors, # a comment."""
     rows = (line.split("#", 1)[0].strip() for line in text.splitlines())
     try:
         return [[float(cell) for cell in row.split(",")] for row in rows if row]
@@ -31,15 +23,7 @@ def csv_rows(source: str, text: str) -> list[list[float]]:
 
 
 def npy_content(file: Path | IO[bytes]) -> Any:
-    """Return the content of an NPY or NPZ file, as ``numpy.load`` does.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-    ValueError
-        It is empty or damaged. NumPy raises other errors for some damaged headers.
-    """
+    """Return the content of an NPY or NPZ file, as ``numpy.load`` does; raise OSError, or ValueError for all damage."""
     try:
         return np.load(file, allow_pickle=False)
     except (EOFError, SyntaxError, tokenize.TokenError) as error:

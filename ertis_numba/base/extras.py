@@ -10,22 +10,7 @@ __all__ = ["extra"]
 
 @contextmanager
 def extra(name: str, need: str, kind: type[ErtisError] = ArgumentError) -> Iterator[None]:
-    """Turn a failed import of an optional dependency into an error that names its extra.
-
-    Parameters
-    ----------
-    name : str
-        Extra in the metadata of this package.
-    need : str
-        Feature and the packages that it needs, as in "metrics need prometheus-client".
-    kind : type of ErtisError
-        Class of the error.
-
-    Raises
-    ------
-    ErtisError
-        An import in the block failed.
-    """
+    """Turn a failed import into an error that names its extra; ``need`` is like "metrics need prometheus-client"."""
     try:
         yield
     except ImportError as error:

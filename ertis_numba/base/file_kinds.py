@@ -30,18 +30,10 @@ _IMPORT = "import it with 'ertis import signals {file} --settings FILE.toml'"
 
 @dataclass(frozen=True, slots=True)
 class FileKind:
-    """Format of a file.
+    """Format of a file, with its article (``a WAV file``), and a remedy with ``{file}`` and ``{stem}``.
 
-    Attributes
-    ----------
-    name : str
-        Format with its article, such as ``a WAV file``.
-    remedy : str
-        Instruction with ``{file}`` and ``{stem}``.
-    is_wav, is_hdf5 : bool
-        True for formats that `open_pcm` reads, if their content fits.
-    is_text : bool
-        True for lines of text.
+    ``is_wav`` and ``is_hdf5`` mark formats that `open_pcm` reads, if their content fits; ``is_text`` marks lines of
+    text.
     """
 
     name: str
@@ -189,9 +181,6 @@ def kind_of(path: str | Path) -> FileKind | None:
 def markup_of(text: str) -> str | None:
     """Return the name of a format of text that is neither a table nor TOML, by its first character; None if unknown.
 
-    Examples
-    --------
-    >>> from ertis_numba.base.file_kinds import markup_of
     >>> markup_of('{"seed": 1}'), markup_of("seed = 1")
     ('JSON', None)
     """
@@ -201,7 +190,7 @@ def markup_of(text: str) -> str | None:
 def problem_of(path: str | Path, wanted: str = "a recording") -> str:
     """Return the format of a file and its remedy, as ``is a FLAC file; convert it with …``; empty if unknown.
 
-    Signals can be converted into a recording. If no recording is wanted, the remedy names what is.
+    Signals can be converted into a recording. Otherwise, the remedy names the ``wanted`` file.
     """
     kind, path = kind_of(path), Path(path)
     if kind is None:

@@ -23,29 +23,14 @@ def usable_cores() -> int:
 
 
 def call_in_forks(method: Callable[[], None]) -> None:
-    """Call a method at the start of each forked process, as long as its object exists.
-
-    Parameters
-    ----------
-    method : bound method
-        Makes the object usable without the threads of the parent. It must raise no error.
-    """
+    """Call a bound method, which must not raise, at the start of each forked process while its object exists."""
     _methods.add(weakref.WeakMethod(method, _methods.discard))
 
 
 class ForkSafeLock:
     """Context manager that admits one thread at a time; free in a forked process, even if another thread was inside.
 
-    Parameters
-    ----------
-    make : callable
-        Type of the lock: `threading.Lock`, the default, or `threading.RLock`.
-
-    Examples
-    --------
-    >>> from ertis_numba.base.forks import ForkSafeLock
-    >>> lock = ForkSafeLock()
-    >>> with lock:
+    >>> with ForkSafeLock():
     ...     print("alone")
     alone
     """

@@ -25,14 +25,11 @@ _ORDERS: Final = {b"RIFF": "<", b"RF64": "<", b"BW64": "<", b"RIFX": ">"}
 
 @dataclass(frozen=True, slots=True)
 class WavFile:
-    """Content of a WAV file.
+    """Content of a WAV file: samples (sample, channel), mapped into memory, at the full scale of their integer type.
 
-    - ``samples``: (sample, channel); slices along the first axis are arrays. The file is mapped into memory. Integers
-      have the full scale of their type, and bytes are unsigned.
-    - ``valid_bits``: bits of a sample that the header states to be used; the samples may have more.
-    - ``notes``: contradictions in the file, and how they were resolved.
-    - ``chunks``: contents of the other chunks up to 1 MiB by name, such as ``bext``, ``iXML`` and ``guan``; of a
-      ``LIST``, by the name of the list, such as ``INFO``. Of several with one name, the first.
+    Bytes are unsigned. ``valid_bits``: used bits that the header states; samples may have more. ``notes``:
+    contradictions in the file, and their resolution. ``chunks``: contents of other chunks up to 1 MiB by name, such as
+    ``bext``; of a ``LIST``, by the name of the list, such as ``INFO``. The first of several with one name counts.
     """
 
     rate_hz: float

@@ -63,10 +63,7 @@ class Form:
 
 
 def read_form(content: bytes, order: str, place: int, path: Path) -> Form:
-    """Return the encoding that a fmt chunk describes.
-
-    ``order`` is ``<`` or ``>``; ``place`` is the byte where the chunk begins, for errors.
-    """
+    """Return the encoding in a fmt chunk at byte ``place`` (for errors); ``order`` is ``<`` or ``>``."""
     where = f"{path}: the fmt chunk at byte {place}"
     if len(content) < _MIN_BYTES:
         raise DataError(f"{where} has {len(content)} bytes, but needs {_MIN_BYTES}; copy the file again")

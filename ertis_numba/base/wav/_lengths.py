@@ -106,11 +106,7 @@ def chain_fits(content: Content, place: int) -> bool:
 
 
 def sample_bytes(content: Content, place: int, wide: int | None, frame_bytes: int) -> Length:
-    """Return the length of the samples.
-
-    The data chunk begins at byte ``place``; a ds64 chunk states its length as ``wide``. ``frame_bytes`` is 1 if
-    unknown.
-    """
+    """Return the length of the samples; ``wide`` is that of a ds64 chunk, and ``frame_bytes`` is 1 if unknown."""
     _, narrow = content.header(place)
     start = place + HEADER_BYTES
     room = len(content) - start

@@ -27,12 +27,7 @@ class Samples(Protocol):
 
 
 def samples_of(content: NDArray[np.uint8], n_channels: int, sample_bytes: int, kind: str, order: str) -> Samples:
-    """Return the samples in the bytes of a file, without a copy of them.
-
-    - ``content`` (byte,) uint8: complete frames.
-    - ``kind``: ``i`` or ``f``; bytes are unsigned.
-    - ``order``: ``<`` for little-endian, ``>`` for big-endian.
-    """
+    """Return a view of complete frames (byte,) as samples; ``kind`` is ``i`` or ``f``, ``order`` is ``<`` or ``>``."""
     if sample_bytes in _SIZES:
         dtype = np.dtype("u1" if sample_bytes == 1 else f"{order}{kind}{sample_bytes}")
         return content.view(dtype).reshape(-1, n_channels)
