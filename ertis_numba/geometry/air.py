@@ -22,16 +22,10 @@ _VAPOUR_HEAT_RATIO = 1.330
 
 
 def sound_speed_m_s(air: Air) -> float:
-    """Return the speed of sound in humid air.
+    """Return the speed of sound in humid air, ``c = sqrt(γ R T / M)`` of an ideal mixture of dry air and water vapour.
 
-    The model is an ideal mixture of dry air and water vapour, ``c = sqrt(γ R T / M)``, with the molar mass and the heat
-    capacity of the mixture and the saturation pressure of ISO 9613-1, annex B. Dry air at 0 °C gives 331.3 m/s;
-    humidity adds up to about 0.4 % at room temperature.
-
-    Returns
-    -------
-    float
-        Metres per second.
+    The saturation pressure is that of ISO 9613-1, annex B. Dry air at 0 °C gives 331.3 m/s; humidity adds up to about
+    0.4 % at room temperature.
     """
     kelvin = _ZERO_C_K + air.temperature_c
     vapour = _water_vapour_fraction(air)
@@ -42,19 +36,7 @@ def sound_speed_m_s(air: Air) -> float:
 
 
 def absorption_db_m(air: Air, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the absorption of a plane wave in air in dB/m at each frequency.
-
-    ISO 9613-1:1993, equations 3 to 5 and annex B: the sum of classical and rotational absorption and of the relaxation
-    of oxygen and of nitrogen.
-
-    Parameters
-    ----------
-    frequency_hz : (frequency,) float64
-
-    Returns
-    -------
-    (frequency,) float64
-    """
+    """Return the absorption of a plane wave in dB/m: (frequency,); ISO 9613-1:1993, equations 3 to 5 and annex B."""
     kelvin = _ZERO_C_K + air.temperature_c
     pressure = air.pressure_pa / _REFERENCE_PRESSURE_PA
     warmth = kelvin / _REFERENCE_K
@@ -70,26 +52,10 @@ def absorption_db_m(air: Air, frequency_hz: NDArray[np.float64]) -> NDArray[np.f
 
 
 def transmission_loss_db(air: Air, distance_m: float, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the transmission loss of a spherical wave in dB at each frequency.
+    """Return the transmission loss of a spherical wave, ``20 log10(r / 1 m) + α r``, in dB: (frequency,).
 
-    ``20 log10(r / 1 m) + α r``: the level at the distance r is the source level minus this loss (R. J. Urick,
-    Principles of Underwater Sound, 1983). The source level is the level at 1 m without absorption by the air.
-
-    Parameters
-    ----------
-    frequency_hz : (frequency,) float64
-
-    Returns
-    -------
-    (frequency,) float64
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ertis_numba.geometry.air import transmission_loss_db
-    >>> from ertis_numba.settings import Air
-    >>> transmission_loss_db(Air(), 2.0, np.array([40e3])).round(1).tolist()
-    [8.7]
+    The level at the distance r is the source level, at 1 m without absorption, minus this loss (R. J. Urick, Principles
+    of Underwater Sound, 1983).
     """
     return 20 * math.log10(distance_m) + distance_m * absorption_db_m(air, frequency_hz)
 

@@ -20,20 +20,10 @@ MAX_DELAY_S = 0.02
 
 
 def delay_matrix(settings: Settings, *, n_directions: int) -> NDArray[np.float64] | None:
-    """Return the delays that ``processing.delay_matrix`` lists or names; None without it.
+    """Return the delays in s, (direction, enabled mic), that ``processing.delay_matrix`` states; None without it.
 
-    Only the differences between microphones matter: the mean over the layout's microphones is subtracted from each
-    direction. Ranges then count from the centre of the array, as they do with plane waves. The result has the delays of
-    the enabled microphones in seconds, (direction, mic), positive for later sound.
-
-    Examples
-    --------
-    >>> from ertis_numba import Settings
-    >>> from ertis_numba.geometry import delay_matrix
-    >>> processing = {"processing.delay_matrix": [[0.0, 9.0]], "processing.delay_rate_hz": 450e3}
-    >>> positions = {"array.positions_m": [[0, 0, 0], [0, 0.01, 0]], "array.layout": "pair"}
-    >>> (delay_matrix(Settings().replace(**processing, **positions), n_directions=1) * 1e6).round(6)
-    array([[-10.,  10.]])
+    Positive delays mean later sound. The mean over the layout's microphones is subtracted from each direction, so that
+    ranges count from the centre of the array, as they do with plane waves.
     """
     processing = settings.processing
     given = processing.delay_matrix
@@ -63,10 +53,7 @@ def delay_matrix(settings: Settings, *, n_directions: int) -> NDArray[np.float64
 
 
 def plane_delays(settings: Settings, grid: Grid, *, sound_speed_m_s: float) -> NDArray[np.float64]:
-    """Return the delays of each direction, the given ones or else those of plane waves.
-
-    The result is (direction, mic), in seconds, for the enabled microphones; positive for later sound.
-    """
+    """Return the given delays or else those of plane waves in s: (direction, enabled mic), positive for later sound."""
     given_s = delay_matrix(settings, n_directions=len(grid))
     if given_s is not None:
         return given_s

@@ -7,15 +7,7 @@ __all__ = ["far_field_delays", "spherical_delays", "unit_vectors"]
 
 
 def unit_vectors(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return directions as unit vectors in the sensor frame: (direction, axis).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ertis_numba.geometry import unit_vectors
-    >>> unit_vectors(np.radians([90.0]), np.array([0.0])).round(6).tolist()
-    [[0.0, 1.0, 0.0]]
-    """
+    """Return directions as unit vectors in the sensor frame: (direction, axis)."""
     level = np.cos(elevation_rad)
     return np.stack([level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), np.sin(elevation_rad)], axis=-1)
 
@@ -23,11 +15,7 @@ def unit_vectors(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.flo
 def far_field_delays(
     positions_m: NDArray[np.float64], directions: NDArray[np.float64], *, sound_speed_m_s: float
 ) -> NDArray[np.float64]:
-    """Return the delays of plane waves at each microphone, ``−p·u / c``, relative to the centroid: (direction, mic).
-
-    The result is in seconds. Positions p (mic, axis) are relative to the centroid; u (direction, axis) are unit vectors
-    towards the source.
-    """
+    """Return the delays of plane waves, ``−p·u / c``, in s: (direction, mic), relative to the centroid."""
     return -(directions @ positions_m.T) / sound_speed_m_s
 
 
@@ -38,10 +26,6 @@ def spherical_delays(
     range_m: float,
     sound_speed_m_s: float,
 ) -> NDArray[np.float64]:
-    """Return the delays of the echoes of points, ``(‖r u − p‖ − r) / c``, relative to the centroid: (direction, mic).
-
-    The result is in seconds. Positions p (mic, axis) and the range r are relative to the centroid; u (direction, axis)
-    are unit vectors towards the points.
-    """
+    """Return the delays of point echoes, ``(‖r u − p‖ − r) / c``, in s: (direction, mic), relative to the centroid."""
     points_m = range_m * directions[:, None, :] - positions_m[None, :, :]
     return np.asarray((np.linalg.norm(points_m, axis=-1) - range_m) / sound_speed_m_s)

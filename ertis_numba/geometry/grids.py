@@ -29,10 +29,7 @@ PAPER_GRIDS = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid(DegreesFromRadians):
-    """Directions of an image; ``azimuth_deg`` and ``elevation_deg`` are the same angles in degrees.
-
-    All are (direction,).
-    """
+    """Directions of an image, (direction,); ``azimuth_deg`` and ``elevation_deg`` are the same angles in degrees."""
 
     azimuth_rad: NDArray[np.float64]
     elevation_rad: NDArray[np.float64]
@@ -42,10 +39,7 @@ class Grid(DegreesFromRadians):
 
 
 def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
-    """Return the number of directions of a named grid or of a list; None if the name is the path of a file.
-
-    ``name`` is that of `Processing.directions`.
-    """
+    """Return the number of directions of `Processing.directions`; None for the path of a file."""
     if not isinstance(name, str):
         return len(name)
     head, colon, count = PAPER_GRIDS.get(name, (name,))[0].partition(":")
@@ -63,10 +57,6 @@ def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
 def named_grid(processing: Processing) -> tuple[str, tuple[float, float], tuple[float, float]] | None:
     """Return the kind of a grid, 2d or 3d, with its azimuth and elevation limits in degrees; None for other directions.
 
-    Examples
-    --------
-    >>> from ertis_numba.settings import Processing
-    >>> from ertis_numba.geometry import named_grid
     >>> named_grid(Processing(directions="1850"))
     ('3d', (-45.0, 45.0), (-45.0, 45.0))
     """
@@ -79,11 +69,10 @@ def named_grid(processing: Processing) -> tuple[str, tuple[float, float], tuple[
 
 
 def direction_grid(processing: Processing) -> Grid:
-    """Return the directions that ``processing.directions`` names or lists.
+    """Return the directions that ``processing.directions`` names, or those of a list or a CSV file in degrees.
 
-    ``90``, ``1850`` and ``3000`` are the paper's grids. ``2d:N`` is N azimuths at one elevation, including both limits.
-    ``3d:N`` is N cells of equal area between the limits, in rows of equal elevation. Any other name is the path of a
-    CSV file of azimuth, elevation in degrees.
+    ``2d:N`` is N azimuths at one elevation, including both limits. ``3d:N`` is N cells of equal area between the
+    limits, in rows of equal elevation. ``90``, ``1850`` and ``3000`` are the paper's grids.
     """
     name = processing.directions
     if not isinstance(name, str):

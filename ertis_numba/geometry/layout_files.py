@@ -109,10 +109,7 @@ class LayoutFile(TomlDocument, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True)
 class ReadLayout:
-    """Array of a layout file.
-
-    ``notes`` are for the user; ``unit_is_stated`` is False if the file states no unit.
-    """
+    """Array of a layout file, with notes for the user; ``unit_is_stated`` is False if the file states no unit."""
 
     array: Array
     notes: tuple[str, ...] = ()
@@ -260,10 +257,7 @@ def _spacing(positions: NDArray[np.float64]) -> float:
 
 
 def unclear_unit(source: str, span: float, reason: str = "") -> str:
-    """Return the question for the unit of a file whose array has an implausible extent in millimetres.
-
-    ``span`` is the extent in the unit of the file; ``reason`` is a clause that explains why it is implausible.
-    """
+    """Return the question for the unit of an array whose extent ``span`` is implausible in mm, for a ``reason``."""
     sizes = {unit: factor_m * span for unit, factor_m in LENGTH_UNITS_M.items()}
     likely = [
         f"{unit} ({_length(size_m)})"

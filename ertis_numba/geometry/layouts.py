@@ -179,10 +179,7 @@ def _shipped_array(name: str) -> Array:
 
 
 def microphones(array: Array) -> Layout:
-    """Return the microphones that array settings describe, by position or by name.
-
-    Positions are relative to the centroid of the layout's microphones, including those in ``array.disabled``.
-    """
+    """Return the microphones of an array, relative to the centroid of its layout, which includes ``array.disabled``."""
     fitted = _fitted(array)
     if not array.disabled:
         return fitted

@@ -15,27 +15,13 @@ _ROUNDING = 1e-9
 
 
 def levelled_grid(grid: Grid, attitude_xyzw: ArrayLike) -> tuple[Grid, NDArray[np.bool_]]:
-    """Return directions of the sensor frame for given directions relative to the horizontal plane.
+    """Return directions of the level frame in the sensor frame, and a mask of those with x ≥ 0 behind the sensor.
 
-    The level frame has the origin and the heading of the sensor, and its z axis points up. With the rotation matrix R
-    of the sensor in the world and the heading ψ of its x axis, a direction d of the level frame is ``Rᵀ Rz(ψ) d`` in
-    the sensor frame. Jansen, Laurijssen and Steckel (arXiv 2406.06255) thus compensate the pitch of a vehicle; this
-    function also compensates roll. ``grid``: directions in the level frame. ``attitude_xyzw`` (4,) array_like of float:
-    unit quaternion that rotates the sensor frame into the world frame. ``turned``: the same directions in the sensor
-    frame. ``is_behind`` (direction,) bool: True for directions with x ≥ 0 in the level frame that lie behind the
-    sensor. A planar array cannot distinguish them from directions in front. Raise ArgumentError if the quaternion is
-    invalid, or the sensor looks straight up or down, so that it has no heading.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ertis_numba.geometry import Grid, levelled_grid
-    >>> from scipy.spatial.transform import Rotation
-    >>> ahead = Grid(np.array([0.0]), np.array([0.0]))
-    >>> nose_down = Rotation.from_euler("y", 10, degrees=True).as_quat()
-    >>> turned, _ = levelled_grid(ahead, nose_down)
-    >>> turned.elevation_deg.round(6).tolist()
-    [10.0]
+    The level frame has the origin and the heading ψ of the sensor, and its z axis points up: the result is ``Rᵀ Rz(ψ)
+    d`` for the rotation R of the sensor in the world, the unit quaternion ``attitude_xyzw``. Jansen, Laurijssen and
+    Steckel (arXiv 2406.06255) thus compensate pitch; this function also compensates roll. A planar array cannot
+    distinguish directions behind it. Raise ArgumentError for a sensor that looks straight up or down, because it has no
+    heading.
     """
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  importing it takes longer than this package
 

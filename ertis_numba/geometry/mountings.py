@@ -17,11 +17,9 @@ _UNIT = 1e-6  # deviation from length 1 due to rounding to six digits
 def mounting(
     sensor: str, translation_m: Sequence[float] | None = None, rotation_xyzw: Sequence[float] | None = None
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the validated mounting of a sensor; empty if it is unknown.
+    """Return the validated translation and unit quaternion of a sensor on its platform; empty if both are unknown.
 
-    If only the translation is given, the rotation is the identity. If only the rotation is given, the sensor is at the
-    origin. The result has ``translation_m`` (3,) and ``rotation_xyzw`` (4,), a unit quaternion from the sensor frame to
-    that of the platform.
+    If one of them is missing, the sensor is at the origin, or its rotation is the identity.
     """
     if translation_m is None and rotation_xyzw is None:
         return {}

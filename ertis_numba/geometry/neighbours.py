@@ -19,10 +19,7 @@ _FINER = 4  # columns of a raster per spacing: a direction is displaced by at mo
 
 
 def spacing_rad(directions: NDArray[np.float64]) -> float:
-    """Return the median angle from a direction to its nearest neighbour in radians; π for fewer than two.
-
-    Equal directions count once. ``directions`` are unit vectors (direction, axis).
-    """
+    """Return the median angle from a unit vector (direction, axis) to its nearest different neighbour; π for none."""
     # Importing SciPy's trees takes a tenth of a second, and processing does not need them.
     from scipy.spatial import KDTree  # noqa: PLC0415
 
@@ -39,10 +36,7 @@ def spacing_rad(directions: NDArray[np.float64]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class AzimuthColumns:
-    """Azimuths, and the directions near each of them.
-
-    ``azimuth_rad`` (column,): azimuths in increasing order.
-    """
+    """Azimuths (column,) in increasing order, and the directions near each of them."""
 
     azimuth_rad: NDArray[np.float64]
     _order: NDArray[np.intp]
@@ -57,9 +51,8 @@ class AzimuthColumns:
 def azimuth_columns(azimuth_rad: NDArray[np.float64], elevation_rad: NDArray[np.float64]) -> AzimuthColumns:
     """Return columns of azimuths for display, each with the directions within half of their spacing.
 
-    Directions at several elevations usually have different azimuths. If there are many, a raster with a quarter of
-    their spacing replaces them. Directions in a plane have one column each. ``azimuth_rad``, ``elevation_rad``
-    (direction,).
+    If directions at several elevations have many different azimuths, a raster with a quarter of their spacing replaces
+    them. Directions in a plane have one column each.
     """
     order = np.argsort(azimuth_rad, kind="stable")
     rising = azimuth_rad[order]

@@ -21,11 +21,10 @@ _UPRIGHT: Final = 0.05  # Component of a unit vector, below which it is 0: 3°.
 
 
 class ObservableAngles(NamedTuple):
-    """Angles that an array can observe.
+    """Angles that an array can observe: False for an angle if echoes from all of its values sound alike.
 
-    - ``azimuth``, ``elevation``: False if echoes from all values of the angle sound alike.
-    - ``note``: predicate of the sensor that names unknown or ambiguous angles, and the reason; None if there are none.
-    - ``line`` (axis,) or None: unit vector along an array on a line; None for others.
+    ``note`` is a predicate of the sensor with the unknown or ambiguous angles and the reason, None if there are none.
+    ``line`` (axis,) is the unit vector along an array on a line, None for others.
     """
 
     azimuth: bool
@@ -42,7 +41,7 @@ class ObservableAngles(NamedTuple):
         """Return the azimuth and the elevation of a direction; NaN for angles that the array cannot observe.
 
         For arrays on a horizontal line, the azimuth is that of the direction in the horizontal plane that sounds alike.
-        ``is_planar``: True if all compared directions lie at one elevation; the azimuth then remains.
+        It also remains if all compared directions lie at one elevation (``is_planar``).
         """
         if self.line is not None and self.azimuth and not is_planar:
             (direction,) = unit_vectors(np.array([azimuth_rad]), np.array([elevation_rad]))

@@ -28,11 +28,7 @@ _UNIT_IN_COMMENT: Final = re.compile(r"\b(?:in|units?)\b[\s:=(\[]*([^\W\d_]+)", 
 
 @dataclass(frozen=True, slots=True)
 class ColumnHeading:
-    """Heading of a column.
-
-    - ``axis``: axis of the positions in the column; empty for other columns.
-    - ``unit``: unit in the heading, also one that is not accepted; empty if there is none.
-    """
+    """Axis and unit in the heading of a column; empty for other columns, or without a unit, which may be unaccepted."""
 
     text: str = ""
     axis: str = ""

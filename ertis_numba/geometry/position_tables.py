@@ -27,11 +27,7 @@ _Rows = Sequence[tuple[int, list[str]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PositionTable:
-    """Positions as a file states them.
-
-    ``positions`` (channel, axis): coordinates x, y and z in the unit of the file; x is 0 if the file has none.
-    ``unit``: unit that the file states; empty if it states none.
-    """
+    """Positions (channel, axis) in the unit that a file states, empty for none; x is 0 if the file has none."""
 
     positions: NDArray[np.float64]
     unit: str
@@ -42,9 +38,8 @@ def read_position_table(source: str, text: str) -> PositionTable:
     """Return the positions in a table with one row per channel, in the order of the bits.
 
     Cells are separated by commas, semicolons, tabs or spaces; a decimal comma is accepted unless commas separate. A
-    comment follows #, % or //. A header, or a comment above the positions, names the axes in any order, and may state
-    their unit, as in ``x_m``, ``y (mm)`` or ``Z [cm]``. Without a header, columns are ``y, z`` or ``x, y, z``, after a
-    column of names or numbers of the channels, if any.
+    comment follows #, % or //. A header, or a comment above the positions, names the axes in any order and may state
+    their unit, as in ``x_m`` or ``y (mm)``. Without one, columns are ``y, z`` or ``x, y, z`` after names or numbers.
     """
     lines, comments = _without_comments(text)
     rows = list(_cells(lines))

@@ -33,10 +33,9 @@ def round_step(length: float, largest: int) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fan:
-    """Sector that an image covers; with several elevations, it shows their maximum.
+    """Sector that an image covers: ranges (first, last) and rising azimuths; several elevations show their maximum.
 
-    ``azimuth_rad`` (azimuth,): rising. A thin image becomes two degrees wide, and a full circle ends with its first
-    azimuth. ``range_m`` (first, last).
+    A thin image becomes two degrees wide, and a full circle ends with its first azimuth.
     """
 
     azimuth_rad: NDArray[np.float64]

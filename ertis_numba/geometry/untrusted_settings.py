@@ -11,8 +11,7 @@ __all__ = ["received_settings"]
 def received_settings(text: bytes | str, source: str, *, are_applied: bool = False) -> Settings:
     """Parse settings from an untrusted source, and reject names of files on this machine.
 
-    ``are_applied``: True to accept any name as ``processing.directions`` and ``delay_matrix``, because the directions
-    themselves accompany the settings, and their images exist.
+    ``are_applied`` accepts any name of directions and delays, because they accompany the settings, and images exist.
     """
     if isinstance(text, bytes):
         if len(text) > Settings.max_bytes:  # before a copy of it is made

@@ -39,17 +39,11 @@ _MAX_ROUNDING_ERROR_DB = (
 
 
 def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.float64]:
-    """Return the emitted call: (sample,) float64, amplitude 1 between its ramps, after the silence before it.
+    """Return the emitted call: (sample,), amplitude 1 between its ramps, after the silence before it.
 
     Hyperbolic sweeps have the frequency ``f(t) = 1 / (1/f₀ + t (1/f₁ − 1/f₀) / T)`` and the phase
     ``2π T / (1/f₁ − 1/f₀) · ln(f₀ / f(t))``, from t = 0 to T inclusive (J. J. Kroszczynski, Pulse compression by means
-    of linear-period modulation, Proc. IEEE 57, 1969). Linear sweeps have the frequency ``f(t) = f₀ + t (f₁ − f₀) / T``
-    and the phase ``2π (f₀ t + t² (f₁ − f₀) / 2T)``. Custom waveforms are interpolated; see `call_at`.
-
-    Parameters
-    ----------
-    rate_hz : float, optional
-        Sample rate in hertz; that of the call by default.
+    of linear-period modulation, Proc. IEEE 57, 1969). Linear sweeps have the frequency ``f(t) = f₀ + t (f₁ − f₀) / T``.
     """
     rate_hz = call.sample_rate_hz if rate_hz is None else rate_hz
     call.require_samples()
@@ -107,19 +101,9 @@ def _phase_rad(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
 def call_spectrum(
     call: Call, settings: Settings, *, n_fft: int, decimation: int | None = None
 ) -> NDArray[np.complex128]:
-    """Return the one-sided spectrum of a call in decimated signals: (bin,) complex128.
+    """Return the one-sided spectrum of a call in decimated signals: (bin,); the decimation defaults to the settings'.
 
-    The call is sampled at the rate of the record. At the decimated rate, a call that is short or has no ramp would
-    alias, because it has power above the Nyquist frequency. The decimation filter removes that power from the signals.
-
-    Parameters
-    ----------
-    settings : Settings
-        Settings of the record.
-    n_fft : int
-        Length of the transform of decimated signals, at least that of the call.
-    decimation : int, optional
-        Samples of the record per signal sample; that of the settings by default.
+    The call is sampled at the rate of the record. At the decimated rate, a short call without ramps would alias.
     """
     decimation = settings.decimation if decimation is None else decimation
     return _call_spectrum(call, settings.recording.sample_rate_hz, n_fft, decimation)
@@ -132,17 +116,9 @@ def _call_spectrum(call: Call, sample_rate_hz: float, n_fft: int, decimation: in
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchedFilterSpectrum:
-    """The matched filter of a call as the occupied bins of a one-sided spectrum.
+    """The matched filter of a call as the occupied bins of a one-sided spectrum, (bin,), from ``first_bin`` on.
 
-    Attributes
-    ----------
-    first_bin : int
-        Bin of the first value.
-    values : (bin,) complex128
-    echo_power : (bin,) float64
-        Spectrum of the filtered call without its phase, in any unit.
-    centre_hz : float
-        Mean frequency of the filtered call, weighted by its power.
+    ``echo_power``: power of the filtered call in any unit; ``centre_hz``: its mean frequency, weighted by this power.
     """
 
     first_bin: int
@@ -161,10 +137,10 @@ def matched_band_hz(settings: Settings) -> tuple[float, float]:
 
 
 def matched_guard_s(settings: Settings, *, down_db: float = 60.0) -> float:
-    """Return the time in seconds that the matched filter rings, until its level has fallen by ``down_db``.
+    """Return the time that the matched filter rings before and after the call until it has fallen by ``down_db``.
 
-    It rings before and after the call. The edges of its band are raised cosines, whose transform falls with the third
-    power of time. Own filters extend it by half of their length.
+    The edges of its band are raised cosines, whose transform falls with the third power of time. Own filters extend it
+    by half of their length.
     """
     low_hz, high_hz = matched_band_hz(settings)
     narrowest_hz = min(settings.call.low_frequency_hz - low_hz, high_hz - settings.call.high_frequency_hz)
@@ -174,26 +150,11 @@ def matched_guard_s(settings: Settings, *, down_db: float = 60.0) -> float:
 
 
 def matched_filter_spectrum(settings: Settings, *, n_fft: int, decimation: int | None = None) -> MatchedFilterSpectrum:
-    """Return the matched filter, with own filters, for spectra of ``n_fft`` points of decimated signals.
+    """Return the read-only matched filter, with own filters, for spectra of ``n_fft`` points of decimated signals.
 
     ``H(f) = g conj(S(f)) W(f) F(f)`` for positive frequencies and 0 for others, with S the spectrum of the call, W a
     window that is 1 over the call's band and falls to 0 outside it as a raised cosine, F the gain of own filters, and g
-    such that the call itself gives an analytic signal with an envelope of 1 at its peak, unless F distorts phases:
-    ``g Σ |S|² W |F| = n_fft``.
-
-    Parameters
-    ----------
-    settings : Settings
-        Settings with the call, the rate of the record and the edges of the band.
-    n_fft : int
-        Even or odd, at least as long as the call.
-    decimation : int, optional
-        Samples of the record per signal sample; that of the settings by default.
-
-    Returns
-    -------
-    MatchedFilterSpectrum
-        Its values are read-only, because several callers share them.
+    such that the call itself gives an envelope of 1, unless F distorts phases: ``g Σ |S|² W |F| = n_fft``.
     """
     decimation = settings.decimation if decimation is None else decimation
     band_hz = matched_band_hz(settings)
@@ -244,9 +205,9 @@ def _matched_filter_spectrum(
 
 
 def matched_noise_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies in hertz, and shares of the power of white noise after the matched filter: (wave,) float64.
+    """Return frequencies in Hz, and shares of the power of white noise after the matched filter: (wave,), sum 1.
 
-    The shares add up to 1. The band of an echo, which is weighted by its own spectrum as well, is slightly narrower.
+    The band of an echo, which is weighted by its own spectrum as well, is slightly narrower.
     """
     rate_hz, fine_hz = settings.signal_rate_hz, 4 * settings.call.high_frequency_hz
     n_fft = round(max(8 * math.ceil(settings.call.end_s * fine_hz), 1024) * rate_hz / fine_hz)
@@ -263,31 +224,10 @@ def matched_noise_spectrum(settings: Settings, *, n_waves: int) -> tuple[NDArray
 def decimation_taps(
     *, sample_rate_hz: float, decimation: int, pass_hz: float, stopband_attenuation_db: float = _STOPBAND_ATTENUATION_DB
 ) -> NDArray[np.float64]:
-    """Return the anti-aliasing filter of a decimation: (tap,) float64, sum 1.
+    """Return the anti-aliasing filter of a decimation, (tap,), with the sum 1: a sinc under a Kaiser window (1974).
 
-    The filter is a sinc under a Kaiser window (J. F. Kaiser, 1974). It attenuates frequencies that would alias into ``0
-    … pass_hz`` by ``stopband_attenuation_db``, with a tolerance of half a decibel. Its length is ``2 k · decimation +
-    1``, so that the group delay is exactly k samples of the decimated signal.
-
-    Parameters
-    ----------
-    sample_rate_hz : float
-        Rate before the decimation in hertz.
-    decimation : int
-        Samples before the decimation per sample after it.
-    pass_hz : float
-        Upper edge of the band without aliasing, in hertz.
-    stopband_attenuation_db : float
-        Stopband attenuation in dB.
-
-    Returns
-    -------
-    (tap,) float64
-
-    Raises
-    ------
-    ArgumentError
-        The decimated rate is too low for ``pass_hz``.
+    It attenuates frequencies that would alias into ``0 … pass_hz`` by the stopband attenuation within half a decibel.
+    Its length is ``2 k · decimation + 1``, so the group delay is exactly k decimated samples.
     """
     taps = _decimation_taps(sample_rate_hz, decimation, pass_hz, stopband_attenuation_db)
     return taps.copy()
@@ -331,24 +271,10 @@ def _windowed_sinc(half: int, decimation: int, width_rad: float) -> NDArray[np.f
 
 
 def integer_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int16] | NDArray[np.int32]:
-    """Return a filter with integer taps whose magnitudes add up to at most the largest integer: (tap,) int16 or int32.
+    """Return (tap,) integers whose magnitudes add up to at most the largest integer of ``bits``, 16 or 32.
 
-    Only the taps are rounded; sums over them are exact. Rounding some hundred taps to 16 bits changes the response by
-    -65 dB or less.
-
-    Parameters
-    ----------
-    taps : (tap,) float64
-    bits : {16, 32}
-
-    Returns
-    -------
-    (tap,) int16 or int32
-
-    Raises
-    ------
-    ArgumentError
-        Rounding so many taps changes the response by more than -50 dB.
+    Sums over them are exact. Rounding some hundred taps to 16 bits changes the response by -65 dB or less. Raise
+    ArgumentError if there are so many taps that it changes by more than -50 dB.
     """
     limit = np.iinfo(np.int16 if bits == 16 else np.int32).max
     scale = max(limit - len(taps) / 2, 0.0) / np.abs(taps).sum()  # Rounding adds up to half a unit per tap.
@@ -364,9 +290,6 @@ def integer_taps(taps: NDArray[np.float64], *, bits: int = 16) -> NDArray[np.int
 
 
 def filter_response(taps: NDArray[np.float64], frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the gain of a symmetric filter without its group delay: (frequency,) float64.
-
-    ``frequency`` is in cycles per sample of the filter's input.
-    """
+    """Return the gain of a symmetric filter without its group delay; frequencies are in cycles per input sample."""
     position = np.arange(len(taps)) - (len(taps) - 1) / 2
     return np.asarray(np.cos(2 * math.pi * frequency[:, None] * position) @ taps)

@@ -16,15 +16,12 @@ _SAMPLES = 4097  # of a window; the error of linear interpolation between them i
 
 
 def array_weights(settings: Settings) -> NDArray[np.float64]:
-    """Return the weight of each enabled microphone, with a mean of 1: (mic,) float64.
+    """Return the weight of each enabled microphone, by its distance from the centre, with a mean of 1: (mic,).
 
-    A window is a function of the distance from the centre of the array, relative to the radius of the aperture. The
-    aperture extends beyond the outermost microphone by half of the mean distance between neighbours, so that no
-    microphone has the weight 0.
-
-    A mean of 1 preserves the level of an echo to which all microphones contribute in phase. The constraint ``wᴴv = 1``
-    does the same for the response in the steered direction (H. L. Van Trees, Optimum Array Processing, 2002, sections
-    2.6 and 3.1).
+    The aperture extends beyond the outermost microphone by half of the mean distance between neighbours, so that no
+    microphone has the weight 0. A mean of 1 preserves the level of an echo to which all microphones contribute in
+    phase, as ``wᴴv = 1`` does in the steered direction (H. L. Van Trees, Optimum Array Processing, 2002, sections 2.6
+    and 3.1).
     """
     layout, given = microphones(settings.array), settings.processing.array_weights
     if given == "uniform":
@@ -40,11 +37,7 @@ def array_weights(settings: Settings) -> NDArray[np.float64]:
 
 
 def effective_count(weights: NDArray[np.float64]) -> float:
-    """Return the number of equally weighted microphones with the same gain over uncorrelated noise, ``(Σw)² / Σw²``.
-
-    It is the white noise gain of the array (Van Trees, section 2.6.2). With uniform weights it is the number of
-    microphones. ``weights`` are (mic,) with a mean of 1.
-    """
+    """Return the number of equally weighted microphones with the same white noise gain, ``(Σw)² / Σw²``."""
     return len(weights) / float(np.mean(weights**2))
 
 
