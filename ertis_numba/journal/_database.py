@@ -52,11 +52,7 @@ _MESSAGES: Final = {
 
 
 class Database:
-    """SQLite file with the tables of a journal, locked against other processes.
-
-    The system releases the lock when the process ends, even after a crash. With ``empty``, an empty file becomes a new
-    journal, and ``is_new`` is true.
-    """
+    """SQLite file with the tables of a journal, locked by this process; an ``empty`` file becomes a new journal."""
 
     def __init__(self, path: Path, *, empty: bool) -> None:
         self._path = path
@@ -145,9 +141,8 @@ class Database:
     def use_rollback_journal(self) -> None:
         """Switch to a rollback journal permanently, so that commits write to the main file at once.
 
-        Until then, a commit needs one sync, and a full log is moved to the main file: if each commit fills it, all data
-        is written twice. A rollback journal stores only the old content of changed pages, of which new rows have none,
-        but a commit needs four syncs. After a DataError, nothing has changed.
+        A full log writes all data twice if each commit fills it, but needs one sync. A rollback journal stores only old
+        content, but a commit needs four syncs. After a DataError, nothing has changed.
         """
         if not self._uses_rollback_journal:
             self._set_rollback_mode("DELETE")
@@ -188,10 +183,7 @@ class Database:
         return bool(self.execute("SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = ?", (name,)))
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """Run a statement and return its rows.
-
-        Raises JournalInUseError, DamagedError, or DataError (disk full, failing or not writable; file closed).
-        """
+        """Run a statement and return its rows; raise JournalInUseError, DamagedError, or DataError."""
         with self._translate_errors():
             return self._connection.execute(statement, values).fetchall()
 
@@ -247,10 +239,7 @@ class Database:
             self.execute(statement)
 
     def copy_to(self, path: Path) -> None:
-        """Copy the current pages of the file.
-
-        The open connection makes the copy. A second descriptor would release the lock when it is closed (POSIX).
-        """
+        """Copy the current pages by the open connection: closing a second descriptor would release the lock (POSIX)."""
         with self._translate_errors():
             copy = sqlite3.connect(path, isolation_level=None)
             try:

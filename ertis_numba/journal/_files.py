@@ -31,10 +31,7 @@ def unused_path(path: Path, end: str) -> Path:
 
 
 def keep_damaged_log(path: Path, content: bytes) -> Path | None:
-    """Keep a copy of a damaged log; return its path, or None if a copy with the same content exists.
-
-    Earlier copies stay: they may contain the only data of other measurements.
-    """
+    """Keep a copy of a damaged log beside earlier ones; return its path, or None if such a copy exists."""
     log = companion(path, "-wal")
     for kept in log.parent.iterdir():
         if kept.name.startswith(f"{log.name}.") and kept.suffix == ".damaged" and _holds(kept, content):

@@ -25,12 +25,10 @@ def recording_bytes(words_bytes: int, *, n_rows: int, n_sensors: int, has_poses:
 
 
 def require_free_space(path: Path, target: Path, *, sizes_bytes: Sequence[int], seals_bytes: int) -> None:
-    """Refuse measurements or poses after which a journal could not be sealed any more.
+    """Refuse measurements or poses of given sizes after which a journal could not be sealed any more.
 
-    The disk of ``target`` needs space for the recording of the whole journal, and a reserve. The disk of the journal
-    needs space to move the log to the main file, and for the new content in both; without a log, for the new content
-    and the changed pages. ``sizes_bytes`` are those of each new measurement, or of all new poses; ``seals_bytes`` is
-    that of the recording with them.
+    The disk of ``target`` needs space for the recording (``seals_bytes``) and a reserve; that of the journal for the
+    new content and for moving the log to the main file or, without a log, for the changed pages.
     """
     log = path.with_name(f"{path.name}-wal")
     grows_bytes = sum((size // PAGE_BYTES + 2) * PAGE_BYTES for size in sizes_bytes)

@@ -23,11 +23,9 @@ __all__ = ["SUFFIX", "Journal"]
 
 
 class Journal(WritableJournal):
-    """Durable measurements until they are sealed into a recording.
+    """Durable measurements until they are sealed into the recording ``target``; threads may share it, processes not.
 
-    Create it with `create` or `open`, and close it after use, or use it in a ``with`` statement. No other process can
-    open it meanwhile. Threads may share it. ``target`` is the recording to be made from it, and ``remark`` a line about
-    files that `create` has renamed.
+    Create it with `create` or `open`, and close it. ``remark`` is a line about files that `create` has renamed.
     """
 
     def __init__(self, path: Path, database: Database) -> None:
@@ -41,11 +39,7 @@ class Journal(WritableJournal):
 
     @classmethod
     def create(cls, path: str | Path, *, target: str | Path, source: str = "") -> Self:
-        """Create a journal.
-
-        By convention, ``path`` is that of the recording ``target`` followed by `SUFFIX`. A relative ``target`` starts
-        at the folder of the journal.
-        """
+        """Create a journal, by convention at ``target`` + `SUFFIX`; a relative target starts at its folder."""
         path = Path(path)
         try:
             os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -71,11 +65,7 @@ class Journal(WritableJournal):
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
-        """Open a journal, regardless of how the process that wrote it ended.
-
-        Raises JournalInUseError if another process has it open; DataError if it is missing, damaged, or not writable;
-        or FormatVersionError if a newer version wrote it.
-        """
+        """Open a journal, regardless of how the process that wrote it ended."""
         path = Path(path)
         log = read_log(path)
         if log is not None and log.is_truncated:
@@ -105,12 +95,10 @@ class Journal(WritableJournal):
 
     @staticmethod
     def abandon(path: str | Path, acked: Mapping[tuple[str, int], int]) -> None:
-        """Limit a closed journal durably to its acknowledged measurements.
+        """Limit a closed journal durably to its ``acked`` numbers by (sensor, session_id); remove it if there are none.
 
         After a failed sync, a journal may show rows that never reach the disk. Store those that were not acknowledged
-        in another journal: the next process that opens this one deletes them first. A journal without acknowledged
-        measurements is removed. ``acked`` has the highest acknowledged number of each (sensor, session_id) that has
-        one. After an OSError or DataError, call this again.
+        in another journal: the next process that opens this one deletes them first. After an error, call this again.
         """
         path = Path(path)
         if acked:
@@ -147,10 +135,7 @@ class Journal(WritableJournal):
         self.tally.begin(self._identity)
 
     def restore_header(self, header: Sequence[Any]) -> None:
-        """Restore the header of the journal from before its log was damaged.
-
-        ``header`` has the columns of the table ``journal``, except the first and the last.
-        """
+        """Restore all columns but the first and the last of the table ``journal`` from before its log was damaged."""
         identity = row_crc32(header)
         with self._lock:
             if identity != self._identity:
@@ -161,10 +146,7 @@ class Journal(WritableJournal):
                 self.tally.begin(identity)
 
     def free_log(self) -> None:
-        """Move the content of the log to the main file and truncate the log, which frees its disk space.
-
-        After a DataError, the stored measurements are safe.
-        """
+        """Move the log to the main file and truncate it to free its space; after a DataError, measurements are safe."""
         with self._lock:
             self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
@@ -182,10 +164,7 @@ class Journal(WritableJournal):
             fsync(self.path.parent)
 
     def set_aside(self, end: str = "damaged") -> Path:
-        """Close the journal, rename it so that it is never sealed again, and return its new path.
-
-        ``end`` is the new suffix without its dot. After a DataError, the journal keeps its name.
-        """
+        """Close the journal, rename it with the suffix ``end`` so that it is never sealed again; return its path."""
         with self._lock:
             try:
                 self._prepare_rename()

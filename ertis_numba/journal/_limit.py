@@ -20,11 +20,7 @@ LIMIT: Final = "-limit"
 
 
 def write_limit(path: Path, acked: Mapping[tuple[str, int], int]) -> None:
-    """Write the limit of a journal durably.
-
-    ``acked`` has the highest acknowledged number of each (sensor, session_id); no number of other sessions was
-    acknowledged.
-    """
+    """Write durably the highest acknowledged number by (sensor, session_id); other sessions have none."""
     runs: list[list[str | int]] = [[sensor, session_id, last] for (sensor, session_id), last in acked.items()]
     text = json.dumps({"runs": runs, "crc32": _check(runs)})
     with atomic_write(_limit_path(path), overwrite=True, token="new") as part:  # noqa: S106  the folder has one writer

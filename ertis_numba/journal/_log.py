@@ -28,11 +28,10 @@ _PAGE_BYTES: Final = range(512, 65_537)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WriteAheadLog:
-    """A write-ahead log as stored on the disk.
+    """A write-ahead log on the disk; SQLite reads ``n_read`` frames, up to the commit before a wrong checksum.
 
-    SQLite reads ``n_read`` frames, up to the last commit before the first wrong checksum; ``n_frames`` counts those up
-    to the last commit of this generation of the log. ``n_lost_commits`` counts the commits that SQLite will not read
-    although they were synced; the last commit of a log never counts.
+    ``n_frames`` counts those up to the last commit of this generation. ``n_lost_commits`` counts the commits that
+    SQLite will not read although they were synced; the last commit of a log never counts.
     """
 
     content: bytes

@@ -29,12 +29,10 @@ _LOCK_BYTES: Final = (0x40000000, 512)  # Lock bytes of SQLite, see https://sqli
 
 
 def choose_log(path: Path, log: WriteAheadLog) -> None:
-    """Replace a damaged log that would damage its journal, and keep a copy of it.
+    """Replace a damaged log that would damage its journal, and keep a copy of it; after an error, nothing has changed.
 
     The log stays if the journal is intact with the part that SQLite reads. Otherwise it is replaced by a repaired log,
-    which SQLite reads completely, or removed, whichever gives an intact journal. A journal that another process has
-    open is not changed. Raises DamagedError if the journal is intact with none of these logs. After an error, nothing
-    has changed.
+    which SQLite reads completely, or removed, whichever gives an intact journal; if neither does, raise DamagedError.
     """
     with _locked(path) as is_unused:
         if not is_unused:

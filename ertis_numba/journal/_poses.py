@@ -25,10 +25,10 @@ _ROW_BYTES: Final = 100  # Numbers, checksum and index of a row: 91 to 102 bytes
 
 @dataclass(frozen=True, slots=True)
 class JournalPose:
-    """Pose of a platform in the world frame, for the measurements of the sensors on it.
+    """Pose of a platform in the world frame at a time since 1970-01-01 UTC, for the measurements of the sensors on it.
 
-    ``timestamp_ns`` counts from 1970-01-01 UTC, and the unit quaternion ``rotation_xyzw`` rotates the platform frame
-    into the world frame. ``covariance`` has 6 by 6 little-endian doubles, as in `Trajectory`; it is empty if unknown.
+    ``rotation_xyzw`` rotates the platform frame into the world frame. ``covariance`` has 6 by 6 little-endian doubles,
+    as in `Trajectory`; it is empty if unknown.
     """
 
     sensors: tuple[str, ...]
@@ -62,10 +62,7 @@ class JournalPose:
 def pose_blocks(
     database: Database, path: Path, *, after: int = 0, n_max: int = _BLOCK
 ) -> Iterator[tuple[list[JournalPose], int]]:
-    """Yield blocks of poses in order of arrival: the undamaged ones, and the number of damaged ones.
-
-    ``after`` is the number of the last row to leave out, and ``n_max`` the largest number of rows in a block.
-    """
+    """Yield blocks of up to ``n_max`` poses after row ``after``: the undamaged ones, and the number of damaged ones."""
     if not database.has_table(POSES):
         return
     statement = select_statement(POSES, "WHERE id > ? ORDER BY id LIMIT ?")
@@ -87,11 +84,9 @@ def read_poses(database: Database, path: Path, *, after: int = 0) -> tuple[list[
 
 
 def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Trajectory:
-    """Return the trajectory through poses; of several poses at one time, the first counts.
+    """Return the trajectory through poses of one platform in any order; of several poses at one time, the first counts.
 
-    The covariance is None if that of any pose is unknown. The source lists the sources of the poses. ``poses`` of one
-    platform are in any order, at least one; ``max_gap_s`` is the longest interval of the trajectory between poses.
-    Raises ArgumentError or ValueError for an impossible pose.
+    The covariance is None if that of any pose is unknown. The source lists the sources of the poses.
     """
     time_ns, first = np.unique([pose.timestamp_ns for pose in poses], return_index=True)
     kept = [poses[index] for index in first]
@@ -108,11 +103,7 @@ def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Tra
 
 
 class PosesAround:
-    """Poses next to given times, selected from any number of poses.
-
-    Memory depends on the number of times only, since a trajectory needs only the first and the last pose between two
-    times. ``time_ns`` is in any order; ``max_gap_s`` is the longest interval of the trajectory between poses.
-    """
+    """First and last pose between two given times, so that memory depends on the number of times only."""
 
     def __init__(self, time_ns: ArrayLike, *, max_gap_s: float) -> None:
         self._wanted_ns = np.unique(np.asarray(time_ns, np.int64))
@@ -123,10 +114,7 @@ class PosesAround:
         self._sources: dict[str, None] = {}
 
     def add(self, poses: Sequence[JournalPose]) -> None:
-        """Add poses in any order; the first of several poses at one time counts.
-
-        Raises ArgumentError or ValueError for an impossible pose.
-        """
+        """Add poses in any order; the first of several poses at one time counts."""
         if not poses:
             return
         self._waiting.append(trajectory_through(poses, max_gap_s=self._max_gap_s))

@@ -33,11 +33,10 @@ skipped by the sensor.
 
 @dataclass(slots=True)
 class _RecoveredRows:
-    """Rows of a repaired copy that the journal lacks.
+    """Rows of a repaired copy that the journal lacks; ``is_complete`` if all rows have readable numbers without holes.
 
     ``lost`` contains measurements with intact record and damaged samples. ``n_unreadable`` counts all other damaged
-    ones. ``pose_damage`` describes lost poses; it is empty if there are none. ``is_complete`` is True if all rows have
-    readable numbers without holes in the order of arrival.
+    ones. ``pose_damage`` describes lost poses; it is empty if there are none.
     """
 
     header: list[Any] = field(default_factory=list)
@@ -52,11 +51,7 @@ class _RecoveredRows:
 
 
 def recover_rows(journal: "Journal", database: Database, log: WriteAheadLog | None) -> str:
-    """Recover rows of a damaged log that SQLite does not read, and note lost numbers as gaps.
-
-    ``log`` is that from before the journal was opened. Returns losses that no gap of the journal covers, or an empty
-    text.
-    """
+    """Recover rows that SQLite does not read in the log from before opening; return losses that no gap covers."""
     n_commits = log.n_lost_commits if log is not None else 0
     try:
         missing = list(_missing(journal))
@@ -126,10 +121,7 @@ def _missing_parts(journal: "Journal", gap: SequenceGap) -> Iterator[SequenceGap
 
 
 def _read_copy(journal: "Journal", database: Database, log: WriteAheadLog) -> _RecoveredRows:
-    """Read the rows that the journal lacks from a copy of it with the repaired log.
-
-    Each row has its own checksum, so a wrong repair cannot give wrong rows.
-    """
+    """Read lacking rows from a copy with the repaired log; by their checksums, a wrong repair gives no wrong row."""
     n_bytes = journal.path.stat().st_size + 2 * len(log.content)
     if shutil.disk_usage(journal.path.parent).free < 2 * n_bytes:
         raise DataError(f"{journal.path.parent} has no space for a copy of {journal.path.name}; free some space")

@@ -39,12 +39,7 @@ class WritableJournal(ReadableJournal):
         translation_m: Sequence[float] | None = None,
         rotation_xyzw: Sequence[float] | None = None,
     ) -> None:
-        """Register a sensor at any time before its first measurement.
-
-        The air of its measurements may differ from ``settings``; the content of layout files is stored in the journal.
-        The mounting is as in `JournalSensor`, and unknown without both parts. Raises ArgumentError if the sensor exists
-        already, or a recording cannot contain it.
-        """
+        """Register a sensor before its first measurement, with an unknown mounting if both parts are None."""
         made = JournalSensor.from_settings(
             name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
         )
@@ -56,13 +51,11 @@ class WritableJournal(ReadableJournal):
             self._register(len(self._ids) + len(self._unusable) + 1, made)
 
     def append(self, entries: Sequence[JournalEntry]) -> None:
-        """Store measurements durably, all or none.
+        """Store measurements of any sensors durably, all or none, with numbers that rise within a session.
 
-        Sensors may be in any order; the sequence numbers of a sensor rise within a session. ``crc32`` is filled in if
-        it is None. Raises ArgumentError if a measurement does not match its sensor, or its number does not rise;
-        DiskFullError if the disk is nearly full and nothing was written, so that a later call may succeed; DataError if
-        the disk fails (earlier measurements are safe); or JournalInUseError if another process removed or replaced the
-        journal.
+        Raises DiskFullError if the disk is nearly full and nothing was written, so that a later call may succeed;
+        DataError if the disk fails (earlier measurements are safe); or JournalInUseError if another process removed or
+        replaced the journal.
         """
         with self._lock:
             last = dict(self._last)
@@ -104,10 +97,7 @@ class WritableJournal(ReadableJournal):
         return row
 
     def note_gap(self, sensor: str, first: int, last: int, reason: str, *, session_id: int) -> None:
-        """Store durably why numbers of a sensor's session are missing, ``first`` and ``last`` included.
-
-        Raises ArgumentError if the sensor or session is unknown, or the reason is not a line of at most 64 bytes.
-        """
+        """Store durably why numbers ``first`` to ``last`` included are missing, in a line of at most 64 bytes."""
         self.note_gaps([SequenceGap(sensor, first, last, reason, session_id)])
 
     def note_gaps(self, gaps: Sequence[SequenceGap]) -> None:
@@ -124,10 +114,7 @@ class WritableJournal(ReadableJournal):
                 self.tally.record(gap.sensor, gap.session_id, gap.first, gap.last)
 
     def append_poses(self, poses: Sequence[JournalPose]) -> None:
-        """Store poses of platforms durably, all or none.
-
-        Raises DiskFullError, DataError and JournalInUseError as `append` does.
-        """
+        """Store poses of platforms durably, all or none; errors are those of `append`."""
         with self._lock:
             sizes_bytes = [sum(pose.n_bytes for pose in poses)]
             seals_bytes = self._recording_bytes(adds_poses=True)
@@ -140,11 +127,10 @@ class WritableJournal(ReadableJournal):
             self._has_poses = True
 
     def discard(self, sensor: str, session_id: int, up_to: int) -> int:
-        """Delete measurements of a sensor's session that another node has stored, and gaps; durably, all or none.
+        """Delete measurements up to a number that another node has stored, and gaps; durably. Return their number.
 
         As rows of several sensors are interleaved, row numbers then have holes; the journal has version `VERSION`, and
-        readers count rows. ``up_to`` is the last sequence number to delete; a gap that extends beyond it is kept
-        unchanged. Returns the number of deleted measurements.
+        readers count rows. A gap that extends beyond ``up_to`` is kept unchanged.
         """
         known = self._sensor(sensor)
         which = self._ids[known.name], session_id, up_to

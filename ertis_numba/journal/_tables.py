@@ -167,16 +167,10 @@ def select_statement(table: str, where: str = "") -> str:
 
 
 def row_crc32(values: Iterable[float | str | bytes | None]) -> int:
-    """Return the CRC-32 of a row.
+    """Return the CRC-32 of a row: of each value its type letter, its length in bytes, and its bytes.
 
-    The checksum covers the values in order. Each value is encoded as a letter for its type, the number of bytes as a
-    little-endian 32-bit integer, and the bytes. The types are:
-
-    - ``I``: integer, as decimal digits with a ``-`` if negative
-    - ``R``: real number, as a little-endian double
-    - ``T``: text, as UTF-8
-    - ``B``: bytes
-    - ``N``: NULL, without bytes
+    The length is a little-endian 32-bit integer. The types are: I, an integer as decimal digits with a ``-`` if
+    negative; R, a little-endian double; T, text as UTF-8; B, bytes; N, NULL without bytes.
     """
     check = 0
     for value in values:

@@ -24,10 +24,7 @@ _BLOCK_BYTES: Final = 512  # Size of a sector, which a disk writes as a whole.
 
 @dataclass(slots=True)
 class SequenceRange:
-    """First and last number of the stored measurements and gaps of a sensor's session.
-
-    Measurements up to ``discarded`` may have been deleted; -1 if none was.
-    """
+    """First and last stored number of a session; numbers up to ``discarded`` may be deleted, -1 if none was."""
 
     sensor: str
     session_id: int
@@ -40,10 +37,7 @@ _FIELDS: Final = tuple(field.name for field in fields(SequenceRange))
 
 
 class Tally:
-    """File with one block for each session, updated after each commit.
-
-    ``damage`` describes known losses that no gap of the journal covers.
-    """
+    """File with one block for each session, updated after each commit; ``damage`` lists losses that no gap covers."""
 
     def __init__(self, journal: Path) -> None:
         self.path = journal.with_name(f"{journal.name}{TALLY}")
@@ -101,10 +95,7 @@ class Tally:
             os.fsync(self._descriptor)
 
     def limit(self, acked: Mapping[tuple[str, int], int]) -> None:
-        """Remove numbers above the acknowledged ones, because a failed journal does not contain them reliably.
-
-        ``acked`` has the highest acknowledged number of each (sensor, session_id) that has one.
-        """
+        """Remove numbers above the acknowledged ones, because a failed journal does not contain them reliably."""
         for run, mark in self.ranges.items():
             last = max(acked.get(run, -1), mark.first - 1)
             if mark.last > last:

@@ -30,15 +30,13 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class SealingResult:
-    """Result of sealing a journal.
+    """Result of sealing a journal; ``recording`` is None if the journal had no measurement.
 
-    ``recording`` is None if the journal had no measurement. Of the ``missing`` measurements, ``damaged`` ones were
-    damaged in the journal, and ``lost`` ones noted before its log was damaged: each number belongs to a stored
-    measurement or a gap, or was skipped by the sensor. ``set_aside`` is the new path of a journal with damaged poses,
-    or damaged or refused measurements; without any, the journal was removed. ``damage`` describes losses from a damaged
-    log that no gap of the recording covers. ``refused`` has by sensor the reason why a recording cannot contain its
-    measurements. ``without_pose`` counts measurements of sensors with poses. ``pose_damage`` is the number of damaged
-    poses, or the reason why all were left out.
+    Of the ``missing`` measurements, ``damaged`` ones were damaged in the journal, and ``lost`` ones noted before its
+    log was damaged: each number belongs to a stored measurement or a gap, or was skipped by the sensor. ``set_aside``
+    is the new path of a journal with damaged poses, or damaged or refused measurements; without any, the journal was
+    removed. ``damage`` describes losses from a damaged log that no gap covers. ``refused`` has the reasons by sensor.
+    ``pose_damage`` is the number of damaged poses, or the reason why all were left out.
     """
 
     journal: Path
@@ -131,14 +129,10 @@ def seal_in_subprocess(
     rests: float | None = None,
     progress: Progress = lambda _done, _of: None,
 ) -> SealingResult:
-    """Make the recording of a journal in a separate process; see `ertis_numba.storage.sealing.seal`.
+    """Make the recording of a journal in a separate process, which Ctrl-C does not reach; it can be repeated.
 
-    Ctrl-C does not reach that process. However it ends, the measurements are in the journal or in the recording, and
-    sealing can be repeated.
-
-    With ``rests``, the process runs at low priority, and pauses after each step for this multiple of its duration.
-    ``progress`` is called about a hundred times. Raises also OSError if no process can be started, and
-    KeyboardInterrupt, whose message states where the measurements are.
+    With ``rests``, it runs at low priority, and pauses after each step for this multiple of its duration. Raise OSError
+    if no process can be started, or KeyboardInterrupt with the place of the measurements as its message.
     """
     replies: list[Sealed | StorageFailed] = []
     try:
