@@ -15,7 +15,13 @@ from ertis_numba.settings import Accuracy, Array, Processing, Recording, Setting
 CPU = kernels.load("cpu")
 PCM = Settings(
     recording=Recording(sample_rate_hz=450e3, n_samples=5_400, encoding="float32"),
-    processing=Processing(directions="3d:400", range_m=(0.7, 1.3), range_decimation=10),
+    processing=Processing(
+        directions="3d:120",
+        azimuth_limits_deg=(-50, 50),
+        elevation_limits_deg=(-30, 30),
+        range_m=(0.7, 1.3),
+        range_decimation=10,
+    ),
     accuracy=Accuracy(precision="int16"),
 )
 COMBINATIONS = {

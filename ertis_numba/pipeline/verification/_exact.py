@@ -25,6 +25,7 @@ from ertis_numba.settings import Settings
 
 __all__ = ["ExactImage"]
 
+_CACHED = 65_536  # Complex numbers in an array of which a processor's cache holds several.
 _RINGING = 100.0  # The ringing of a raised cosine of width w is below -160 dB after 100 / w.
 
 
@@ -138,12 +139,13 @@ class ExactImage:
         # exact.
         n = self._tabled.shape[2]
         spacing_rad_s = self._wave_rad_s[1] - self._wave_rad_s[0] if len(self._bins) > 1 else 0.0
-        out: NDArray[np.complex128] = np.empty(at_s.shape, dtype=np.complex128)
-        for mic, (table, time_s) in enumerate(zip(self._tabled, at_s, strict=True)):
-            coarse = _steps(time_s, n * spacing_rad_s, len(table))
-            fine = _steps(time_s, spacing_rad_s, n)
-            beam = np.einsum("bt,bt->t", table @ coarse, fine)
-            out[mic] = beam * np.exp(1j * self._wave_rad_s[0] * time_s)
+        out: NDArray[np.complex128] = np.exp(1j * self._wave_rad_s[0] * at_s)
+        n_at_once = max(1, _CACHED // (len(out) * n))
+        for first in range(0, len(range_m), n_at_once):
+            part = np.s_[:, first : first + n_at_once]
+            coarse = _steps(at_s[part], n * spacing_rad_s, n)
+            fine = _steps(at_s[part], spacing_rad_s, n)
+            out[part] *= np.einsum("mbt,mbt->mt", self._tabled @ coarse, fine)
         return out
 
     @cached_property
@@ -213,10 +215,12 @@ def _powers(time_s: NDArray[np.float64], wave_rad_s: NDArray[np.float64]) -> NDA
 
 
 def _steps(time_s: NDArray[np.float64], spacing_rad_s: float, count: int) -> NDArray[np.complex128]:
-    """Return ``exp(jk·spacing·t)`` for k from 0 to ``count - 1``: (count, time) complex128."""
-    turns: NDArray[np.complex128] = np.empty((count, len(time_s)), dtype=np.complex128)
-    turns[0] = 1.0
-    once = np.exp(1j * spacing_rad_s * time_s)
-    for k in range(1, count):
-        np.multiply(turns[k - 1], once, out=turns[k])
+    """Return ``exp(jk·spacing·t)`` for k from 0 to ``count - 1``: (mic, count, time) complex128."""
+    turns: NDArray[np.complex128] = np.empty((len(time_s), count, time_s.shape[1]), dtype=np.complex128)
+    turns[:, 0] = 1.0
+    done = 1
+    while done < count:  # Each turn by ``done`` steps doubles the number of known powers.
+        more = min(done, count - done)
+        turns[:, done : done + more] = turns[:, :more] * np.exp(1j * done * spacing_rad_s * time_s)[:, None]
+        done += more
     return turns
