@@ -29,18 +29,7 @@ def how_to_record(target: Target) -> str:
 
 
 def require_directions(source_m: NDArray[np.float64], target: Target) -> None:
-    """Refuse recordings from too few or too similar directions to tell positions from delays.
-
-    Parameters
-    ----------
-    source_m : (record, axis) float64
-    target : {"reflector", "wall", "beacon"}
-
-    Raises
-    ------
-    DataError
-        There are fewer than 4 recordings, or they are all from about the same direction.
-    """
+    """Raise DataError for fewer than 4 recordings, or if all sources are in about the same direction."""
     remedy = "or keep the positions of the layout (position_tolerance_m=0)"
     if len(source_m) < _MIN_RECORDS:
         raise DataError(
@@ -59,18 +48,7 @@ def require_directions(source_m: NDArray[np.float64], target: Target) -> None:
 
 
 def not_observable(observed: NDArray[np.bool_], target: Target, *, positions: bool, is_line: bool) -> tuple[str, ...]:
-    """Return the quantities that the recordings cannot determine, one line each.
-
-    Parameters
-    ----------
-    observed : (mic, quantity) bool
-        True for gain, delay, and x, y and z if the recordings determine them.
-    target : {"reflector", "wall", "direct", "beacon"}
-    positions : bool
-        True if positions were fitted.
-    is_line : bool
-        True if the microphones lie on a line.
-    """
+    """Return the quantities that no recording determines, one line each; observed is (mic, gain, delay, x, y, z)."""
     lines = [
         "a common gain, delay or polarity of all microphones: their means are unchanged",
         "a rotation or shift of the whole array, or a mirrored layout if the place of no reflector is given",

@@ -229,13 +229,7 @@ def _fit(job: _Prepared, seen: Observations, source_m: NDArray[np.float64]) -> A
 
 
 def _of_other_targets(job: _Prepared, seen: Observations, fit: ArrayFit) -> dict[int, str]:
-    """Return the recordings whose sound comes from another kind of target, with the reason.
-
-    Raises
-    ------
-    DataError
-        That is the case for all recordings.
-    """
+    """Return recordings of another kind of target, with the reason; raise DataError if all are."""
     if job.target == "direct":
         return {}
     other: Target = "wall" if job.target == "reflector" else "reflector"

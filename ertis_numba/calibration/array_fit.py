@@ -21,27 +21,14 @@ _MEDIAN_OF_NORMAL = 0.6745  # of the magnitude, in standard deviations
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArrayFit:
-    """Delays and positions of microphones, and sources.
-
-    Attributes
-    ----------
-    delay_s : (mic,) float64
-    positions_m : (mic, axis) float64
-    source_m : (record, axis) float64
-    distance_m : (record, mic) float64
-        Distances from the sources to the microphones.
-    residual_s : (record, mic) float64
-        Measured minus fitted times.
-    covariance : (4 mic, 4 mic) float64
-        Covariance of the delay in µs and the position x, y, z in mm of each microphone, in this order.
-    """
+    """Delays and positions of microphones, and positions of sources."""
 
     delay_s: NDArray[np.float64]
     positions_m: NDArray[np.float64]
-    source_m: NDArray[np.float64]
-    distance_m: NDArray[np.float64]
-    residual_s: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    source_m: NDArray[np.float64]  # (record, axis)
+    distance_m: NDArray[np.float64]  # (record, mic) from the source to the microphone
+    residual_s: NDArray[np.float64]  # (record, mic), measured minus fitted times
+    covariance: NDArray[np.float64]  # (4 mic, 4 mic) of delay in µs and x, y, z in mm, microphone by microphone
 
 
 def fit_array(
@@ -53,25 +40,12 @@ def fit_array(
     target: Target,
     expected: Tolerances,
 ) -> ArrayFit:
-    """Fit delays, positions and sources to times of arrival.
+    """Fit delays, positions and sources to times of arrival, starting at the layout and approximate sources.
 
     The fit minimises ``Σ ρ((t − τ − T(s, x)) / σ)`` with the travel times T of `travel_times`, plus the squared changes
-    of τ and x relative to the expected deviations. It is the maximum of the posterior density with normal priors. ρ is
-    quadratic for small residuals and linear for large ones, by repeated weighting of the least squares.
-
-    The covariance is the inverse of the Fisher information, including that of the priors, for delays and positions
-    after removing what no recording can observe: the common delay, a translation and a rotation of the array.
-
-    Parameters
-    ----------
-    delay_s : (mic,) float64
-        Delays of the layout.
-    positions_m : (mic, axis) float64
-        Positions of the layout.
-    source_m : (record, axis) float64
-        First approximation of the sources.
-    speed_m_s : (record,) float64
-    target : {"reflector", "wall", "direct", "beacon"}
+    of τ and x relative to the expected deviations. ρ is quadratic for small residuals and linear for large ones. The
+    covariance is the inverse of the Fisher information with the priors, without what no recording can observe: the
+    common delay, a translation and a rotation of the array.
     """
     problem = SeparableProblem(seen, delay_s, positions_m, source_m, speed_m_s, target, expected)
     source_mm = problem.start_mm
@@ -152,28 +126,11 @@ def fit_gains(
     absorption_1_m: float,
     expected: Tolerances,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Fit the gains of microphones to levels.
+    """Fit gains to levels; return their changes and covariance in Np, and residuals (record, mic) in Np.
 
     The level is ``ln |a| = γ + A − ln d − α d``: gain of the microphone, level of the recording, spreading and
-    absorption over the distance d. The gains have a normal prior. The weights of levels that fit badly decrease
-    (Cauchy). The mean change of γ is 0, because no recording can observe a common gain.
-
-    Parameters
-    ----------
-    former_np : (mic,) float64
-        Gains of the layout in nepers.
-    distance_m : (record, mic) float64
-    absorption_1_m : float
-        Absorption in nepers per metre.
-
-    Returns
-    -------
-    change_np : (mic,) float64
-        Changes of the gains in nepers.
-    covariance : (mic, mic) float64
-        In square nepers.
-    residual_np : (record, mic) float64
-        NaN for values that are left out.
+    absorption (Np/m) over the distance d. Priors are normal, levels that fit badly lose weight (Cauchy), and the mean
+    change of γ is 0, because no recording can observe a common gain. Residuals are NaN for values that are left out.
     """
     known = np.isfinite(seen.level_sd)
     level = np.log(np.where(known, np.abs(seen.level), 1.0)) + np.log(distance_m) + absorption_1_m * distance_m

@@ -27,54 +27,25 @@ _LEAST_SPECTRUM = 0.05  # Magnitude of the call's spectrum, relative to its maxi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoundArrival:
-    """One sound at each microphone.
+    """Times and levels of one sound at each microphone; arrays are (mic,)."""
 
-    Attributes
-    ----------
-    time_s : (mic,) float64
-        Time of arrival from the start of the record, in seconds.
-    time_sd_s : (mic,) float64
-        Standard deviation of the time due to noise, in seconds.
-    level : (mic,) float64
-        Amplitude relative to the mean pulse; negative for inverted polarity.
-    level_sd : (mic,) float64
-        Standard deviation of the amplitude, relative to it.
-    coherence : (mic,) float64
-        Share of the power in the gate that the common pulse explains.
-    power : (mic,) float64
-        Power in the gate, in units that are equal for all microphones of a recording.
-    other_sound : (float, float)
-        Standard deviations of times in seconds and of relative levels because of other sound, such as other echoes.
-        Motion of the reflector causes them, too.
-    evidence : (mic,) float64
-        Logarithm of the likelihood of normal polarity relative to inverted polarity, at the best delays of both.
-    """
-
-    time_s: NDArray[np.float64]
-    time_sd_s: NDArray[np.float64]
-    level: NDArray[np.float64]
-    level_sd: NDArray[np.float64]
-    coherence: NDArray[np.float64]
-    power: NDArray[np.float64]
-    other_sound: tuple[float, float]
-    evidence: NDArray[np.float64]
+    time_s: NDArray[np.float64]  # from the start of the record
+    time_sd_s: NDArray[np.float64]  # by noise alone
+    level: NDArray[np.float64]  # amplitude relative to the mean pulse; negative for inverted polarity
+    level_sd: NDArray[np.float64]  # relative to the level
+    coherence: NDArray[np.float64]  # share of the power in the gate that the common pulse explains
+    power: NDArray[np.float64]  # in the gate, in a unit common to the microphones of a recording
+    other_sound: tuple[float, float]  # standard deviations of times (s) and relative levels by other echoes or motion
+    evidence: NDArray[np.float64]  # log likelihood of normal relative to inverted polarity, at the best delays
 
 
 def measure_arrival(pulses: Compressed, call: Call, at_s: NDArray[np.float64], used: NDArray[np.bool_]) -> SoundArrival:
-    """Measure the sound around the given times by maximum likelihood.
+    """Measure the sound around times that are known to a few microseconds, by maximum likelihood.
 
     All microphones receive the same unknown pulse R with real amplitudes a and delays d, in white noise of the same
-    power: ``Y(f) = a R(f) exp(−2πj f d) + N(f)``. The estimates of a and d maximise the likelihood, and so does R,
-    which is the mean of the aligned signals with weights a. The standard deviations are the Cramér-Rao bounds for a
-    known pulse, ``σ_d = σ / (2π a √(2 Σ f² |R|²))`` and ``σ_a = σ / √(2 Σ |R|²)`` (S. M. Kay, Fundamentals of
-    Statistical Signal Processing: Estimation Theory, 1993, sections 3.11 and 7.9).
-
-    Parameters
-    ----------
-    at_s : (mic,) float64
-        Times to within a few microseconds, in seconds.
-    used : (mic,) bool
-        Microphones that determine the common pulse.
+    power: ``Y(f) = a R(f) exp(−2πj f d) + N(f)``. The standard deviations are the Cramér-Rao bounds for a known pulse,
+    ``σ_d = σ / (2π a √(2 Σ f² |R|²))`` and ``σ_a = σ / √(2 Σ |R|²)`` (S. M. Kay, Fundamentals of Statistical Signal
+    Processing: Estimation Theory, 1993, sections 3.11 and 7.9). The used microphones determine the common pulse.
     """
     bins, frequency_hz = _whitened(pulses, call, at_s)
     made = _estimate(bins, frequency_hz, used)
@@ -134,7 +105,7 @@ def _between_halves(
     time_sd_s: NDArray[np.float64],
     level_sd: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Return standard deviations of times and relative levels because of other sound, such as overlapping echoes.
+    """Return standard deviations of times and relative levels because of other sound, such as other echoes.
 
     Other sound moves the estimates of the lower and of the upper half of the band differently. Noise does the same, by
     four times its variance in the whole band. A larger difference counts, and its share in the whole band is a quarter.

@@ -23,18 +23,10 @@ _MIN_RECORDS: Final = 3  # With fewer recordings, a delay and another position c
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Permutation:
-    """Positions at which channels fit.
+    """Positions at which channels fit."""
 
-    Attributes
-    ----------
-    place : (mic,) int64
-        Index of the position of each microphone in the layout; ``place[i] == i`` for a microphone in its own place.
-    misfit_s : (mic,) float64
-        Root-mean-square residual of each microphone at its own position, without its mean, in seconds.
-    """
-
-    place: NDArray[np.int64]
-    misfit_s: NDArray[np.float64]
+    place: NDArray[np.int64]  # (mic,) index of the position in the layout; place[i] == i where it is right
+    misfit_s: NDArray[np.float64]  # (mic,) root-mean-square residual at the own position, without its mean
 
     def cycles(self) -> list[tuple[int, ...]]:
         """Return the groups of microphones that exchanged places; a pair is a swap."""
@@ -55,22 +47,12 @@ def find_swaps(
     speed_m_s: NDArray[np.float64],
     target: Target,
 ) -> Permutation:
-    """Find microphones whose sounds arrive as they would at the positions of others.
+    """Find microphones whose sounds arrive as they would at the positions of others; NaN times are left out.
 
     The cost of microphone m at position j is the mean square over the recordings of its time minus the travel time to
     j, without the constant part, which is a delay. The assignment of least total cost (H. W. Kuhn, The Hungarian method
-    for the assignment problem, 1955) is accepted for microphones that fit their own position badly and another one much
-    better, so that errors of delays and positions are not taken for swaps.
-
-    Parameters
-    ----------
-    time_s : (record, mic) float64
-        Times of arrival without the delays of the layout; NaN for values that are left out.
-    positions_m : (mic, axis) float64
-    source_m : (record, axis) float64
-        First approximation of the sources.
-    speed_m_s : (record,) float64
-    target : {"reflector", "wall", "direct", "beacon"}
+    for the assignment problem, 1955) is accepted only where the own position fits badly and another one much better, so
+    that errors of delays and positions are not taken for swaps.
     """
     n_mics = len(positions_m)
     place = np.arange(n_mics)
@@ -118,21 +100,7 @@ def _costs(time_s: NDArray[np.float64], expected_s: NDArray[np.float64]) -> NDAr
 def find_order(
     shares: Callable[[NDArray[np.float64]], float], layout: Layout
 ) -> tuple[str, NDArray[np.float64]] | None:
-    """Find an order of the channels, or a shipped layout, that fits the sounds; None if there is none.
-
-    Parameters
-    ----------
-    shares : callable
-        Function that returns the share of the microphones that wavefronts fit, for positions of all channels.
-    layout : Layout
-        Layout whose own order does not fit.
-
-    Returns
-    -------
-    name : str
-        Such as "the reversed order", or "layout eRTIS_v2".
-    positions_m : (channel, axis) float64
-    """
+    """Find an order of the channels, or a shipped layout, by the share of microphones that wavefronts fit."""
     candidates = [(name, layout.positions_m[order]) for name, order in _known_orders(len(layout.enabled)).items()]
     for name in layout_names():
         other = load_layout(name)

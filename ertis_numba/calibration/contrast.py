@@ -20,16 +20,7 @@ _MAX_RECORDS: Final = 4
 
 
 def image_contrast_db(sounds: Iterable[Sound], channels: NDArray[np.intp], layout: Layout) -> float:
-    """Return the contrast of delay-and-sum images, in dB.
-
-    The contrast is the power of the strongest direction relative to the mean over all directions, both summed over the
-    ranges beyond the direct sound. Waves are plane.
-
-    Parameters
-    ----------
-    channels : (mic,) intp
-        Channels of the sounds.
-    """
+    """Return the power of the strongest direction relative to the mean, beyond the direct sound, in dB."""
     azimuth_rad, elevation_rad = (
         grid.ravel() for grid in np.radians(np.meshgrid(_AZIMUTH_DEG, _ELEVATION_DEG, indexing="ij"))
     )

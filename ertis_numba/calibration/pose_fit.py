@@ -18,51 +18,25 @@ _MIN_FACTOR: Final = 0.15  # Errors that waves share, as those of overlapping ec
 
 
 class WaveTable(NamedTuple):
-    """Waves with their origins.
+    """Waves with their origins; arrays are (wave, ...)."""
 
-    Attributes
-    ----------
-    receiver, emitter : (wave,) intp
-        Numbers of the sensors that heard the wave and that emitted it.
-    reflector : (wave,) intp
-        Number of the reflector; −1 for calls that arrive directly.
-    parameters : (wave, parameter) float64
-        See `Wave`.
-    root : (wave, parameter, parameter) float64
-        Square root W of the information, ``Wᵀ W``.
-    sync_m : (wave,) float64
-        Path that sound travels from the start of the receiver's record to the emission.
-    """
-
-    receiver: NDArray[np.intp]
-    emitter: NDArray[np.intp]
-    reflector: NDArray[np.intp]
-    parameters: NDArray[np.float64]
-    root: NDArray[np.float64]
-    sync_m: NDArray[np.float64]
+    receiver: NDArray[np.intp]  # number of the sensor that heard the wave
+    emitter: NDArray[np.intp]  # number of the sensor that emitted it
+    reflector: NDArray[np.intp]  # number; −1 for calls that arrive directly
+    parameters: NDArray[np.float64]  # as in `Wave`
+    root: NDArray[np.float64]  # (wave, parameter, parameter), W with information Wᵀ W
+    sync_m: NDArray[np.float64]  # path of sound from the start of the receiver's record to the emission
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseFit:
-    """Poses and reflectors.
+    """Poses and reflectors."""
 
-    Attributes
-    ----------
-    rotation : (sensor, axis, axis) float64
-    translation_m : (sensor, axis) float64
-    reflectors_m : (reflector, axis) float64
-    covariance : (sensor, 6, 6) float64
-        Of the translation in the frame of the reference in metres, and of a rotation about the axes of the sensor in
-        radians; 0 for the reference.
-    path_residual_m : (wave,) float64
-        Measured minus fitted paths.
-    """
-
-    rotation: NDArray[np.float64]
-    translation_m: NDArray[np.float64]
-    reflectors_m: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-    path_residual_m: NDArray[np.float64]
+    rotation: NDArray[np.float64]  # (sensor, axis, axis)
+    translation_m: NDArray[np.float64]  # (sensor, axis)
+    reflectors_m: NDArray[np.float64]  # (reflector, axis)
+    covariance: NDArray[np.float64]  # (sensor, 6, 6), as in `SensorPose`; 0 for the reference
+    path_residual_m: NDArray[np.float64]  # (wave,), measured minus fitted
 
 
 def predicted_waves(
@@ -71,20 +45,7 @@ def predicted_waves(
     place_m: NDArray[np.float64],
     emitter_m: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return the waves from sources as sensors hear them: (wave, parameter) float64.
-
-    The wave comes from the source s, a reflector or an emitter. The path is ``|s − e| + |s − p|``.
-
-    Parameters
-    ----------
-    source_m : (wave, axis) float64
-    rotation : (wave, axis, axis) float64
-        Rotation of the receiver.
-    place_m : (wave, axis) float64
-        Position p of the receiver.
-    emitter_m : (wave, axis) float64
-        Position e of the emitter.
-    """
+    """Return the wave from each source s at a receiver p, with path ``|s − e| + |s − p|``: (wave, parameter)."""
     inside_m = np.einsum("wij,wi->wj", rotation, source_m - place_m)
     distance_m = np.maximum(np.linalg.norm(inside_m, axis=1), 1e-6)
     path_m = np.linalg.norm(source_m - emitter_m, axis=1) + distance_m
@@ -96,17 +57,6 @@ class PoseProblem:
 
     The unknowns are, for each sensor except the reference, the change of its position in metres and a rotation vector
     about its own axes in radians, and then the positions of the reflectors in metres.
-
-    Parameters
-    ----------
-    rotation : (sensor, axis, axis) float64
-        Rotations of the start.
-    translation_m : (sensor, axis) float64
-        Positions of the start.
-    reflectors_m : (reflector, axis) float64
-        Reflectors of the start.
-    reference : int
-        Sensor that stays.
     """
 
     def __init__(
@@ -221,9 +171,8 @@ class PoseProblem:
 
 
 def fit_poses(problem: PoseProblem, *, max_steps: int = 30) -> PoseFit:
-    """Fit poses and reflectors by robust least squares.
+    """Fit poses and reflectors by least squares with the loss soft_l1.
 
-    The loss is quadratic for small residuals and linear for large ones (``soft_l1`` of `scipy.optimize.least_squares`).
     The covariance is the inverse of the Fisher information ``Jᵀ J`` with the reflectors eliminated, times the robust
     mean square of the residuals (B. Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 6).
     """

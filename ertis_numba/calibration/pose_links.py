@@ -28,13 +28,7 @@ _SAME_COSINE: Final = 0.03
 
 
 class RigidLink(NamedTuple):
-    """Rigid transform from the frame of one sensor to that of another, ``x = R y + t``.
-
-    Attributes
-    ----------
-    rotation : (axis, axis) float64
-    translation_m : (axis,) float64
-    """
+    """Rigid transform ``x = R y + t`` from the frame of one sensor to that of another."""
 
     rotation: NDArray[np.float64]
     translation_m: NDArray[np.float64]
@@ -49,10 +43,7 @@ class _Pairs(NamedTuple):
 
 
 def unit_direction(wave: Wave) -> NDArray[np.float64]:
-    """Return the direction to the source as a unit vector: (axis,) float64.
-
-    A flat array cannot distinguish front from back; the source is assumed to be in front.
-    """
+    """Return the unit vector to the source, in front if the array is flat and cannot tell front from back."""
     direction = wave.parameters[1:4].copy()
     if wave.information[1, 1] < 1:
         across = float(direction[1] ** 2 + direction[2] ** 2)
@@ -61,10 +52,7 @@ def unit_direction(wave: Wave) -> NDArray[np.float64]:
 
 
 def echo_points(waves: Sequence[Wave]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Return the places of reflectors if each wave is an echo of the sensor's own call, and the numbers of the waves.
-
-    Waves whose curvature excludes a reflector at half of the path are left out.
-    """
+    """Return reflectors of waves that can be echoes of the own call (curvature is possible), and their numbers."""
     points, numbers = [], []
     for number, wave in enumerate(waves):
         expected = 2 / max(wave.path_m, 1e-3)
@@ -90,16 +78,11 @@ def _emitter_points(waves: Sequence[Wave]) -> list[NDArray[np.float64]]:
 
 
 def candidate_links(first: WavesOfSensor, second: WavesOfSensor, seed: int = 0) -> list[RigidLink]:
-    """Return transforms from the second sensor to the first for which many reflectors agree, the best first.
+    """Return transforms from the second sensor to the first that many reflectors agree with, best first.
 
     Echoes of one measurement in two sensors may be the same reflector. Three such pairs with equal distances yield a
     transform (W. Kabsch, Acta Cryst. A 32, 1976, 922), and transforms that most pairs agree with are returned (M. A.
     Fischler and R. C. Bolles, Comm. ACM 24, 1981, 381).
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the random choice of pairs.
     """
     pairs = _pairs(first, second)
     triples = _triples(pairs, np.random.default_rng(seed))

@@ -28,19 +28,11 @@ class Gates(NamedTuple):
 
 
 class Matched(NamedTuple):
-    """Waves whose origins are known.
-
-    Attributes
-    ----------
-    reflectors_m : (reflector, axis) float64
-        Approximate positions.
-    pulse : tuple of (int, int)
-        SYNC pulse of each reflector.
-    """
+    """Waves whose origins are known."""
 
     waves: WaveTable
-    reflectors_m: NDArray[np.float64]
-    pulse: tuple[tuple[int, int], ...]
+    reflectors_m: NDArray[np.float64]  # (reflector, axis), approximate
+    pulse: tuple[tuple[int, int], ...]  # SYNC pulse of each reflector
 
 
 class _Poses(NamedTuple):
@@ -71,17 +63,10 @@ def match_waves(
     speed_m_s: float,
     gates: Gates,
 ) -> Matched:
-    """Return the waves that reflectors and emitters explain.
+    """Return the waves that reflectors and emitters explain; sensors are in the order of the SYNC chain.
 
     Each echo of a sensor's own call suggests a reflector. The reflector that explains most waves of a measurement, as
     echoes of all emitters, is accepted first. A reflector at rest counts once, because its errors do not average out.
-
-    Parameters
-    ----------
-    waves : mapping of str to WavesOfSensor
-        Sensors in the order of the SYNC chain.
-    rotation : (sensor, axis, axis) float64
-    translation_m : (sensor, axis) float64
     """
     poses = _Poses(rotation, translation_m, speed_m_s)
     sensors = list(waves.values())
@@ -106,17 +91,7 @@ def match_waves(
 def without_outliers(
     matched: Matched, reflectors_m: NDArray[np.float64], residual_m: NDArray[np.float64], limit_m: float
 ) -> Matched:
-    """Return the waves that fit, without reflectors that lose too many of theirs.
-
-    Parameters
-    ----------
-    reflectors_m : (reflector, axis) float64
-        Reflectors after the fit.
-    residual_m : (wave,) float64
-        Measured minus fitted paths.
-    limit_m : float
-        Largest residual.
-    """
+    """Return waves with fitted paths to limit_m, without reflectors that lose too many of theirs."""
     fits = np.abs(residual_m) < limit_m
     reflector = matched.waves.reflector
     counts = np.bincount(reflector[fits & (reflector >= 0)], minlength=len(reflectors_m))

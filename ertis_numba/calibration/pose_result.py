@@ -15,29 +15,16 @@ _INTERVAL = 1.96  # half of a 95 % interval in standard deviations
 class SensorPose:
     """Pose of a sensor relative to the reference sensor.
 
-    Attributes
-    ----------
-    translation_m : (axis,) float64
-        Position x, y, z in the frame of the reference, in metres.
-    rotation_xyzw : (4,) float64
-        Unit quaternion that rotates the frame of the sensor into that of the reference.
-    covariance : (6, 6) float64
-        Covariance of x, y and z in metres, and of a small rotation about the x, y and z axes of the sensor in radians;
-        0 for the reference.
-    residual_m : float
-        Root mean square of measured minus fitted paths of the waves that the sensor heard, in metres.
-    n_reflectors : int
-        Number of reflectors that the sensor has in common with others.
-    n_waves : int
-        Number of waves that the sensor heard, including calls of other sensors.
+    The covariance (6, 6) is that of x, y and z in metres, and of a small rotation about the x, y and z axes of the
+    sensor in radians; 0 for the reference.
     """
 
     translation_m: NDArray[np.float64]
-    rotation_xyzw: NDArray[np.float64]
+    rotation_xyzw: NDArray[np.float64]  # unit quaternion, frame of the sensor to that of the reference
     covariance: NDArray[np.float64]
-    residual_m: float
-    n_reflectors: int
-    n_waves: int
+    residual_m: float  # root mean square of measured minus fitted paths of the waves that were heard
+    n_reflectors: int  # in common with other sensors
+    n_waves: int  # heard, including calls of other sensors
 
     @property
     def translation_interval_m(self) -> NDArray[np.float64]:
@@ -83,30 +70,14 @@ class SensorPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseCalibration:
-    """Poses of several sensors on one platform, as measured by the sensors.
+    """Poses of several sensors on one platform, as measured by the sensors."""
 
-    Attributes
-    ----------
-    reference : str
-        Sensor whose frame the poses refer to.
-    poses : dict of str to SensorPose
-        Poses of all sensors.
-    reflectors_m : (reflector, axis) float64
-        Reflectors that several sensors heard, in the frame of the reference, in metres.
-    n_measurements : int
-        Number of SYNC pulses with measurements of more than one sensor.
-    unused : tuple of int
-        Numbers of the SYNC pulses in which no new reflector was found.
-    not_observable : tuple of str
-        Quantities that these recordings cannot determine, with what to do about it.
-    """
-
-    reference: str
+    reference: str  # sensor whose frame the poses refer to
     poses: dict[str, SensorPose]
-    reflectors_m: NDArray[np.float64]
-    n_measurements: int
-    unused: tuple[int, ...]
-    not_observable: tuple[str, ...]
+    reflectors_m: NDArray[np.float64]  # (reflector, axis), heard by several sensors
+    n_measurements: int  # SYNC pulses with measurements of more than one sensor
+    unused: tuple[int, ...]  # SYNC pulses in which no new reflector was found
+    not_observable: tuple[str, ...]  # quantities that the recordings cannot determine, with remedies
 
     @property
     def mounting(self) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:

@@ -38,51 +38,13 @@ def calibrate_poses(
     reference: str | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> PoseCalibration:
-    """Estimate positions and orientations of sensors from reflectors that they hear in common, and from their calls.
+    """Estimate poses of sensors from reflectors that they hear in common, and from each other's calls.
 
-    All sensors emit together, as on one SYNC chain. Each hears echoes of its own call, echoes of the others' calls, and
-    their calls themselves. Record 10 to 20 measurements with one small reflector at different places, 0.5 to 2 m away.
-    Not every sensor must hear each place: front and back may be linked by a third sensor. Further reflectors at rest do
-    no harm.
-
-    Waves are found in each measurement (`find_waves`), sensors are placed by common reflectors (`place_sensors`), waves
-    are matched to reflectors and emitters (`match_waves`), and poses and reflectors are fitted together (`fit_poses`).
-
-    Parameters
-    ----------
-    measurements : mapping of str to iterable of Measurement
-        Measurements of each sensor by its name, in the order of the SYNC chain, at whose pulses sensors start 400 ns
-        after one another. Measurements of the same SYNC pulse belong together; some may be missing.
-    reference : str, optional
-        Sensor whose frame the poses refer to; the first by default.
-    on_progress : callable, optional
-        Function that is called with the number of measurements so far.
-
-    Returns
-    -------
-    PoseCalibration
-
-    Raises
-    ------
-    ArgumentError
-        There are fewer than two sensors, the reference is not among them, or they do not share SYNC pulses.
-    DataError
-        A sensor hears no echoes, or has fewer than 3 reflectors in common with the others.
-
-    Notes
-    -----
-    An error of the speed of sound scales all distances: 1 °C changes them by 0.17 %. Emitters are assumed to be at the
-    origins of the sensors, and reflectors to be points: in simulations, balls with a radius of 4 cm cause errors of 4
-    mm and 0.4°. Delays of microphones that are not calibrated turn directions, so calibrate arrays first.
-
-    Examples
-    --------
-    Calibrate a platform with three sensors::
-
-        names = ("front", "left", "right")
-        recordings = {name: ertis.open_recording("run.h5", sensor=name) for name in names}
-        calibration = calibrate_poses(recordings)
-        print(calibration.poses["left"].translation_m, calibration.poses["left"].translation_interval_m)
+    All sensors emit together on one SYNC chain, in the order of `measurements`. Record 10 to 20 measurements with one
+    small reflector at different places, 0.5 to 2 m away. Not every sensor must hear each place: front and back may be
+    linked by a third sensor. An error of the speed of sound scales all distances: 1 °C changes them by 0.17 %. In
+    simulations, balls with a radius of 4 cm, taken for points, cause errors of 4 mm and 0.4°. Calibrate arrays first:
+    wrong delays of microphones turn directions.
     """
     if len(measurements) < 2:
         raise ArgumentError(

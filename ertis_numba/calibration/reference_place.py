@@ -38,13 +38,7 @@ class ReflectorPlace(NamedTuple):
         return min(abs(self.azimuth_deg), abs(self.elevation_deg)) >= _MIN_ASIDE_DEG
 
     def checked(self) -> "ReflectorPlace":
-        """Return the place if its numbers are possible.
-
-        Raises
-        ------
-        ArgumentError
-            An angle or the range is out of its limits.
-        """
+        """Return the place; raise ArgumentError if an angle or the range is out of its limits."""
         checks.between("azimuth of the place", self.azimuth_deg, -90.0, 90.0)
         checks.between("elevation of the place", self.elevation_deg, -90.0, 90.0)
         checks.between("range of the place", self.range_m, 0.05, 100.0)
@@ -52,33 +46,14 @@ class ReflectorPlace(NamedTuple):
 
 
 class SoundSpeed(NamedTuple):
-    """Measured speed of sound.
-
-    Attributes
-    ----------
-    speed_m_s, sd_m_s : float
-        Speed and its standard deviation.
-    """
+    """Measured speed of sound and its standard deviation."""
 
     speed_m_s: float
     sd_m_s: float
 
 
 def mirror_of(source_m: NDArray[np.float64], place: ReflectorPlace) -> str:
-    """Return how the layout is mirrored, judged by a reflector at a known place; empty if it is not.
-
-    Parameters
-    ----------
-    source_m : (axis,) float64
-        Measured position of the reflector.
-    place : ReflectorPlace
-        True position, whose direction may be rough, and for which ``shows_mirroring`` is True.
-
-    Raises
-    ------
-    DataError
-        The directions differ, and no mirror image explains it.
-    """
+    """Return how the layout is mirrored; empty if it is not; raise DataError if no mirror image explains source_m."""
     known = unit_vectors(np.radians(place.azimuth_deg), np.radians(place.elevation_deg)).ravel()
     found = source_m / np.linalg.norm(source_m)
     tried = {"": (1.0, 1.0, 1.0), **_FLIPS}
@@ -106,22 +81,7 @@ def _apart_deg(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 def speed_from_distance(
     source_m: NDArray[np.float64], place: ReflectorPlace, speed_m_s: float, target: Target
 ) -> SoundSpeed:
-    """Return the speed of sound from a reflector at a known distance.
-
-    A wrong speed c scales the measured range r, so that the true speed is ``c r₀ / r`` at the known distance r₀. The
-    standard deviation is that of a distance measured to 2 mm.
-
-    Parameters
-    ----------
-    source_m : (axis,) float64
-        Measured position of the reflector.
-    place : ReflectorPlace
-        True position.
-    speed_m_s : float
-        Speed that the measured position was computed with.
-    target : {"reflector", "wall", "beacon"}
-        The mirror image of the emitter in a wall is twice as far away as the wall.
-    """
+    """Return the speed ``c r₀ / r`` by the known distance r₀, to 2 mm, of a reflector measured at r with c."""
     paths = 2.0 if target == "wall" else 1.0
     found = float(speed_m_s * paths * place.range_m / np.linalg.norm(source_m))
     return SoundSpeed(found, found * _DISTANCE_SD_M / place.range_m)
@@ -135,21 +95,10 @@ def speed_from_spread(
     speed_m_s: float,
     target: Target,
 ) -> SoundSpeed:
-    """Return the speed of sound from the spread of the times at which direct sound arrives.
+    """Return the speed of sound from the spread of the times (mic,) at which direct sound arrives.
 
     Least squares with the emitter's position and the pace 1 / c as unknowns, and a normal prior of 5 % for the pace.
     The uncertainty is the Cramér-Rao bound.
-
-    Parameters
-    ----------
-    time_s, time_sd_s : (mic,) float64
-        Times of arrival, and standard deviations that include those of the delays.
-    positions_m : (mic, axis) float64
-    source_m : (axis,) float64
-        First approximation of the emitter.
-    speed_m_s : float
-        First approximation of the speed.
-    target : {"direct"}
     """
 
     def residuals(unknown: NDArray[np.float64]) -> NDArray[np.float64]:

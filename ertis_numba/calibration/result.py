@@ -15,17 +15,9 @@ _WELL_KNOWN = 0.5  # Largest standard deviation of an observable quantity, relat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Residuals:
-    """Deviations of the measured times and levels from those of the layout, before and after the calibration.
+    """Measured times and levels (record, mic) minus those of the layout, before and after the calibration."""
 
-    Attributes
-    ----------
-    before_time_s, after_time_s : (record, mic) float64
-        Times of arrival minus the travel times to the fitted reflectors; NaN for values that are left out.
-    before_level_db, after_level_db : (record, mic) float64
-        Levels relative to those of the layout.
-    """
-
-    before_time_s: NDArray[np.float64]
+    before_time_s: NDArray[np.float64]  # minus the travel times to the fitted reflectors; NaN if left out
     after_time_s: NDArray[np.float64]
     before_level_db: NDArray[np.float64]
     after_level_db: NDArray[np.float64]

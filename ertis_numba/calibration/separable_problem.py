@@ -17,20 +17,11 @@ _INNER_ROUNDS: Final = 3  # Travel times are almost linear in the positions of m
 
 
 class Solution(NamedTuple):
-    """Microphones and sources.
+    """Microphones and sources."""
 
-    Attributes
-    ----------
-    own : (mic, quantity) float64
-        Change of the delay in µs and, if positions are fitted, of x, y and z in mm.
-    source_m : (record, axis) float64
-    residual_s : (record, mic) float64
-        Measured minus fitted times.
-    """
-
-    own: NDArray[np.float64]
-    source_m: NDArray[np.float64]
-    residual_s: NDArray[np.float64]
+    own: NDArray[np.float64]  # (mic, quantity): change of the delay in µs, then of x, y and z in mm if fitted
+    source_m: NDArray[np.float64]  # (record, axis)
+    residual_s: NDArray[np.float64]  # (record, mic), measured minus fitted
 
 
 class SeparableProblem:
@@ -40,17 +31,6 @@ class SeparableProblem:
     travel times are almost linear in its position. The remaining problem has three unknowns per recording (variable
     projection: G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10, 1973). Its Jacobian omits the derivative of the
     projection, as L. Kaufman, BIT 15, 1975, proposes.
-
-    Parameters
-    ----------
-    delay_s : (mic,) float64
-        Delays of the layout.
-    positions_m : (mic, axis) float64
-        Positions of the layout.
-    source_m : (record, axis) float64
-        First approximation of the sources.
-    speed_m_s : (record,) float64
-    target : {"reflector", "wall", "direct", "beacon"}
     """
 
     def __init__(
@@ -103,21 +83,10 @@ class SeparableProblem:
         return Solution(own, MM * source_mm.reshape(-1, 3), np.where(self._precision_us > 0, rest_s, np.nan))
 
     def covariance(self, source_mm: NDArray[np.float64], factor: float) -> tuple[NDArray[np.float64], float]:
-        """Return the covariance of the microphones, and the number of unknowns that the times determine.
+        """Return the covariance (mic, quantity, mic, quantity) and the number of determined unknowns.
 
-        The inverse of the Fisher information follows from the blocks of the microphones and the Schur complement of
-        the sources.
-
-        Parameters
-        ----------
-        source_mm : (3 record,) float64
-        factor : float
-            Variance of the times relative to the expected one.
-
-        Returns
-        -------
-        covariance : (mic, quantity, mic, quantity) float64
-        n_determined : float
+        It follows from the blocks of the microphones and the Schur complement of the sources; factor is the variance of
+        the times relative to the expected one.
         """
         projected, inverse, gain = self._projected(self._solved(source_mm), source_mm, factor)
         rows = projected.reshape(-1, 3 * self.n_records)
@@ -166,15 +135,10 @@ class SeparableProblem:
     def _projected(
         self, own: NDArray[np.float64], source_mm: NDArray[np.float64], factor: float = 1.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return the projected derivatives by the sources, and two parts of the covariance.
+        """Return projected derivatives by the sources, and two parts of the covariance.
 
-        Returns
-        -------
-        projected : (mic, row, 3 record) float64
-        inverse : (mic, quantity, quantity) float64
-            Covariance of each microphone for known sources.
-        gain : (mic, quantity, 3 record) float64
-            Change of the microphones by changes of the sources, with a negative sign.
+        The derivatives are (mic, row, 3 record). The covariance of each microphone for known sources is (mic, quantity,
+        quantity); its change by changes of the sources, with a negative sign, is (mic, quantity, 3 record).
         """
         scale = 1 / np.sqrt(factor)
         slopes = self._slopes(own, source_mm)

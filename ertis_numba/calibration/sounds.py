@@ -37,41 +37,21 @@ _FLAT_M: Final = 1e-3  # Extent of the array along an axis that directions canno
 
 
 class Source(NamedTuple):
-    """Source of a sound.
-
-    Attributes
-    ----------
-    source_m : (axis,) float64
-        Reflector, mirror image or emitter, in metres.
-    share : float
-        Share of the microphones that its wavefront fits.
-    """
+    """Source of a sound: position (axis,) of a reflector, mirror image or emitter."""
 
     source_m: NDArray[np.float64]
-    share: float
+    share: float  # of the microphones that its wavefront fits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sound:
-    """Strongest sound of a measurement.
-
-    Attributes
-    ----------
-    pulses : Compressed
-        Signals after the matched filter, without their envelopes.
-    arrival : SoundArrival
-        Times and levels at the highest envelope of each microphone.
-    middle_s : float
-        Middle of the times, in seconds.
-    speed_m_s : float
-        Speed of sound according to the settings.
-    """
+    """Strongest sound of a measurement."""
 
     settings: Settings
-    pulses: Compressed
-    arrival: SoundArrival
-    middle_s: float
-    speed_m_s: float
+    pulses: Compressed  # after the matched filter, without envelopes
+    arrival: SoundArrival  # at the highest envelope of each microphone
+    middle_s: float  # middle of the times
+    speed_m_s: float  # according to the settings
 
     def measure(self, at_s: NDArray[np.float64], used: NDArray[np.bool_]) -> SoundArrival:
         """Measure the sound at other times; see `measure_arrival`."""
@@ -81,20 +61,9 @@ class Sound:
 def hear(
     measurement: Measurement, channels: NDArray[np.intp], positions_m: NDArray[np.float64], target: Target
 ) -> Sound:
-    """Return the strongest sound of a measurement.
+    """Return the strongest sound; raise DataError if saturated, or if no sound or not a single one stands out.
 
-    Parameters
-    ----------
-    channels : (mic,) intp
-        Channels with a microphone.
-    positions_m : (mic, axis) float64
-    target : {"reflector", "wall", "direct", "beacon"}
-        Direct sound is searched at paths below 0.5 m, other sound at longer ones.
-
-    Raises
-    ------
-    DataError
-        The channels are saturated, no sound stands out, or the strongest is not a single one.
+    Direct sound is searched at paths below 0.5 m, other sound at longer ones.
     """
     settings = measurement.settings
     signals, _, _, loud, n_samples = _signals(measurement, channels)
@@ -167,17 +136,7 @@ def find_source(
     delay_s: NDArray[np.float64],
     target: Target,
 ) -> Source:
-    """Locate the source of a sound by the wavefront that most of the used microphones agree with.
-
-    Parameters
-    ----------
-    used : (mic,) bool
-    positions_m : (mic, axis) float64
-        Positions of all microphones.
-    delay_s : (mic,) float64
-        Delays of all microphones.
-    target : {"reflector", "wall", "direct", "beacon"}
-    """
+    """Locate the source of a sound by the wavefront that most of the used microphones agree with."""
     times_s, places_m = (sound.arrival.time_s - delay_s)[used], positions_m[used]
     if target == "direct":
         starts = _EMITTERS_M

@@ -16,17 +16,9 @@ _MAX_SHRINK: Final = 1e-4  # Smallest square root that the near field may yield;
 def wave_lags(
     direction: NDArray[np.float64], curvature_1_m: NDArray[np.float64], positions_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return how much longer the path to each microphone is than that to the origin: (..., mic) float64, in metres.
+    """Return the path to each microphone minus that to the origin: (..., mic), m.
 
     The source is at distance ``r = 1 / κ`` in the direction u: ``|r u − x| − r = (√(1 − 2 κ u·x + κ² |x|²) − 1) / κ``.
-
-    Parameters
-    ----------
-    direction : (..., axis) float64
-        Unit vectors to the source.
-    curvature_1_m : (...) float64
-        Inverse distances of the source, in 1/m.
-    positions_m : (mic, axis) float64
     """
     along_m, root = _root(direction, curvature_1_m, positions_m)
     squared_m2 = np.sum(positions_m**2, axis=1)
@@ -37,7 +29,7 @@ def wave_lags(
 def wave_slopes(
     direction: NDArray[np.float64], curvature_1_m: float, positions_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the derivatives of path lengths by path, direction and curvature: (mic, parameter) float64.
+    """Return the derivatives of path lengths by path, direction and curvature: (mic, parameter).
 
     The direction counts as three independent numbers, so that a flat array does not observe the one across it.
     """
@@ -64,23 +56,9 @@ def fit_wave(
     *,
     n_rounds: int = 6,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fit a spherical wave to the path lengths of the microphones (Gauss-Newton with Cauchy weights).
+    """Fit a spherical wave to path lengths (mic,) by Gauss-Newton; return it, and weights (mic,) from 0 to 1.
 
-    Parameters
-    ----------
-    paths_m : (mic,) float64
-        Times of arrival multiplied by the speed of sound.
-    positions_m : (mic, axis) float64
-    start : (parameter,) float64
-        Path to the origin in metres, direction, and curvature in 1/m.
-    scale_m : float
-        Residual beyond which a microphone loses weight.
-
-    Returns
-    -------
-    wave : (parameter,) float64
-    weight : (mic,) float64
-        Weights of the microphones, from 0 to 1.
+    The weights are those of Cauchy: residuals beyond scale_m lose weight. The parameters are those of `Wave`.
     """
     wave = np.array(start, dtype=np.float64)
     weight = np.ones(len(paths_m))

@@ -36,15 +36,7 @@ _MAX_SILENT_POWER: Final = 0.1  # Power of a silent channel around the sound, re
 
 
 class OtherLayoutError(DataError):
-    """Another shipped layout than that of the settings fits the recordings.
-
-    Attributes
-    ----------
-    finding : str
-        Both layouts, as a clause.
-    layout : str
-        Name of the layout that fits.
-    """
+    """Another shipped layout than that of the settings fits the recordings; finding names both in a clause."""
 
     def __init__(self, given: str, share: float, layout: str) -> None:
         self.finding = (
@@ -137,13 +129,7 @@ def silent_channels(sounds: dict[int, Sound]) -> NDArray[np.bool_]:
 
 
 def unclear_channels(sounds: dict[int, Sound], max_level_db: float) -> NDArray[np.bool_]:
-    """Return True for microphones whose sound differs from the common one in most recordings: (mic,) bool.
-
-    Parameters
-    ----------
-    max_level_db : float
-        Largest plausible level relative to the median microphone.
-    """
+    """Return True for microphones whose sound differs from the common one in most recordings: (mic,)."""
     coherence = np.stack([sound.arrival.coherence for sound in sounds.values()])
     power = np.stack([sound.arrival.power / np.median(sound.arrival.power) for sound in sounds.values()])
     is_too_loud = np.median(power, axis=0) > 10 ** (max_level_db / 10)
@@ -161,7 +147,7 @@ def _sources(heard: Heard, every: Microphones, used: NDArray[np.bool_], target: 
 def ordered(
     heard: Heard, every: Microphones, used: NDArray[np.bool_], target: Target
 ) -> tuple[Microphones, NDArray[np.float64], str]:
-    """Return the microphones in the order that fits the sounds, the sources, and the name of an unexpected order.
+    """Return microphones in the order that fits, their sources, and the name of an unexpected order.
 
     Recordings that no wavefront fits are removed.
     """

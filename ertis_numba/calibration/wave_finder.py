@@ -37,20 +37,13 @@ _OVERLAP_SD_M: Final = 12e-3  # Error of the path for a pulse that has nothing i
 class Wave(NamedTuple):
     """Call that arrives at a sensor as a spherical wave.
 
-    Attributes
-    ----------
-    parameters : (parameter,) float64
-        Path from the emission to the origin of the sensor in metres, direction to the source x, y and z, and curvature,
-        the inverse distance of the source, in 1/m.
-    information : (parameter, parameter) float64
-        Inverse of the covariance; singular if the array is flat.
-    amplitude : float
-        Amplitude after the matched filter.
+    The parameters are: path from the emission to the origin of the sensor in m, direction to the source x, y and z, and
+    curvature, the inverse distance of the source, in 1/m.
     """
 
     parameters: NDArray[np.float64]
-    information: NDArray[np.float64]
-    amplitude: float
+    information: NDArray[np.float64]  # inverse covariance of the parameters; singular if the array is flat
+    amplitude: float  # after the matched filter
 
     @property
     def path_m(self) -> float:
@@ -64,17 +57,11 @@ class Wave(NamedTuple):
 
 
 def find_waves(measurement: Measurement) -> list[Wave]:
-    """Return the waves of one measurement, strongest first.
+    """Return the waves of one measurement, strongest first; raise DataError if too few microphones work.
 
     The strongest peak of all envelopes starts a search over directions for the spherical wave whose envelopes add up
-    best. The times of the microphones are then measured by their phases relative to the mean of the aligned signals,
-    and a robust fit yields the wave. The mean pulse is subtracted, and the search goes on with the rest (Högbom,
-    Astron. Astrophys. Suppl. 15, 1974, 417, applied to wavefronts).
-
-    Raises
-    ------
-    DataError
-        Fewer than 6 microphones work, or most of them are saturated.
+    best. Phases relative to the mean of the aligned signals yield the times, and a robust fit yields the wave. The mean
+    pulse is subtracted, and the search goes on with the rest (Högbom, Astron. Astrophys. Suppl. 15, 1974, 417).
     """
     record, receivers = wave_record(measurement)
     speed_m_s = sound_speed_m_s(measurement.settings.air)
@@ -104,10 +91,7 @@ def find_waves(measurement: Measurement) -> list[Wave]:
 
 
 def _floor(envelope: NDArray[np.float64], near_step: int) -> NDArray[np.float64]:
-    """Return the smallest peak that can be a wave: (step,) float64.
-
-    Echoes may be much weaker than direct sound, which ends before them.
-    """
+    """Return the smallest peak that can be a wave: (step,). Echoes may be far weaker than the earlier direct sound."""
     floor = np.full(envelope.shape[1], _PROMINENCE * float(np.median(envelope)))
     for part in (slice(None, near_step), slice(near_step, None)):
         floor[part] = np.maximum(floor[part], _DYNAMIC_RANGE * envelope[:, part].max(initial=0.0))

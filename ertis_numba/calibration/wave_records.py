@@ -97,13 +97,7 @@ def _receivers(array: Array, faulty: tuple[int, ...] = ()) -> WorkingMicrophones
 
 
 def wave_record(measurement: Measurement) -> tuple[WaveRecord, WorkingMicrophones]:
-    """Return the signals of one measurement, and the microphones that work.
-
-    Raises
-    ------
-    DataError
-        Fewer than 6 microphones work, or most of them are saturated.
-    """
+    """Return the signals, and the microphones that work; raise DataError if those are fewer than 6."""
     settings = measurement.settings
     receivers = _receivers(settings.array)
     signals, _, stuck, loud, n_samples = _signals(measurement, receivers.channels)

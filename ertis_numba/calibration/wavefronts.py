@@ -17,23 +17,12 @@ _STEP_M = 1e-9  # Change of a position at which the search has converged.
 
 
 class TravelTimes(NamedTuple):
-    """Travel times and their derivatives.
-
-    Attributes
-    ----------
-    time_s : (record, mic) float64
-    distance_m : (record, mic) float64
-        Distance from the source to the microphone.
-    by_microphone : (record, mic, axis) float64
-        Derivative by the position of the microphone, in s/m.
-    by_source : (record, mic, axis) float64
-        Derivative by the position of the source, in s/m.
-    """
+    """Travel times (record, mic) and their derivatives (record, mic, axis) in s/m."""
 
     time_s: NDArray[np.float64]
-    distance_m: NDArray[np.float64]
-    by_microphone: NDArray[np.float64]
-    by_source: NDArray[np.float64]
+    distance_m: NDArray[np.float64]  # from the source to the microphone
+    by_microphone: NDArray[np.float64]  # by the position of the microphone
+    by_source: NDArray[np.float64]  # by the position of the source
 
 
 def travel_times(
@@ -47,16 +36,6 @@ def travel_times(
     The emitter e is at the origin of the sensor. A reflector at s delays the call by ``(|s − e| + |s − x|) / c``. A
     wall delays it as if it came from the mirror image s of the emitter, by ``|s − x| / c``, and so does the call of
     another sensor at s. Direct sound does the same, and its s is the place of the emitter.
-
-    Parameters
-    ----------
-    source_m : (record, axis) float64
-        Reflector, mirror image or emitter, in metres.
-    positions_m : (mic, axis) float64
-        Microphones, in metres.
-    speed_m_s : float or (record,) float64
-        Speed of sound in m/s.
-    target : {"reflector", "wall", "direct", "beacon"}
     """
     apart_m = positions_m - source_m[:, None]
     distance_m = np.maximum(np.linalg.norm(apart_m, axis=2), 1e-9)
@@ -79,19 +58,7 @@ def locate_source(
     *,
     scale_s: float,
 ) -> NDArray[np.float64]:
-    """Return the position of a source by robust least squares (Gauss-Newton with Cauchy weights): (axis,) float64.
-
-    Parameters
-    ----------
-    time_s : (mic,) float64
-        Times of arrival.
-    positions_m : (mic, axis) float64
-    start_m : (axis,) float64
-        First approximation.
-    target : {"reflector", "wall", "direct", "beacon"}
-    scale_s : float
-        Residual beyond which a microphone loses weight, in seconds.
-    """
+    """Return the position of a source (axis,) by Gauss-Newton; residuals beyond scale_s lose weight (Cauchy)."""
     source_m = np.array(start_m, dtype=np.float64)
     damping = 1e-6
     for _ in range(_ROUNDS):
