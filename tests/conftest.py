@@ -4,6 +4,7 @@ import gc
 import logging
 import os
 import random
+import signal
 import threading
 import types
 
@@ -15,6 +16,16 @@ import threadpoolctl
 # The load of a machine must not decide whether a law holds.
 hypothesis.settings.register_profile("any_load", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
 hypothesis.settings.load_profile("any_load")
+
+# `nohup` and background jobs of scripts start this process with ignored signals, which its children would inherit.
+# A handler replaces them: children start with the default then, and a hangup still ends no tests.
+for _number, _handler in {
+    signal.SIGINT: signal.default_int_handler,
+    signal.SIGQUIT: signal.SIG_DFL,
+    signal.SIGHUP: lambda *_: None,
+}.items():
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _handler)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
