@@ -45,18 +45,13 @@ _AT_ONCE: Final = 64
 
 @dataclass(slots=True)
 class SubscriberCounts:
-    """Counts of an application's products.
+    """Counts of an application's products."""
 
-    The application has taken ``received`` products; the publisher ``dropped`` others because the application was slow.
-    ``missed`` numbers never arrived: those dropped, except for any still on their way. ``damaged`` messages were
-    invalid; each ends a connection.
-    """
-
-    received: int = 0
-    dropped: int = 0
-    missed: int = 0
+    received: int = 0  # taken by the application
+    dropped: int = 0  # by the publisher, because the application was slow
+    missed: int = 0  # never arrived: dropped, except for any still on their way
     reconnects: int = 0
-    damaged: int = 0
+    damaged: int = 0  # invalid messages; each ends a connection
 
 
 @dataclass(slots=True)
@@ -120,10 +115,7 @@ class Subscription:
             self._close()
 
     def turn(self, woken: WakeupSocket, now_s: float) -> None:
-        """Do pending work, or wait up to a tenth of a second.
-
-        Raises RefusedError if the publisher has never accepted this application.
-        """
+        """Do pending work, or wait up to 0.1 s; raise RefusedError if the publisher never accepted us."""
         connection = self._connection
         if connection is None:
             if now_s < self._wait_until_s:
@@ -170,10 +162,7 @@ class Subscription:
         self._dropped_before, self._missed_before = self._counts.dropped, self._counts.missed
 
     def _restarted(self) -> None:
-        """Start again on a connection that ZeroMQ has re-established with another publisher at the same address.
-
-        The consumed count continues: a publisher counts from the first value that it receives.
-        """
+        """Start again after ZeroMQ reconnected to another publisher, which counts from our consumed count."""
         numbers = self._numbers
         numbers.reader, numbers.received, numbers.next_number = ProductReader(), 0, 0
         self._counts.reconnects += 1

@@ -27,11 +27,7 @@ _HTTP_HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9][A-Za-z0-9.-]*)(
 
 
 def endpoint(text: str, *, name: str = "address") -> str:
-    """Return an address in the form of ZeroMQ.
-
-    ``text`` is ``tcp://HOST:PORT``. A node that listens may give port 0 or ``*`` for a free port, and host ``*`` for
-    all interfaces. ``name`` is used in errors, such as the option by which users give it.
-    """
+    """Return ``tcp://HOST:PORT`` for ZeroMQ; port 0 or ``*``: any free; host ``*``: all; name is for errors."""
     found = _ADDRESS.fullmatch(text) if isinstance(text, str) else None
     if found is None or (found[2] != "*" and int(found[2]) > 65535):
         raise ArgumentError(f"{name} {text!r} cannot be used; use tcp://HOST:PORT, such as {DEFAULT_LISTEN}")
@@ -68,10 +64,7 @@ def is_loopback(endpoint: str) -> bool:
 
 
 def is_own_host(given: str, host: str) -> bool:
-    """Return True if the Host of an HTTP request is a loopback name or address, or the server's own host.
-
-    ``given`` may have a port; ``host`` is that of the server, without brackets.
-    """
+    """Return True if the Host of an HTTP request, port optional, is loopback or the server's own, without brackets."""
     found = _HTTP_HOST.fullmatch(given)
     if found is None:
         return False

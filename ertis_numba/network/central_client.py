@@ -166,10 +166,7 @@ class CentralClient:
         again_s: float | None = None,
         silent: str = "",
     ) -> Answer:
-        """Send a request until it is answered, and return the answer; threads take turns.
-
-        It is sent once if ``again_s`` is None. ``silent`` is the error about a sent request without an answer.
-        """
+        """Repeat a request until it is answered, once if again_s is None; silent is the error if it is not."""
         with self._turn:
             return self._exchange_alone(frames, answer_in, patience_s, again_s=again_s, silent=silent)
 

@@ -51,10 +51,7 @@ class Checked(TomlDocument, frozen=True, kw_only=True):
 
 
 def _crc32(document: Checked) -> str:
-    """Return the CRC-32 of the content as JSON.
-
-    Empty fields are left out, so that fields added later change it only if they are used.
-    """
+    """Return the CRC-32 of the content as JSON, without empty fields, so that it survives new unused fields."""
     return f"{zlib.crc32(msgspec.json.encode(_without_empty(msgspec.to_builtins(document)))):08x}"
 
 

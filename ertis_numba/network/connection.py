@@ -16,14 +16,11 @@ _READ_OR_WRITE: Final = zmq.POLLIN | zmq.POLLOUT
 
 
 class Connection:
-    """Socket of a client with its monitor: sends, receives, pings, and reports refusals. One thread uses it.
+    """Socket of a client with its monitor: sends, receives, pings, and reports refusals; for one thread.
 
     ZeroMQ reconnects in the background. A client that has been refused, or hears nothing, makes a new connection.
-
-    Without ``keys``, it connects on loopback only. ``max_bytes`` limits a frame. ``sent_s`` is that of the first
-    message sent, which requires a peer. The reader of valid messages sets ``heard_s``. If there was no room for a
-    message, it ``is_blocked``, and `wait` ends when there is room. Raises NetworkError if the address can never be
-    connected to.
+    Without ``keys``, it connects on loopback only. ``sent_s`` is that of the first message, which requires a peer; the
+    reader of valid messages sets ``heard_s``. `wait` of a connection that ``is_blocked`` ends when there is room.
     """
 
     def __init__(

@@ -25,13 +25,7 @@ class Writable(Protocol):
 
 
 class EventLog:
-    """Logger of one part of a node.
-
-    ::
-
-        log = logger("central_node")
-        log.warning("conflict", sensor="front", session_id=7, sequence=41, text="both are kept")
-    """
+    """Logger of one part of a node, as in ``logger("central_node").warning("conflict", sensor="front", text="…")``."""
 
     def __init__(self, name: str) -> None:
         self._logger = logging.getLogger(f"{_ROOT}.{name}")

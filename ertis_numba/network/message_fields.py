@@ -49,15 +49,11 @@ def as_line(text: str) -> str:
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind", tag=str.lower):
-    """Header of a message. Its class declares the message once: tables, checks of roles and handlers derive from it.
+    """Header of a message, declared once: tables, checks of roles and handlers derive from its class."""
 
-    ``routes`` are (sender, receiver). ``payload`` describes its payload frames, for the documentation, and ``product``
-    is what it brings to applications.
-    """
-
-    routes: ClassVar[tuple[tuple[Party, Party], ...]] = ()
-    payload: ClassVar[str] = ""
-    product: ClassVar[str] = ""
+    routes: ClassVar[tuple[tuple[Party, Party], ...]] = ()  # (sender, receiver)
+    payload: ClassVar[str] = ""  # description of the payload frames, for the documentation
+    product: ClassVar[str] = ""  # that it brings to applications
 
     @classmethod
     def kind(cls) -> str:
@@ -71,20 +67,15 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class OfMeasurement(Message, frozen=True, kw_only=True):
-    """Header fields of a message about a measurement.
-
-    ``sensor``, ``session_id``, ``sequence``, ``sync_count`` and ``behaviour`` are as in `ertis_numba.frames.Stamp`. The
-    emission starts at ``timestamp_ns`` ± ``uncertainty_ns`` since 1970-01-01 UTC, by the sensor node's clock; by its
-    monotonic clock, the measurement has arrived completely at ``monotonic_ns``.
-    """
+    """Header fields of a message about a measurement; unexplained ones are as in `ertis_numba.frames.Stamp`."""
 
     sensor: Name
     session_id: Count
     sequence: Number
     sync_count: Int64
-    timestamp_ns: Int64
+    timestamp_ns: Int64  # start of the emission since 1970-01-01 UTC, by the node's clock
     uncertainty_ns: Uint32
-    monotonic_ns: Int64
+    monotonic_ns: Int64  # complete arrival, by the node's monotonic clock
     behaviour: Behaviour = "unknown"
 
     @property

@@ -91,47 +91,35 @@ SILENCE_LIMIT_S: Final = 3.0
 
 
 class Hello(Message, frozen=True, kw_only=True):
-    """A sensor node has measurements of a sensor. Payload: the sensor's settings as TOML.
-
-    ``session_id`` and its sequence numbers are the identity of a measurement. ``next_sequence`` is the oldest number
-    that the node still has, or the next one. The mounting of the sensor on its platform is None if unknown.
-    """
+    """A sensor node has measurements of a sensor. Payload: the sensor's settings as TOML."""
 
     routes = (("sensor", "central"),)
     payload = "settings (TOML)"
 
     sensor: Name
-    session_id: Count
-    next_sequence: Number
+    session_id: Count  # with the sequence number, the identity of a measurement
+    next_sequence: Number  # oldest number that the node still has, or the next one
     settings_crc32: Uint32
     firmware: Annotated[str, Meta(max_length=64)] = ""
-    translation_m: Position | None = None
+    translation_m: Position | None = None  # on the platform; None if unknown
     rotation_xyzw: Quaternion | None = None
 
 
 class Welcome(Message, frozen=True, kw_only=True):
-    """The central node accepts measurements of a sensor.
-
-    ``acks`` is the meaning of an `Ack`: ``stored`` on disk, or ``accepted`` in memory. ``window`` limits the
-    unacknowledged measurements. Up to ``acked_through``, each measurement is stored, or known to be missing; -1 if
-    there is none.
-    """
+    """The central node accepts measurements of a sensor."""
 
     routes = (("central", "sensor"),)
 
     sensor: Name
     session_id: Count
     state: State
-    acks: Literal["stored", "accepted"]
-    window: Annotated[int, Meta(ge=1, le=1024)]
-    acked_through: AckedThrough
+    acks: Literal["stored", "accepted"]  # stored on disk, or accepted in memory
+    window: Annotated[int, Meta(ge=1, le=1024)]  # limit on unacknowledged measurements
+    acked_through: AckedThrough  # each up to here is stored or known to be missing; -1: none
 
 
 class Data(OfMeasurement, frozen=True, kw_only=True):
-    """A measurement. Payload: its samples, little-endian.
-
-    ``crc32`` is that of the payload.
-    """
+    """A measurement. Payload: its samples, little-endian, with this CRC-32."""
 
     routes = (("sensor", "central"),)
     payload = "samples"
@@ -178,11 +166,10 @@ class Ack(Message, frozen=True, kw_only=True):
 
 
 class PlatformPose(Message, frozen=True, kw_only=True):
-    """Pose of a platform at a time, to be stored with the measurements of its sensors.
+    """Pose of a platform, as in `ertis_numba.frames.Trajectory`, to be stored with its sensors' measurements.
 
     The key must be allowed to send for all ``sensors`` on the platform. The sender keeps ``session_id`` when it
-    connects again. ``timestamp_ns`` counts from 1970-01-01 UTC. ``position_m`` and ``rotation_xyzw`` are as in
-    `ertis_numba.frames.Trajectory`. ``covariance`` has the rows of its covariance; None if it is unknown.
+    connects again. ``timestamp_ns`` counts from 1970-01-01 UTC. ``covariance`` has its rows; None if it is unknown.
     """
 
     routes = (("sensor", "central"),)
@@ -231,9 +218,8 @@ class Bye(Message, frozen=True, kw_only=True):
 class Refused(Message, frozen=True, kw_only=True):
     """The central node refused a message.
 
-    ``code`` is the reason for programs. ``hello``: the session is unknown; the node should send `Hello` again.
-    ``sensor``: no sensor node sends the sensor that the message is for. ``reason`` is for people: what was got, what is
-    accepted, the remedy.
+    The code ``hello`` means that the session is unknown: the node should send `Hello` again. ``sensor`` means that no
+    node sends the sensor. ``reason`` is for people: what was got, what is accepted, the remedy.
     """
 
     routes = (("central", "sensor"), ("central", "application"), ("publisher", "application"))
@@ -245,33 +231,25 @@ class Refused(Message, frozen=True, kw_only=True):
 
 
 class Configure(Message, frozen=True, kw_only=True):
-    """Request for new settings of a sensor, which the central node forwards. Payload: the settings as TOML.
-
-    The answer is recognised by ``request_id``, a random number. The central node fills in ``max_bytes``, its limit on a
-    measurement; it is 0 from an admin.
-    """
+    """Request for new settings of a sensor, which the central node forwards. Payload: the settings as TOML."""
 
     routes = (("admin", "central"), ("central", "sensor"))
     payload = "settings (TOML)"
 
     sensor: Name
-    request_id: Count
-    max_bytes: Count = 0
+    request_id: Count  # random; identifies the answer
+    max_bytes: Count = 0  # limit on a measurement, filled in by the central node; 0 from an admin
 
 
 class Configured(Message, frozen=True, kw_only=True):
-    """Answer to a `Configure`.
-
-    ``sensors`` are those of the sensor node, at most 32, if they have the new settings. ``error`` is the reason why the
-    former ones are still in use; otherwise empty.
-    """
+    """Answer to a `Configure`."""
 
     routes = (("sensor", "central"), ("central", "admin"))
 
     sensor: Name
     request_id: Count
-    sensors: Annotated[tuple[Name, ...], Meta(max_length=32)] = ()
-    error: Line = ""
+    sensors: Annotated[tuple[Name, ...], Meta(max_length=32)] = ()  # of the node, if they have the new settings
+    error: Line = ""  # reason why the former ones are still in use; otherwise empty
 
 
 class AskStatus(Message, frozen=True, kw_only=True):
@@ -297,10 +275,7 @@ def encode(message: Message) -> bytes:
 
 
 def decode(header: "bytes | memoryview", wanted: Sequence[type[Message]] | None = None) -> Any:
-    """Return the message of a header frame.
-
-    ``wanted`` are the accepted messages; any by default.
-    """
+    """Return the message of a header frame; wanted are the accepted messages, any by default."""
     if len(header) > HEADER_BYTES:
         raise DataError(f"a header has {len(header)} bytes; the limit is {HEADER_BYTES}")
     beginning = bytes(header[: len(_BEGINNING)])

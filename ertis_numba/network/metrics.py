@@ -38,15 +38,10 @@ _NOW_OF_SENSOR: Final = {
 
 
 class Metrics:
-    """Server of a central node's status as metrics, over HTTP and on this machine only.
+    """HTTP server of a central node's status as metrics, on this machine; refuses other Hosts with 421.
 
-    Requests whose Host is not a loopback name or address are refused with 421. ``address`` is ``HOST:PORT``; port 0
-    selects a free one, which the attribute shows after the start. Other threads call ``latest``.
-
-    ::
-
-        with Metrics("127.0.0.1:9101", node.status):
-            ...
+    ``address`` is ``HOST:PORT``; port 0 selects a free one, which the attribute shows after the start. Other threads
+    call ``latest``.
     """
 
     def __init__(self, address: str, latest: Callable[[], Status]) -> None:
@@ -169,7 +164,7 @@ class Metrics:
 
 
 def _of_own_hosts(app: "WSGIApplication", host: str) -> "WSGIApplication":
-    """Return an application that refuses requests for other host names, as DNS rebinding sends them.
+    """Return an application that refuses other host names, as DNS rebinding sends them.
 
     A browser that fetches from ``evil.example`` names it as Host, even if that name resolves to this machine.
     """

@@ -43,11 +43,10 @@ def private_folder(folder: Path) -> Path:
 
 
 def require_own(path: Path, about: str = "is an allow list of keys") -> None:
-    """Refuse a file that other users of this machine may change or replace.
+    """Raise SettingsError for a file that users other than this one and root may change or replace.
 
-    Other users are all except this user and root. The function follows each link of the path and checks each folder, as
-    StrictModes of OpenSSH does for the folders above ``authorized_keys``. Raises SettingsError, or OSError if the file
-    does not exist.
+    The function follows each link of the path and checks each folder, as StrictModes of OpenSSH does for the folders
+    above ``authorized_keys``. It raises OSError if the file does not exist.
     """
     if os.name != "posix":
         return

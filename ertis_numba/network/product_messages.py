@@ -24,18 +24,14 @@ PRODUCTS: Final[tuple[Product, ...]] = get_args(Product)
 
 
 class Subscribe(Message, frozen=True, kw_only=True):
-    """An application subscribes to products; sent each second, and whenever it has consumed a product.
-
-    ``sensors`` are all by default. ``consumed`` counts the products that the application has taken since the connection
-    was made; ``credit`` is the number of further products that the publisher may send.
-    """
+    """An application subscribes to products; sent each second, and whenever it has consumed a product."""
 
     routes = (("application", "publisher"),)
 
     sensors: Annotated[tuple[Name, ...], Meta(max_length=32)] | None = None
     products: Annotated[tuple[Product, ...], Meta(min_length=1, max_length=8)]
-    consumed: Count = 0
-    credit: Annotated[int, Meta(ge=1, le=64)] = 2
+    consumed: Count = 0  # taken since the connection was made
+    credit: Annotated[int, Meta(ge=1, le=64)] = 2  # further products that the publisher may send
 
 
 class Description(Message, frozen=True, kw_only=True):
@@ -65,27 +61,20 @@ class _Product(OfMeasurement, frozen=True, kw_only=True):
 
 
 class Image(_Product, frozen=True, kw_only=True):
-    """An energyscape. Payloads: its amplitudes, little-endian, cut into frames.
-
-    ``shape`` is (direction, range). ``received_ns`` and ``published_ns`` are the arrival of the measurement at the
-    central node, and the departure of the image, by a monotonic clock there.
-    """
+    """An energyscape. Payloads: its amplitudes, little-endian, cut into frames."""
 
     routes = (("publisher", "application"),)
     payload = "amplitude, in frames of 512 KiB"
     product = "energyscape"
 
-    shape: tuple[Count, Count]
+    shape: tuple[Count, Count]  # (direction, range)
     dtype: Literal["float32", "float16"]
-    received_ns: Int64
-    published_ns: Int64
+    received_ns: Int64  # arrival of the measurement, by a monotonic clock of the central node
+    published_ns: Int64  # departure of the image, by the same clock
 
 
 class Points(_Product, frozen=True, kw_only=True):
-    """A point cloud. Payload: ``(point, 4)`` little-endian float32, each x, y, z in m and the amplitude.
-
-    ``received_ns`` and ``published_ns`` are as in `Image`.
-    """
+    """A point cloud. Payload: ``(point, 4)`` little-endian float32, each x, y, z in m and the amplitude."""
 
     routes = (("publisher", "application"),)
     payload = "`(point, 4)` float32: x, y, z in m, amplitude"
@@ -112,10 +101,9 @@ class Raw(_Product, frozen=True, kw_only=True):
 class Group(Message, frozen=True, kw_only=True):
     """Simultaneous measurements, once all have arrived or no more are expected.
 
-    ``group`` is the pulse of the SYNC chain, as all sensors count it. ``members`` are (sensor, session_id, sequence),
-    and ``missing`` sensors. ``spread_ns`` is the time between the first and the last timestamp. ``flags`` are faults:
-    ``incomplete``, sensors are missing; ``clock``, timestamps disagree although counters agree; ``pulse``, a sensor has
-    lost a pulse or seen one twice.
+    ``group`` is the pulse of the SYNC chain. ``members`` are (sensor, session_id, sequence), ``missing`` sensors.
+    ``spread_ns`` is the last minus the first timestamp. Flags: ``incomplete``, sensors are missing; ``clock``,
+    timestamps disagree although counters agree; ``pulse``, a sensor has lost a pulse or seen one twice.
     """
 
     routes = (("publisher", "application"),)
@@ -136,10 +124,7 @@ class Group(Message, frozen=True, kw_only=True):
 
 
 class Report(Message, frozen=True, kw_only=True):
-    """Status of the central node. Payload: `ertis_numba.network.status.Status` as MessagePack.
-
-    ``number`` and ``dropped`` are 0 in the answer to `AskStatus`.
-    """
+    """Status of the central node. Payload: `Status` as MessagePack. Both numbers are 0 in answers to `AskStatus`."""
 
     routes = (("central", "application"), ("publisher", "application"))
     payload = "status (MessagePack)"

@@ -32,38 +32,25 @@ _COLUMNS = 4  # Columns of a point: x, y, z and amplitude.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrival:
-    """A received product.
-
-    ``arrived_ns`` is the complete arrival by the monotonic clock (`time.monotonic_ns`), which a sensor node on this
-    machine also uses for ``header.monotonic_ns``; ``arrived_utc_ns`` is by the system clock. Product numbers count from
-    0 in each ``connection``. The mounting of the sensor on its platform is None if unknown.
-    """
+    """A received product."""
 
     item: Item
     header: Header
-    arrived_ns: int
-    arrived_utc_ns: int
-    connection: int
-    translation_m: tuple[float, float, float] | None = None
+    arrived_ns: int  # complete arrival by time.monotonic_ns, as header.monotonic_ns on this machine
+    arrived_utc_ns: int  # by the system clock
+    connection: int  # product numbers count from 0 in each
+    translation_m: tuple[float, float, float] | None = None  # of the sensor on its platform; None if unknown
     rotation_xyzw: tuple[float, float, float, float] | None = None
 
     @property
     def age_s(self) -> float | None:
-        """Time in s from the emission to the arrival here, if the clocks of both machines agree.
-
-        None without a timestamp.
-
-        A sensor whose clock was never set has no timestamp either.
-        """
+        """Time from the emission to the arrival here, if both clocks agree; None without a timestamp or a set clock."""
         stamp: Stamp | None = getattr(self.header, "stamp", None)
         return (self.arrived_utc_ns - stamp.timestamp_ns) / 1e9 if stamp is not None and stamp.is_timed else None
 
     @property
     def made_in_s(self) -> float | None:
-        """Time in s from the arrival of the measurement at the central node to the departure of the product.
-
-        None for products that it does not compute.
-        """
+        """Time from the measurement's arrival at the central node to departure; None if not computed there."""
         if not isinstance(self.header, Image | Points):
             return None
         return (self.header.published_ns - self.header.received_ns) / 1e9
@@ -93,10 +80,7 @@ class _Described:
 
 @dataclass(slots=True)
 class ProductReader:
-    """Decoder of the products of one connection, with its descriptions.
-
-    Arrays are copies, which the caller may change.
-    """
+    """Decoder of the products of one connection; arrays are copies, which the caller may change."""
 
     _described: dict[int, _Described] = field(default_factory=dict)
 

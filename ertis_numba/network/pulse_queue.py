@@ -77,10 +77,7 @@ class PulseQueue(Generic[Pulse]):
 
     @contextmanager
     def keeping(self) -> Iterator[None]:
-        """Keep all pulses that arrive until the block ends, and until the application has caught up.
-
-        It must do so within twice the duration of the block. The images that wait take at most 64 MB.
-        """
+        """Keep all pulses, up to 64 MB of images, until the application caught up within twice the block's time."""
         begun_s = time.monotonic()
         self._kept_until_s = math.inf
         try:

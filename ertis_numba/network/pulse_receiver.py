@@ -28,15 +28,11 @@ _STOP_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReceivedPulse:
-    """Images of a SYNC pulse, and the mountings of all sensors so far.
+    """Images of a SYNC pulse, and the mountings of all sensors so far."""
 
-    ``images`` are by sensor. ``mountings`` are (translation_m, rotation_xyzw) by sensor, in the order in which they
-    became known. ``first_ns`` is the emission, by the monotonic clock of the sensor node.
-    """
-
-    images: Mapping[str, Energyscape]
-    mountings: Mountings
-    first_ns: int
+    images: Mapping[str, Energyscape]  # by sensor
+    mountings: Mountings  # (translation_m, rotation_xyzw) by sensor, first known first
+    first_ns: int  # emission, by the node's monotonic clock
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -58,14 +54,10 @@ class _Received:
 class PulseReceiver:
     """Receiver that groups the images of a central node by SYNC pulse, in a thread.
 
-    A pulse is complete when all sensors of the two pulses before have sent their image. A missing sensor delays it
-    until up to three later pulses have begun, or until no image has come for 0.25 s. An application that is too slow
-    gets the latest pulses. A sensor without a mounting, and one that sends images with NaN, is left out with a note.
-
-    The central node publishes at ``address``, ``tcp://HOST:PORT``. ``mountings``, (translation_m, rotation_xyzw) by
-    sensor, replace those that the central node sends. ``sensors`` are all by default; ``keys`` are None on loopback
-    only. A thread calls ``on_note`` with a line for each change of the connection, and ``on_image`` with each image
-    that awaits others of its pulse, unless a pulse waits for `receive`.
+    A pulse is complete when all sensors of the two pulses before have sent their image, when three later pulses have
+    begun, or when no image has come for 0.25 s. A slow application gets the latest pulses. A sensor without a mounting,
+    in ``mountings`` or from the central node, and one that sends NaN, is left out with a note. A thread calls
+    ``on_note`` for each change of the connection, and ``on_image`` for images unless a pulse waits for `receive`.
     """
 
     def __init__(
@@ -106,11 +98,7 @@ class PulseReceiver:
         return self.queue.n_skipped
 
     def receive(self, timeout_s: float | None = None) -> ReceivedPulse | None:
-        """Return the images of the next pulse; None after ``timeout_s``, or once the receiver is closed.
-
-        ``timeout_s`` is unlimited by default. Raises RefusedError if the central node has never accepted this
-        application.
-        """
+        """Return the images of the next pulse; None after timeout_s, or once closed; raises RefusedError."""
         self._owner.require_this_process()
         group = self.queue.take(timeout_s)
         if group is None:

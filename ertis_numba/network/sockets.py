@@ -73,11 +73,10 @@ def server(
     max_bytes: int = MAX_BYTES,
     option: str = "--listen",
 ) -> "zmq.Socket[bytes]":
-    """Return a ROUTER that listens.
+    """Return a listening ROUTER; on loopback only without keys; raise NetworkError if the address is in use.
 
-    With keys, its context needs a `ZapAuthenticator` made before. Without ``keys``, it listens on loopback only.
-    ``max_bytes``, the longest frame, also bounds the memory that an unauthenticated peer can occupy, so set no more
-    than necessary. Users set the address by ``option``. Raises NetworkError if another program uses it.
+    With keys, its context needs a `ZapAuthenticator` made before. ``max_bytes``, the longest frame, also bounds the
+    memory that an unauthenticated peer can occupy, so set no more than necessary. Users set the address by ``option``.
     """
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)
@@ -116,10 +115,9 @@ def bound(socket: "zmq.Socket[bytes]") -> str:
 def client(
     context: "zmq.Context[zmq.Socket[bytes]]", endpoint: str, *, keys: ClientKeys | None, max_bytes: int = MAX_BYTES
 ) -> "zmq.Socket[bytes]":
-    """Return a DEALER that connects and reconnects; a `Monitor` of it reports failures.
+    """Return a DEALER that reconnects, but not after a refusal, which a `Monitor` of it reports.
 
-    It does not reconnect after a refusal: create a new one to try again. Without ``keys``, it connects on loopback
-    only. ``max_bytes`` is the longest frame. Raises NetworkError if the address can never be connected to.
+    Without ``keys``, it connects on loopback only. Raises NetworkError if the address can never be connected to.
     """
     endpoint = addresses.endpoint(endpoint)
     addresses.require_keys(endpoint, keys=keys)
@@ -184,10 +182,9 @@ class _Events:
 
 
 class Monitor(_Events):
-    """Monitor of a client's failed and interrupted connections.
+    """Monitor of a client's failed and interrupted connections: `read` its readable socket.
 
-    Poll ``socket``, and call `read` when it is readable. ``final`` is true if the client has given up: only a new
-    socket tries again.
+    ``final`` is true if the client has given up: only a new socket tries again.
     """
 
     def __init__(self, client: "zmq.Socket[bytes]") -> None:

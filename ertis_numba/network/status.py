@@ -55,8 +55,7 @@ class SensorStatus(msgspec.Struct, kw_only=True):
     """Status of one sensor, since the start of the central node.
 
     ``received`` counts each measurement once, however often it is sent. With processing, ``received = published +
-    sum(dropped.values()) + in_flight``. The only exceptions are measurements lost to an error in this package, which
-    ``refused["internal"]`` counts.
+    sum(dropped.values()) + in_flight``, except for those lost to internal errors: ``refused["internal"]``.
     """
 
     connected: bool = False

@@ -16,10 +16,7 @@ VARIABLE: Final = "ERTIS_TRACE"
 
 
 class TraceWriter:
-    """Writer of one line per mark: stage, sensor, sequence and time; a killed process loses none.
-
-    A mark that cannot be written, as on a full disk, is omitted, because the event loops of nodes write them.
-    """
+    """Writer of a line per mark, which a killed process keeps; omits marks that the disk cannot take."""
 
     def __init__(self, folder: Path) -> None:
         if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):

@@ -42,17 +42,10 @@ _AUTH: Final = int(zmq.EVENT_HANDSHAKE_FAILED_AUTH)
 class ZapAuthenticator:
     """Handler that accepts listed keys and identifies the sender of a message.
 
-    Without ``keys``, every peer has all permissions. ``refused`` counts connections by reason, to which callers add
-    messages. ``note`` is the error of the allow list, which keeps all nodes out.
-
-    ::
-
-        gate = ZapAuthenticator(context, keys)          # before any server
-        socket = sockets.server(context, address, keys=keys)
-        gate.watch(socket)                              # counts connections without a key
-        gate.self_test(sockets.bound(socket))
-        # in the loop: gate.serve() when gate.socket is readable; gate.tick() several times a second;
-        # gate.who(frames) for each message.
+    Make it before any server, `watch` each server to count connections without a key, and call `self_test`. In the
+    loop, call `serve` when ``socket`` is readable, `tick` several times a second, and `who` for each message. Without
+    ``keys``, every peer has all permissions. ``refused`` counts connections by reason, to which callers add messages.
+    ``note`` is the error of the allow list, which keeps all nodes out.
     """
 
     def __init__(self, context: "zmq.Context[zmq.Socket[bytes]]", keys: ServerKeys | None) -> None:
@@ -117,10 +110,7 @@ class ZapAuthenticator:
         return (self._mark + permission.public, "") if permission else ("", _UNKNOWN_KEY)
 
     def who(self, frames: Sequence[zmq.Frame]) -> Permission | None:
-        """Return the current permissions of a message's sender; None, and counted, if there are none.
-
-        ``frames`` come from a ROUTER without copying: the routing id, then the message.
-        """
+        """Return the permissions of the sender of uncopied ROUTER frames; None, and counted, without any."""
         if not frames or was_chosen(frames[0].bytes):
             self.refused["chosen routing id"] += 1
             return None
@@ -149,10 +139,7 @@ class ZapAuthenticator:
         return changed
 
     def _look(self) -> None:
-        """Read the list if due.
-
-        An unreadable list refuses all keys after a second failure, as an editor may be writing it.
-        """
+        """Read the list if due; refuse all keys if it fails twice, as an editor may be writing it."""
         now_s = time.monotonic()
         if self._keys is None or now_s < self._next_look_s:
             return
@@ -174,10 +161,7 @@ class ZapAuthenticator:
         self._changed = self._changed or self._allowed != before
 
     def self_test(self, endpoint: str) -> None:
-        """Verify that connections with an unknown key, and without a key, are refused.
-
-        ``endpoint`` is that of a server in this context. Raises NetworkError if one was accepted, or nothing answered.
-        """
+        """Raise NetworkError unless connections with an unknown key, and without a key, are refused."""
         if self._keys is None:
             return
         self._try(endpoint, _NO_KEY)

@@ -61,10 +61,7 @@ _PEERS_OF_KEY: Final = 64
 
 
 class Unwanted(Exception):  # noqa: N818  it is an answer
-    """Refused message, with a code of `ertis_numba.network.messages.Refused`.
-
-    ``reason`` is one line for the sender, and ``kind`` the category in the counts.
-    """
+    """Refused message: code of `Refused`, one line for the sender, and the category in the counts."""
 
     def __init__(self, code: Any, reason: str, kind: str) -> None:
         super().__init__(reason)
@@ -78,14 +75,11 @@ class Unwanted(Exception):  # noqa: N818  it is an answer
 
 @dataclass(slots=True, eq=False)
 class ReceivedMessage:
-    """Sender and frames of a message.
+    """Sender and frames of a message."""
 
-    ``frames`` are sender, header and payload; ``arrived_ns`` is by `time.monotonic_ns`.
-    """
-
-    frames: list[zmq.Frame]
+    frames: list[zmq.Frame]  # sender, header and payload
     who: Permission
-    arrived_ns: int
+    arrived_ns: int  # by time.monotonic_ns
 
     @property
     def sender(self) -> bytes:
@@ -163,10 +157,7 @@ def require_room(
     run: SensorSession,
     key: str,
 ) -> None:
-    """Refuse a peer, session or sensor beyond the limits.
-
-    ``peer`` is None before its hello, ``key`` empty without keys.
-    """
+    """Refuse a peer (None before hello), session or sensor beyond the limits; key is empty without keys."""
     if peer is None and len(peers) >= _PEERS:
         raise Unwanted("size", f"this central node already has {_PEERS} sensor nodes; use another", "too many")
     if peer is None and key and sum(each.key == key for each in peers.values()) >= _PEERS_OF_KEY:

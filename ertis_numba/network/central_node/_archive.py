@@ -41,11 +41,10 @@ _STUCK_S: Final = 5.0
 
 
 class Archive:
-    """Storage of measurements in journals, which become recordings.
+    """Storage of measurements in journals, which become recordings; one archive can use a folder at a time.
 
-    Only one archive can use ``folder`` at a time. ``name`` is the prefix of recording names, before the time. A
-    recording is full after ``rotate_bytes`` of data and poses, or after ``rotate_s``. Without ``seal``, journals are
-    left to ``ertis import journals``.
+    The name is the prefix of recording names, before the time. A recording is full after ``rotate_bytes`` of data and
+    poses, or after ``rotate_s``. Without ``seal``, journals are left to ``ertis import journals``.
     """
 
     def __init__(
@@ -80,10 +79,7 @@ class Archive:
         self.fault = ""
 
     def open(self) -> int:
-        """Open the folder, recover journals left by a crash, and return a descriptor to poll.
-
-        Call `read` when it is readable.
-        """
+        """Open the folder, recover journals left by a crash, and return a descriptor: call `read` when readable."""
         try:
             make_folder(self.folder)
         except OSError as error:

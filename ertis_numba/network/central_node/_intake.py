@@ -28,10 +28,7 @@ _NEVER: Final = "never reached the central node"
 
 
 class Intake:
-    """Receiver of measurements from greeted nodes, each number once and in order.
-
-    Without a ``store``, accepted measurements are acknowledged at once.
-    """
+    """Receiver of measurements, each number once and in order; without a store, acks are immediate."""
 
     def __init__(
         self,
@@ -63,11 +60,7 @@ class Intake:
         return source_in(hello, payload, max_bytes=self._max_bytes)
 
     def greet(self, peer_id: bytes, hello: Hello, source: JournalSensor, key: str = "") -> Stream:
-        """Accept a hello, and return the session.
-
-        ``source`` is the sensor from `read`. The number of peers per ``key`` is limited more strictly than the number
-        of peers.
-        """
+        """Accept a hello with the sensor from `read`, and return the session; peers per key are limited strictly."""
         run = SensorSession(hello.sensor, hello.session_id)
         peer = self.peers.get(peer_id)
         require_room(self.peers, self.tracks, peer, run, key)

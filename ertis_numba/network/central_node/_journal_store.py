@@ -28,11 +28,10 @@ _MAX_DUPLICATES: Final = 4096
 
 
 class JournalStore:
-    """Journals that store each item once and in order.
+    """Journals in a locked folder that store each item once and in order.
 
-    An item is stored only if it follows the acknowledged ones. The folder is locked. ``name`` is the prefix of
-    recording names. Up to ``acked_through``, a session is stored or known to be missing; ``volume`` is the journal in
-    use, and ``to_hand_on`` lists journals to seal.
+    An item is stored only if it follows the acknowledged ones. Up to ``acked_through``, a session is stored or known to
+    be missing; ``volume`` is the journal in use, and ``to_hand_on`` lists journals to seal.
     """
 
     def __init__(self, folder: Path, name: str, ledger: Ledger, notify: Callable[[Event], None]) -> None:
@@ -95,10 +94,7 @@ class JournalStore:
         self._by_age[run] = None
 
     def store(self, items: list[ReceivedItem]) -> None:
-        """Store items durably and report them; after an error, call it again with the same ones.
-
-        If the disk fails, reported items are durable, and the others are not lost.
-        """
+        """Store items durably and report them; after an error, call it again: reported items are durable."""
         try:
             self._abandon_failed()
             self._store(items)
@@ -241,10 +237,7 @@ class JournalStore:
         self._poses.add(poses, self.volume)
 
     def store_poses(self) -> None:
-        """Store poses durably in the journal in use.
-
-        After a DiskFullError, the next call tries again; after another error, the poses are stored in the next journal.
-        """
+        """Store poses durably: in this journal once there is room, after another error in the next one."""
         if self.volume is not None:
             try:
                 self._poses.store(self.volume)
@@ -256,10 +249,7 @@ class JournalStore:
                 raise
 
     def rotate(self) -> None:
-        """Begin new recordings with the next item.
-
-        If a failed journal still fails, the next start recovers it.
-        """
+        """Begin new recordings with the next item; the next start recovers a journal that still fails."""
         self._abandon_failed()
         volumes, self.volume, self._duplicates = (self.volume, self._duplicates), None, None
         for volume in volumes:
@@ -280,10 +270,7 @@ class JournalStore:
         self._is_saved = False
 
     def hand_on(self) -> list[Path]:
-        """Return journals that can be sealed, once the ledger durably contains their content.
-
-        After a DataError or OSError, call this again.
-        """
+        """Return journals to seal, once the ledger durably contains them; after an error, call this again."""
         if not self._is_saved:
             self._save(open_=self._open)
         found = [path for path in self.to_hand_on if not self._poses.waits(path)]
@@ -320,10 +307,7 @@ class JournalStore:
                     volume.close()
 
     def _abandon_failed(self) -> None:
-        """Limit failed journals durably to their acknowledged measurements, and queue them for sealing.
-
-        After an error, call this again.
-        """
+        """Limit failed journals to acknowledged measurements, to seal them; call again after an error."""
         while self._failed:
             volume = self._failed[0]
             if volume.path.exists():

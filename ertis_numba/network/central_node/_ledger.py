@@ -81,14 +81,11 @@ class _Old(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
 
 class Ledger:
-    """Durable record of the highest acknowledged number of each session of a folder.
+    """Durable record of the highest acknowledged number of the newest 64 sessions of each sensor.
 
-    Each line has the CRC-32 of an entry in hexadecimal, and the entry as a JSON array; wrong ones are omitted. The file
-    keeps the newest 64 sessions of each sensor.
-
-    ``damage`` describes omitted entries and the consequence. In ``acked_through``, the session that grew last comes
-    last. ``open`` journals may contain more; ``unsealed`` ones are to be sealed. ``gaps`` are in no recording yet.
-    ``tails`` has the CRC-32 of the newest measurements, by number.
+    Each line has the CRC-32 of an entry in hexadecimal, and the entry as a JSON array; wrong ones are omitted, and
+    ``damage`` describes them. In ``acked_through``, the session that grew last comes last. ``open`` journals may
+    contain more; ``gaps`` are in no recording yet. ``tails`` has the CRC-32 of the newest measurements, by number.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -175,10 +172,7 @@ class Ledger:
         gaps: Sequence[SequenceGap] = (),
         tails: Mapping[SensorSession, Mapping[int, int]] | None = None,
     ) -> None:
-        """Replace the content of the file durably; after an OSError or DataError, the old content stays.
-
-        The session that grew last comes last in ``acked_through``; only the newest sessions of each sensor are kept.
-        """
+        """Replace the file durably, the session that grew last at the end; after an error, the old content stays."""
         kept = _newest(acked_through)
         opened, left = list(open_), list(unsealed)
         lines: list[_Line] = [

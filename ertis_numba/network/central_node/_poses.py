@@ -30,10 +30,7 @@ class _Sender:
 
 
 class PoseIntake:
-    """Receiver of poses. Each sensor has one sender at a time, until this sender has been silent for some seconds.
-
-    The session identifies a sender, because a sender that connects again is another peer.
-    """
+    """Receiver of poses from one sender per sensor, until it is silent for some seconds; sessions identify senders."""
 
     def __init__(self, store: Archive | None) -> None:
         self._store = store

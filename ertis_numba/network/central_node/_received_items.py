@@ -32,24 +32,18 @@ class SensorSession(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class ReceivedItem:
-    """Item to store.
-
-    ``first`` to ``last`` are acknowledged once it is stored. The peer ``owner`` sent it; ``arrived_s`` is by
-    `time.monotonic`. ``turn``, the number of the transmission, rises if a session has to be sent again, which
-    invalidates earlier items. ``again`` is true if the number was acknowledged before: the item is stored only if the
-    measurement differs. ``done`` is true once its result was reported.
-    """
+    """Item to store."""
 
     run: SensorSession
-    first: int
+    first: int  # acknowledged through last once stored
     last: int
     content: JournalEntry | SequenceGap
     source: JournalSensor
-    arrived_s: float
-    owner: bytes
-    turn: int = 0
-    again: bool = False
-    done: bool = False
+    arrived_s: float  # by time.monotonic
+    owner: bytes  # peer that sent it
+    turn: int = 0  # number of the transmission; a session that is sent again invalidates earlier items
+    again: bool = False  # acknowledged before: store it only if the measurement differs
+    done: bool = False  # the result was reported
 
     @property
     def n_bytes(self) -> int:

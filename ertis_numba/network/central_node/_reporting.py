@@ -27,11 +27,7 @@ _LOG_INTERVAL_S: Final = 1.0  # Interval between events about internal errors.
 
 
 class Condition:
-    """State and status of a central node.
-
-    ``listen`` is the requested address, and ``begun_s`` the time of opening by `time.monotonic`. ``fault`` is the
-    latest error of the archive; empty while it can store.
-    """
+    """State of a central node: requested address, start by time.monotonic, and the archive's fault, if any."""
 
     def __init__(
         self,
@@ -111,10 +107,7 @@ def _memory_bytes() -> int:
 
 
 class EventReporter:
-    """Reporter of changes as events.
-
-    The functions are those of `CentralNode`.
-    """
+    """Reporter of changes as events, to the functions of `CentralNode`."""
 
     def __init__(
         self, on_event: Callable[[dict[str, Any]], None], on_stored: Callable[[str, int, int, int], None] | None = None

@@ -33,10 +33,7 @@ _SHARE: Final = 0.25
 
 
 class Sealing:
-    """Thread that seals one journal after the other, each in a separate process.
-
-    Both functions are called in the thread, ``on_failed`` with a line on the reason.
-    """
+    """Thread that seals journals one by one, each in a process; calls both functions, on_failed with a line."""
 
     def __init__(self, on_sealed: Callable[[SealingResult], None], on_failed: Callable[[str], None]) -> None:
         self._on_sealed, self._on_failed = on_sealed, on_failed

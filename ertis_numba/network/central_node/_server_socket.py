@@ -20,10 +20,7 @@ _LINGER_MS: Final = 500
 
 
 class ServerSocket:
-    """Socket that receives messages of listed keys; never blocks.
-
-    ``address`` is the actual address, in the form that nodes on this machine use.
-    """
+    """Non-blocking socket for messages of listed keys, with its address as nodes on this machine use it."""
 
     def __init__(self, keys: ServerKeys | None) -> None:
         self._keys = keys
@@ -115,10 +112,7 @@ class ServerSocket:
         return [peer_id for peer_id, frames in self._badges.items() if gate.who(frames) is None]
 
     def send(self, peer_id: bytes, message: Message, *payload: bytes) -> bool:
-        """Send a message if possible without blocking; important messages are repeated.
-
-        Returns False if the peer is gone.
-        """
+        """Send without blocking, important messages repeatedly; return False if the peer is gone."""
         if self._socket is None:
             return True
         parts = [peer_id, messages.encode(message), *payload]

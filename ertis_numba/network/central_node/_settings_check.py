@@ -16,10 +16,7 @@ _PREFIX: Final = "no image could be computed from measurements with them: "
 
 
 class SettingsCheck:
-    """Checker of the settings in requests, in the order of the requests.
-
-    ``require`` is called in the thread; it raises an ArgumentError if settings cannot be used.
-    """
+    """Checker of requests in their order, in a thread; require raises ArgumentError for unusable settings."""
 
     def __init__(self, require: Callable[[Settings], None]) -> None:
         self._require = require
@@ -48,10 +45,7 @@ class SettingsCheck:
             self._thread.submit(self._check, request_id, sensor, text)
 
     def take(self) -> list[tuple[int, bytes, str]]:
-        """Return the requests that were checked since the last call: identifier, settings, and fault or an empty text.
-
-        This never blocks.
-        """
+        """Return (identifier, settings, fault or empty text) of newly checked requests, without blocking."""
         if self._wakeup_socket is not None:
             self._wakeup_socket.clear()
         return [self._done.popleft() for _ in range(len(self._done))]

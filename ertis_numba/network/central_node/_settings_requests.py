@@ -31,11 +31,7 @@ class _OpenRequest:
 
 
 class SettingsRequests:
-    """Checks and forwards requests, and forwards their answers.
-
-    ``send``, with a peer, a message to it and its payload, returns False if the peer is gone. ``nodes_of`` returns the
-    sensor nodes that send a sensor. ``require`` is as for `SettingsCheck`.
-    """
+    """Forwarder of checked requests and their answers; send returns False if the peer is gone."""
 
     def __init__(
         self,
@@ -59,9 +55,9 @@ class SettingsRequests:
             self._check.close()
 
     def forward(self, admin_id: bytes, request: Configure, payload: list[bytes]) -> None:
-        """Forward a request to the sensor node, once it is checked.
+        """Forward a checked request to the only sensor node, or refuse it.
 
-        Refuses it if no node or several send the sensor, the settings are missing or too long, too many requests are
+        Reasons are: no node or several send the sensor, the settings are missing or too long, too many requests are
         open, or an equal one is.
         """
         self._forget_old()
@@ -106,11 +102,7 @@ class SettingsRequests:
             self._send(found.admin_id, answer)
 
     def tick(self, nodes: Container[bytes], sign_of_life: Pong) -> None:
-        """Answer requests whose sensor node is gone.
-
-        Sensor nodes with a request get ``sign_of_life``: it shows that a connection has ended before the node is
-        missed.
-        """
+        """Answer requests whose node is gone; sign_of_life reveals a broken connection of the others early."""
         for request_id, request in list(self._open.items()):
             if request.node_id not in nodes or not self._send(request.node_id, sign_of_life):
                 self._refuse(request_id, _LEFT)

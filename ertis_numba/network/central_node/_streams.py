@@ -30,10 +30,7 @@ _DROPS: Final = 32  # Limit on the drops in one ack.
 
 
 def source_of(hello: Hello, text: bytes, *, max_bytes: int) -> JournalSensor:
-    """Return the sensor of a hello.
-
-    ``text`` has the settings as TOML; ``max_bytes`` limits a measurement.
-    """
+    """Return the sensor of a hello, from its settings as TOML; max_bytes limits a measurement."""
     return _source(hello.sensor, text, hello.firmware, hello.translation_m, hello.rotation_xyzw, max_bytes)
 
 
@@ -113,10 +110,7 @@ class SensorTrack:
         )
 
     def _rate_hz(self) -> float:
-        """Return the rate of recent measurements of the latest session, 0 if there are fewer than two.
-
-        The median interval ignores pauses. After a pause, kept measurements arrive much faster than they were made.
-        """
+        """Return the rate of the latest session by its median interval; kept measurements come in bursts."""
         now_s = time.monotonic()
         latest = [each for each in self.times if each.session_id == self.times[-1].session_id]
         recent = [each for each in latest if now_s - each.arrived_s < _RECENT_S]
@@ -135,24 +129,18 @@ def _median_interval_s(times_s: Sequence[float]) -> float:
 
 @dataclass(slots=True, eq=False)
 class Stream:
-    """A greeted session.
-
-    Everything is acknowledged up to ``acked_through``, and will be up to ``taken`` once the waiting items are stored.
-    ``begins`` is the oldest number that the node has; the peer ``owner`` sent the latest hello. Measurements up to
-    ``shown`` were counted and shown. ``turn`` is as in `ReceivedItem`. ``dropped`` has the latest (sequence, reason)
-    discarded by processing and not yet reported to the node.
-    """
+    """A greeted session."""
 
     run: SensorSession
     source: JournalSensor
     track: SensorTrack
-    acked_through: int
-    taken: int
-    begins: int
-    owner: bytes
-    shown: int = -1
-    turn: int = field(default_factory=_turns.__next__)
-    dropped: deque[tuple[int, str]] = field(default_factory=lambda: deque(maxlen=_DROPS_KEPT))
+    acked_through: int  # all up to here is acknowledged
+    taken: int  # will be acknowledged once the waiting items are stored
+    begins: int  # oldest number that the node has
+    owner: bytes  # peer that sent the latest hello
+    shown: int = -1  # counted and shown up to here
+    turn: int = field(default_factory=_turns.__next__)  # as in ReceivedItem
+    dropped: deque[tuple[int, str]] = field(default_factory=lambda: deque(maxlen=_DROPS_KEPT))  # drops not yet reported
     recent: OrderedDict[int, int] = field(default_factory=OrderedDict)
     _air: tuple[tuple[float, float, float], Settings] | None = None
 
@@ -184,22 +172,16 @@ class Stream:
 
 @dataclass(slots=True, eq=False)
 class PeerConnection:
-    """Connection of a sensor node.
-
-    Its last message came at ``heard_s``, by `time.monotonic`; ``waiting_bytes`` from it wait for the disk.
-    """
+    """Connection of a sensor node."""
 
     streams: dict[SensorSession, Stream] = field(default_factory=dict)
-    heard_s: float = 0.0
-    waiting_bytes: int = 0
+    heard_s: float = 0.0  # latest message, by time.monotonic
+    waiting_bytes: int = 0  # waiting for the disk
     key: str = ""
 
 
 class Acks:
-    """Pending acks, one per session for any number of measurements.
-
-    ``status`` is that of `Ack`. ``latencies`` are times from the arrival of a measurement to its ack.
-    """
+    """Pending acks, one per session; status as in `Ack`, latencies from the arrival of a measurement to its ack."""
 
     def __init__(self, send: Callable[[bytes, Message], object], status: Literal["stored", "accepted"]) -> None:
         self._send: Final = send

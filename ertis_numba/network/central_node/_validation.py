@@ -21,16 +21,12 @@ MAX_WAITING_BYTES: Final = 64_000_000
 
 @dataclass(slots=True, eq=False)
 class Greeting:
-    """Hello message, with its result.
+    """Hello message, with its result: the sensor of the settings, or the error."""
 
-    The authenticator identifies its sender again by ``frames``. ``key`` is the public key of the peer; empty without
-    keys. ``result`` is the sensor of the settings, or the error.
-    """
-
-    frames: list[zmq.Frame]
+    frames: list[zmq.Frame]  # identify the sender again
     hello: Hello
     payload: list[bytes]
-    key: str
+    key: str  # public; empty without keys
     result: JournalSensor | Exception | None = None
 
     @property
@@ -45,10 +41,7 @@ class Greeting:
 
 
 class Greetings:
-    """Reader of the settings in Hello messages, one at a time; peers take turns.
-
-    ``read`` is called in the thread; it returns the sensor of a message and its payload, or raises an error.
-    """
+    """Reader of settings in Hello messages, peers in turn; read runs in the thread and may raise errors."""
 
     def __init__(self, read: Callable[[Hello, list[bytes]], JournalSensor]) -> None:
         self._read = read

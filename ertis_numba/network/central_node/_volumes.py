@@ -22,10 +22,7 @@ _TAIL: Final = 16  # Per session: the largest window of a sensor node.
 
 
 def journal_name(folder: Path, name: str, *, end: str = "", taken: Iterable[str] = ()) -> str:
-    """Return a new journal name, whose journal and recording do not exist in a folder.
-
-    Within a second, later journals have higher numbers, even if earlier ones are gone: names tell the order.
-    """
+    """Return a new journal name; names within a second have rising numbers, even if earlier ones are gone."""
     stem = f"{name}_{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     numbered = re.compile(rf"{re.escape(stem)}(?:_(\d+))?{end}\.h5")
     found = [numbered.match(other) for other in [*taken, *(path.name for path in folder.glob(f"{stem}*"))]]
@@ -88,10 +85,7 @@ class Volume:
         self._known[source.name] = source
 
     def append(self, items: list[ReceivedItem]) -> None:
-        """Store measurements or gaps durably, all or none; see `Journal.append`.
-
-        ``items`` are either measurements or gaps.
-        """
+        """Store either measurements or gaps durably, all or none, as `Journal.append`."""
         for item in items:
             self._add(item.source)
         entries = [item.content for item in items if isinstance(item.content, JournalEntry)]
@@ -154,10 +148,7 @@ def same(one: JournalSensor, other: JournalSensor) -> bool:
 
 
 class Checksums:
-    """CRC-32 of the newest measurements by session and number.
-
-    ``tails`` has those from earlier processes.
-    """
+    """CRC-32 of the newest measurements by session and number; tails are those from earlier processes."""
 
     def __init__(self, tails: Mapping[SensorSession, Mapping[int, int]]) -> None:
         self._kept: OrderedDict[tuple[SensorSession, int], int] = OrderedDict()

@@ -29,16 +29,12 @@ _chains: "OrderedDict[tuple[str, str, str], SharedPipeline]" = OrderedDict()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClusterResult:
-    """Result of processing a measurement.
+    """Result of processing a measurement."""
 
-    ``image`` is (direction, range) float32 or float16; ``points`` is (point, 4), empty unless requested. ``worker`` is
-    an address.
-    """
-
-    image: NDArray[Any]
-    points: NDArray[np.float32]
+    image: NDArray[Any]  # (direction, range) float32 or float16
+    points: NDArray[np.float32]  # (point, 4), empty unless requested
     took_s: float
-    worker: str
+    worker: str  # address
 
 
 def prepare(kind: int, settings: str, device: str, plan: "PlanCosts" = "nominal") -> "Prepared | str":

@@ -21,10 +21,7 @@ _EVENTS: Final[dict["Subject", Literal["call_mismatch", "start_mismatch", "layou
 
 
 class Predictions:
-    """Checks of some measurements of sensors, one at a time.
-
-    ``busy`` is true while a prediction is not finished, or not yet drained.
-    """
+    """Checks of some measurements, one at a time; busy until a prediction is finished and drained."""
 
     def __init__(self, device: str) -> None:
         self._device = device

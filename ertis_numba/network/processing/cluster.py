@@ -60,15 +60,12 @@ class _Attempt:
 
 
 class Cluster:
-    """`Runner` whose jobs run on the workers of a dask scheduler.
+    """`Runner` whose jobs run on the workers of a dask scheduler, at the address options.cluster.
 
-    Measurements and images go directly to and from each worker. Workers keep their pipelines, and need the same version
-    of this package. Each worker has as many jobs under way as threads. With more, each took 30 ms instead of 23 ms at
-    the same throughput. A worker that misses the deadline or loses its connection gets no jobs until it is reached
-    again. Anyone who reaches a scheduler can run code on its workers: keep it among trusted machines, or use dask's
-    TLS.
-
-    ``options.cluster`` is the scheduler's address. ``respawned`` counts workers that have left, or did not answer.
+    Workers need the same version of this package. Each has as many jobs under way as threads: with more, each took 30
+    ms instead of 23 ms at the same throughput. A worker that misses the deadline or loses its connection gets no jobs
+    until it is reached again. Anyone who reaches a scheduler can run code on its workers: keep it among trusted
+    machines, or use dask's TLS. ``respawned`` counts workers that have left, or did not answer.
     """
 
     def __init__(self, options: ProcessingOptions, log: Callable[[str], None]) -> None:

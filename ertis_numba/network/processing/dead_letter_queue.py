@@ -24,10 +24,7 @@ _CLOSED_S: Final = 2.0
 
 
 class DeadLetterQueue:
-    """Writer of measurements into a journal, in a separate thread, so that a slow disk delays nothing.
-
-    ``ertis import journals`` makes a recording of the journal.
-    """
+    """Writer of measurements into a journal in a thread, for ``ertis import journals``; a slow disk delays nothing."""
 
     def __init__(self, folder: Path, log: EventLog) -> None:
         self._folder, self._log = folder, log

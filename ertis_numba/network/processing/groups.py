@@ -45,14 +45,12 @@ class _Group:
 
 
 class Groups:
-    """Grouping of measurements with the same pulse number.
+    """Grouping of measurements with the same pulse number; wrong data of one sensor never moves groups of others.
 
-    Within a session, sensors have the same SYNC count. Counts of sessions differ by an offset, from the timestamp of
-    the first measurement, and then from the sensor node's monotonic clock: a system clock that is set by an hour moves
-    no measurement into another group. If a timestamp is impossible, the time of arrival counts: it lies in the future,
-    or long ago although no older measurements are being caught up with. A count that contradicts the time is aligned
-    again, like that of a new session. Wrong data of one sensor never moves groups of others. ``closed`` counts groups
-    by ``complete``, or their flags; its ``measurement too late`` counts measurements of closed groups.
+    Counts of sessions differ by an offset, from the timestamp of the first measurement, and then from the sensor node's
+    monotonic clock: a system clock that is set by an hour moves no measurement into another group. If a timestamp is
+    impossible, the time of arrival counts: it lies in the future, or long ago although nothing older is caught up with.
+    A count that contradicts the time is aligned again. ``closed`` counts groups, and measurements that came too late.
     """
 
     def __init__(self) -> None:

@@ -17,34 +17,23 @@ __all__ = ["ProcessingOptions"]
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessingOptions:
-    """Options of image processing.
+    """Options of image processing."""
 
-    ``publish`` is the address for applications; without ``keys``, only on loopback. ``processing`` has fields of
-    `ertis_numba.settings.Processing` that override a sensor's own. ``max_error_db`` is the error budget of images; the
-    sensor's own by default. ``without`` excludes channels, of all sensors or of some. ``plan`` is as for
-    `ertis_numba.Pipeline`. ``workers`` are processes: by default one for each core, or one for a GPU; ``threads`` are
-    those of all together, by default all cores. ``deadline_s`` is the timeout of a measurement, after which its worker
-    is killed; ``prepare_s`` includes the compilation of kernels for a sensor. ``dtype`` is that of published images.
-    ``quarantine`` is the folder of the dead-letter queue, for measurements that made two workers fail. Workers prepare
-    in advance for ``expected``, the settings of a likely sensor. ``cluster`` is the address of a dask scheduler whose
-    workers replace local ones.
-    """
-
-    publish: str = DEFAULT_PUBLISH
+    publish: str = DEFAULT_PUBLISH  # address for applications; without keys, only on loopback
     keys: ServerKeys | None = None
-    processing: dict[str, Any] = field(default_factory=dict)
-    max_error_db: float | None = None
-    without: ExcludedChannels = field(default_factory=ExcludedChannels)
+    processing: dict[str, Any] = field(default_factory=dict)  # fields of `Processing` that override the sensor's own
+    max_error_db: float | None = None  # error budget of images; the sensor's own by default
+    without: ExcludedChannels = field(default_factory=ExcludedChannels)  # channels to exclude, of all or some sensors
     device: str = "auto"
-    plan: PlanCosts = "nominal"
-    workers: int | None = None
-    threads: int | None = None
-    deadline_s: float = 2.0
-    prepare_s: float = 300.0
-    dtype: Literal["float32", "float16"] = "float32"
-    quarantine: Path | None = None
-    expected: Settings | None = None
-    cluster: str | None = None
+    plan: PlanCosts = "nominal"  # as for `Pipeline`
+    workers: int | None = None  # processes; one for each core, or one for a GPU
+    threads: int | None = None  # of all workers together; all cores by default
+    deadline_s: float = 2.0  # after that, the worker of a measurement is killed
+    prepare_s: float = 300.0  # includes the compilation of kernels for a sensor
+    dtype: Literal["float32", "float16"] = "float32"  # of published images
+    quarantine: Path | None = None  # dead-letter folder, for measurements that made two workers fail
+    expected: Settings | None = None  # of a likely sensor, to prepare for in advance
+    cluster: str | None = None  # dask scheduler whose workers replace local ones
 
     def __post_init__(self) -> None:
         checks.choice("plan", self.plan, PLAN_COSTS)

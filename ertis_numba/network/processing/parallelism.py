@@ -35,10 +35,7 @@ class Load:
         self._forget(now_s)
 
     def recent(self, now_s: float) -> tuple[float, Sequence[float]]:
-        """Return the rate in measurements per second, and the times of arrival.
-
-        There are none before the load has been observed for as long as arrivals are kept.
-        """
+        """Return measurements per second, and times of arrival; none until observed as long as arrivals are kept."""
         self._forget(now_s)
         if self._begun_s is None or now_s - self._begun_s < _RATE_S:
             return 0.0, ()
@@ -62,12 +59,11 @@ class Mode:
 
 
 class Choice:
-    """Choice by measured times and load.
+    """Choice of one measurement on all cores, or several at once, by measured times and load.
 
     One measurement on all cores is done soonest. Several at once, with a share of the cores each, have a higher
-    throughput, and wait less for each other if they arrive in bursts, as from sensors on a common SYNC line.
-    ``threads`` are those of all workers. ``modes`` are one at a time, then 2, 4, 8 and so on at once, up to the number
-    of workers.
+    throughput, and wait less for each other if they arrive in bursts, as from sensors on a common SYNC line. ``modes``
+    are one at a time, then 2, 4, 8 and so on, up to the number of workers. ``threads`` are those of all workers.
     """
 
     def __init__(self, workers: int, threads: int) -> None:
@@ -152,10 +148,7 @@ def _smoothed(before: float | None, now: float) -> float:
 
 
 def _delay_s(arrivals_s: Sequence[float], at_once: int, time_s: float, *, apart_s: float) -> float:
-    """Return the delay of the last image of a burst, by a replay of arrivals; mean over measurements.
-
-    Bursts are more than ``apart_s`` apart.
-    """
+    """Return the mean delay of the last image of bursts more than apart_s apart, by a replay of arrivals."""
     free_s = [-math.inf] * at_once
     total_s = slowest_s = 0.0
     n_burst, previous_s = 0, -math.inf

@@ -99,10 +99,7 @@ class Ready(_Note, frozen=True, kw_only=True):
 
 
 class Prepared(_Note, frozen=True, kw_only=True):
-    """A worker is ready for a kind.
-
-    Times are those of one measurement: on all threads, and with a share of the threads.
-    """
+    """A worker is ready for a kind."""
 
     kind: int
     settings: str
@@ -110,8 +107,8 @@ class Prepared(_Note, frozen=True, kw_only=True):
     elevation_rad: bytes
     range_m: bytes
     shape: tuple[int, int]
-    wide_s: float = 0.0
-    many_s: float = 0.0
+    wide_s: float = 0.0  # time of one measurement on all threads
+    many_s: float = 0.0  # time of one measurement with a share of the threads
 
 
 class Unusable(_Note, frozen=True, kw_only=True):
@@ -166,16 +163,13 @@ class Describe(_Note, frozen=True, kw_only=True):
 
 
 class Publish(_Note, frozen=True, kw_only=True):
-    """A measurement and its products are in a slot, until `ProductsQueued` releases it.
-
-    ``description`` is None without an image.
-    """
+    """A measurement and its products are in a slot, until `ProductsQueued` releases it."""
 
     job: int
     slot: int
     data: Data
     received_ns: int
-    description: int | None
+    description: int | None  # None without an image
     raw_description: int
     shape: tuple[int, int]
     dtype: Literal["float32", "float16"]
@@ -219,15 +213,12 @@ class Wanted(_Note, frozen=True, kw_only=True):
 
 
 class Served(_Note, frozen=True, kw_only=True):
-    """State of the publisher, sent each second.
-
-    ``reports`` counts the accepted `StatusNote` messages; ``keys_note`` is the error of the allow list.
-    """
+    """State of the publisher, sent each second."""
 
     subscribers: tuple[SubscriberStatus, ...]
     refused: dict[str, int]
-    reports: int
-    keys_note: str = ""
+    reports: int  # accepted StatusNote messages
+    keys_note: str = ""  # error of the allow list
 
 
 FromPublisher = Started | ProductsQueued | Wanted | Served

@@ -91,11 +91,7 @@ class ImageProcessing:
         return self._publisher.refused
 
     def start(self, stopping: Callable[[], bool] = lambda: False) -> None:
-        """Start the processes; applications can subscribe when this returns.
-
-        ``stopping`` is polled five times a second; once it returns True, this returns without waiting for the
-        processes.
-        """
+        """Start the processes, until applications can subscribe or ``stopping``, polled each 0.2 s, is True."""
         try:
             self._runner = _runner(self._options, self._log)
             self._publisher.start(stopping)
@@ -108,10 +104,7 @@ class ImageProcessing:
             raise
 
     def require_usable(self, settings: Settings) -> None:
-        """Refuse settings from which no image can be computed; any thread may call this.
-
-        Refuses images that are too large, ranges outside the record, and a last stage without images.
-        """
+        """Refuse settings without a possible image, or with too large a one; any thread may call this."""
         applied = self._options.applied(settings)
         if applied.processing.mode != "passive":
             require_images(applied)
@@ -122,11 +115,7 @@ class ImageProcessing:
             self._groups.register(hello.sensor, time.monotonic_ns())
 
     def offer(self, data: Data, words: NDArray[np.unsignedinteger[Any]], arrived_ns: int) -> None:
-        """Accept a measurement, and count it until it is published or dropped.
-
-        ``words`` are samples as bytes; they are not copied, and must not change. ``arrived_ns`` is by
-        `time.monotonic_ns`.
-        """
+        """Accept a measurement; words are not copied and must not change; arrived_ns by time.monotonic_ns."""
         kind = self._sensors.kind_of(data)
         self._emit_event(self._groups.add(data, arrived_ns))
         if kind is not None and not kind.settings:

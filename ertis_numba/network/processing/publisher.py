@@ -35,11 +35,7 @@ _CLOSED_S: Final = 2.0
 
 
 class Publisher:
-    """Process that sends products to applications.
-
-    ``address`` is that for applications; it stays the same after a restart. ``refused`` counts messages and keys by
-    reason.
-    """
+    """Process that sends products to applications, at a lasting address; refused counts messages and keys."""
 
     def __init__(self, options: ProcessingOptions, log: EventLog) -> None:
         self._options, self._log = options, log

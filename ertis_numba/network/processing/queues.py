@@ -18,20 +18,15 @@ SUPERSEDED: Final = "superseded"
 
 @dataclass(slots=True)
 class ProcessingCounts:
-    """Counts of one sensor's measurements.
-
-    ``received = published + sum(dropped.values()) + in_flight`` at any time. ``passive`` ones are published without a
-    call and an image, and ``dropped`` ones are counted by reason. ``in_flight`` includes the ``queue`` for a worker.
-    ``times`` are from arrival to publication.
-    """
+    """Counts of one sensor's measurements: ``received = published + sum(dropped.values()) + in_flight``."""
 
     received: int = 0
     published: int = 0
-    passive: int = 0
-    dropped: Counter[str] = field(default_factory=Counter)
-    in_flight: int = 0
-    queue: int = 0
-    times: Latencies = field(default_factory=Latencies)
+    passive: int = 0  # published without a call and an image
+    dropped: Counter[str] = field(default_factory=Counter)  # by reason
+    in_flight: int = 0  # includes the queue
+    queue: int = 0  # waiting for a worker
+    times: Latencies = field(default_factory=Latencies)  # from arrival to publication
 
     @property
     def latency(self) -> Percentiles:
@@ -40,10 +35,7 @@ class ProcessingCounts:
 
 
 class Queues:
-    """Waiting measurements, at most two per sensor, served in turn.
-
-    ``dropped`` has the latest drops as (sensor, session_id, sequence, reason), removed when they are reported.
-    """
+    """Waiting measurements, at most two per sensor, in turn; latest drops as (sensor, session_id, sequence, reason)."""
 
     def __init__(self) -> None:
         self.counts: dict[str, ProcessingCounts] = {}

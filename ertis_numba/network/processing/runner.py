@@ -18,37 +18,28 @@ __all__ = ["Event", "FinishedJob", "Job", "JobKind", "KindFailed", "KindReady", 
 
 @dataclass(frozen=True, slots=True)
 class JobKind:
-    """Measurements that one pipeline can process, or measurements of which no image is made.
-
-    ``settings`` are those of the pipeline as TOML; empty without one.
-    """
+    """Measurements that one pipeline can process, or measurements of which no image is made."""
 
     number: int
-    settings: str
+    settings: str  # of the pipeline as TOML; empty without one
     words_bytes: int
 
 
 @dataclass(slots=True, eq=False)
 class Job:
-    """A measurement to process.
-
-    ``words`` are contiguous bytes, kept until the image is done for a second try. ``arrived_ns`` is by a monotonic
-    clock. ``points`` are made if an application subscribes to them, and ``tries`` counts failed tries. ``predict``
-    warns if images may exceed the error budget; ``check_sound`` warns if the sound contradicts the settings. ``slot``
-    has samples and image once it is `FinishedJob`; release it afterwards.
-    """
+    """A measurement to process."""
 
     number: int
     data: Data
-    words: NDArray[np.unsignedinteger[Any]]
+    words: NDArray[np.unsignedinteger[Any]]  # contiguous bytes, kept until the image is done for a second try
     kind: JobKind
-    arrived_ns: int
-    points: bool = False
-    tries: int = 0
-    slot: Slot | None = None
+    arrived_ns: int  # by a monotonic clock
+    points: bool = False  # an application subscribes to them
+    tries: int = 0  # failed ones
+    slot: Slot | None = None  # has samples and image once finished; release it afterwards
     n_points: int = 0
-    predict: bool = False
-    check_sound: bool = False
+    predict: bool = False  # warn if images may exceed the error budget
+    check_sound: bool = False  # warn if the sound contradicts the settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,13 +83,9 @@ Event: TypeAlias = FinishedJob | Lost | KindReady | KindFailed
 
 
 class Runner(Protocol):
-    """Executor of jobs.
+    """Executor of jobs. Only `close` blocks: other calls copy a measurement or start a process at most."""
 
-    No method blocks, except `close`: calls take the copy of a measurement, or the start of a process. ``respawned``
-    counts replaced workers.
-    """
-
-    respawned: int
+    respawned: int  # replaced workers
 
     @property
     def choice(self) -> str:

@@ -27,24 +27,17 @@ _PASSIVE: Final = 0  # Number of the kind of measurements without a call; kinds 
 
 @dataclass(slots=True)
 class RegisteredSensor:
-    """A sensor.
-
-    ``stated`` are the settings of its hello, and ``settings`` the same with air close to that of its latest
-    measurement. ``kind`` is None if no pipeline can use its settings. ``passive`` is the kind of its measurements
-    without a call or an image. ``applied`` are the settings with the options of this node; None if the options do not
-    suit them. ``raw`` and ``image`` are numbers of descriptions. ``air`` is temperature, humidity and pressure of the
-    latest measurement.
-    """
+    """A sensor."""
 
     hello: Hello
-    stated: Settings
-    settings: Settings
-    kind: JobKind | None
-    passive: JobKind
-    applied: Settings | None
-    raw: int = -1
-    image: int = -1
-    air: tuple[float, float, float] | None = None
+    stated: Settings  # settings of its hello
+    settings: Settings  # the same with air close to that of its latest measurement
+    kind: JobKind | None  # None if no pipeline can use its settings
+    passive: JobKind  # of its measurements without a call or an image
+    applied: Settings | None  # with the options of this node; None if they do not suit
+    raw: int = -1  # number of the description
+    image: int = -1  # number of the description
+    air: tuple[float, float, float] | None = None  # temperature (°C), humidity (%) and pressure (Pa)
 
 
 class Sensors:
@@ -94,9 +87,8 @@ class Sensors:
         self._describe_images(known)
 
     def kind_of(self, data: Data) -> JobKind | None:
-        """Return the kind of a measurement, None if it cannot be processed.
+        """Return the kind of a measurement, None if it cannot be processed, as without a call.
 
-        Measurements without a call become no images, unless ``processing.mode`` requests them.
         Air determines ranges, and therefore the kind. A new kind needs a difference of 0.5 °C, 5 % or 1 kPa, because a
         pipeline cannot be made for each measurement of a warming day. The resulting error of ranges at 20 °C is at most
         0.09 % for temperature, 0.02 % for humidity and 0.003 % for pressure: 6 mm at 5 m for all together.
@@ -204,10 +196,7 @@ class Sensors:
 
 
 def _about(came: Air, used: Air) -> Air:
-    """Return the air for processing a measurement: the present one, as long as it is about the same.
-
-    New air is rounded, so that sensors in the same air share a pipeline.
-    """
+    """Return the present air while it is about the same; new air is rounded, so that sensors share a pipeline."""
     changes = {}
     for name, step in _AIR_STEPS.items():
         value = getattr(came, name)

@@ -24,11 +24,7 @@ _TIMED: Final = 5  # Number of measurements, of which the median counts.
 
 
 class SharedPipeline:
-    """Pipeline for one kind of measurements, from their bytes to images and points; thread-safe.
-
-    ``settings`` are TOML. ``shape`` of its images is (direction, range); ``format`` is the layout of the samples in a
-    measurement.
-    """
+    """Thread-safe pipeline for one kind, from bytes in a format to images (direction, range) and points."""
 
     def __init__(self, settings: str, device: str, plan: PlanCosts = "nominal") -> None:
         stated = Settings.from_toml(settings, "settings of a sensor", find_line=False)

@@ -24,10 +24,7 @@ def _paged(n_bytes: int) -> int:
 
 
 class SlotView:
-    """Access of one process to a slot: the samples of a measurement, its image, its points.
-
-    ``descriptor`` is that of the memory; it may be closed afterwards.
-    """
+    """Access of one process to a slot: samples, image and points; the descriptor may be closed afterwards."""
 
     def __init__(self, descriptor: int, words_bytes: int, image_bytes: int) -> None:
         self._image = _paged(words_bytes)
@@ -74,10 +71,7 @@ class Slot:
 
 
 class SlotPool:
-    """Slots that are used again once they are free.
-
-    ``numbers`` of the slots limit how many are in use at the same time.
-    """
+    """Slots that are used again once they are free; their numbers limit how many are in use at the same time."""
 
     def __init__(self, numbers: Iterable[int]) -> None:
         self._numbers = iter(numbers)

@@ -40,17 +40,13 @@ Header: TypeAlias = Image | Points | Raw | Group | Report
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QueuedProduct:
-    """Product to send to its subscribers.
-
-    ``sensor`` is empty for products without one. ``header`` lacks its numbers. ``payloads`` are frames once `share` was
-    called. ``description``, (number, frames), is sent before.
-    """
+    """Product to send to its subscribers."""
 
     product: Product
-    sensor: str
-    header: Header
-    payloads: "list[bytes | memoryview | zmq.Frame]" = field(default_factory=list)
-    description: tuple[int, Sequence[bytes]] | None = None
+    sensor: str  # empty for products without one
+    header: Header  # without its numbers
+    payloads: "list[bytes | memoryview | zmq.Frame]" = field(default_factory=list)  # frames after `share`
+    description: tuple[int, Sequence[bytes]] | None = None  # (number, frames), sent before
 
     @property
     def n_bytes(self) -> int:
@@ -58,10 +54,7 @@ class QueuedProduct:
         return sum(map(len, self.payloads))
 
     def share(self) -> None:
-        """Copy the payloads into messages of ZeroMQ, which all subscribers share and the last one frees.
-
-        Their original memory may be used again afterwards.
-        """
+        """Copy payloads into ZeroMQ messages that all subscribers share, so that their memory is free again."""
         self.payloads[:] = [
             each if isinstance(each, zmq.Frame) else zmq.Frame(each, copy=True) for each in self.payloads
         ]
@@ -69,12 +62,9 @@ class QueuedProduct:
 
 @dataclass(slots=True, eq=False)
 class ConnectedSubscriber:
-    """A connected application.
+    """A connected application."""
 
-    Its key is checked again by ``frames``, its latest message.
-    """
-
-    frames: Sequence[zmq.Frame]
+    frames: Sequence[zmq.Frame]  # latest message, to check its key again
     name: str
     wants: Subscribe
     before: int = 0  # Products consumed when it was first heard of.
@@ -137,11 +127,7 @@ class ConnectedSubscriber:
 
 
 class Subscribers:
-    """All applications, with their common socket.
-
-    ``socket`` is a ROUTER. ``with_keys`` is true if applications have keys, each of which may use a share of the places
-    only.
-    """
+    """All applications, with their common ROUTER; with keys, each key may use a share of the places only."""
 
     def __init__(self, socket: "zmq.Socket[bytes]", *, with_keys: bool = False) -> None:
         self._socket = socket

@@ -44,10 +44,9 @@ _TRIES: Final = 3  # Limit on workers that die while preparing for a kind that h
 
 
 class LocalWorkerPool:
-    """`Runner` whose jobs run in processes of this machine.
+    """`Runner` whose jobs run in processes of this machine; one that misses its deadline is killed.
 
-    Each worker has its own pipe and two slots, so that its death at any time costs only its job. A worker that misses
-    its deadline is killed.
+    Each worker has its own pipe and two slots, so that its death at any time costs only its job.
     """
 
     def __init__(self, options: ProcessingOptions, log: EventLog) -> None:

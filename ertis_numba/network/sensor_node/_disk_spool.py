@@ -28,11 +28,7 @@ _GAP_NUMBERS = 64  # Refused numbers to collect before the journal is written.
 
 
 class DiskSpool(Spool):
-    """Measurements in journals of a folder, and also in memory while there is room.
-
-    ``folder`` is created if it does not exist. ``ring_bytes`` limits the data in memory, and ``max_bytes`` the data in
-    the journals. Any thread may call ``on_note``.
-    """
+    """Measurements in journals up to max_bytes, also in memory up to ring_bytes; any thread calls on_note."""
 
     def __init__(self, folder: Path, ring_bytes: int, max_bytes: int | None, *, on_note: Callable[[str], None]) -> None:
         super().__init__(ring_bytes)

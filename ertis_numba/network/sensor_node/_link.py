@@ -36,10 +36,10 @@ _WANTED: Final = (messages.Welcome, messages.Ack, messages.Pong, messages.Refuse
 
 
 class Link(threading.Thread):
-    """Sender of a spool's items, which reconnects until it is stopped.
+    """Thread that sends a spool's items, and reconnects until it is stopped; its functions must not raise.
 
-    The functions are called from this thread and must not raise; without ``on_settings``, requests for new settings are
-    refused. ``central`` is its last reported state, and ``reconnects`` counts reconnections after it was away.
+    Without ``on_settings``, requests for new settings are refused. ``central`` is its last reported state, and
+    ``reconnects`` counts reconnections after it was away.
     """
 
     def __init__(

@@ -25,33 +25,27 @@ _ACKED_IN_ORDER = 1000  # Number of items.
 
 @dataclass(slots=True)
 class SensorCounts:
-    """Counts of one sensor's measurements at its node.
+    """Counts of one sensor's measurements at its node, including those found in the spool.
 
-    ``accepted = stored + taken + overwritten + damaged + unacked``, including measurements found in the spool.
-
-    ``refused`` ones found the spool full. The central node acknowledged measurements as ``stored`` on its disk or
-    ``taken`` into its memory, and ``dropped`` some of them. Later ones replaced ``overwritten`` ones in memory;
-    ``damaged`` ones were found in the spool. The source of measurements reported ``missing`` numbers, by reason.
-    ``unacked`` ones are kept.
+    ``accepted = stored + taken + overwritten + damaged + unacked``.
     """
 
     accepted: int = 0
-    refused: int = 0
-    stored: int = 0
-    taken: int = 0
-    dropped: Counter[str] = field(default_factory=Counter)
-    overwritten: int = 0
-    damaged: int = 0
-    missing: Counter[str] = field(default_factory=Counter)
-    unacked: int = 0
+    refused: int = 0  # the spool was full
+    stored: int = 0  # acknowledged on disk
+    taken: int = 0  # acknowledged in memory
+    dropped: Counter[str] = field(default_factory=Counter)  # by processing, of the acknowledged ones
+    overwritten: int = 0  # in memory, by later ones
+    damaged: int = 0  # in the spool
+    missing: Counter[str] = field(default_factory=Counter)  # numbers missing at the source, by reason
+    unacked: int = 0  # kept
     unacked_bytes: int = 0
 
 
 class Spool:
-    """Measurements in memory; the oldest become gaps if there is no more room.
+    """Measurements in memory up to max_bytes; the oldest become gaps if there is no more room.
 
-    ``max_bytes`` limits the data in memory. ``turn`` is the lock of `runs` and `counts`; its condition ``acked`` is
-    notified of each acknowledgement. ``runs`` has the oldest session first.
+    ``turn`` is the lock of `runs`, oldest first, and `counts`; each acknowledgement notifies its condition ``acked``.
     """
 
     def __init__(self, max_bytes: int) -> None:

@@ -21,40 +21,32 @@ _MAX_PATIENCE_S = 8.0
 
 @dataclass(slots=True, eq=False)
 class UnackedItem:
-    """Measurement or gap that waits for its acknowledgement.
-
-    ``first`` and ``last`` are its numbers, equal for a measurement. ``reason`` is that of a gap; empty for a
-    measurement. ``entry`` is the measurement, if it is in memory.
-    """
+    """Measurement or gap that waits for its acknowledgement."""
 
     first: int
-    last: int
-    reason: str = ""
+    last: int  # equal to first for a measurement
+    reason: str = ""  # of a gap; empty for a measurement
     n_bytes: int = 0
-    entry: JournalEntry | None = None
+    entry: JournalEntry | None = None  # measurement, if in memory
 
 
 @dataclass(slots=True, eq=False)
 class OutgoingSession:
-    """Items of one session of a sensor, oldest first, with a send window: go-back-N.
+    """Items of one session of a sensor, oldest first, with a send window: go-back-N; one thread at a time.
 
-    Positions are numbers, so that items may be moved or replaced meanwhile. One thread at a time uses a session.
-
-    ``following`` is the number after the last item. The central node has everything up to ``acked_through``; everything
-    was sent up to ``sent``, and anything ever up to ``reached``: an ack beyond it belongs to other items. The ``stage``
-    of the handshake began at ``since_s``; "waiting" ends then.
+    Positions are numbers, so that items may be moved or replaced meanwhile.
     """
 
     sensor: JournalSensor
     session_id: int
     journal: Journal | None = None
     items: deque[UnackedItem] = field(default_factory=deque)
-    following: int | None = None
-    acked_through: int = -1
-    sent: int = -1
-    reached: int = -1
+    following: int | None = None  # number after the last item
+    acked_through: int = -1  # the central node has everything up to here
+    sent: int = -1  # sent up to here
+    reached: int = -1  # ever sent up to here: an ack beyond it belongs to other items
     stage: Literal["new", "asked", "welcome", "waiting"] = "new"
-    since_s: float = 0.0
+    since_s: float = 0.0  # beginning of the stage, end of "waiting"
     window: int = 1
     _under_way: int = 0  # Number of sent items at the front.
     _patience_s: float = field(default_factory=lambda: _PATIENCE_S)

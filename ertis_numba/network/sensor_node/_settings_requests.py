@@ -38,10 +38,7 @@ class SettingsRequest:
 
 
 class RequestQueue:
-    """Reader of requests, and queue of their answers.
-
-    Without ``on_request``, the node accepts no requests. ``wake`` is called when there is an answer to send.
-    """
+    """Reader of requests, refused without on_request; calls wake when there is an answer to send."""
 
     def __init__(self, on_request: Callable[[SettingsRequest], None] | None, wake: Callable[[], None]) -> None:
         self._on_request, self._wake = on_request, wake

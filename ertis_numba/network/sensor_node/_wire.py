@@ -20,15 +20,11 @@ _FIRMWARE_CHARACTERS = 64
 
 @dataclass(frozen=True, slots=True)
 class Acknowledged:
-    """Acknowledgement by the central node.
-
-    Up to ``acked_through``, everything is stored or accepted, or known to be missing. The other fields are those of
-    `ertis_numba.network.messages.Ack`.
-    """
+    """Acknowledgement by the central node, as `ertis_numba.network.messages.Ack`."""
 
     sensor: str
     session_id: int
-    acked_through: int
+    acked_through: int  # all up to here is stored, accepted, or known to be missing
     status: Literal["stored", "accepted"]
     dropped: tuple[tuple[int, str], ...] = ()
 
