@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
 __all__ = ["grid_options", "image_options", "with_given"]
 
-_OWN = "the recording's own by default"
-
 
 def grid_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of the beam grid."""
@@ -36,18 +34,18 @@ def image_options(command: Callable[..., Any]) -> Callable[..., Any]:
         command,
         grid_options,
         click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m."),
-        click.option("--method", type=click.Choice(["fast", "paper"]), help=f"Processing method; {_OWN}."),
-        options.beamforming("the recording's own"),
-        options.cleaning("the recording's own"),
+        click.option("--method", type=click.Choice(["fast", "paper"]), help="Processing method."),
+        options.beamforming(),
+        options.cleaning(),
         click.option(
             "--array-weights",
             metavar="WINDOW",
-            help=f"Window for the microphone weights, such as uniform, hann or taylor:35; {_OWN}.",
+            help="Window for the microphone weights, such as uniform, hann or taylor:35.",
         ),
         click.option(
             "--wavefront",
             type=click.Choice(["plane", "spherical", "auto"]),
-            help=f"Wavefront model of echoes; {_OWN}.",
+            help="Wavefront model of echoes.",
         ),
         click.option(
             "--max-error",

@@ -4,25 +4,58 @@ import glob
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _acoustic_maps, _naming, _plans, _progress, _tables, options
+from ertis_cli import _naming, _plans, _progress, _tables, options
+from ertis_cli._config import typed
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from ertis_numba.campaign import CampaignOptions, Event, RecordingEnded
 
-__all__ = ["are_meant", "process_many", "summary"]
+__all__ = ["are_meant", "process_many", "processing", "require_options_of_one", "summary"]
 
 _MAX_ROWS = 20  # limit for a table of all recordings
 _WAVEFRONT = ("wavefront_error_db", "wavefront_error_range_m")
 _MAX_FAILED = 50  # limit for failed recordings in the final table
+
+
+def processing(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options for processing one or several recordings: checks, device and processes."""
+    for option in (
+        click.option(
+            "--scheduler",
+            metavar="tcp://HOST:PORT",
+            help="Dask scheduler whose workers process several recordings.",
+        ),
+        click.option(
+            "--workers",
+            type=click.IntRange(min=1),
+            metavar="N",
+            help="Number of processes for several recordings; one per core by default.",
+        ),
+        options.threads,
+        options.device,
+        click.option("--strict", is_flag=True, help="Refuse recordings with faulty microphones instead of warning."),
+    ):
+        command = option(command)
+    return command
+
+
+def require_options_of_one() -> None:
+    """Refuse options for several recordings."""
+    for name in ("workers", "scheduler"):
+        if typed(name):
+            raise click.UsageError(
+                f"--{name} applies to several recordings; add recordings, use a folder or a pattern, or end -o with /",
+                click.get_current_context(),
+            )
 
 
 def are_meant(paths: Sequence[str], target: str | None) -> bool:
@@ -67,14 +100,21 @@ def process_many(
     report.close()
 
 
-def summary(target: Path, rows: Sequence[dict[str, Any]], device: str) -> Iterator[str]:
-    """Yield a line with the output of each sensor."""
-    for row in rows:
-        of = f" of {row['sensor']}" if len(rows) > 1 else ""
+def summary(target: Path, report: dict[str, Any]) -> Iterator[str]:
+    """Yield a line with the images or maps of each sensor, from the report of a recording."""
+    for row in report["sensors"]:
+        of = f" of {row['sensor']}" if len(report["sensors"]) > 1 else ""
+        made = ""
+        if "maps" in row:
+            made = f"{options.counted(row['maps'], 'acoustic map')} of "
+            axis = options.counted(row["bands"], "band")
+        else:
+            axis = (
+                f"{options.counted(row['ranges'], 'range')} from {row['range_m'][0]:.4g} to {row['range_m'][1]:.4g} m"
+            )
         yield (
-            f"{target}: {options.counted(row['measurements'], 'measurement')}{of}, "
-            f"{options.counted(row['directions'], 'direction')} × {options.counted(row['ranges'], 'range')} "
-            f"from {row['range_m'][0]:.4g} to {row['range_m'][1]:.4g} m on {device}, "
+            f"{target}: {made}{options.counted(row['measurements'], 'measurement')}{of}, "
+            f"{options.counted(row['directions'], 'direction')} × {axis} on {report['device']}, "
             f"{row['median_ms']:.1f} ms each (median)"
         )
 
@@ -206,12 +246,11 @@ def _lines(event: "RecordingEnded", *, reported: bool) -> Iterator[str]:
     match event.outcome:
         case "made":
             yield from _plan_lines(event, reported=reported)
-            lines = _acoustic_maps.summary if event.made.get("kind") == "acoustic_map" else summary
-            yield from lines(event.output, event.made["sensors"], event.made["device"])
+            yield from summary(event.output, event.made)
         case "kept":
             yield from _plan_lines(event, reported=reported)
             yield f"{event.output}: exists already, kept"
-        case "skipped":
+        case "skipped" if not event.made:  # Otherwise, a warning has the reason.
             yield f"{event.recording}: a result of processing, not a recording; skipped"
 
 

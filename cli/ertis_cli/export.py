@@ -255,7 +255,7 @@ class _Items:
         if n_passive:
             left_out = options.counted(n_passive, "measurement")
             options.note(
-                f"{left_out} without a call left out; 'ertis process --mode passive' makes acoustic maps",
+                f"{left_out} without a call left out; 'ertis acoustic' makes maps of their sound",
                 quiet=quiet,
             )
 
@@ -289,7 +289,7 @@ def _with_call(reader: "RecordingReader | EnergyscapeReader", chosen: range) -> 
     if chosen and not found:
         raise DataError(
             f"{reader.path}: all chosen measurements of sensor {reader.sensor} are passive and have no echoes; make "
-            "acoustic maps with 'ertis process --mode passive', or images with --mode active, and export these"
+            "maps of their sound with 'ertis acoustic', and export these"
         )
     return found
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import _image_options, _pulses, _results, options
+from ertis_cli._help_sections import SectionedCommand
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +28,7 @@ _OTHER_FORMATS = {".npz", ".png", ".jpg", ".jpeg", ".pdf", ".svg"}
 _CHECKED_PULSES = 8
 
 
-@click.command()
+@click.command(cls=SectionedCommand)
 @options.input_files("REC.h5...")
 @options.output("Energyscape file to write, by default REC.fused.h5 beside the first recording.")
 @options.without("Channels to exclude, such as those of faulty microphones")

@@ -36,6 +36,7 @@ _SECTIONS = {
     },
     "Results": {
         "process": ("ertis_cli.process:process", "Process recordings into energyscapes."),
+        "acoustic": ("ertis_cli.acoustic:acoustic", "Process recordings of sound into acoustic maps."),
         "peaks": ("ertis_cli.peaks:peaks", "List the reflectors in an energyscape file."),
         "plot": ("ertis_cli.plot:plot", "Plot a measurement or an array."),
         "view": ("ertis_cli.view:view", "Show live or recorded images in a browser."),

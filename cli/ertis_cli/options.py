@@ -164,23 +164,22 @@ def _number(option: BeamformerOption) -> click.IntRange | click.FloatRange:
     return click.FloatRange(option.low, option.high)
 
 
-def beamforming(default: str) -> Decorator:
+def beamforming(default: str = "") -> Decorator:
     """Return the options of all registered beamformers and weightings, named like the fields of `Processing`.
 
+    ``default`` ends the help of each option, unless a heading above them states the default.
     The command receives them by those names, and None where an option is not given.
     """
     declared = (option for beamformer in BEAMFORMERS.values() for option in beamformer.options)
     added = [
-        click.option("--beamformer", type=click.Choice(list(BEAMFORMERS)), help=f"Beamformer; {default} by default."),
-        click.option(
-            "--weighting", type=click.Choice(list(WEIGHTINGS)), help=f"Weighting of amplitudes; {default} by default."
-        ),
+        click.option("--beamformer", type=click.Choice(list(BEAMFORMERS)), help=f"Beamformer{default}."),
+        click.option("--weighting", type=click.Choice(list(WEIGHTINGS)), help=f"Weighting of amplitudes{default}."),
         *(
             click.option(
                 "--" + option.name.replace("_", "-"),
                 type=_number(option),
                 metavar="N" if isinstance(option.low, int) else "X",
-                help=f"{option.help}; {default} by default.",
+                help=f"{option.help}{default}.",
             )
             for option in declared
         ),
@@ -194,21 +193,21 @@ def beamforming(default: str) -> Decorator:
     return add
 
 
-def cleaning(default: str) -> Decorator:
+def cleaning(default: str = "") -> Decorator:
     """Return the options of range-wise cleaning, named like the fields of `Processing`."""
     within = click.option(
         "--clean-within",
         "clean_within_db",
         type=click.FloatRange(0, 1000),
         metavar="DB",
-        help=f"Keep amplitudes within DB of the strongest direction of each range; {default} by default.",
+        help=f"Keep amplitudes within DB of the strongest direction of each range{default}.",
     )
     above_mean = click.option(
         "--clean-above-mean",
         "clean_above_mean_db",
         type=click.FloatRange(0, 1000),
         metavar="DB",
-        help=f"Keep amplitudes at least DB above the mean of each range; {default} by default.",
+        help=f"Keep amplitudes at least DB above the mean of each range{default}.",
     )
     return lambda command: within(above_mean(command))
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["peaks"]
 
-_WANTED = "an energyscape file or a file of acoustic maps ('ertis process' writes them)"
+_WANTED = "an energyscape file or a file of acoustic maps ('ertis process' and 'ertis acoustic' write them)"
 _TOP = 10
 _MIN_LEVEL_DB = -30.0
 _FALSE_ALARM = 1e-4  # per bin, with CFAR

@@ -1,4 +1,4 @@
-"""``ertis process``: process recordings into energyscapes or acoustic maps."""
+"""``ertis process``: process recordings into energyscapes."""
 
 import functools
 from contextlib import ExitStack, closing, contextmanager
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _acoustic_maps, _image_options, _mountings, _plans, _presets, _process_many, _results, options
-from ertis_cli._config import typed
+from ertis_cli import _image_options, _mountings, _plans, _presets, _process_many, _results, options
+from ertis_cli._help_sections import SectionedCommand
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -22,7 +22,7 @@ __all__ = ["process"]
 _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 
 
-@click.command()
+@click.command(cls=SectionedCommand)
 @click.argument("paths", metavar="REC.h5...", nargs=-1, required=True, type=options.TEXT_PATH)
 @click.option(
     "--output",
@@ -30,8 +30,8 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     "target",
     type=options.TEXT_PATH,
     metavar="FILE|DIR",
-    help="File to write, by default REC.energy.h5 beside the recording, or REC.acoustic.h5 for acoustic maps; a folder "
-    "for several recordings; FILE.npz for signals or beams.",
+    help="File to write, by default REC.energy.h5 beside the recording; a folder for several recordings; FILE.npz for "
+    "signals or beams.",
 )
 @options.sensor("Process this sensor only; all sensors by default.")
 @options.without("Channels to exclude, such as those of faulty microphones")
@@ -40,15 +40,13 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 @click.option(
     "--level/--no-level",
     default=None,
-    help="Turn directions by the roll and pitch of the poses, so that they refer to the horizontal plane; the "
-    "recording's own by default.",
+    help="Turn directions by the roll and pitch of the poses, so that they refer to the horizontal plane.",
 )
 @click.option(
     "--last-stage",
     type=click.Choice(["demodulation", "matched_filter", "beams", "envelope"]),
-    help="Last step of processing; all but envelope need -o FILE.npz; the recording's own by default.",
+    help="Last step of processing; all but envelope need -o FILE.npz.",
 )
-@_acoustic_maps.map_options
 @options.plan
 @click.option("--explain", is_flag=True, help="First print the plan with its predicted error and time.")
 @click.option(
@@ -65,9 +63,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     help="Data type of images. float16 halves the file; it keeps three digits down to -84 dBFS and fewer below, and "
     "netCDF programs cannot read it.",
 )
-@click.option("--strict", is_flag=True, help="Refuse recordings with faulty microphones instead of warning.")
-@options.device
-@options.threads
+@_process_many.processing
 @click.option(
     "--batch",
     type=click.IntRange(min=1),
@@ -75,17 +71,6 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     show_default=True,
     metavar="N",
     help="Number of measurements to process at the same time, fewer for large images; 1 is one after the other.",
-)
-@click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    metavar="N",
-    help="Number of processes for several recordings; one per core by default.",
-)
-@click.option(
-    "--scheduler",
-    metavar="tcp://HOST:PORT",
-    help="Dask scheduler whose workers process several recordings.",
 )
 @_mountings.mounting
 @options.force
@@ -117,11 +102,7 @@ def process(
 ) -> None:
     """Process recordings into energyscapes.
 
-    Passive measurements become acoustic maps.
-
-    Measurements without a call are passive. Acoustic maps show the sound power from each direction, in bands of
-    frequencies. If only some measurements of a recording are passive, they are left out, and the others become images.
-    With --mode passive, all become maps, without the time of the call.
+    Measurements without a call are left out; 'ertis acoustic' makes maps of their sound.
 
     The settings file overrides the settings of the recording, the preset overrides both, and other options override
     all of them. The same recording gives the same amplitudes, bit by bit, for any number of threads and any batch. All
@@ -134,13 +115,11 @@ def process(
     The fast method chooses the fastest plan whose predicted error meets --max-error. The error is relative to the exact
     image, over all directions and ranges.
     """
-    keys = {name: other.pop(name) for name in [*other] if name.startswith("passive_")}
     level = other.pop("level")
 
     def changed(recorded: "Settings") -> "Settings":
         given = {**other, "level_directions": level}
         settings = _image_options.with_given(recorded, settings_file=settings_file, preset=preset, given=given)
-        settings = _acoustic_maps.with_map_options(settings, keys)
         if not _results.is_results_file(target):
             _results.require_image(settings)
         _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=other["max_error_db"])
@@ -162,10 +141,8 @@ def process(
         mounting=_mountings.mountings(mounting, None if sensor is None else [sensor]),
         explain=explain,
         verify=verify,
-        maps_only=other["mode"] == "passive",
     )
     if _process_many.are_meant(paths, target):
-        _acoustic_maps.require_options_of(other["mode"])
         _process_many.process_many(
             paths, target, wanted, workers=workers, scheduler=scheduler, quiet=quiet, as_json=as_json
         )
@@ -175,9 +152,8 @@ def process(
 
 
 def _write_one(path: Path, target: str | None, wanted: "CampaignOptions", *, quiet: bool, as_json: bool) -> None:
-    """Write the signals, acoustic maps or images of one recording."""
+    """Write the signals or images of one recording."""
     if target is not None and _results.is_results_file(target):
-        _acoustic_maps.require_none(f"{target} contains signals or beams; choose a .h5 file")
         _results.write_results(
             path,
             Path(target),
@@ -192,16 +168,10 @@ def _write_one(path: Path, target: str | None, wanted: "CampaignOptions", *, qui
             plan=wanted.plan,
         )
         return
-    sensors = options.sensors_of(path, wanted.sensor, "a recording")
-    if _acoustic_maps.are_wanted(path, sensors, wanted.settings):
-        maps_file = Path(target) if target else path.with_suffix(".acoustic.h5")
-        _acoustic_maps.write_maps(path, maps_file, wanted, sensors=sensors, quiet=quiet, as_json=as_json)
-        return
-    _acoustic_maps.require_none("measurements with a call become images; use --mode passive")
     target_file = Path(target) if target else path.with_suffix(".energy.h5")
     report = _process_one(path, target_file, wanted, quiet=quiet, as_json=as_json)
     _note_mountings(target_file, quiet=quiet)
-    for line in _process_many.summary(Path(report["output"]), report["sensors"], report["device"]):
+    for line in _process_many.summary(Path(report["output"]), report):
         options.say(line, quiet=quiet)
     if as_json:
         options.print_json(report)
@@ -209,18 +179,12 @@ def _write_one(path: Path, target: str | None, wanted: "CampaignOptions", *, qui
 
 def _require_options_of_one(target: str | None) -> None:
     """Refuse options for several recordings, and pictures."""
-    context = click.get_current_context()
-    for name in ("workers", "scheduler"):
-        if typed(name):
-            raise click.UsageError(
-                f"--{name} applies to several recordings; add recordings, use a folder or a pattern, or end -o with /",
-                context,
-            )
+    _process_many.require_options_of_one()
     if target is not None and Path(target).suffix.lower() in _PICTURES:
         raise click.UsageError(
             f"-o {target} is a picture, but process writes energyscapes; choose a .h5 file and plot it with 'ertis "
             "plot'",
-            context,
+            click.get_current_context(),
         )
 
 
@@ -257,7 +221,7 @@ def _process_one(path: Path, target: Path, wanted: "CampaignOptions", *, quiet: 
         path,
         target,
         wanted,
-        sensors=options.sensors_of(path, wanted.sensor),
+        sensors=options.sensors_of(path, wanted.sensor, "a recording"),
         pipelines=pipelines,
         warn=options.warn,
         show=show,

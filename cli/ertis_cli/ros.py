@@ -361,8 +361,8 @@ class _RosReport:
         """Report that measurements of a file without a call are left out."""
         self._n_passive = count
         self.note(
-            f"note: {options.counted(count, 'measurement')} without a call left out; 'ertis process --mode passive' "
-            "makes acoustic maps"
+            f"note: {options.counted(count, 'measurement')} without a call left out; 'ertis acoustic' makes maps "
+            "of their sound"
         )
 
     def show_notes(self) -> None:

@@ -33,8 +33,8 @@ __all__ = ["serve"]
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own grid by default.")
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
 @click.option("--method", type=click.Choice(["fast", "paper"]), help="Processing method; the sensor's own by default.")
-@options.beamforming("the sensor's own")
-@options.cleaning("the sensor's own")
+@options.beamforming("; the sensor's own by default")
+@options.cleaning("; the sensor's own by default")
 @click.option(
     "--max-error",
     "max_error_db",

@@ -119,7 +119,7 @@ _ONLY = {
     "--decay", type=float, default=0.0, show_default=True, metavar="S", help="Time for which points stay visible."
 )
 @click.option("--colours", type=click.Choice(_COLOURS), default="inferno", show_default=True, help="Colour map.")
-@options.cleaning("no further cleaning")
+@options.cleaning("; no further cleaning by default")
 @click.option("--loop", is_flag=True, help="Restart a file at its end.")
 @click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @click.option(

@@ -10,12 +10,12 @@ from typing import Any, Final
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, ErtisError
 from ertis_numba.base.forks import usable_cores
-from ertis_numba.campaign.echo_measurements import count_images, passive_note
+from ertis_numba.campaign.echo_measurements import count_images, no_images, passive_note, require_images
 from ertis_numba.campaign.events import Event, Outcome, RecordingEnded, RecordingProgress, RecordingStarted
 from ertis_numba.campaign.existing_output import difference
 from ertis_numba.campaign.folder import clear_parts, exclusive_folder
 from ertis_numba.campaign.plans import Plans
-from ertis_numba.campaign.recordings import RecordingFile, ResultKind, known_sensors, map_path, output_paths
+from ertis_numba.campaign.recordings import RecordingFile, known_sensors, output_paths
 from ertis_numba.campaign.tasks import (
     MAX_WAITING_BYTES,
     TASK_OPTIONS,
@@ -39,17 +39,11 @@ class _RecordingState:
     """Recording in progress."""
 
     found: RecordingFile
-    targets: dict[ResultKind, Path]
-    kind: ResultKind
+    target: Path
     measurements: int = 0
     wanted: dict[str, Settings] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     is_kept: bool = False
-
-    @property
-    def target(self) -> Path:
-        """Output of the kind of result that is expected or, after the inspection, chosen."""
-        return self.targets[self.kind]
 
     def ended(self, outcome: Outcome, **more: Any) -> RecordingEnded:
         return RecordingEnded(self.found.path, self.target, outcome, **more)
@@ -58,7 +52,8 @@ class _RecordingState:
 class Campaign:
     """Processing of many recordings to energyscape files, or files of acoustic maps, in a folder.
 
-    A recording whose measurements are all passive becomes acoustic maps. If only some are, the others become images.
+    A recording whose measurements are all passive has no images. It fails if it was given by name, and is skipped
+    otherwise. If only some are passive, the others become images.
 
     The files do not depend on the number of workers or threads: only the date in them differs. A plan is chosen once
     for all recordings with the same settings. An existing file is kept if it was made from the same recording with the
@@ -102,14 +97,10 @@ class Campaign:
                     "them"
                 )
         self.folder, self._options = Path(folder), options or CampaignOptions()
-        targets = output_paths(recordings, self.folder)
-        self._names = {name for target in targets for name in (target.name, map_path(target).name)}
+        targets = output_paths(recordings, self.folder, self._options.result)
+        self._names = {target.name for target in targets}
         self._n_recordings = len(recordings)
-        expected: ResultKind = "acoustic_map" if self._options.maps_only else "energyscape"
-        self._waiting = deque(
-            _RecordingState(found, {"energyscape": target, "acoustic_map": map_path(target)}, expected)
-            for found, target in zip(recordings, targets, strict=True)
-        )
+        self._waiting = deque(map(_RecordingState, recordings, targets))
         if self._options.without.of_sensor:
             self._options.without.require_known(known_sensors(recordings))
         self._workers, self._scheduler = workers, scheduler
@@ -180,11 +171,11 @@ class Campaign:
     def _to_plan(self, n_workers: int) -> tuple[Task, _RecordingState] | None:
         """Return a planning task, unless all planning has to wait."""
         for case in self._unplanned:
-            settings = next(each for each in case.wanted.values() if self._plans.get(case.kind, each) is None)
-            if (kernels := self._plans.begin(case.kind, settings)) is not None:
+            settings = next(each for each in case.wanted.values() if self._plans.get(each) is None)
+            if (kernels := self._plans.begin(settings)) is not None:
                 self._unplanned.remove(case)
                 arguments = {
-                    "kind": case.kind,
+                    "kind": self._options.result,
                     "settings": settings.to_toml(),
                     "warm": kernels == "new",
                     **self._shares(n_workers),
@@ -199,7 +190,8 @@ class Campaign:
     def _inspection(self, case: _RecordingState) -> dict[str, Any]:
         return {
             "path": self._path(case.found.path),
-            "targets": {kind: self._path(target) for kind, target in case.targets.items()},
+            "target": self._path(case.target),
+            "kind": self._options.result,
             "named": case.found.named,
             "dtype": self._options.dtype,
             "sensor": self._options.sensor,
@@ -218,11 +210,11 @@ class Campaign:
         options = self._options
         planned = {}
         for name, settings in case.wanted.items():
-            plan = self._plans.get(case.kind, settings)
+            plan = self._plans.get(settings)
             if isinstance(plan, Accuracy):
                 planned[name] = settings.replace(accuracy=plan).to_toml()
         return {
-            "kind": case.kind,
+            "kind": options.result,
             "path": self._path(case.found.path),
             "target": self._path(case.target),
             **self._shares(n_workers),
@@ -244,7 +236,7 @@ class Campaign:
         del self._submitted[news.number]
         if task.action == "plan":
             settings = Settings.from_toml(task.arguments["settings"], "settings")
-            self._plans.finish(task.arguments["kind"], settings, news.result)
+            self._plans.finish(settings, news.result)
             if "by_chance" not in news.result:
                 yield from self._planned(pool, case, news.result)
                 return
@@ -264,7 +256,11 @@ class Campaign:
             return
         try:
             self._choose_results(case, reported)
-            made = reported["made"][case.kind]
+            if not case.measurements and not case.found.named:
+                yield case.ended("skipped", made={"warnings": [no_images(case.found.path)]})
+                return
+            require_images(case.found.path, case.measurements)
+            made = reported["made"]
             differs = "" if made is None else difference(made, case.wanted, self._options.mounting)
         except (ErtisError, OSError) as error:
             yield case.ended("failed", error=" ".join(str(error).split()))
@@ -280,21 +276,19 @@ class Campaign:
             yield from self._advance(case)
 
     def _choose_results(self, case: _RecordingState, reported: dict[str, Any]) -> None:
-        """Set the kind of result, the settings of each sensor that has results, and the number of measurements."""
+        """Set the settings of each sensor that has results, and the number of measurements."""
         path, behaviours = case.found.path, reported["behaviours"]
         wanted = {
             name: self._options.settings_of(name, Settings.from_toml(text, f"{path}: settings"))
             for name, text in reported["sensors"].items()
         }
         wanted = {name: self_contained(_absolute(settings)) for name, settings in wanted.items()}
-        n_images = {name: count_images(settings, behaviours[name]) for name, settings in wanted.items()}
-        case.measurements = sum(n_images.values())
-        if not case.measurements:
-            self._options.require_maps(path)
-            case.kind, case.wanted = "acoustic_map", wanted
+        if self._options.result == "acoustic_map":
+            case.wanted = wanted
             case.measurements = sum(sum(counts.values()) for counts in behaviours.values())
             return
-        case.kind = "energyscape"
+        n_images = {name: count_images(settings, behaviours[name]) for name, settings in wanted.items()}
+        case.measurements = sum(n_images.values())
         for name, settings in wanted.items():
             if n_images[name]:  # Otherwise, the sensor has no measurement that a worker could report.
                 case.wanted[name] = settings
@@ -320,7 +314,7 @@ class Campaign:
 
     def _advance(self, case: _RecordingState) -> Iterator[Event]:
         """Queue a recording for processing if its plans are known, otherwise for planning."""
-        plans = [self._plans.get(case.kind, settings) for settings in case.wanted.values()]
+        plans = [self._plans.get(settings) for settings in case.wanted.values()]
         failed = [plan for plan in plans if isinstance(plan, str)]
         if failed:
             yield case.ended("failed", error=f"{case.found.path}: {failed[0]}")

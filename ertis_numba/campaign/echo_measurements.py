@@ -5,13 +5,14 @@ from pathlib import Path
 from typing import overload
 
 from ertis_numba.base.errors import DataError
+from ertis_numba.base.file_kinds import quoted
 from ertis_numba.campaign.attitudes import Attitudes
 from ertis_numba.frames import Behaviour, Measurement, Stamp, is_passive
 from ertis_numba.settings import Settings
 from ertis_numba.storage import RecordingReader
 from ertis_numba.storage.recording import Mounting
 
-__all__ = ["EchoMeasurements", "count_images", "passive_note", "require_images"]
+__all__ = ["EchoMeasurements", "count_images", "no_images", "passive_note", "require_images"]
 
 
 class EchoMeasurements(Sequence[Measurement]):
@@ -60,7 +61,7 @@ class EchoMeasurements(Sequence[Measurement]):
             return ""
         return (
             f"no call was emitted for {self._n_silent} of {len(self)} measurements, so their images show no echoes "
-            "of a call; use mode='auto' or 'passive' for maps of their sound"
+            "of a call; use 'ertis acoustic' for maps of their sound"
         )
 
     @property
@@ -80,15 +81,20 @@ def passive_note(path: Path, sensor: str, n_images: int, n_measurements: int) ->
         return ""
     count = f"{n_measurements - n_images} of {n_measurements}"
     return (
-        f"{path}: {count} measurements of sensor {sensor} are passive and left out; use "
-        "mode='passive' for acoustic maps, or mode='active' for images of all"
+        f"{path}: {count} measurements of sensor {sensor} are passive and left out; use 'ertis acoustic' for maps of "
+        "their sound"
+    )
+
+
+def no_images(path: Path) -> str:
+    """Return a line on a recording of which no measurement becomes an image."""
+    return (
+        f"{path}: all measurements are passive and have no echoes; use 'ertis acoustic {quoted(path)}' for maps of "
+        'their sound, or the setting processing.mode = "active" for images'
     )
 
 
 def require_images(path: Path, n_images: int) -> None:
     """Refuse a recording of which no measurement becomes an image."""
     if not n_images:
-        raise DataError(
-            f"{path}: all measurements are passive and have no images; make acoustic maps, or use "
-            "mode='active' for images"
-        )
+        raise DataError(no_images(path))

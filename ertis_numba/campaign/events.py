@@ -35,7 +35,7 @@ class RecordingEnded:
         Recording, and its energyscape file or file of acoustic maps.
     outcome : {"made", "kept", "skipped", "failed"}
         ``kept`` means that the output exists, made with the same settings and versions. ``skipped`` means a
-        result of processing that was not given by name.
+        result of processing, or a recording without images, that was not given by name.
     error : str
         Reason of a failure in one line; empty otherwise.
     made : dict

@@ -59,7 +59,7 @@ def inspect_output(target: Path, recording: RecordingReader, kind: ResultKind, d
     if not target.exists():
         return None
     try:
-        found, made_of = _read(target, recording, kind, "float32" if kind == "acoustic_map" else dtype)
+        found, made_of = _read(target, recording, kind, dtype)
     except DamagedError:
         return {"differs": "is damaged"}
     except (ErtisError, *_UNREADABLE):

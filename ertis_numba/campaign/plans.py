@@ -4,14 +4,13 @@ import hashlib
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from ertis_numba.campaign.recordings import ResultKind
 from ertis_numba.settings import Accuracy, Air, Settings
 
 __all__ = ["Plans"]
 
 
 class Plans:
-    """Plans by the kind of result and the settings, and the plans in progress.
+    """Plans by settings, and the plans in progress.
 
     Without them, workers with different measured costs could choose different plans, and the files would depend on the
     worker. Acoustic maps have nothing to plan, but their kernels are also compiled by one worker.
@@ -22,25 +21,25 @@ class Plans:
         self._compiled: set[bytes] = set()  # Settings without their air, whose kernels are compiled.
         self._in_progress: dict[bytes, bool] = {}  # True for settings with new kernels.
 
-    def get(self, kind: ResultKind, settings: Settings) -> Accuracy | str | None:
+    def get(self, settings: Settings) -> Accuracy | str | None:
         """Return the plan for settings, or an error text, or None while it is not known."""
-        return self._found.get(_key(kind, settings))
+        return self._found.get(_key(settings))
 
-    def begin(self, kind: ResultKind, settings: Settings) -> Literal["new", "known"] | None:
+    def begin(self, settings: Settings) -> Literal["new", "known"] | None:
         """Register settings as being planned; return ``new`` or ``known`` for their kernels, None if they have to wait.
 
         Settings that differ only in the air have the same kernels. Those with new kernels are planned one at a time,
         because several processes that compile the same kernels could corrupt the cache.
         """
-        key, new = _key(kind, settings), _kernels_key(kind, settings) not in self._compiled
+        key, new = _key(settings), _kernels_key(settings) not in self._compiled
         if key in self._in_progress or (new and any(self._in_progress.values())):
             return None
         self._in_progress[key] = new
         return "new" if new else "known"
 
-    def finish(self, kind: ResultKind, settings: Settings, reported: Mapping[str, Any]) -> None:
+    def finish(self, settings: Settings, reported: Mapping[str, Any]) -> None:
         """Store the result; after a temporary error, the next request plans again."""
-        key = _key(kind, settings)
+        key = _key(settings)
         self._in_progress.pop(key)
         if "by_chance" in reported:
             return
@@ -48,12 +47,12 @@ class Plans:
             self._found[key] = str(reported["error"])
         else:
             self._found[key] = Settings.from_toml(reported["settings"], "settings").accuracy
-            self._compiled.add(_kernels_key(kind, settings))
+            self._compiled.add(_kernels_key(settings))
 
 
-def _key(kind: ResultKind, settings: Settings) -> bytes:
-    return hashlib.sha256(f"{kind}\n{settings.to_toml()}".encode()).digest()
+def _key(settings: Settings) -> bytes:
+    return hashlib.sha256(settings.to_toml().encode()).digest()
 
 
-def _kernels_key(kind: ResultKind, settings: Settings) -> bytes:
-    return _key(kind, settings.replace(air=Air()))
+def _kernels_key(settings: Settings) -> bytes:
+    return _key(settings.replace(air=Air()))

@@ -11,12 +11,12 @@ from typing import Final, Literal
 from ertis_numba.base.errors import ArgumentError, DataError, ErtisError
 from ertis_numba.storage import is_map, sensor_names
 
-__all__ = ["RecordingFile", "ResultKind", "find_recordings", "known_sensors", "map_path", "output_paths"]
+__all__ = ["RESULT_SUFFIXES", "RecordingFile", "ResultKind", "find_recordings", "known_sensors", "output_paths"]
 
 ResultKind = Literal["energyscape", "acoustic_map"]
 
-_SUFFIX: Final = ".energy.h5"
-_MAP_SUFFIX: Final = ".acoustic.h5"
+RESULT_SUFFIXES: Final[dict[ResultKind, str]] = {"energyscape": ".energy.h5", "acoustic_map": ".acoustic.h5"}
+"""Ends of the names of result files, which replace ``.h5`` of the recording."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +93,8 @@ def known_sensors(recordings: Iterable[RecordingFile]) -> set[str]:
     return names
 
 
-def output_paths(recordings: Sequence[RecordingFile], folder: Path) -> list[Path]:
-    """Return the energyscape file in ``folder`` for each recording.
-
-    Recordings without images have files of acoustic maps instead; see `map_path`.
-    """
+def output_paths(recordings: Sequence[RecordingFile], folder: Path, kind: ResultKind = "energyscape") -> list[Path]:
+    """Return the file of results in ``folder`` for each recording."""
     if folder.exists() and not folder.is_dir():
         raise ArgumentError(f"output {folder} is a file, but several recordings need a folder; choose another name")
     if not folder.parent.is_dir():
@@ -107,22 +104,16 @@ def output_paths(recordings: Sequence[RecordingFile], folder: Path) -> list[Path
     taken: dict[str, Path] = {}
     targets = []
     for found in recordings:
-        target = folder / found.path.with_suffix(_SUFFIX).name
+        target = folder / found.path.with_suffix(RESULT_SUFFIXES[kind]).name
         name = os.path.normcase(target)
         if name in taken:
             raise ArgumentError(
                 f"{taken[name]} and {found.path} would both become {target}; process them into separate folders"
             )
-        for output in (target, map_path(target)):
-            if os.path.realpath(output) in named:
-                raise ArgumentError(
-                    f"{found.path} would become {output}, which is itself to be processed; choose another folder"
-                )
+        if os.path.realpath(target) in named:
+            raise ArgumentError(
+                f"{found.path} would become {target}, which is itself to be processed; choose another folder"
+            )
         taken[name] = found.path
         targets.append(target)
     return targets
-
-
-def map_path(target: Path) -> Path:
-    """Return the file of acoustic maps that replaces an energyscape file of `output_paths`."""
-    return target.with_name(f"{target.name.removesuffix(_SUFFIX)}{_MAP_SUFFIX}")

@@ -63,8 +63,7 @@ def _one_line(error: OSError | MemoryError) -> str:
 def _inspect(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
     """Return sensors, settings and measurements of a recording, and a description of its existing output.
 
-    ``behaviours`` has the number of measurements of each sensor by their behaviour. ``made`` has the description by
-    kind of result.
+    ``behaviours`` has the number of measurements of each sensor by their behaviour.
     """
     path = Path(arguments["path"])
     if not arguments["named"] and file_kind(path) != "recording":
@@ -77,10 +76,7 @@ def _inspect(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
             "behaviours": {
                 recording.sensor: Counter(stamp.behaviour for stamp in recording.stamps()) for recording in recordings
             },
-            "made": {
-                kind: inspect_output(Path(target), recordings[0], kind, arguments["dtype"])
-                for kind, target in arguments["targets"].items()
-            },
+            "made": inspect_output(Path(arguments["target"]), recordings[0], arguments["kind"], arguments["dtype"]),
         }
 
 

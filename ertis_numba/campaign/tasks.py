@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final, Literal, Protocol, TypeAlias
 
 import msgspec
 
 from ertis_numba.base import checks
-from ertis_numba.base.errors import DataError
+from ertis_numba.base.errors import ArgumentError
+from ertis_numba.campaign.recordings import RESULT_SUFFIXES, ResultKind
 from ertis_numba.chain.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.settings import ExcludedChannels, Settings
 from ertis_numba.storage.recording import Mounting
@@ -65,9 +65,9 @@ class CampaignOptions:
     verify : bool
         Measure the error of each sensor's first image, and report it under the key ``verified``. A recording fails if
         the error exceeds the budget.
-    maps_only : bool
-        All results are acoustic maps, because ``settings`` returns the mode ``passive``. A recording that cannot be
-        read is then reported with the name of a file of acoustic maps.
+    result : {"energyscape", "acoustic_map"}
+        Images of the measurements that are not passive, by default; or acoustic maps of all measurements, which have
+        the mode ``passive`` and no ``dtype``, ``explain`` or ``verify``.
     """
 
     settings: Callable[[Settings], Settings] = lambda recorded: recorded
@@ -83,32 +83,23 @@ class CampaignOptions:
     mounting: Mapping[str, Mounting] | None = None
     explain: bool = False
     verify: bool = False
-    maps_only: bool = False
+    result: ResultKind = "energyscape"
 
     def __post_init__(self) -> None:
         checks.choice("dtype", self.dtype, ("float32", "float16"))
         checks.choice("plan", self.plan, PLAN_COSTS)
         checks.choice("device", self.device, ("auto", "cpu", "cuda", "numpy"))
         checks.integer("batch", self.batch, 1)
+        checks.choice("result", self.result, RESULT_SUFFIXES)
+        if self.result == "acoustic_map" and (self.dtype != "float32" or self.explain or self.verify):
+            raise ArgumentError("dtype, explain and verify are for images, but result is 'acoustic_map'; omit them")
 
     def settings_of(self, sensor: str, recorded: Settings) -> Settings:
         """Return the settings for processing a sensor, given the recorded ones, without its excluded channels."""
-        return self.without.applied(self.settings(recorded), sensor)
-
-    def require_maps(self, path: Path) -> None:
-        """Refuse options that need images, for a recording that becomes acoustic maps.
-
-        Raises
-        ------
-        DataError
-            ``explain`` or ``verify`` is set.
-        """
-        for name in ("explain", "verify"):
-            if getattr(self, name):
-                raise DataError(
-                    f"{path}: all measurements become acoustic maps, which have no error budget; "
-                    f"remove {name}=True, or use mode='active' for images"
-                )
+        settings = self.settings(recorded)
+        if self.result == "acoustic_map":
+            settings = settings.replace("processing.mode", "passive")
+        return self.without.applied(settings, sensor)
 
     @property
     def examines_existing(self) -> bool:

@@ -182,12 +182,12 @@ class FileReader(Sequence[Item]):
 
     def _remedy(self, kind: str) -> str:
         """Return the way from a file of another kind to one that can be read here."""
-        mode = "active" if self._kind == "energyscape" else "passive"
+        command = "process" if self._kind == "energyscape" else "acoustic"
         if self._kind == "recording":
             return "use the recording from which it was made"
         if kind == "recording":
-            return f"process it first ('ertis process {quoted(self.path)} --mode {mode}')"
-        return f"process the recording from which it was made ('ertis process RECORDING --mode {mode}')"
+            return f"process it first ('ertis {command} {quoted(self.path)}')"
+        return f"process the recording from which it was made ('ertis {command} RECORDING')"
 
     def _select_sensor(self, sensor: str | None) -> str:
         names = ", ".join(self.sensors[:_MAX_NAMES]) + ", …" * (len(self.sensors) > _MAX_NAMES)

@@ -261,12 +261,12 @@ def test_process_warns_of_another_layout_on_stderr_and_in_the_file(tmp_path):
     assert "layout eRTIS_v3D1 fits far better" in strict.stderr
 
 
-@pytest.mark.parametrize("more", [(), ("--mode", "passive")])
-def test_process_with_the_settings_of_another_array_warns(tmp_path, more):
+@pytest.mark.parametrize("command", ["process", "acoustic"])
+def test_processing_with_the_settings_of_another_array_warns(tmp_path, command):
     shutil.copy(DATA / "reflectors_3d.h5", tmp_path / "rec.h5")
     (tmp_path / "other.toml").write_text('array.layout = "eRTIS_v2"\nprocessing.directions = "2d:9"\n')
     files = [str(tmp_path / "rec.h5"), "--settings", str(tmp_path / "other.toml")]
-    done = CliRunner().invoke(cli, ["process", *files, *more])
+    done = CliRunner().invoke(cli, [command, *files])
     assert done.exit_code == 0, done.stderr
     assert "layout eRTIS_v3D1 fits far better" in done.stderr
 

@@ -83,7 +83,7 @@ def test_several_recordings_exclude_channels_of_the_sensor_that_some_contain(rec
     assert not (tmp_path / "other").exists()
 
 
-@pytest.mark.parametrize("line", ["process", "fuse", "process --mode passive", "process --sensor left"])
+@pytest.mark.parametrize("line", ["process", "fuse", "acoustic", "process --sensor left"])
 def test_unknown_sensors_are_refused_with_those_of_the_recording(recording, tmp_path, line):
     done = run(*line.split(), recording, "-o", tmp_path / "a.h5", "--without", "labB:7", code=1)
     (line,) = [each for each in done.stderr.splitlines() if "error" in each]

@@ -1,4 +1,4 @@
-"""Acoustic maps on the command line: `ertis process`, `ertis info` and `ertis peaks`."""
+"""Acoustic maps on the command line: `ertis acoustic`, `ertis info` and `ertis peaks`."""
 
 import dataclasses
 import json
@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_cli import process
+from ertis_cli import acoustic
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
@@ -64,6 +64,7 @@ def recorded(tmp_path_factory):
     ertis.write_recording(made / "both.h5", both, mounting={"right": ((0.1, 0.0, 0.0), TURNED)})
     silent = [*heard(["passive"], "left"), *heard(["passive"], "right")]
     ertis.write_recording(made / "silent.h5", silent, mounting=dict.fromkeys(("left", "right"), ((0, 0, 0), TURNED)))
+    (made / "images.toml").write_text('processing.mode = "active"')
     return made
 
 
@@ -92,7 +93,7 @@ def azimuths_deg(rows):
 
 
 def test_passive_recording_becomes_acoustic_maps():
-    done = run("process passive.h5 --device cpu --json")
+    done = run("acoustic passive.h5 --device cpu --json")
     report = json.loads(done.stdout)
     assert (report["output"], report["kind"]) == ("passive.acoustic.h5", "acoustic_map")
     assert (report["measurements"], report["maps"], report["directions"], report["bands"]) == (3, 2, 61, 2)
@@ -121,9 +122,9 @@ def test_bands_of_quantisation_noise_are_reported():
     pdm = ertis.Settings().replace(**{"recording.n_samples": 81_920, "processing.range_m": (0.5, 1.0)})
     noise = np.random.default_rng(5).integers(0, 2**32, 81_920, dtype=np.uint32)
     ertis.write_recording("pdm.h5", [ertis.Measurement(noise, pdm, Stamp(behaviour="passive"))])
-    quiet = run("process pdm.h5 -o low.h5 --bands 20000:130000")
+    quiet = run("acoustic pdm.h5 -o low.h5 --bands 20000:130000")
     assert "quantisation" not in quiet.stderr
-    noisy = run("process pdm.h5 -o high.h5 --bands 20000:30000,200000:300000")
+    noisy = run("acoustic pdm.h5 -o high.h5 --bands 20000:30000,200000:300000")
     (line,) = (line for line in noisy.stderr.splitlines() if "quantisation noise" in line)
     assert "dominates above 130 kHz, and therefore in 200 to 300 kHz; choose lower bands" in line
 
@@ -132,7 +133,7 @@ def test_silent_sensor_of_a_scene_needs_no_fitting_call(folder):
     """The default call reaches 50 kHz, above half of the sample rate."""
     (folder / "ear.toml").write_text(SILENT_SCENE)
     run("simulate ear.toml -o ear.h5")
-    run("process ear.h5 -o ear.acoustic.h5")
+    run("acoustic ear.h5 -o ear.acoustic.h5")
     with ertis.open_acoustic_maps("ear.acoustic.h5") as maps:
         assert maps.band_hz.tolist() == [[2000.0, 4000.0]]
         (loudest,) = maps[0].loudest()
@@ -142,7 +143,7 @@ def test_silent_sensor_of_a_scene_needs_no_fitting_call(folder):
 def test_options_of_maps_override_the_settings(folder):
     (folder / "given.toml").write_text('[passive]\nmethod = "music"\naverages = 9\nfocus_m = 3\n')
     run(
-        "process passive.h5 -o maps.h5 --settings given.toml --bands 25000:30000,30000:35000 --map-method functional "
+        "acoustic passive.h5 -o maps.h5 --settings given.toml --bands 25000:30000,30000:35000 --method functional "
         "--average 3 --focus 2 --device numpy"
     )
     with ertis.open_acoustic_maps("maps.h5") as found:
@@ -152,21 +153,23 @@ def test_options_of_maps_override_the_settings(folder):
 
 
 def test_emission_is_masked_and_reported():
-    done = run("process mixed.h5 -o maps.h5 --mode passive --device cpu")
+    done = run("acoustic mixed.h5 -o maps.h5 --device cpu")
     assert "mixed.h5: sensor sensor emitted its call in 2 of 4 measurements; maps leave out the first " in done.stderr
     assert "ms of each, but contain echoes of the call" in done.stderr
     with ertis.open_acoustic_maps("maps.h5") as found:
         assert [each.masked_s > found.settings.call.duration_s for each in found] == [True, True]
-    assert "emitted" not in run("process passive.h5 -o quiet.h5 --device cpu").stderr
+    assert "emitted" not in run("acoustic passive.h5 -o quiet.h5 --device cpu").stderr
 
 
 def test_mixed_recording_becomes_images_of_its_calls():
     done = run("process mixed.h5 -o img.h5 --device cpu --json")
-    assert "mixed.h5: 2 of 4 measurements of sensor sensor are passive and left out; use --mode passive" in done.stderr
+    assert (
+        "mixed.h5: 2 of 4 measurements of sensor sensor are passive and left out; use 'ertis acoustic'" in done.stderr
+    )
     assert json.loads(done.stdout)["measurements"] == 2
     with ertis.open_energyscapes("img.h5") as images:
         assert [stamp.sequence for stamp in images.stamps()] == [0, 2]
-    run("process mixed.h5 -o all.h5 --mode active --device cpu")
+    run("process mixed.h5 -o all.h5 --settings images.toml --device cpu")
     with ertis.open_energyscapes("all.h5") as images:
         assert len(images) == 4
 
@@ -175,32 +178,59 @@ def test_sensor_without_calls_is_left_out_of_images():
     done = run("process both.h5 -o img.h5 --device cpu")
     assert "2 of 2 measurements of sensor right are passive and left out" in done.stderr
     assert ertis.storage.sensor_names("img.h5") == ("left",)
-    run("process both.h5 -o maps.h5 --sensor right --device cpu")
+    run("acoustic both.h5 -o maps.h5 --sensor right --device cpu")
     with ertis.open_acoustic_maps("maps.h5") as maps:
         assert (maps.sensors, maps.translation_m.tolist()) == (("right",), [0.1, 0.0, 0.0])
 
 
+NO_IMAGES = (
+    "passive.h5: all measurements are passive and have no echoes; "
+    "use 'ertis acoustic passive.h5' for maps of their sound"
+)
+
+
+def test_process_names_the_command_for_a_recording_of_sound(folder):
+    done = run("process passive.h5 --device cpu", code=1)
+    assert [line for line in done.stderr.splitlines() if "passive" in line] == [
+        f'ertis: error: {NO_IMAGES}, or the setting processing.mode = "active" for images'
+    ]
+    assert not list(folder.glob("*.energy.h5"))
+
+
 @pytest.mark.usefixtures("in_test_process")
-def test_several_recordings_become_images_or_maps(folder):
-    (folder / "both.h5").unlink()
-    done = run("process active.h5 mixed.h5 passive.h5 -o out/ --device cpu --average 3 --workers 1 --json")
+def test_recordings_of_sound_are_skipped_unless_named(folder):
+    for name in ("both", "silent"):
+        (folder / f"{name}.h5").unlink()
+    done = run("process *.h5 -o out/ --device cpu --workers 1")
+    assert f"ertis: warning: {NO_IMAGES}" in done.stderr
     assert "mixed.h5: 2 of 4 measurements of sensor sensor are passive" in done.stderr
+    assert "3 recordings: 2 made, 1 skipped; 4 measurements in " in done.stderr
+    assert names_in(folder / "out") == ["active.energy.h5", "mixed.energy.h5"]
+    done = run("process active.h5 passive.h5 -o named/ --device cpu --workers 1", code=1)
+    assert f"ertis: failed: {NO_IMAGES}" in done.stderr
+    assert names_in(folder / "named") == ["active.energy.h5"]
+
+
+@pytest.mark.usefixtures("in_test_process")
+def test_several_recordings_become_maps(folder):
+    done = run("acoustic active.h5 mixed.h5 passive.h5 -o out/ --device cpu --average 3 --workers 1 --json")
     assert "out/passive.acoustic.h5: 1 acoustic map of 3 measurements, 61 directions × 2 bands on cpu" in done.stderr
-    assert "3 recordings: 3 made; 7 measurements in " in done.stderr
-    assert names_in(folder / "out") == ["active.energy.h5", "mixed.energy.h5", "passive.acoustic.h5"]
-    (made,) = [row for row in map(json.loads, done.stdout.splitlines()) if row.get("kind") == "acoustic_map"]
-    alone = json.loads(run("process passive.h5 -o alone.h5 --device cpu --average 3 --json").stdout)
+    assert "3 recordings: 3 made; 9 measurements in " in done.stderr
+    assert names_in(folder / "out") == ["active.acoustic.h5", "mixed.acoustic.h5", "passive.acoustic.h5"]
+    rows = list(map(json.loads, done.stdout.splitlines()))
+    (made,) = [row for row in rows if row.get("output") == "out/passive.acoustic.h5"]
+    alone = json.loads(run("acoustic passive.h5 -o alone.h5 --device cpu --average 3 --json").stdout)
     assert (made["output"], made["outcome"], made["maps"]) == ("out/passive.acoustic.h5", "made", 1)
     assert made["loudest"] == alone["loudest"]
     with ertis.open_acoustic_maps("out/passive.acoustic.h5") as one, ertis.open_acoustic_maps("alone.h5") as other:
         assert one.uuid == other.uuid
-    run("process out -o more/ --device cpu")  # results of processing are skipped
+    run("acoustic out -o more/ --device cpu")  # results of processing are skipped
     assert not list((folder / "more").glob("*.h5"))
 
 
 @pytest.mark.usefixtures("in_test_process")
 def test_finished_maps_are_kept(folder):
-    line = "process passive.h5 silent.h5 -o maps/ --device cpu --workers 1"
+    line = "acoustic passive.h5 silent.h5 -o maps/ --device cpu --workers 1"
     run(line)
     assert "2 recordings: 2 kept; 0 measurements in " in run(line).stderr
     assert "2 kept" in run(f"{line} --strict").stderr
@@ -219,7 +249,7 @@ def test_finished_maps_are_kept(folder):
 @pytest.mark.usefixtures("in_test_process")
 def test_failed_recordings_do_not_stop_maps_of_others(folder):
     (folder / "torn.h5").write_bytes((folder / "passive.h5").read_bytes()[:90_000])
-    done = run("process passive.h5 torn.h5 active.h5 -o maps --mode passive --device cpu --json", code=1)
+    done = run("acoustic passive.h5 torn.h5 active.h5 -o maps --device cpu --json", code=1)
     *rows, _ = [json.loads(line) for line in done.stdout.splitlines()]
     assert {row["recording"]: (row["outcome"], row["output"]) for row in rows} == {
         "passive.h5": ("made", "maps/passive.acoustic.h5"),
@@ -229,18 +259,14 @@ def test_failed_recordings_do_not_stop_maps_of_others(folder):
     assert "ertis: failed: torn.h5 is cut short or damaged" in done.stderr
     assert "active.h5: sensor sensor emitted its call in 2 of 2 measurements; maps leave out the first" in done.stderr
     assert names_in(folder / "maps") == ["active.acoustic.h5", "passive.acoustic.h5"]
-    done = run("process passive.h5 active.h5 -o images --verify --device cpu", code=1)
-    assert (
-        "passive.h5: all measurements become acoustic maps, which have no error budget; remove --verify" in done.stderr
-    )
-    assert names_in(folder / "images") == ["active.energy.h5"]
-    done = run("process passive.h5 silent.h5 -o more --bands 80000:100000 --device cpu", code=1)
+    done = run("acoustic passive.h5 silent.h5 -o more --bands 80000:100000 --device cpu", code=1)
     assert done.stderr.count("--bands ends at 100000 Hz, but the record reaches only 90000 Hz") == 2
 
 
 @pytest.mark.usefixtures("in_test_process")
 def test_progress_of_maps_counts_measurements():
-    started, *progress, ended = Campaign(find_recordings(["passive.h5"]), "maps", CampaignOptions(device="cpu")).run()
+    wanted = CampaignOptions(device="cpu", result="acoustic_map")
+    started, *progress, ended = Campaign(find_recordings(["passive.h5"]), "maps", wanted).run()
     assert started == RecordingStarted(Path("passive.h5"), 3)
     assert [each.done for each in progress] == [1, 2, 3]
     assert (ended.outcome, ended.output) == ("made", Path("maps/passive.acoustic.h5"))
@@ -255,49 +281,46 @@ def test_images_of_silent_sensors_are_fused_only_if_asked(folder):
 
 
 def test_check_names_the_kind_of_a_file_of_maps():
-    run("process passive.h5 -o maps.h5 --device cpu")
+    run("acoustic passive.h5 -o maps.h5 --device cpu")
     assert "maps.h5 is a file of acoustic maps, wanted a recording" in run("sensors check maps.h5", code=1).stderr
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("active.h5 --average 2", "--average is for acoustic maps, but measurements with a call become images"),
-        ("passive.h5 --range 0.5:1", "--range is for images, but all measurements become acoustic maps; use --mode"),
-        ("passive.h5 --verify", "--verify is for images, but all measurements become acoustic maps; use --mode"),
-        (
-            "passive.h5 active.h5 -o out/ --verify --mode passive",
-            "--verify is for images, but --mode passive makes acoustic maps; leave out --mode, or leave out --verify",
-        ),
-        ("active.h5 --verify --mode passive", "--verify is for images, but --mode passive makes acoustic maps; leave"),
+        ("passive.h5 --verify", "No such option"),
+        ("passive.h5 --workers 2", "--workers applies to several recordings"),
         ("passive.h5 --bands wide", "'wide' is not a list of bands; use third_octaves, octaves, or edges in Hz"),
         ("passive.h5 --bands 20000:30000:40000", "is not a list of bands"),
-        ("passive.h5 active.h5 -o out/ --focus 2 --mode active", "--focus is for acoustic maps, but --mode active"),
-        ("passive.h5 active.h5 -o out/ --range 1:2 --mode passive", "--range is for images, but --mode passive"),
-        ("passive.h5 -o s.npz --last-stage demodulation --bands octaves", "--bands is for acoustic maps, but s.npz"),
     ],
 )
 def test_options_without_effect_are_refused(folder, line, message):
-    assert message in " ".join(run(f"process {line} --device numpy", code=2).stderr.split())
+    assert message in " ".join(run(f"acoustic {line} --device numpy", code=2).stderr.split())
     assert not list(folder.glob("*.energy.h5")) + list(folder.glob("*.acoustic.h5"))
 
 
 def test_errors_of_maps_leave_no_file(folder):
-    done = run("process passive.h5 --bands 80000:100000 --device numpy", code=1)
+    done = run("acoustic passive.h5 --bands 80000:100000 --device numpy", code=1)
     assert "--bands ends at 100000 Hz, but the record reaches only 90000 Hz" in done.stderr
     (folder / "passive.acoustic.h5").write_bytes(b"old")
-    assert "exists" in run("process passive.h5 --device numpy", code=1).stderr
+    assert "exists" in run("acoustic passive.h5 --device numpy", code=1).stderr
     assert (folder / "passive.acoustic.h5").read_bytes() == b"old"
 
 
+@pytest.mark.parametrize("changes", [{"dtype": "float16"}, {"explain": True}, {"verify": True}])
+def test_campaigns_of_maps_refuse_options_of_images(changes):
+    with pytest.raises(ertis.ArgumentError, match="are for images, but result is 'acoustic_map'; omit them"):
+        CampaignOptions(result="acoustic_map", **changes)
+
+
 def test_methods_are_those_of_the_settings():
-    option = next(each for each in process.process.params if each.name == "passive_method")
+    option = next(each for each in acoustic.acoustic.params if each.name == "passive_method")
     assert isinstance(option.type, click.Choice)
     assert tuple(option.type.choices) == MAP_METHODS
 
 
 def test_info_describes_acoustic_maps():
-    run("process both.h5 -o maps.h5 --mode passive --device numpy --average 2 --focus 2")
+    run("acoustic both.h5 -o maps.h5 --device numpy --average 2 --focus 2")
     report = json.loads(run("info maps.h5 --json").stdout)
     assert report["kind"] == "acoustic_map"
     assert [(row["sensor"], row["measurements"], row["maps"]) for row in report["sensors"]] == [
@@ -313,7 +336,7 @@ def test_info_describes_acoustic_maps():
 
 
 def test_peaks_are_the_sources_of_maps():
-    run("process passive.h5 -o maps.h5 --device numpy")
+    run("acoustic passive.h5 -o maps.h5 --device numpy")
     rows = json.loads(run("peaks maps.h5 --top 1 --json").stdout)["sources"]
     with ertis.open_acoustic_maps("maps.h5") as maps:
         expected = [each for found in maps for each in ertis.find_sound_sources(found, top=1)]
@@ -329,20 +352,20 @@ def test_peaks_are_the_sources_of_maps():
 
 def test_levels_are_sound_pressures_if_the_sensitivity_is_known(folder):
     (folder / "given.toml").write_text("[array]\nsensitivity_dbfs = -26\n")
-    report = json.loads(run("process passive.h5 -o maps.h5 --settings given.toml --device numpy --json").stdout)
+    report = json.loads(run("acoustic passive.h5 -o maps.h5 --settings given.toml --device numpy --json").stdout)
     for row in report["loudest"]:
         assert row["level_db"] - row["level_dbfs"] == pytest.approx(94 + 26 + 3, abs=0.05)
     heading, first, *_ = run("peaks maps.h5").stdout.splitlines()
     assert heading.split()[-2:] == ["level_dbfs", "level_db"]
     with ertis.open_acoustic_maps("maps.h5") as maps:
         assert float(first.split()[-1]) == pytest.approx(ertis.find_sound_sources(maps[0])[0].level_db, abs=0.06)
-    run("process passive.h5 -o unknown.h5 --device numpy")
+    run("acoustic passive.h5 -o unknown.h5 --device numpy")
     assert {row["level_db"] for row in json.loads(run("peaks unknown.h5 --json").stdout)["sources"]} == {None}
 
 
 def test_source_levels_are_listed_if_the_distance_is_known(folder):
     (folder / "given.toml").write_text("[array]\nsensitivity_dbfs = -26\n")
-    run("process passive.h5 -o maps.h5 --settings given.toml --focus 4 --device numpy")
+    run("acoustic passive.h5 -o maps.h5 --settings given.toml --focus 4 --device numpy")
     heading, first, *_ = run("peaks maps.h5").stdout.splitlines()
     assert heading.split()[-3:] == ["level_dbfs", "level_db", "source_level_db"]
     with ertis.open_acoustic_maps("maps.h5") as maps:
@@ -353,14 +376,14 @@ def test_source_levels_are_listed_if_the_distance_is_known(folder):
 
 
 def test_maps_of_music_have_no_level():
-    report = json.loads(run("process passive.h5 -o maps.h5 --map-method music --device numpy --json").stdout)
+    report = json.loads(run("acoustic passive.h5 -o maps.h5 --method music --device numpy --json").stdout)
     assert [row["level_dbfs"] for row in report["loudest"]] == [None, None]
     assert run("peaks maps.h5 -m 0").stdout.splitlines()[1].split()[-1] == "-"
 
 
 @pytest.mark.parametrize("option", ["--detector peaks", "--all", "--truth"])
 def test_peaks_of_maps_refuse_options_of_images(option):
-    run("process passive.h5 -o maps.h5 --device numpy")
+    run("acoustic passive.h5 -o maps.h5 --device numpy")
     message = f"{option.split()[0]} is for images, but maps.h5 holds acoustic maps; leave it out"
     assert message in run(f"peaks maps.h5 {option}", code=2).stderr
 
@@ -403,15 +426,15 @@ def test_info_states_no_call_of_passive_measurements(name):
 
 
 def test_info_states_no_call_of_maps_of_passive_measurements():
-    run("process passive.h5 --device cpu -o maps.h5")
+    run("acoustic passive.h5 --device cpu -o maps.h5")
     assert json.loads(run("info maps.h5 --json").stdout)["call_khz"] is None
 
 
 def test_images_of_measurements_without_a_call_are_warned_of(in_test_process):  # noqa: ARG001
-    done = run("process mixed.h5 -o images.h5 --mode active --device cpu")
+    done = run("process mixed.h5 -o images.h5 --settings images.toml --device cpu")
     assert "no call was emitted for 2 of 4 measurements, so their images show no echoes of a call" in done.stderr
     assert json.loads(run("info images.h5 --json").stdout)["call_khz"] is not None
-    picture = run("process passive.h5 -o silent_images.h5 --mode active --device cpu")
+    picture = run("process passive.h5 -o silent_images.h5 --settings images.toml --device cpu")
     assert "no call was emitted for 3 of 3 measurements" in picture.stderr
     assert json.loads(run("info silent_images.h5 --json").stdout)["call_khz"] is None
     assert run("process active.h5 -o active_images.h5 --device cpu").stderr.count("no call") == 0

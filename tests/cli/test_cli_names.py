@@ -28,9 +28,9 @@ USAGE = {
     "plot r.h5 -o a.png --kind signals --microphone -1": "--microphone is -1; use a whole number",
     "simulate s.toml --layout x": "No such option '--layout'",
     "process r.h5 -o a.h5 --max-error 300": "--max-error is 300; use",
-    "process r.h5 -o a.h5 --bands 0:2000": "--bands is 0; use a number from 1 to 1e+09",
-    "process r.h5 -o a.h5 --bands 3000:2000": "--bands runs from 3000 to 2000; use the smaller number first",
-    "process r.h5 -o a.h5 --bands 3000:5000,4000:6000": "--bands has overlapping bands 3000 to 5000 Hz and 4000",
+    "acoustic r.h5 -o a.h5 --bands 0:2000": "--bands is 0; use a number from 1 to 1e+09",
+    "acoustic r.h5 -o a.h5 --bands 3000:2000": "--bands runs from 3000 to 2000; use the smaller number first",
+    "acoustic r.h5 -o a.h5 --bands 3000:5000,4000:6000": "--bands has overlapping bands 3000 to 5000 Hz and 4000",
     "process r.h5 -o a.h5 --directions 2d:9 --azimuth 200:300": "--azimuth is 200; use a number from -180 to 180",
     "process r.h5 -o a.h5 --directions 3d:9 --elevation 9:0": "--elevation runs from 9 to 0; use the smaller number",
     "process r.h5 -o a.h5 --directions 2d:99999999999": "directions '2d:99999999999' has a count of 11 digits; use",
@@ -126,18 +126,19 @@ def test_plot_steer_rejects_a_single_number(folder, monkeypatch):
 @pytest.mark.parametrize(
     ("given", "message", "stated"),
     [
-        ("--method fast", "passive.method is 'music'; choose another", "passive.method"),
-        ("--without 3", "array.disabled is 99; choose another", "array.disabled"),
-        ("--without 99", "array.disabled is 99; choose another", "--without"),
-        ("--map-method music", "passive.method is 'music'; choose another", "--map-method"),
-        ("--map-method music", "processing.method is 'fast'; choose another", "processing.method"),
-        ("--method fast", "processing.method is 'fast'; choose another", "--method"),
-        ("--average 3", "passive.averages is 3; choose another", "--average"),
-        ("--bands octaves", "passive.bands_hz[0] ends at 9 Hz; choose another", "--bands"),
+        ("process --method fast", "passive.method is 'music'; choose another", "passive.method"),
+        ("process --without 3", "array.disabled is 99; choose another", "array.disabled"),
+        ("process --without 99", "array.disabled is 99; choose another", "--without"),
+        ("acoustic --method music", "passive.method is 'music'; choose another", "--method"),
+        ("acoustic --method music", "processing.method is 'fast'; choose another", "processing.method"),
+        ("process --method fast", "processing.method is 'fast'; choose another", "--method"),
+        ("acoustic --average 3", "passive.averages is 3; choose another", "--average"),
+        ("acoustic --bands octaves", "passive.bands_hz[0] ends at 9 Hz; choose another", "--bands"),
     ],
 )
 def test_keys_that_are_no_options_keep_their_names(given, message, stated):
-    ctx = cli.get_command(click.Context(cli), "process").make_context("process", ["a.h5", "-o", "b.h5", *given.split()])
+    name, *given = given.split()
+    ctx = cli.get_command(click.Context(cli), name).make_context(name, ["a.h5", "-o", "b.h5", *given])
     assert _naming.named(message, ctx) == f"{stated} {message.partition(' ')[2]}"
 
 

@@ -138,10 +138,10 @@ map rec.h5 -o m.h5
 map img.h5 -o m.h5 --poses nope.csv
 odometry rec.h5 -o p.csv
 process rec.h5 -o y.h5 --settings wide.toml
-process rec.h5 -o y.h5 --mode passive --range 1:2
+acoustic rec.h5 -o y.h5 --bands 1:2
 process rec.h5 -o y.h5 --level
 fuse rec.h5 -o y.h5
-process rec.h5 -o y.h5 --bands 0:1
+acoustic rec.h5 -o y.h5 --bands 0:1
 process rec.h5 -o y.h5 --layout eRTIS_v2
 reference settings nope
 example nope

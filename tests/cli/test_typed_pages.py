@@ -26,7 +26,8 @@ RESULTS = {
     "simulate": (".h5",),
     "map": (".map.h5", ".yaml"),
     "plot": (".png",),
-    "process": (".energy.h5", ".acoustic.h5"),
+    "process": (".energy.h5",),
+    "acoustic": (".acoustic.h5",),
     "fuse": (".fused.h5",),
 }
 

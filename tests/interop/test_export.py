@@ -103,10 +103,7 @@ def test_export_leaves_out_measurements_without_a_call(tmp_path):
     ]
     write_recording(tmp_path / "rec.h5", passive)
     done = run(tmp_path / "rec.h5", "-o", tmp_path / "a.npz", "--json")
-    assert (
-        "note: 2 measurements without a call left out; 'ertis process --mode passive' makes acoustic maps"
-        in done.stderr
-    )
+    assert "note: 2 measurements without a call left out; 'ertis acoustic' makes maps of their sound" in done.stderr
     assert json.loads(done.stdout[done.stdout.index("{") :])["measurements"] == 1
     with np.load(tmp_path / "a.npz") as data:
         assert data["sequence"].tolist() == [1]

@@ -168,11 +168,13 @@ def test_recording_without_a_call_needs_no_fitting_call(tmp_path):
             found = camera.process(recording[1])
     assert found.band_hz.tolist() == [[2000.0, 4000.0]]
     assert check_recording(tmp_path / "rec.h5").is_fit
-    for line in ("process rec.h5 -o maps.h5", "plot rec.h5 -o a.png", "info rec.h5 --health", "sensors check rec.h5"):
+    for line in ("acoustic rec.h5 -o maps.h5", "plot rec.h5 -o a.png", "info rec.h5 --health", "sensors check rec.h5"):
         arguments = [str(tmp_path / each) if "." in each else each for each in line.split()]
         done = CliRunner().invoke(cli, arguments)
         assert done.exit_code == 0, (line, done.stderr, done.exception)
-    images = CliRunner().invoke(cli, ["process", str(tmp_path / "rec.h5"), "--mode", "active"])
+    (tmp_path / "active.toml").write_text('processing.mode = "active"')
+    files = [str(tmp_path / "rec.h5"), "--settings", str(tmp_path / "active.toml")]
+    images = CliRunner().invoke(cli, ["process", *files])
     assert images.exit_code != 0
     assert "use a decimation that leaves more than twice the call's 50000 Hz" in images.stderr
 
