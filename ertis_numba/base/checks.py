@@ -158,11 +158,7 @@ def sensor_name(name: str) -> str:
 
 
 def reason_unreadable(error: OSError | UnicodeDecodeError) -> str:
-    """Return why a text file cannot be read, in words.
-
-    >>> reason_unreadable(FileNotFoundError(2, "No such file or directory"))
-    'No such file or directory'
-    """
+    """Return why a text file cannot be read, in words."""
     if isinstance(error, UnicodeDecodeError):
         wrong = f"byte {error.object[error.start]:#04x} at position {error.start}"
         return f"it is not text in {error.encoding.upper()} ({wrong})"

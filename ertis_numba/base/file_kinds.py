@@ -179,11 +179,7 @@ def kind_of(path: str | Path) -> FileKind | None:
 
 
 def markup_of(text: str) -> str | None:
-    """Return the name of a format of text that is neither a table nor TOML, by its first character; None if unknown.
-
-    >>> markup_of('{"seed": 1}'), markup_of("seed = 1")
-    ('JSON', None)
-    """
+    """Return the name of a format of text that is neither a table nor TOML, by its first character; None if unknown."""
     return {"{": "JSON", "<": "XML"}.get(text.lstrip()[:1])
 
 

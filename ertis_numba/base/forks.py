@@ -28,12 +28,7 @@ def call_in_forks(method: Callable[[], None]) -> None:
 
 
 class ForkSafeLock:
-    """Context manager that admits one thread at a time; free in a forked process, even if another thread was inside.
-
-    >>> with ForkSafeLock():
-    ...     print("alone")
-    alone
-    """
+    """Context manager that admits one thread at a time; free in a forked process, even if another thread was inside."""
 
     def __init__(self, make: Callable[[], Any] = threading.Lock) -> None:
         self._make = make

@@ -55,11 +55,7 @@ def grid_count(name: str | tuple[tuple[float, float], ...]) -> int | None:
 
 
 def named_grid(processing: Processing) -> tuple[str, tuple[float, float], tuple[float, float]] | None:
-    """Return the kind of a grid, 2d or 3d, with its azimuth and elevation limits in degrees; None for other directions.
-
-    >>> named_grid(Processing(directions="1850"))
-    ('3d', (-45.0, 45.0), (-45.0, 45.0))
-    """
+    """Return the kind of a named grid, 2d or 3d, and its azimuth and elevation limits in degrees; None for others."""
     name = processing.directions
     if not isinstance(name, str) or grid_count(name) is None:
         return None

@@ -55,6 +55,11 @@ def test_checks_return_valid_values():
     checks.shape("x", (2, 3), (2, 3))
 
 
+def test_reason_unreadable_states_the_reason_without_the_path():
+    error = FileNotFoundError(2, "No such file or directory", "array.csv")
+    assert checks.reason_unreadable(error) == "No such file or directory"
+
+
 def test_errors_derive_from_standard_exceptions():
     assert issubclass(errors.ArgumentError, ValueError)
     assert issubclass(errors.SettingsError, errors.ArgumentError)

@@ -23,7 +23,7 @@ from scipy.io import wavfile
 
 import ertis_numba as ertis
 from ertis_numba.base.errors import DataError
-from ertis_numba.base.file_kinds import kind_of, problem_of
+from ertis_numba.base.file_kinds import kind_of, markup_of, problem_of
 
 RECORDING = Path(__file__).parents[2] / "data" / "synthetic" / "reflectors.h5"
 N_WORDS = 65_536
@@ -312,3 +312,8 @@ def test_remedy_for_a_text_file_is_what_the_command_takes(tmp_path, monkeypatch,
     assert (done.exit_code, done.stderr.count("\n")) == (1, 1)
     assert done.stderr.startswith("ertis: error: notes.txt")
     assert WANTED[command] in done.stderr
+
+
+def test_markup_of_names_json_and_accepts_toml():
+    assert markup_of('{"seed": 1}') == "JSON"
+    assert markup_of("seed = 1") is None

@@ -22,6 +22,7 @@ from ertis_numba.geometry import (
     layout_names,
     load_layout,
     microphones,
+    named_grid,
     plan_m,
     reach_rad,
     spacing_rad,
@@ -495,3 +496,8 @@ def test_fan_finds_directions_and_gaps():
 
 def test_fan_of_a_full_circle_has_each_ray_once():
     assert fan(np.arange(0, 360, 2)).rays_deg() == [*range(-150, 181, 30)]
+
+
+def test_named_grid_has_the_limits_of_named_directions_only():
+    assert named_grid(Processing(directions="1850")) == ("3d", (-45.0, 45.0), (-45.0, 45.0))
+    assert named_grid(Processing(directions="grid.csv")) is None
