@@ -41,11 +41,9 @@ _AS_EVER = (0.3, 0.7)  # Share of differing bits there; near overload, which com
 class BitCheck:
     """Detector of blocks that microphones cannot have sent.
 
-    At the slower clock of 1.125 MHz, neither splices nor stretches of noise can be distinguished from sound.
-    ``enabled``, (channel,), is true for channels with a microphone; all by default. ``splices`` also detects nearly all
-    missing and misplaced words; false alarms were tested with simulated sensors and the only public measurement.
-    ``density``, (channel,), is the share of ones in the last checked block; 0 or 1 is a stuck microphone, which is no
-    reason for rejection.
+    At the slower clock of 1.125 MHz, neither splices nor stretches of noise can be distinguished from sound. False
+    alarms were tested with simulated sensors and the only public measurement. ``density``, (channel,), is the share of
+    ones in the last checked block; 0 or 1 is a stuck microphone, which is no reason for rejection.
     """
 
     def __init__(
@@ -68,12 +66,11 @@ class BitCheck:
         self._splices = Splices(n_samples, pdm_rate_hz) if splices and self._is_fast else None
 
     def check(self, words: NDArray[np.uint32]) -> str | None:
-        """Return the reason for rejecting a block, or None.
+        """Return the reason for rejecting a block of (sample,) words, whose bit m is channel m, or None.
 
         ``constant bits``: no channel changes, in the whole block or in a stretch with abrupt ends. ``density``: most
         channels have too many ones or zeros, and change unlike a modulator. ``noise``: the bits are random, in the
-        whole block or in a stretch. ``splice``: words are missing or misplaced. Bit m of ``words``, (sample,) uint32,
-        is channel m.
+        whole block or in a stretch. ``splice``: words are missing or misplaced.
         """
         checks.shape("words", words.shape, (self._n_samples,))
         if words.dtype != np.uint32:
@@ -115,7 +112,7 @@ class BitCheck:
         return False
 
     def _chance(self, mean: Floats, power: Floats, product: Floats) -> str | None:
-        """Return ``density`` or ``noise`` if bits are not those of modulators, in the whole block or in a stretch.
+        """Return ``density`` or ``noise`` if bits are not those of modulators, in the block or in a stretch.
 
         ``mean`` has shape (channel, n): means of 31 samples each. ``power`` and ``product``, both (n,), are the mean
         square of these means, and the mean product of neighbours minus that square.

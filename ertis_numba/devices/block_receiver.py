@@ -20,16 +20,12 @@ _MAX_SKIPPED = 256  # Limit on the numbers that a block skips after it has cut a
 
 
 class BlockParser:
-    """Parser of blocks in a stream of bytes, for any division into pieces: framing only.
+    """Parser of blocks (header, counter, words, footer) in a stream of bytes, for any division into pieces.
 
-    A block is header, counter, words, footer. After a header without a footer, the parser searches again directly
-    behind that header, so that damage costs only its own block. Two damaged blocks may have the correct length
-    together; the later arrival of the second header reveals this.
-
-    ``bytes fed = n_bytes · blocks returned + rejected.total() + pending`` at any time. Bytes that come ``apart_s``
-    after the first byte of a block may belong to another one; never by default. ``n_bytes`` is the size of a whole
-    block. ``rejected`` counts bytes by reason (``no header``, ``footer``, ``cut short``), each once, with the header
-    that led to it; ``rejected_blocks`` counts headers without a block.
+    After a header without a footer, the parser searches again directly behind that header, so that damage costs only
+    its own block. Two damaged blocks may have the correct length together; the later arrival of the second header, more
+    than ``apart_s`` after the first byte, reveals this. At any time, ``bytes fed = n_bytes · blocks returned +
+    rejected.total() + pending``; ``rejected_blocks`` counts headers without a block.
     """
 
     def __init__(self, n_samples: int, *, apart_s: float = math.inf) -> None:
@@ -54,10 +50,7 @@ class BlockParser:
         return self.n_bytes - len(self._data) if self._data else 0
 
     def new_words(self) -> tuple[int, NDArray[np.uint32]]:
-        """Return the words of the incomplete block that this has not returned before, and the number of the first.
-
-        Call it after `take` has returned None. The block may still prove to be none.
-        """
+        """Return new words of the incomplete block, perhaps none, and the number of the first, after `take`."""
         begin, n_shown = self._shown
         first = n_shown if begin == self._position else 0
         stop = max(first, min((len(self._data) - _WORDS_AT) // 4, self._n_samples))
@@ -156,13 +149,9 @@ class BlockReceiver:
     """Validation of a stream: framing, then the counter, then the bits.
 
     A block with an uncertain number is held until others decide (see `CounterCheck`), so that `feed` may return several
-    at once, in order. `expect` sets the next number; call it before each commanded measurement, and no block is held.
-
-    ``bytes fed = n_bytes · (blocks returned + held) + rejected.total() + pending`` at any time. ``n_samples`` counts
-    the words of a block. The first block has the number ``expected`` or the one after; any by default. ``shortest_s``
-    is the minimum time between measurements. ``bits`` returns the reason why words, (sample,) uint32, cannot come from
-    microphones, or None. ``on_words`` gets words of an incomplete block as they arrive, except the last, and the number
-    of the first, 0 for a new block; the block may still be rejected. `feed` raises its exceptions, which lose no block.
+    at once, in order; none is held if `expect` is called before each commanded measurement. At any time, ``bytes fed =
+    n_bytes · (blocks returned + held) + rejected.total() + pending``. ``on_words`` gets words of an incomplete block as
+    they arrive, which may still be rejected. Its exceptions leave `feed` and lose no block.
     """
 
     def __init__(
@@ -228,10 +217,7 @@ class BlockReceiver:
         return good
 
     def expire(self) -> list[Block]:
-        """Abandon the incomplete block after its deadline.
-
-        Between blocks, return the held blocks that fit the elapsed time.
-        """
+        """Abandon an incomplete block after its deadline; between blocks, return held ones that fit the time."""
         if self.missing:
             self._parser.expire()
             return []
@@ -243,10 +229,7 @@ class BlockReceiver:
         return self._settle(self._counters.finish())
 
     def expect(self, counter: int) -> None:
-        """Set the next number to ``counter`` or its successor, after the counter was set.
-
-        Incomplete and held blocks are discarded: they belong to the time before.
-        """
+        """Set the next number to counter or its successor; discard the blocks of the time before."""
         self._clear()
         self._settle(self._counters.expect(counter))
 

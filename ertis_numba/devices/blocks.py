@@ -33,29 +33,21 @@ COUNTERS: Final = 2**32
 
 @dataclass(frozen=True, slots=True)
 class Instant:
-    """Time of an arrival.
+    """Time of an arrival."""
 
-    ``realtime_ns`` counts from 1970-01-01 UTC; ``uncertainty_ns`` is the longest possible delay before it was read.
-    """
-
-    realtime_ns: int
+    realtime_ns: int  # since 1970-01-01 UTC
     monotonic_ns: int
-    uncertainty_ns: int
+    uncertainty_ns: int  # longest possible delay before it was read
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block:
-    """One measurement as a sensor sent it.
-
-    ``data`` has shape (sample,): PDM words in separate, read-only memory. ``arrived`` is the arrival of its first byte.
-    ``behaviour`` is ``active`` if the sensor was told to emit its call, ``passive`` if not; a block does not contain
-    it, so `SonarDriver` sets it.
-    """
+    """One measurement as a sensor sent it."""
 
     counter: int
-    data: NDArray[np.uint32]
-    arrived: Instant
-    behaviour: Behaviour = "unknown"
+    data: NDArray[np.uint32]  # PDM words in separate, read-only memory
+    arrived: Instant  # of the first byte
+    behaviour: Behaviour = "unknown"  # set by SonarDriver: active if it was told to emit its call
 
 
 def encode_block(counter: int, words: NDArray[np.uint32]) -> bytes:

@@ -120,10 +120,7 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class CustomCommand:
-    """One command as text, which may have a code that only some firmware knows.
-
-    ``text`` is of the form ``!X,i,j,k``, such as ``!Y,0,0,0``, and must not measure.
-    """
+    """One command as text ``!X,i,j,k``, such as ``!Y,0,0,0``, which must not measure."""
 
     text: str
 

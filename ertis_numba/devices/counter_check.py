@@ -34,20 +34,16 @@ class _Entry:
 
 
 class CounterCheck:
-    """Detector of damaged counters.
+    """Detector of damaged counters, by comparison of blocks.
 
-    A block contains no evidence that its counter is correct, so other blocks are compared:
+    1. A number directly after its predecessor, without a rejected byte between them, is correct.
+    2. A number that is ahead by the number of triggers is correct. Regular triggers are counted by the clock, others by
+       the bursts in which bytes arrived, damaged ones included: a triggered sensor sends at once and is then silent.
+    3. Other numbers are held, for at most three blocks. Two that agree in the sense of 1 and 2 are correct, and so are
+       three successive ones, regardless of earlier numbers: the count recovers after any loss, and after a restart.
+    4. A number between the last correct one and a later one is correct if the time between them has room for it.
 
-    1. A number directly after its predecessor, without a rejected byte between them, is correct. 2. A number that is
-    ahead by the number of triggers is correct. Regular triggers are counted by the clock, others by the bursts in which
-    bytes arrived, damaged ones included: a triggered sensor sends at once and is then silent. 3. Any other number is
-    held until later blocks decide. Two that agree in the sense of 1 and 2 are correct, and so are three successive
-    ones, regardless of earlier numbers. This recovers the count after any loss, and after a sensor has restarted. 4. A
-    number between the last correct one and a later one is correct if the time between them has room for it.
-
-    A block is held for at most three others. A repeated number is a copy. ``shortest_s`` is the minimum time between
-    triggers. The block ``expected`` or the following one comes first, any by default. ``lost`` counts the numbers
-    skipped between correct ones.
+    A repeated number is a copy. ``lost`` counts the numbers skipped between correct ones.
     """
 
     def __init__(self, *, shortest_s: float, expected: int | None = None) -> None:
@@ -79,10 +75,7 @@ class CounterCheck:
             self._burst_ns.append(at_ns)
 
     def judge(self, block: Block, rejected: float) -> list[tuple[Block, bool]]:
-        """Return all blocks that this one decides, in order of arrival, and True for each correct one.
-
-        ``rejected`` is the number of bytes rejected outside of blocks up to now, relative to the size of a block.
-        """
+        """Return (block, correct) for all blocks that this one decides; rejected is in sizes of a block."""
         place = bisect.bisect_right(self._burst_ns, block.arrived.monotonic_ns) - 1
         self._bursts += max(place, 0)
         # All later bytes belong to this block, even if it is late.

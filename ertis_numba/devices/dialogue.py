@@ -21,10 +21,9 @@ _log = logging.getLogger("ertis_numba")
 
 
 class Dialogue(SerialLine):
-    """Serial line with commands and answers.
+    """Serial line with commands and answers, which differ from data only in that nothing follows them.
 
-    An answer differs from four bytes of a measurement only in that nothing follows it. ``dropped`` counts bytes without
-    a request.
+    ``dropped`` counts bytes without a request.
     """
 
     def __init__(self, path: str, *, timeout_s: float, stop: Callable[[], bool]) -> None:
@@ -33,7 +32,7 @@ class Dialogue(SerialLine):
         self._timeout_s = timeout_s
 
     def drain(self, *, within_s: float, repeat: Command | None = None) -> int:
-        """Drop bytes until none arrive, and return their number without the answers to ``repeat``.
+        """Drop bytes until none arrive; return their number without the answers to ``repeat``.
 
         ``repeat`` is sent again and again while bytes keep coming: the first may have followed half of another command.
         """
@@ -62,10 +61,10 @@ class Dialogue(SerialLine):
         self.dropped = before + max(0, count - _ANSWER_BYTES)
 
     def ask(self, command: Command | CustomCommand, *, alone: bool = True) -> int:
-        """Send a command and return its answer.
+        """Send a command and return its answer; alone is false where measurements may follow it.
 
-        Earlier bytes are dropped. If more than an answer arrives, it belonged to something else, and the command is
-        sent again afterwards. ``alone`` is false where measurements may follow the answer.
+        Earlier bytes are dropped. If more than an answer arrives, it belonged to something else: the command is sent
+        again.
         """
         deadline = time.monotonic() + self._timeout_s
         while True:

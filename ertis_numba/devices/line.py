@@ -52,11 +52,10 @@ _log = logging.getLogger("ertis_numba")
 
 
 class SerialLine:
-    """Serial port for exclusive use.
+    """Serial port for exclusive use; other threads may call only `close`.
 
-    Other threads may call only `close`. ``stop`` is called before each read and write, some hundred times a second;
-    once it returns True, these raise an error. Raises SonarError if the port cannot be opened: its ``errno`` is ENOENT,
-    EBUSY, EACCES, or EINVAL for a path that is not a serial port.
+    ``stop`` is called some hundred times a second; once it returns True, reads and writes raise an error. Opening
+    raises SonarError with ``errno`` ENOENT, EBUSY, EACCES, or EINVAL for a path that is not a serial port.
     """
 
     def __init__(self, path: str, *, stop: Callable[[], bool]) -> None:
@@ -83,8 +82,7 @@ class SerialLine:
         """Return bytes that arrive within some milliseconds, perhaps none, and the time of the first.
 
         ``missing`` is the number of bytes still missing of a block or answer. With 0, a new one may begin: its first
-        byte is returned alone as soon as it arrives, unless it has arrived before. Raises SonarDisconnectedError, or
-        SonarError if ``stop`` returned True or the line is closed.
+        byte is returned alone as soon as it arrives, unless it has arrived before.
         """
         with self._lock:
             self._check()
@@ -103,10 +101,7 @@ class SerialLine:
         return data, arrived
 
     def send(self, data: bytes) -> None:
-        """Write all of ``data``.
-
-        Raises SonarDisconnectedError, or SonarError if it reads nothing, ``stop`` returned True, or the line is closed.
-        """
+        """Write all data; raise SonarDisconnectedError, or SonarError if stopped, closed, or not read."""
         with self._lock:
             self._check()
             try:
@@ -134,20 +129,13 @@ class SerialLine:
                 self._port.close()
 
     def hang_up(self, why: str | None = None) -> None:
-        """Close the port of an absent or silent device; later uses raise `SonarDisconnectedError`.
-
-        ``why`` is the message of this error: by default that of an earlier call, or an empty one if the device was
-        unplugged.
-        """
+        """Close the port; later uses raise `SonarDisconnectedError` with why, or the message of an earlier call."""
         self._is_hung_up = True
         self._why_hung_up = self._why_hung_up if why is None else why
         self.close()
 
     def _read(self, size: int) -> bytes:
-        """Return up to ``size`` bytes that arrive without a pause.
-
-        For a file descriptor, this takes a sixth less processor time than pyserial's own loop.
-        """
+        """Return bytes that arrive without a pause, on Linux in a sixth less CPU time than pyserial's own loop."""
         if os.name != "posix":
             return bytes(self._port.read(size))
         here, read = self._port.fileno(), 0

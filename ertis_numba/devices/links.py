@@ -30,10 +30,7 @@ def require_terminals() -> None:
 
 
 def emulated_folder() -> Path:
-    """Return the folder of links to emulated devices: ``$ERTIS_EMULATED_DIR``, or one in the user's cache folder.
-
-    It need not exist, and does not depend on ``TMPDIR``, which may differ between terminals.
-    """
+    """Return the folder of links to emulated devices, which may not exist: $ERTIS_EMULATED_DIR, or in the cache."""
     folder = Path(os.environ.get("ERTIS_EMULATED_DIR") or Path(platformdirs.user_cache_dir("ertis"), "emulated"))
     with suppress(FileNotFoundError):
         found = folder.stat()
@@ -46,11 +43,10 @@ def emulated_folder() -> Path:
 
 
 class HeldLink:
-    """Symbolic link that belongs to one emulated device during its life.
+    """Symbolic link that belongs to one emulated device during its life; replaces that of a killed device.
 
-    A link left by a killed device is replaced. A lock on a hidden file beside the link shows if the device is alive.
-    The existence of the port does not, because the system reuses its number. The folder of ``path`` is made, for this
-    user only, if it is missing.
+    A lock on a hidden file beside the link shows if the device is alive. The existence of the port does not, because
+    the system reuses its number.
     """
 
     def __init__(self, path: Path) -> None:
@@ -101,10 +97,7 @@ class HeldLink:
 
 
 def is_held(link: Path) -> bool:
-    """Return True if a link belongs to a running device, and False if a killed emulator left it.
-
-    The number of its pseudo terminal may soon belong to a shell. See `HeldLink`.
-    """
+    """Return True if a link belongs to a running device; the port of a dead one may soon belong to a shell."""
     if not link.name:
         return True
     try:

@@ -19,16 +19,11 @@ _CDC_ACM = ("ttyACM", "cu.usbmodem", "tty.usbmodem", "COM")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Port:
-    """A serial port.
+    """A serial port."""
 
-    ``path``, such as ``/dev/ttyACM0``, may change when the device is plugged in again. ``link`` is a stable name, such
-    as one in ``/dev/serial/by-id``; empty if there is none. ``serial_number`` is that of the USB device, or the name of
-    an emulated one; empty if unknown.
-    """
-
-    path: str
-    link: str = ""
-    serial_number: str = ""
+    path: str  # may change when the device is plugged in again
+    link: str = ""  # stable name, such as one in /dev/serial/by-id; empty if there is none
+    serial_number: str = ""  # of the USB device, or name of an emulated one; empty if unknown
     description: str = ""
     emulated: bool = False
 
@@ -54,10 +49,7 @@ def find_ports() -> list[Port]:
 
 
 def resolve(port: str) -> Port:
-    """Return the port of this path, link, serial number, or name of an emulated device.
-
-    Raises SonarError if there is no such port (its ``errno`` is ENOENT), or several have this serial number (EINVAL).
-    """
+    """Return the port of a path, link, serial number or emulated name; raise SonarError (ENOENT; EINVAL: several)."""
     found = find_ports()
     named = [item for item in found if port in item.names]
     if len({item.path for item in named}) > 1:
@@ -82,10 +74,7 @@ def resolve(port: str) -> Port:
 
 
 def find_again(port: Port) -> Port:
-    """Return the port of a device that was plugged in again: by its serial number, by its link, or at the same path.
-
-    Raises SonarError as `resolve` does.
-    """
+    """Return the port of a device that was plugged in again, by serial number, link or path, as `resolve`."""
     if port.serial_number and not port.emulated:
         return replace(resolve(port.serial_number), link=port.link)
     return resolve(port.link or port.path)

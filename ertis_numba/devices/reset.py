@@ -20,11 +20,7 @@ _SILENT: Final = {errno.ETIMEDOUT, errno.ENOENT}
 def reset_sensor(
     port: str, pulse: Callable[[], None] = pulse_reset_pin, *, within_s: float = 60.0
 ) -> Iterator[tuple[SonarDriver, bool]]:
-    """Reset a sensor, whether it answers or not; use it in a ``with`` statement.
-
-    ``port`` is as for `SonarDriver.open`, and may be missing until the sensor is reset. The sensor must answer in
-    ``within_s``. Yields the open driver, which is not configured, and the result of `SonarDriver.reset`.
-    """
+    """Reset a sensor, even a missing one; yield its unconfigured driver and the result of `SonarDriver.reset`."""
     try:
         sonar = SonarDriver.open(port)
     except SonarError as error:

@@ -15,10 +15,7 @@ _PULSE_S: Final = 1.0
 
 
 def pulse_reset_pin(pin: int = RESET_PIN) -> None:
-    """Set a pin to 0 for a second, and to 1 again.
-
-    ``pin`` is the number on the board.
-    """
+    """Set a pin, numbered as on the board, to 0 for a second, and to 1 again."""
     try:
         pins = importlib.import_module("Jetson.GPIO")
         pins.setmode(pins.BOARD)

@@ -54,10 +54,7 @@ _LOUDEST, _LOUDEST_SHARE = 0.35, 0.8  # Full scale 1, in most channels: overload
 
 
 class _Filter:
-    """Decimation filter of the bits of all channels, on one thread.
-
-    ``taps`` has shape (tap,): symmetric, an odd number.
-    """
+    """Decimation filter of the bits of all channels, on one thread; the number of symmetric taps is odd."""
 
     def __init__(self, n_samples: int, taps: NDArray[np.int16], scale: float, step: int) -> None:
         self._kernels = kernels.load("cpu")
@@ -104,10 +101,9 @@ class Splices:
         return pdm_rate_hz >= _MIN_RATE_HZ
 
     def found(self, words: NDArray[np.uint32], mean: Floats, moving: NDArray[np.bool_]) -> bool:
-        """Return True if there is a splice.
+        """Return True if there is a splice in (sample, 1) words; mean is (channel, n), of `MEAN_OF` samples each.
 
-        ``words`` has shape (sample, 1). ``mean`` has shape (channel, n): means of `MEAN_OF` samples each. ``moving``
-        has shape (channel,): true for channels with a microphone that is not stuck.
+        ``moving``, (channel,), is true for channels with a microphone that is not stuck.
         """
         if self._n_samples < 8 * self._edge * _STEP:
             return False
@@ -137,7 +133,7 @@ class Splices:
     def _is_splice(
         self, words: NDArray[np.uint32], mean: Floats, moving: NDArray[np.bool_], at: int, variance: float
     ) -> bool:
-        """Return True if the impulse near sample ``at`` is a splice; ``variance`` is that of sizes by noise alone.
+        """Return True if the impulse near sample ``at`` is a splice; ``variance``: of sizes by noise alone.
 
         Impulses of any size are fitted to each channel, all at the sample where they explain most. Quadrature
         components represent sound, which reaches some microphones slightly earlier or later.

@@ -18,24 +18,17 @@ _STATES: dict[int | None, State] = {errno.EBUSY: "in use", errno.EACCES: "not al
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """Result of probing a port.
-
-    ``state`` is "ready", "in use", "not allowed" or "no answer". ``firmware`` is empty and ``call_hash`` None unless
-    the sensor is ready; ``error`` is the reason why it is not.
-    """
+    """Result of probing a port."""
 
     port: Port
     state: State
-    firmware: str = ""
-    call_hash: int | None = None
-    error: SonarError | None = None
+    firmware: str = ""  # empty unless ready
+    call_hash: int | None = None  # None unless ready
+    error: SonarError | None = None  # reason why the sensor is not ready
 
 
 def survey(ports: Iterable[Port], *, timeout_s: float = 0.3) -> list[Answer]:
-    """Probe ports for sensors, in less than a second.
-
-    This stops a measurement for a host that has ended; ports in use are skipped.
-    """
+    """Probe unused ports for sensors in less than a second; this stops a measurement for a host that has ended."""
 
     def ask(port: Port) -> Answer:
         try:

@@ -25,21 +25,15 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class BlockArrived:
-    """A received measurement.
-
-    ``count`` is the number of the command, or else the sensor's own counter, without wrap-around. ``tick`` is the
-    number of the command, which all sensors share; None with SYNC pulses. Since the previous block, the sensor counted
-    ``skipped`` measurements that did not arrive, blocks were rejected if ``damaged``, and the reader waited
-    ``waited_s`` for the disk.
-    """
+    """A received measurement."""
 
     sensor: str
     block: Block
-    count: int
-    tick: int | None
-    skipped: int = 0
-    damaged: bool = False
-    waited_s: float = 0.0
+    count: int  # number of the command, or the sensor's counter without wrap-around
+    tick: int | None  # number of the command, common to all sensors; None with SYNC pulses
+    skipped: int = 0  # measurements counted since the previous block that did not arrive
+    damaged: bool = False  # blocks were rejected since the previous one
+    waited_s: float = 0.0  # wait for the disk
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,23 +86,18 @@ Event = BlockArrived | MeasurementFailed | SensorMessage | CounterRestarted | Se
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TriggerClock:
-    """Times of commands: ticks that all sensors share.
+    """Times of commands: ticks that all sensors share."""
 
-    The first tick is at ``start_s`` by `time.monotonic`. ``n`` is the number of measurements of each sensor, unlimited
-    if None.
-    """
-
-    start_s: float
+    start_s: float  # first tick, by time.monotonic
     rate_hz: float
-    n: int | None
+    n: int | None  # measurements of each sensor; None: unlimited
 
 
 class SensorReader(threading.Thread):
     """Thread that receives the blocks of one sensor, and reconnects after it was unplugged.
 
-    Nothing else may use the sensor meanwhile. The driver is configured, and armed with SYNC pulses, which need no
-    ``pace``. ``patience_s`` is the timeout for a silent or unplugged sensor. While ``events`` is full, the sensor
-    waits.
+    The driver is configured, and armed with SYNC pulses, which need no ``pace``. Nothing else may use the sensor. While
+    ``events`` is full, the sensor waits.
     """
 
     def __init__(

@@ -39,14 +39,10 @@ _MAX_OPEN_GROUPS = 16  # Limit on open groups: sensors deliver simultaneous meas
 
 @dataclass(frozen=True, slots=True)
 class SettingsChange:
-    """Change of the settings of all sensors, between two measurements.
-
-    ``on_done`` is called with None once the sensors are configured, or with the error because of which all of them keep
-    their former settings.
-    """
+    """Change of the settings of all sensors, between two measurements."""
 
     settings: Settings
-    on_done: Callable[[Exception | None], None] = lambda _: None
+    on_done: Callable[[Exception | None], None] = lambda _: None  # None, or the error that keeps former settings
 
 
 @dataclass(slots=True)
@@ -64,17 +60,9 @@ class CaptureSession:
     """Capture session: receives measurements from sensors, stores them durably, and reports them.
 
     Sequence numbers are those of the commands to a sensor, or of the SYNC pulses since its first one. They start at 0,
-    and a missing number is a missing measurement.
-
-    ``sonars`` are configured drivers by their names in the recording; active ones are armed in this order. ``trigger``
-    is ``command`` for commands of this computer, or ``sync`` for pulses of the SYNC chain. ``n`` is the number of
-    measurements of each sensor, or of pulses; like ``duration_s``, it is unlimited by default. ``patience_s`` is the
-    timeout for a silent or unplugged sensor. ``mounting`` has (translation_m, rotation_xyzw) by sensor; unknown by
-    default. ``session_id`` is random by default. ``on_stored`` gets the entries of each commit, once they are durable;
-    ``on_note`` a sensor's name and a message about it; ``on_back`` its name and the seconds that it was unplugged.
-    ``on_tick`` is called about ten times a second. `change` requires ``configure``, which configures the driver of a
-    named sensor. ``complete`` and ``incomplete`` count the pulses with measurements of all sensors, and of some sensors
-    only.
+    and a missing number is a missing measurement. ``sonars`` are configured, and active ones are armed in this order.
+    ``on_stored`` gets entries once they are durable; ``on_tick`` is called about ten times a second. ``complete`` and
+    ``incomplete`` count the pulses with measurements of all sensors, and of some sensors only.
     """
 
     def __init__(  # noqa: PLR0913  trigger, limits and callbacks
@@ -133,11 +121,7 @@ class CaptureSession:
         self._first_pulse: int | None = None  # First pulse that all sensors could receive.
 
     def change(self, change: SettingsChange) -> None:
-        """Request other settings for all sensors; any thread may call this.
-
-        The sensors are configured after the current measurements. The following ones belong to a new session, whose
-        numbers start at 0.
-        """
+        """Request other settings for all sensors, from any thread: a new session after current measurements."""
         if self._configure is None:
             raise ArgumentError("this session cannot change settings; create it with configure")
         if self._has_ended:
@@ -149,11 +133,7 @@ class CaptureSession:
         self._stop.set()
 
     def run(self, sink: MeasurementSink) -> None:
-        """Capture until the session ends.
-
-        Raises SonarError if sensors have failed permanently, or DataError if further measurements cannot be stored; all
-        reported ones are durable.
-        """
+        """Capture until the session ends; raise SonarError or DataError, after storing all reported ones."""
         end_s = None if self._duration_s is None else time.monotonic() + self._duration_s
         for sensor in self._sonars:
             self._register(sink, sensor, self._settings)

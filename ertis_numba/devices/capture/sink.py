@@ -24,10 +24,7 @@ class MeasurementSink(Protocol):
         translation_m: Sequence[float] | None = ...,
         rotation_xyzw: Sequence[float] | None = ...,
     ) -> None:
-        """Register a sensor before its first measurement, or again with settings for the following sessions.
-
-        A `Journal` accepts each sensor once, so that changes of settings are refused.
-        """
+        """Register a sensor first, or again with other settings, which a `Journal` refuses."""
 
     def append(self, entries: Sequence[JournalEntry]) -> Sequence[JournalEntry] | None:
         """Store measurements, and return those that were stored, or None for all."""
@@ -41,15 +38,12 @@ _RECENT_S = 3.0  # Interval of the reported rate.
 
 @dataclass(slots=True)
 class CaptureCounts:
-    """Counts of one sensor's measurements.
-
-    ``missing`` counts by reason, and ``skipped`` the commands that were skipped because the sensor was still busy.
-    """
+    """Counts of one sensor's measurements."""
 
     stored: int = 0
-    missing: Counter[str] = field(default_factory=Counter)
+    missing: Counter[str] = field(default_factory=Counter)  # by reason
     unplugged: int = 0
-    skipped: int = 0
+    skipped: int = 0  # commands, because the sensor was still busy
     times_s: deque[float] = field(default_factory=lambda: deque(maxlen=64))
     """Times of the latest stored measurements by `time.monotonic`, in seconds."""
 

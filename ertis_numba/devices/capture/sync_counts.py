@@ -36,11 +36,8 @@ class PulseAligner(Generic[Item]):
     Each sensor counts its own triggers. The counters differ by an offset, because sensors are armed one after the other
     and an unplugged or busy sensor misses pulses. The times of arrival give the offsets: chained sensors measure within
     microseconds, and pulses are at least 50 ms apart. A block may arrive late, so the majority of three blocks decides.
-    The offset then stays, until the times of five successive blocks contradict it.
-
-    The first of ``sensors`` is armed first, and receives every pulse that any other receives. ``shortest_s`` is the
-    minimum interval between pulses. ``realigned`` counts changed offsets. ``interval_ns`` is the interval between
-    pulses; the minimum while it is unknown.
+    The offset then stays, until the times of five successive blocks contradict it. The first sensor receives all
+    pulses.
     """
 
     def __init__(self, sensors: list[str], *, shortest_s: float) -> None:
@@ -62,11 +59,7 @@ class PulseAligner(Generic[Item]):
         return found
 
     def add(self, sensor: str, item: Item, counter: int, arrived_ns: int) -> list[tuple[Item, int]]:
-        """Add a block, and return the blocks whose pulse is now known, with its number.
-
-        ``counter`` is that of the sensor, without wrap-around; ``arrived_ns`` is the time of arrival by a monotonic
-        clock.
-        """
+        """Add a block by its unwrapped counter and monotonic time; return blocks with known pulse numbers."""
         self._sensors[sensor].held.append(_HeldBlock(item, counter, arrived_ns))
         return self.release(arrived_ns)
 

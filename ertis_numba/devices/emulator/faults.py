@@ -34,16 +34,12 @@ class Unplug:
 
 @dataclass(frozen=True, slots=True)
 class BlockFault:
-    """One fault in a block, of one of `KINDS`.
-
-    ``place`` is the first affected byte, counted after earlier faults, and ``n_bytes`` the number of affected bytes.
-    ``detail`` is for a flip the part of the block, and for a swap the place of the added bytes.
-    """
+    """One fault in a block, of one of `KINDS`."""
 
     kind: str
-    place: int
-    n_bytes: int
-    detail: str = ""
+    place: int  # first affected byte, counted after earlier faults
+    n_bytes: int  # affected bytes
+    detail: str = ""  # part of the block for a flip, place of the added bytes for a swap
 
     def __str__(self) -> str:
         detail = f" ({self.detail})" if self.detail else ""
@@ -73,12 +69,8 @@ class Faults:
 
     ``flip``: a byte is changed, half of the time in header, counter or footer. ``duplicate``: the block is sent twice.
     ``lose``: bytes are cut out, half of the time whole words. ``add``: random bytes are inserted. ``swap``: bytes are
-    lost in one place and as many random ones added in another, so that the length stays. ``cut``: the rest is never
-    sent; ``drop``: nothing of it is sent. ``stall``: a pause. ``unplug``: the sensor is removed in the middle. Each is
-    drawn independently, so that a block may have several.
-
-    ``kinds`` has the probability per block of each of `KINDS`, 0 by default. Its ``short_reads`` is true for pieces of
-    1 to 4,095 bytes by chance, which is no fault; else pieces are as long as can be.
+    lost in one place and as many random ones added in another. ``cut``: the rest is never sent; ``drop``: nothing is
+    sent. ``stall``: a pause. ``unplug``: the sensor is removed in the middle. Each has its own probability per block.
     """
 
     def __init__(

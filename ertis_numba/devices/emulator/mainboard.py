@@ -25,18 +25,13 @@ _BUFFERED = 2  # Limit on measurements that wait for a reader.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Quirks:
-    """Faulty behaviour of a device apart from its data.
+    """Faulty behaviour of a device apart from its data."""
 
-    If ``silent``, it obeys but answers nothing; with ``wrong_hash``, it reports a wrong hash of the call, however often
-    it is loaded. ``bytes_per_s`` is the data rate; as fast as the host reads by default. The device returns ``away_s``
-    after a fault has unplugged it.
-    """
-
-    silent: bool = False
-    wrong_hash: bool = False
+    silent: bool = False  # obeys but answers nothing
+    wrong_hash: bool = False  # reports a wrong hash of the call
     answer_delay_s: float = 0.0
-    bytes_per_s: float | None = None
-    away_s: float = 1.0
+    bytes_per_s: float | None = None  # None: as fast as the host reads
+    away_s: float = 1.0  # absence after a fault has unplugged it
 
     def __post_init__(self) -> None:
         checks.between("answer_delay_s", self.answer_delay_s, 0.0, 3600.0)
@@ -58,9 +53,8 @@ class _PendingRecording:
 class Mainboard:
     """Device that obeys commands and records, from power-up until it is unplugged.
 
-    ``accepts`` is called with a changed configuration, after a call was loaded and before a measurement. If it returns
-    False, the device reports a wrong hash of the call and does not measure. ``outputs`` wait to be sent, in order.
-    ``refused`` counts commands that were none, and those whose numbers the device cannot use.
+    If ``accepts`` returns False for a configuration, the device reports a wrong hash of the call and does not measure.
+    ``outputs`` wait to be sent, in order. ``refused`` counts invalid commands and unusable numbers.
     """
 
     def __init__(self, measurements: Measurements, accepts: Accepts | None = None) -> None:

@@ -40,12 +40,9 @@ _NUMBERS = {  # By command: register and range of the first number.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeviceConfig:
-    """Call and record that the host has configured.
+    """Call and record that the host has configured."""
 
-    ``codes`` has shape (sample,): samples of the call, all 0 if none was loaded.
-    """
-
-    codes: NDArray[np.uint16]
+    codes: NDArray[np.uint16]  # samples of the call, all 0 if none was loaded
     dac_rate_hz: int
     n_samples: int
     pdm_rate_hz: float
@@ -65,11 +62,9 @@ class Registers:
     """State of a device, initially as after power-up.
 
     The initial state of a real device is known for the amplifier (on) and the external trigger (off); the rest is
-    assumed. So are the answers to settings, here 1. A refused command has no effect, and the answer is 0.
-
-    ``n_bytes`` is the size of the words of one measurement; ``clock`` is 0 for 4.5 MHz and 1 for 1.125 MHz. ``codes``
-    has shape (65535,) uint16: samples of the call, of which the first ``n_codes`` count. ``armed`` is 1 if SYNC pulses
-    trigger measurements, and ``pin`` is the number of the input. ``counter`` is the number of the next measurement.
+    assumed, and so are the answers to settings, here 1 if they have an effect, otherwise 0. ``clock`` is 0 for 4.5 MHz
+    and 1 for 1.125 MHz. ``armed`` is 1 if SYNC pulses at input ``pin`` trigger. ``counter`` is that of the next
+    measurement, with ``n_bytes`` of words. The first ``n_codes`` of ``codes``, (65535,), are the call.
     """
 
     def __init__(self) -> None:

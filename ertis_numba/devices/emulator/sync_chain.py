@@ -19,12 +19,9 @@ class SyncChain:
     """Trigger of emulated devices at a steady rate; use it in a ``with`` statement, or `start` it.
 
     Deadlines are absolute, so the rate does not drift; a pulse that would be too late for the next is skipped. Each
-    device has its pulse `SYNC_STEP_S` after the previous one, but only in its timestamps: the step is far below the
-    resolution here, and samples from a scene contain it already.
-
-    Pulses are numbered from the first that a device accepted. All devices send the samples of the same number.
-    ``devices`` are in the order of the chain. ``before`` is called before each pulse with its number, and pulses
-    meanwhile are left out. Some device took ``pulses`` of them.
+    device has its pulse `SYNC_STEP_S` after the previous one in the chain, but only in its timestamps: samples from a
+    scene contain that step already. Pulses are numbered from the first that a device accepted. ``before`` is called
+    with the number before each pulse, and pulses meanwhile are left out.
     """
 
     def __init__(

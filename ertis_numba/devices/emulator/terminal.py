@@ -17,11 +17,10 @@ _LINE = re.compile(rb"[^!\n]+(?=!)|!?[^!\n]*\n|![^!\n]*(?=!)")
 
 
 class Terminal:
-    """Raw pseudo terminal.
+    """Raw pseudo terminal: ``master`` is a descriptor that never waits, ``port`` the path for a host.
 
     The host's side stays open here, so that a host may open and close it for every command. Unread bytes then wait in
-    the system's buffer of about 12 kB; a real port would discard them. ``master`` is a file descriptor to read and
-    write without waiting; a host opens the path ``port``.
+    the system's buffer of about 12 kB; a real port would discard them.
     """
 
     def __init__(self) -> None:
@@ -60,8 +59,8 @@ class Terminal:
 class CommandReader:
     """Splitter of input into command lines.
 
-    A command ends with its line. The authors' code for Windows sends a measurement command without a line end: it is
-    complete once the next one begins, or after a while.
+    The authors' code for Windows sends a measurement command without a line end: it is complete once the next one
+    begins, or after a while.
     """
 
     def __init__(self) -> None:
