@@ -32,11 +32,7 @@ _MAX_NAMES = 8
 
 
 def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
-    """Write the signals of a measurement, and the positions of its microphones.
-
-    Signals are divided by the calibrated gains; calibrated delays are left in. Positions are in the sensor frame, x
-    forward, y left and z up, in metres.
-    """
+    """Write signals divided by the calibrated gains, delays left in, and positions x forward, y left, z up, in m."""
     layout = microphones(measurement.settings.array)
     signals = signals_of(measurement)
     geometry.write_text(_xml(layout), encoding="utf-8")
@@ -52,11 +48,10 @@ def write_acoular(path: Path, geometry: Path, measurement: Measurement) -> None:
 
 
 def read_acoular(path: Path) -> tuple[float, Samples, Settings | None]:
-    """Return the sample rate in Hz, the signals, (sample, channel), and the settings of a file from `write_acoular`.
+    """Return sample rate in Hz, lazily read signals (sample, channel), and settings of own files, otherwise None.
 
-    Signals are read from the file when they are sliced. The settings describe the file's content: only enabled
-    microphones, without gains, because the signals are divided by them, and ranges counted in its samples. For other
-    files they are None.
+    The settings describe the file's content: only enabled microphones, without gains, because the signals are divided
+    by them, and ranges counted in its samples.
     """
     with open_file(path, _WANTED) as file, reading(file, path):
         data = _time_data(file, path)

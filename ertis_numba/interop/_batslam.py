@@ -32,10 +32,7 @@ _UPRIGHT: Final = 0.7  # Largest vertical component of the normal of a wall in a
 
 
 def write_batslam(path: Path, measurements: Iterable[Measurement], drive: Drive, mountings: Mountings) -> None:
-    """Write the measurements of one sensor, in order of time.
-
-    The frame of a sensor without one is that of the platform.
-    """
+    """Write the measurements of one sensor in order of time; without a mounting, it is at the platform's origin."""
     echoes = _EchoRows.of(measurements, drive.beam_azimuth_deg)
     true, measured = (
         _planar(_at(trajectory, echoes.time_ns, name), mountings.get(echoes.sensor))

@@ -30,14 +30,11 @@ _POINT_OPTIONS = ("mounting", "top", "min_level_db")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportFormat:
-    """Export format.
-
-    ``options``: options of `export` that apply to this format, but not to all formats. None by default.
-    """
+    """Export format."""
 
     suffix: str
     fields: tuple[str, ...]
-    options: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()  # of `export` that apply to this format, but not to all
 
 
 FORMATS: Final = {

@@ -47,21 +47,13 @@ _TRANSIENT_LOCAL, _VOLATILE = 1, 2  # Constants of rmw_qos_durability_policy_t.
 def write_mcap(
     path: Path, images: Iterable[Energyscape], find: FindPoints, mountings: Mountings, *, topics: Collection[str]
 ) -> None:
-    """Write the messages of images as they arrive.
-
-    Raise ArgumentError if the packages for MCAP are not installed, the name of a sensor is invalid, or a time is
-    outside the range of ROS 2, or directions are levelled.
-    """
+    """Write images as they arrive; refuse invalid names, times that ROS 2 cannot hold, and levelled directions."""
     with path.open("wb") as file, _started(file) as writer:
         _McapWriter(writer, find, mountings, topics).write(images)
 
 
 def map_mcap(occupancy: OccupancyMap, *, probabilities: bool = False) -> bytes:
-    """Return a file that holds a map as one latched message of type nav_msgs/msg/OccupancyGrid on the topic /map.
-
-    `occupancy_values` describes the cells. Raise ArgumentError if the packages for MCAP are not installed, or the time
-    is outside the range of ROS 2.
-    """
+    """Return a file with a map as latched OccupancyGrid on /map, its cells as in `occupancy_values`."""
     file = io.BytesIO()
     with _started(file) as writer:
         message = occupancy_message(occupancy, probabilities=probabilities)

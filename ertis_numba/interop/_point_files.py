@@ -48,10 +48,7 @@ _HEADING = "Point cloud of ertis-numba"
 
 
 def write_ply(path: Path, table: PointTable, *, text: bool) -> None:
-    """Write points as PLY, little-endian or as text.
-
-    Raise ArgumentError if a number exceeds its type, or the name of a sensor is invalid.
-    """
+    """Write points as PLY, little-endian or text; refuse numbers beyond their type, and invalid names of sensors."""
     properties = [f"property {_PLY_TYPES[dtype]} {name}" for name, dtype in POINT_FIELDS.items()]
     head = [
         "ply",
@@ -65,10 +62,9 @@ def write_ply(path: Path, table: PointTable, *, text: bool) -> None:
 
 
 def write_pcd(path: Path, table: PointTable, *, text: bool) -> None:
-    """Write points as PCD 0.7, little-endian or as text.
+    """Write points as PCD 0.7, little-endian or text; refuse numbers beyond their type, and invalid names.
 
-    PCL reads positions in float32 only. They are float64 if float32 would round one by more than 10 µm. Raise
-    ArgumentError if a number exceeds its type, or the name of a sensor is invalid.
+    PCL reads positions in float32 only. They are float64 if float32 would round one by more than 10 µm.
     """
     fields = POINT_FIELDS | dict.fromkeys("xyz", "<f4" if table.fits_float32 else "<f8")
     kinds = [np.dtype(dtype) for dtype in fields.values()]

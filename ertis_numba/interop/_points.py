@@ -31,18 +31,11 @@ _MAX_SEC = 2**31 - 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTable:
-    """Points of several measurements, one row each.
+    """Points of several measurements, one row each."""
 
-    - ``rows`` (point,) structured: position and uncertainty in metres, intensity, number of the sensor, and stamp of
-      the measurement.
-    - ``sensors``: names by number.
-    - ``frame``: frame of the positions: the platform frame if mountings are known, otherwise the frame of the only
-      sensor.
-    """
-
-    rows: NDArray[np.void]
-    sensors: tuple[str, ...]
-    frame: str
+    rows: NDArray[np.void]  # (point,) position and uncertainty in m, intensity, number of the sensor, and stamp
+    sensors: tuple[str, ...]  # names by number
+    frame: str  # of the positions: the platform if mountings are known, otherwise the only sensor
 
     @property
     def fits_float32(self) -> bool:
@@ -71,10 +64,7 @@ class PointTable:
         return cls(np.concatenate(parts), tuple(numbers), frame)
 
     def columns(self, dtypes: dict[str, str]) -> NDArray[np.void]:
-        """Return some columns, packed, in the types of a format.
-
-        ``sec`` and ``nanosec`` are the time of the measurement in the form of ROS 2.
-        """
+        """Return some columns, packed, in the types of a format; sec and nanosec are the time as in ROS 2."""
         made = np.empty(len(self.rows), np.dtype(list(dtypes.items())))
         times = self._ros_times() if {"sec", "nanosec"} & dtypes.keys() else {}
         for name, dtype in dtypes.items():

@@ -26,22 +26,14 @@ _MAX_POSITION_M: Final = 1e8  # As for Trajectory.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseRows:
-    """Poses of a file, as its rows state them.
+    """Poses of a file, as its rows state them."""
 
-    - ``kind``: name of a row in messages: "line" or "message".
-    - ``numbers`` (row,) int64: numbers of the rows in the file, from 1.
-    - ``time_ns`` (row,) int64
-    - ``position_m`` (row, 3): NaN where the file has no number.
-    - ``rotation_xyzw`` (row, 4): as for ``position_m``.
-    - ``covariance`` (row, 6, 6), or None
-    """
-
-    kind: str
-    numbers: NDArray[np.int64]
-    time_ns: NDArray[np.int64]
-    position_m: Floats
-    rotation_xyzw: Floats
-    covariance: Floats | None = None
+    kind: str  # name of a row in messages: "line" or "message"
+    numbers: NDArray[np.int64]  # (row,) from 1
+    time_ns: NDArray[np.int64]  # (row,)
+    position_m: Floats  # (row, 3), NaN where the file has no number
+    rotation_xyzw: Floats  # (row, 4), likewise
+    covariance: Floats | None = None  # (row, 6, 6)
     notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:

@@ -80,12 +80,7 @@ _ORDER_OF_TUM: Final = _Columns(0, None, {"x": 1, "y": 2, "z": 3}, {"x": 4, "y":
 
 
 def read_table(text: str, *, needs_header: bool, time_unit: str | None, times: str | None = None) -> PoseRows:
-    """Return the poses of a text.
-
-    - ``needs_header``: refuse rows without a line that names the columns, instead of reading them as TUM or KITTI.
-    - ``time_unit`` {"s", "ms", "us", "ns"} or None: unit of times whose column states none; by their magnitude if None.
-    - ``times``: text with one time per pose, for poses of KITTI.
-    """
+    """Return poses; needs_header refuses TUM and KITTI; time_unit None: by column or magnitude; times: for KITTI."""
     columns, rows = _header(text, needs_header=needs_header)
     if not rows:
         raise DataError("the file contains no poses; choose a file with at least one")

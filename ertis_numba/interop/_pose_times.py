@@ -27,10 +27,9 @@ _DATE: Final = re.compile(
 
 
 def times_of(cells: Sequence[tuple[int, str]], unit: str | None) -> tuple[NDArray[np.int64], tuple[str, ...]]:
-    """Return times in nanoseconds, and notes on their unit.
+    """Return times of (line, text) cells in ns, and notes on their unit.
 
-    ``cells`` are (line, text). Without a unit, it is that in which the times lie between 1973 and 2116; smaller ones
-    are seconds.
+    Without a unit, it is that in which the times lie between 1973 and 2116; smaller ones are seconds.
     """
     dates = [_DATE.fullmatch(text.strip()) for _, text in cells]
     if cells and dates[0] is not None:

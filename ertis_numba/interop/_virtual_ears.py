@@ -28,10 +28,7 @@ _MIN_BASELINE_M: Final = 1e-4
 
 
 class BinauralSignals(NamedTuple):
-    """Signals of both ears, with a full scale of 1.
-
-    ``left``, ``right`` (sample,).
-    """
+    """Signals of both ears, (sample,), with a full scale of 1."""
 
     left: Floats
     right: Floats
@@ -49,13 +46,9 @@ class _HalfArray:
 class VirtualEars:
     """Beamformer of both ears.
 
-    - ``settings``: settings of the measurements. The range ends at ``processing.range_m``, or at the end of the record.
-    - ``azimuth_deg``: azimuth of the left ear in degrees; the right ear is steered to its negative. 0 steers both to
-      the front.
-    - ``max_range_m``: range of the last echo that the signals hold completely.
-    - ``n_samples``: samples per ear. Sample n is n / rate_hz after the start of the call.
-    - ``baseline_m``: lateral distance between the centroids of both halves.
-    - ``call`` (sample,): emitted call at the same rate.
+    The left ear is steered to ``azimuth_deg``, the right one to its negative. The signals hold echoes up to
+    ``max_range_m`` completely. Sample n is n / rate_hz after the start of the call. ``baseline_m`` is the lateral
+    distance between the centroids of both halves. ``call`` has the same rate.
     """
 
     def __init__(self, settings: Settings, azimuth_deg: float) -> None:

@@ -24,17 +24,12 @@ _NEARLY: Final = 0.8  # Minimum length of the last measurement of a file, relati
 
 @dataclass(frozen=True, slots=True)
 class Cuts:
-    """Measurements of equal length in files.
-
-    - ``samples`` list of (measurement,) int64: first sample of each measurement of each file.
-    - ``times_s`` list of (measurement,): time of each emission since the start of its file, in seconds.
-    - ``notes``: assumption about the emission, or where it was found.
-    """
+    """Measurements of equal length in files."""
 
     n_samples: int
-    samples: list[NDArray[np.int64]]
-    times_s: list[NDArray[np.float64]]
-    notes: tuple[str, ...]
+    samples: list[NDArray[np.int64]]  # (measurement,) first samples, for each file
+    times_s: list[NDArray[np.float64]]  # (measurement,) emissions since the start of the file, for each file
+    notes: tuple[str, ...]  # assumption about the emission, or where it was found
 
     def __len__(self) -> int:
         return sum(map(len, self.samples))
@@ -46,10 +41,7 @@ class Cuts:
 
 
 def cut_regularly(files: Sequence[PcmFile], *, skip_s: float, length_s: float | None) -> Cuts:
-    """Return one measurement per file, with the length of the shortest file, or several of ``length_s``.
-
-    Raise ArgumentError if a time is invalid.
-    """
+    """Return one measurement per file, as long as the shortest file, or several of length_s."""
     rate_hz = files[0].rate_hz
     skipped = round(checks.between("skip_s", skip_s, 0.0, _MAX_DURATION_S) * rate_hz)
     # An interval between emissions may contain a fraction of a sample, which must not accumulate.
@@ -79,11 +71,7 @@ def cut_regularly(files: Sequence[PcmFile], *, skip_s: float, length_s: float | 
 def cut_at_emissions(
     files: Sequence[PcmFile], call: Call, *, channel: int, length_s: float | None, sound_speed_m_s: float
 ) -> Cuts:
-    """Return a measurement for each emission in a channel, which lasts until the next one or for ``length_s``.
-
-    Raise ArgumentError if the length is invalid. Raise DataError if a file contains no emission, or the next emission
-    follows before the length.
-    """
+    """Return a measurement for each emission, until the next one or for length_s; raise DataError without."""
     rate_hz = files[0].rate_hz
     found = [
         find_emissions(
@@ -149,10 +137,7 @@ def _assumption(skip_s: float, length_s: float | None) -> str:
 
 
 def _shortest(files: Sequence[PcmFile], several: Sequence[NDArray[np.int64]]) -> int:
-    """Return the smallest number of samples from an emission to the next one, or to the end of its file.
-
-    The end of a file with several emissions may cut off the last one, unless it nearly fits.
-    """
+    """Return the fewest samples from an emission to the next or to the end, which may nearly cut off the last one."""
     intervals = [int(np.diff(starts).min()) for starts in several if len(starts) > 1]
     rests = [(file.n_samples - int(starts[-1]), len(starts)) for file, starts in zip(files, several, strict=True)]
     needed = _NEARLY * min([*intervals, *(rest for rest, count in rests if count == 1)])

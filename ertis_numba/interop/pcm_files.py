@@ -37,21 +37,15 @@ _MAX_FLOAT32: Final = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True, slots=True)
 class PcmFile:
-    """Properties of a PCM file, or of several whose channels are joined.
+    """Properties of a PCM file, or of several whose channels are joined."""
 
-    - ``paths``: files in the order of their channels.
-    - ``rate_hz``: rate at which the sound was recorded.
-    - ``counts``: number of channels of each file.
-    - ``is_wide``: True for integers of 32 or 64 bits, all of which are used according to the file.
-    """
-
-    paths: tuple[Path, ...]
-    rate_hz: float
+    paths: tuple[Path, ...]  # in the order of their channels
+    rate_hz: float  # at which the sound was recorded
     n_samples: int
-    counts: tuple[int, ...]
+    counts: tuple[int, ...]  # channels of each file
     kind: np.dtype[Any]
     metadata: RecorderMetadata
-    is_wide: bool
+    is_wide: bool  # integers of 32 or 64 bits use all bits according to the file
     notes: tuple[str, ...] = ()
     settings: Settings | None = None
 
@@ -89,10 +83,7 @@ class PcmSamples:
         self._without = without
 
     def block(self, samples: slice, enabled: NDArray[np.bool_] | None = None) -> NDArray[Any]:
-        """Return samples, (sample, channel); non-finite samples of disabled channels become 0.
-
-        Raise DataError if a sample of an enabled channel is not finite, or exceeds float32.
-        """
+        """Return (sample, channel); 0 for non-finite disabled ones; raise DataError for other unusable samples."""
         numbers = self._numbers(samples)
         if self._without is not None:
             numbers = np.delete(numbers, self._without, axis=1)
@@ -139,11 +130,7 @@ def inspect(path: Path, expansion: float | None = None) -> PcmFile:
 
 
 def joined(files: Sequence[PcmFile]) -> PcmFile:
-    """Return one file with the channels of all, cut to the shortest.
-
-    Raise DataError if the files differ in rate, type of numbers or time, or are in the order of the alphabet but not of
-    numbers.
-    """
+    """Return one file with all channels, cut to the shortest; raise DataError if they differ or 10 precedes 2."""
     require_alike(files, joined=True)
     _require_one_measurement(files)
     first = files[0]

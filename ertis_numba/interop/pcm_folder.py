@@ -22,10 +22,7 @@ def is_wav_folder(path: str | Path) -> bool:
 
 
 def wav_files(folder: Path, *, by_time: bool) -> list[Path]:
-    """Return the WAV files of a folder in the order of their times, otherwise of their names, in which numbers count.
-
-    Hidden files, which computers add to cards, are left out.
-    """
+    """Return the WAV files by time, or by name with numbers; without hidden ones, which computers add to cards."""
     visible = [
         each
         for each in folder.iterdir()

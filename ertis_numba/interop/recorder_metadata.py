@@ -27,18 +27,12 @@ _BEXT_DATE: Final = slice(320, 338)
 
 @dataclass(slots=True)
 class RecorderMetadata:
-    """Statements of a recorder about a file.
+    """Statements of a recorder about a file."""
 
-    - ``stated_times``: time of the first sample, from each source that states it; the most reliable source comes first.
-    - ``expansion``: factor by which the header's rate is too low, as stated.
-    - ``rate_hz``: true sample rate, as stated.
-    - ``notes``: statements that cannot be read.
-    """
-
-    stated_times: list[StatedTime] = field(default_factory=list)
-    expansion: float | None = None
-    rate_hz: float | None = None
-    notes: list[str] = field(default_factory=list)
+    stated_times: list[StatedTime] = field(default_factory=list)  # of the first sample, most reliable first
+    expansion: float | None = None  # factor by which the header's rate is too low
+    rate_hz: float | None = None  # true sample rate
+    notes: list[str] = field(default_factory=list)  # statements that cannot be read
 
 
 def read_metadata(chunks: Mapping[str, bytes], rate_hz: float) -> RecorderMetadata:

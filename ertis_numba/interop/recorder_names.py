@@ -29,16 +29,11 @@ _HEX_S: Final = range(round(datetime(2014, 1, 1, tzinfo=UTC).timestamp()), 2**31
 
 
 class StatedTime(NamedTuple):
-    """Time at which a file begins, as its source states it.
+    """Time at which a file begins, as its source states it."""
 
-    - ``clock``: reading of the clock, without a zone.
-    - ``offset``: offset of the clock from UTC; None if the source states none. UTC is then assumed.
-    - ``source``: words for the source, such as ``GUANO``.
-    """
-
-    clock: datetime
-    offset: timedelta | None
-    source: str
+    clock: datetime  # without a zone
+    offset: timedelta | None  # from UTC; None if not stated, and UTC is assumed
+    source: str  # such as GUANO
     resolution_s: float = 1.0
 
     @classmethod

@@ -27,10 +27,10 @@ _UNKNOWN: Final = "set start_ns for the first file, or for each file"
 def file_times(
     files: Sequence[PcmFile], starts_ns: Sequence[int], *, first_s: Sequence[float]
 ) -> tuple[list[int], list[str]]:
-    """Return the time of the first measurement of each file, in nanoseconds since 1970, and notes about the times.
+    """Return the time of each file's first measurement in ns since 1970, and notes; files are in order of time.
 
-    ``files`` are in the order of their times. ``starts_ns`` are given by the user: none, that of the first file, or one
-    per file. ``first_s`` are relative to the starts of the files.
+    ``starts_ns`` are given by the user: none, the first, or one per file. ``first_s`` count from the starts of the
+    files.
     """
     if len(starts_ns) not in {0, 1, len(files)}:
         raise ArgumentError(
@@ -101,10 +101,7 @@ def _require_order(files: Sequence[PcmFile], times_ns: Sequence[int]) -> None:
 def _without_overlaps(
     files: Sequence[PcmFile], times_ns: list[int], resolution_s: float
 ) -> tuple[list[int], list[str]]:
-    """Return times in which files begin after the end of the previous one, and notes on overlaps.
-
-    Times of a whole second may be up to a second too early.
-    """
+    """Return times without overlaps, and notes; times of a whole second may be up to 1 s too early."""
     found, overlaps, moved_s = list(times_ns), [], [0.0]
     for number in range(1, len(files)):
         end_ns = found[number - 1] + round(1e9 * files[number - 1].duration_s)

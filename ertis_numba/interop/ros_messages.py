@@ -69,10 +69,10 @@ _INVALID_CHARACTERS = re.compile(r"[^A-Za-z0-9]+")
 
 
 class TopicNames(dict[str, str]):
-    """Name of each sensor in topics, by sensor. Characters that ROS does not allow become ``_``.
+    """Name of each sensor in topics; characters that ROS does not allow become ``_``.
 
-    The topics of fused images, whose sensor is ``base_link``, lie in ``fused``. If another sensor has the same name in
-    topics, the later one gets a number, such as ``a_b_2``. Raise ArgumentError if the name of a sensor is invalid.
+    The topics of fused images, whose sensor is ``base_link``, lie in ``fused``. A later sensor of the same name gets a
+    number, such as ``a_b_2``.
     """
 
     def __missing__(self, sensor: str) -> str:
@@ -86,10 +86,7 @@ class TopicNames(dict[str, str]):
 
 
 def header(stamp: Stamp, *, frame: str | None = None) -> dict[str, Any]:
-    """Return the header of a message: the time of the emission, and the frame of the sensor or another one.
-
-    Raise ArgumentError if the time is before 1970 or after 2038.
-    """
+    """Return the header: time of the emission, from 1970 to 2038, and the frame of the sensor or another one."""
     sec, nanosec = ros_time(stamp)
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame or stamp.sensor}
 
@@ -124,10 +121,7 @@ def points_message(cloud: PointCloud) -> dict[str, Any]:
 
 
 class ImageMessages:
-    """Converter of images to grey pictures for display, as sensor_msgs/msg/Image (mono8).
-
-    The tables of a sensor are computed once for its directions.
-    """
+    """Converter of images to sensor_msgs/msg/Image (mono8); computes the tables of a sensor once."""
 
     def __init__(self) -> None:
         self._pictures: dict[str, tuple[Energyscape, GreyImage]] = {}
@@ -175,7 +169,7 @@ def sonar_image_message(image: Energyscape) -> dict[str, Any]:
 
 
 def occupancy_values(occupancy: OccupancyMap, *, probabilities: bool = False) -> NDArray[np.int8]:
-    """Return the cells in the values of nav_msgs/msg/OccupancyGrid: (row, column) int8.
+    """Return the cells in the values of nav_msgs/msg/OccupancyGrid: (row, column).
 
     Occupied cells hold 100, free ones 0, and all others −1, as gmapping and slam_toolbox publish them: Nav2 takes only
     100 for an obstacle, and every other value except −1 for free space. With ``probabilities``, cells hold the
@@ -225,7 +219,7 @@ def sonar_frame_message(stamp: Stamp) -> dict[str, Any]:
 
 
 def odometry_message(pose: PlanarPose, velocity: EgoVelocity | None) -> dict[str, Any]:
-    """Return the pose in the frame ``odom`` and the velocity in that of the platform, as nav_msgs/msg/Odometry.
+    """Return the pose in ``odom`` and the velocity in the platform frame, as nav_msgs/msg/Odometry.
 
     Height, roll and pitch are 0, and so are their covariances. An unknown velocity is 0, with the largest measurable
     speeds as standard deviations.

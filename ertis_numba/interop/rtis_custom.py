@@ -26,12 +26,10 @@ _UNEVEN: Final = 0.1  # Largest distance of a range from an even spacing, relati
 
 
 def with_custom_files(folder: Path, reported: Mapping[str, Any], settings: Settings) -> Settings:
-    """Return settings with the directions, delays and ranges of the CSV files that settings of RTIS Dev name.
+    """Return settings with directions, delays and ranges of the CSV files that RTIS Dev settings name.
 
-    ``reported`` are the settings of RTIS Dev, in ``folder`` with the files; ``settings`` are all others, with the air.
     Delays are exact. The spacing of the ranges is the multiple of ``c / (2 · sample rate)`` that is nearest to that of
-    the file. Raise DataError if a file cannot be read or used. Raise ArgumentError if the settings cannot hold the
-    content of a file.
+    the file.
     """
     changes: dict[str, Any] = {}
     if "directionsCustom" in reported:

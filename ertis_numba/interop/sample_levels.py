@@ -17,11 +17,7 @@ _MAX_PASCALS: Final = 200.0  # 140 dB
 
 
 class SampleLevels:
-    """Peak and number of samples at full scale of the samples of a file.
-
-    ``kind`` is the type of the samples in the file; ``is_wide`` states that all bits of integers of 32 or 64 bits are
-    used.
-    """
+    """Peak and number of full-scale samples of a file; is_wide: 32- or 64-bit integers use all bits."""
 
     def __init__(self, full_scale: float, kind: np.dtype[Any], *, is_wide: bool) -> None:
         self._top = _TOP_OF_BYTES if kind.itemsize == 1 else _TOP if full_scale == 1 else full_scale - 1

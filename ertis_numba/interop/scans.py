@@ -23,16 +23,13 @@ _HALF_POWER: Final = 0.44  # Half of the main lobe of an array of length 1, at h
 def scan_message(
     image: Energyscape, *, min_level_db: float = -20.0, floor_dbfs: float = -math.inf
 ) -> dict[str, Any] | None:
-    """Return the nearest echo of each azimuth, as sensor_msgs/msg/LaserScan; None for images that are not planar.
+    """Return the nearest echo of each azimuth, as LaserScan, intensities in dBFS; None if not planar.
 
     The angles of a scan are evenly spaced. Each has the echo of the nearest direction of the image, or infinity. The
-    intensities are levels in dBFS. `ertis_numba.analysis.nearest_echo` describes both limits.
-
-    The scan of an image with `Energyscape.points` has these reflectors only, if they are confirmed or nearest to the
+    scan of an image with `Energyscape.points` has these reflectors only, if they are confirmed or nearest to the
     sensors. A reflector fills the beam nearest to it, and all beams within one standard deviation of its direction. In
     other beams within half of the main lobe of the array, 3.5° for eRTIS at 25 to 50 kHz, the range beyond it is
-    unknown, and infinite: farther echoes may be those of sound that it reflected to another surface. This holds for
-    points without `PointCloud.confirmed` as well.
+    infinite, because farther echoes may be those of sound that it reflected to another surface.
     """
     if not image.is_planar or len(image.azimuth_rad) < 2 or len(image.range_m) < 3:
         return None
@@ -91,11 +88,7 @@ def _half_lobe_rad(settings: Settings) -> float:
 
 
 def reflectors_ahead(cloud: PointCloud, image: Energyscape, mounting: Mounting) -> PointCloud:
-    """Return the reflectors of a platform that are certain, and in front of one of its sensors, in its frame.
-
-    ``cloud`` is in the frame of the platform, ``image`` is that of the sensor at the same SYNC pulse, and ``mounting``
-    its pose on the platform.
-    """
+    """Return certain reflectors of a cloud in the platform frame that are ahead of a sensor, in its frame."""
     translation_m, rotation_xyzw = mounting
     rotation = Rotation.from_quat(rotation_xyzw)
     position_m = rotation.inv().apply(cloud.position_m - np.array(translation_m)).astype(np.float32)

@@ -36,20 +36,16 @@ Reader = Callable[[slice], NDArray[np.float64]]
 
 @dataclass(frozen=True, slots=True)
 class Emissions:
-    """Emissions in a file.
+    """Emissions in a file."""
 
-    ``times`` (emission,): times of the emissions since the first sample, in samples; range 0 of the call.
-    """
-
-    times: NDArray[np.float64]
+    times: NDArray[np.float64]  # (emission,) in samples since the first; range 0 of the call
     notes: tuple[str, ...]
 
 
 def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, path: Path, channel: int) -> Emissions:
-    """Return the emissions in a loopback channel.
+    """Return the emissions in a loopback channel, by the matched filter of the call.
 
-    The matched filter of the call finds them. If no part of the channel resembles the call, its pulses are found by
-    their onsets, as those of a trigger. ``read`` returns consecutive samples of the channel.
+    If no part of the channel resembles the call, its pulses are found by their onsets, as those of a trigger.
     """
     times, match = _of_call(read, n_samples, call_samples(call, rate_hz=rate_hz), call.start_s * rate_hz)
     notes = []
@@ -90,10 +86,9 @@ def louder_and_earlier(
     channel: int,
     n_channels: int,
 ) -> str:
-    """Return a note if another channel contains the call more loudly and up to half an interval earlier.
+    """Return a note if another channel has the call louder and up to half an interval earlier.
 
-    Nothing contains a call before the loopback does, so ``channel`` may be that of a microphone. ``emissions`` are
-    those in ``channel``.
+    Nothing contains a call before the loopback does, so ``channel`` may be that of a microphone.
     """
     at = float(emissions.times[0])
     interval = float(np.diff(emissions.times).min()) if len(emissions.times) > 1 else math.inf
@@ -199,10 +194,7 @@ def _read_padded(read: Reader, first: int, last: int, n_samples: int) -> NDArray
 
 
 def _onsets(read: Reader, n_samples: int, rate_hz: float) -> tuple[NDArray[np.float64], float]:
-    """Return the times of the onsets of pulses in samples, and the rise time of the first pulse.
-
-    The time is −1 for a pulse that began before the first sample.
-    """
+    """Return the onsets of pulses in samples, −1 before the first sample, and the rise time of the first pulse."""
     blocks = [slice(first, min(first + _BLOCK, n_samples)) for first in range(0, n_samples, _BLOCK)]
     middles = [float(np.median(read(block))) for block in blocks]
     middle = float(np.median(middles))

@@ -14,10 +14,7 @@ _TOLERANCE: Final = 1e-3
 def true_rate_hz(
     path: Path, header_hz: float, metadata: RecorderMetadata, expansion: float | None
 ) -> tuple[float, list[str]]:
-    """Return the rate at which the sound was recorded, in hertz, and notes if it is not that of the header.
-
-    ``expansion`` is the user's factor, which overrides the metadata.
-    """
+    """Return the rate of the recorded sound and notes if it differs; expansion overrides the metadata."""
     stated = metadata.expansion
     ratio = None if metadata.rate_hz is None else metadata.rate_hz / header_hz
     if expansion is not None:

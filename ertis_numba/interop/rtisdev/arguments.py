@@ -86,11 +86,7 @@ def disabled(given: ArrayLike, n_mics: int) -> tuple[int, ...]:
 
 
 def words(given: ArrayLike, n_samples: int) -> NDArray[np.uint32]:
-    """Return the PDM words of a measurement, (sample, 1) uint32.
-
-    Words keep their value, whatever the order of their bytes. Integers of 8 or 16 bits are parts of words, the lowest
-    part first.
-    """
+    """Return PDM words (sample, 1) by value, in any byte order; 8- or 16-bit integers are parts, the lowest first."""
     array = given if isinstance(given, np.ndarray) else as_array("the measurement", given)
     if array.dtype.kind not in "iu" or array.dtype.itemsize > _WORD_BYTES or array.nbytes != _WORD_BYTES * n_samples:
         raise ArgumentError(f"the measurement is {array.dtype} of shape {array.shape}; use {n_samples} words of uint32")

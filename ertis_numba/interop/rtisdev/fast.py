@@ -39,13 +39,11 @@ Real = NDArray[np.float32]
 
 
 class FastProcessor:
-    """Processing of measurements by the fast chain. Several threads may call `process`.
+    """Thread-safe processing by the fast chain; ``exact`` computes the rest, and the images to compare with.
 
-    ``exact`` computes whatever the fast chain does not, and the images to compare with. ``difference_db``: RMS of the
-    difference of both images of a simulated measurement with loud echoes, relative to the exact image.
-    ``weak_difference_db``: the same for echoes that are 60 dB weaker. Images of noise alone differ more. Raise
-    ArgumentError if the fast chain cannot do what the arguments say, or differs by more than -15 dB for loud or weak
-    echoes. Raise DeviceError if the device does not exist.
+    ``difference_db`` is the RMS of the difference of both images of a simulated measurement with loud echoes, relative
+    to the exact image; ``weak_difference_db`` is that of echoes 60 dB weaker. Images of noise alone differ more. Raises
+    ArgumentError if either exceeds -15 dB, or for arguments that the fast chain does not support.
     """
 
     def __init__(self, exact: Processor, *, device: str = "auto") -> None:

@@ -34,41 +34,26 @@ Combine = Callable[[NDArray[np.int32], Real], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Configuration:
-    """Arguments of `rtiscuda.preload`; None for stages that are off.
+    """Arguments of `rtiscuda.preload`; None for stages that are off."""
 
-    - ``pdm_filter`` (tap,) float32: low pass for PDM demodulation.
-    - ``pre_filter``, ``post_filter`` (tap,) float32 or None: filters of the signals, and of the beams.
-    - ``envelope_filter`` (tap,) float32: low pass of rectified beams.
-    - ``matched_filter`` (mic, bin) complex64 or None: factors for the spectra of the signals, as `numpy.fft.rfft`
-      returns them.
-    - ``delays`` (direction, mic) int32 or None: delays in samples of the signals, at least 0.
-    - ``pdm_factor``, ``envelope_factor``: decimation of the PDM words to signals, and of the rectified beams to the
-      image.
-    - ``beamforming_drop``: number of samples at the end of signals without beams.
-    - ``first_range``, ``last_range``: range of the image in its samples; the last is not included.
-    - ``clean_multipliers`` (float, float) or None: amplitudes of a range become 0 below the first number times the mean
-      of the range, and below the second number times its maximum.
-    - ``dmas_order``: 1 for delay-and-sum; 2 to 5 for delay-multiply-and-sum.
-    """
-
-    pdm_filter: Real
-    pre_filter: Real | None
-    envelope_filter: Real
-    post_filter: Real | None
-    matched_filter: NDArray[np.complex64] | None
-    delays: NDArray[np.int32] | None
+    pdm_filter: Real  # low pass for PDM demodulation
+    pre_filter: Real | None  # of the signals
+    envelope_filter: Real  # low pass of rectified beams
+    post_filter: Real | None  # of the beams
+    matched_filter: NDArray[np.complex64] | None  # (mic, bin), as of rfft
+    delays: NDArray[np.int32] | None  # (direction, mic), in samples of the signals, at least 0
     n_mics: int
     n_directions: int
     n_samples: int
-    pdm_factor: int
-    beamforming_drop: int
-    envelope_factor: int
-    first_range: int
-    last_range: int
-    clean_multipliers: tuple[float, float] | None
+    pdm_factor: int  # decimation of the PDM words to signals
+    beamforming_drop: int  # samples at the end of signals without beams
+    envelope_factor: int  # decimation of the rectified beams to the image
+    first_range: int  # in samples of the image
+    last_range: int  # not included
+    clean_multipliers: tuple[float, float] | None  # 0 below these times mean and maximum of a range
     has_envelope: bool
     disabled: tuple[int, ...]
-    dmas_order: int
+    dmas_order: int  # 1 for delay-and-sum; 2 to 5 for delay-multiply-and-sum
     coherent: bool
 
     def __post_init__(self) -> None:
@@ -118,10 +103,9 @@ class Configuration:
 
 
 class Processor:
-    """Processing of measurements with one configuration. Several threads may call `process`.
+    """Thread-safe processing of measurements with one configuration.
 
-    Fourier transforms and filters other than that of PDM use the CPU on any device. Raise DeviceError if the device
-    does not exist.
+    Fourier transforms and filters other than that of PDM use the CPU on any device.
     """
 
     def __init__(self, configuration: Configuration, *, device: str = "auto") -> None:
@@ -293,7 +277,7 @@ def rounded(taps: NDArray[np.floating[Any]]) -> tuple[NDArray[np.int16], float]:
 
 
 def _sixteen_bits(signals: Real, n_tiles: int) -> tuple[NDArray[np.int16], Real]:
-    """Return tiles of signals as 16-bit numbers whose sum over the microphones fits into 16 bits, and their units.
+    """Return tiles of signals as 16-bit numbers whose sum over microphones fits 16 bits, and their units.
 
     With 32 microphones, a sample has 11 bits of the largest one in its tile. The error of a beam is then about 85 dB
     below a beam in which all microphones have such a sample.

@@ -54,12 +54,7 @@ def preload(  # noqa: PLR0913, PLR0917  as the original has it
     dmas_order: int,
     coherence_factor_enable: int,
 ) -> None:
-    """Prepare a configuration for `processing`, and replace an earlier one of this name.
-
-    All arguments are those that ``rtisdev`` passes, in its order. `processor.Configuration` describes them. Raise
-    ArgumentError if a type, shape or value is wrong, or they do not fit together. Raise DeviceError if the device of
-    ERTIS_RTISDEV_DEVICE does not exist.
-    """
+    """Prepare or replace a configuration for `processing`; arguments as ``rtisdev`` passes: see `Configuration`."""
     with _errors_logged():
         name = arguments.text("name", name)
         n_mics = arguments.whole("n_microphones", n_microphones, 1, _MAX_MICROPHONES)
@@ -99,7 +94,7 @@ def preload(  # noqa: PLR0913, PLR0917  as the original has it
 
 
 def processing(data: NDArray[Any], pdm: int, dim1: int, dim2: int, name: str) -> NDArray[np.float32]:
-    """Process a measurement with a preloaded configuration; return (dim1, dim2) float32.
+    """Process a measurement with a preloaded configuration; return (dim1, dim2).
 
     With a ``pdm`` other than 0, ``data`` are PDM words (sample,) uint32. Otherwise they are the finite result of an
     earlier stage: signals (mic, sample), or, without beamforming, beams (direction, sample).

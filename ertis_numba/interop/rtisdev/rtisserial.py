@@ -34,12 +34,10 @@ _awaits_triggers = False  # after the command that switches external triggers on
 
 
 def connect(port: str, baud: int) -> None:  # noqa: ARG001  USB ignores the rate
-    """Open a serial port, and close the one that was open.
+    """Open a serial port, or that of ERTIS_RTISDEV_PORT, and close the former; drop bytes for a former program.
 
-    Bytes that still arrive for a former program are dropped. The variable ERTIS_RTISDEV_PORT overrides ``port``: a
-    path, link, serial number, or name of an emulated device. ``baud`` is ignored, because USB has no rate. Raise
-    ConnectionRefusedError if another program uses the port, and ConnectionError if it does not exist or may not be
-    used.
+    Raises ConnectionRefusedError if another program uses the port, and ConnectionError if it does not exist or may not
+    be used. USB has no ``baud``.
     """
     global _line  # noqa: PLW0603  one connection per process
     with _errors_translated():
@@ -70,10 +68,9 @@ def _quiet(path: str) -> Dialogue:
 
 
 def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as the original has it
-    """Send a command, which ends with a new line, and return its answer, a number, or None if none is wanted.
+    """Send a line; return the number that answers it, or None if none is wanted.
 
-    Raise ConnectionRefusedError without an open port, ConnectionError if the device was unplugged, and TimeoutError
-    without an answer.
+    Raises ConnectionRefusedError without an open port, ConnectionError if unplugged, TimeoutError without an answer.
     """
     global _awaits_triggers  # noqa: PLW0603  one connection per process
     line = _connected()
@@ -89,10 +86,9 @@ def command(text: str, wants_answer: bool) -> int | None:  # noqa: FBT001  as th
 
 
 def getdata(n_bytes: int) -> NDArray[np.uint8]:
-    """Return ``n_bytes`` bytes as soon as they have arrived, (byte,) uint8.
+    """Return bytes (n_bytes,) as soon as they have arrived, without a limit of time while external triggers are on.
 
-    There is no limit of time while external triggers are on. Raise ConnectionRefusedError without an open port,
-    ConnectionError if the device was unplugged, and TimeoutError if the measurement does not arrive.
+    Raises ConnectionRefusedError without an open port, ConnectionError if unplugged, TimeoutError without measurement.
     """
     with _errors_translated():
         n_bytes = arguments.whole("n_bytes", n_bytes, 0)
