@@ -79,14 +79,12 @@ def make_plan(scene: Scene) -> EffectPlan:
     apply to something in the scene are on.
 
     The other effects are estimated for all sensors at the beginning, at the end, in between and at waypoints. The
-    greatest change counts. Effects are estimated one after the other, each given those before it: geometry first, then
-    filters of echoes, then additional sound. Estimation repeats, given all other effects, until no decision changes. An
-    effect that changes the recorded sound of a source by more than the tolerance is on, even if no image shows it.
+    greatest change counts. Effects are estimated in the order of the registry, each given those before it, and then
+    given all others until no decision changes. An effect that changes the recorded sound of a source is on as well.
 
-    If an estimate is not certain enough, A/B renders measure the change. They process the measurements with the
-    greatest estimates with and without the effect. They also process the loudest one, because estimates do not model
-    converters. Raise ArgumentError if a surface touches or encloses a microphone or an emitter, or the scene exceeds a
-    limit.
+    If an estimate is not certain enough, A/B renders of the measurements with the greatest estimates measure the
+    change, and of the loudest one, because estimates do not model converters. Raise ArgumentError if a surface touches
+    or encloses a microphone or an emitter, or the scene exceeds a limit.
     """
     indices = _indices(scene)
     cache = Cache()

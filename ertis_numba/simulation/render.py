@@ -1,5 +1,10 @@
 """Rendering of a scene to the raw samples that its sensors would record."""
 
+import functools
+from dataclasses import dataclass, field
+
+import msgspec
+
 from ertis_numba.base import checks
 from ertis_numba.frames import Measurement
 from ertis_numba.settings import Array, Recording
@@ -48,8 +53,21 @@ class Simulator(Engine):
         self, scene: Scene, *, sensor: str | None = None, plan: EffectPlan | None = None, threads: int | None = None
     ) -> None:
         checks.instance("scene", scene, Scene, "load_scene returns")
-        self.plan = make_plan(scene) if plan is None else plan
+        self.plan = _plan_of(_ByValue(msgspec.msgpack.encode(scene), scene)) if plan is None else plan
         super().__init__(scene, scene.sensor(sensor), self.plan.active, threads=threads)
+
+
+@dataclass(frozen=True, slots=True)
+class _ByValue:
+    """Scene as the key of a cache; its dictionary of effects has no hash."""
+
+    encoded: bytes
+    scene: Scene = field(compare=False)
+
+
+@functools.lru_cache(maxsize=8)  # Planning takes longer than a rendering, and all sensors of a scene share its plan.
+def _plan_of(key: _ByValue) -> EffectPlan:
+    return make_plan(key.scene)
 
 
 def render(scene: Scene, index: int = 0, *, sensor: str | None = None) -> Measurement:

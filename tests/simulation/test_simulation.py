@@ -293,3 +293,13 @@ def test_roll_is_clockwise_seen_from_behind():
     scene = scene_of(Point(position_m=(1.0, -1.0, 0.0)), sensor=SENSOR.replace(roll_deg=90))
     [point] = Simulator(scene, plan=only("spreading")).reflectors()
     assert_allclose((point.azimuth_deg, point.elevation_deg), (0, 45), atol=1e-9)
+
+
+def test_simulators_of_equal_scenes_share_a_plan(monkeypatch):
+    made = []
+    monkeypatch.setattr("ertis_numba.simulation.render.make_plan", lambda scene: made.append(scene) or make_plan(scene))
+    scene = Scene(seed=77, sensors=(SENSOR,), points=(Point(range_m=0.5),))
+    assert Simulator(scene).plan is Simulator(scene.replace(seed=77)).plan
+    scene.effects["absorption"] = True
+    assert "absorption" in Simulator(scene).plan.active
+    assert len(made) == 2
