@@ -22,29 +22,14 @@ _SILENCE = 1e-25  # Power of rounding in maps of capon; sound of one-bit or floa
 
 
 class SoundDirection(NamedTuple):
-    """Direction of sound in a band, with its level.
-
-    Attributes
-    ----------
-    band_hz : (low, high)
-        Edges of the band in hertz.
-    azimuth_rad, elevation_rad : float
-        Direction in the sensor frame; NaN for an angle that the array cannot observe.
-    level_dbfs : float or None
-        Level at the array in dBFS; None for the method ``music``.
-    level_db : float or None
-        Sound pressure level at the array in dB re 20 µPa; None if the sensitivity of the microphones is unknown.
-    source_level_db : float or None
-        Source level in dB re 20 µPa at 1 m; None if the sensitivity or the distance of the sources is unknown, or if
-        the air absorbs more than 60 dB over this distance.
-    """
+    """Direction of sound in a band, with its level at the array; None for levels that are unknown."""
 
     band_hz: tuple[float, float]
-    azimuth_rad: float
-    elevation_rad: float
-    level_dbfs: float | None
-    level_db: float | None
-    source_level_db: float | None
+    azimuth_rad: float  # NaN if the array cannot observe it
+    elevation_rad: float  # likewise
+    level_dbfs: float | None  # None for the method music
+    level_db: float | None  # re 20 µPa; needs the sensitivity
+    source_level_db: float | None  # re 20 µPa at 1 m; needs the distance, and at most 60 dB of absorption
     grid_error_rad: float = math.nan
 
     @classmethod
@@ -58,17 +43,7 @@ class SoundDirection(NamedTuple):
         power: float,
         grid_error_rad: float = math.nan,
     ) -> Self:
-        """Return a direction of a map, with all known levels of a power.
-
-        Parameters
-        ----------
-        band : int
-            Index of the band.
-        power : float
-            Mean square of the sound at the array.
-        grid_error_rad : float
-            NaN, the default, if it is unknown.
-        """
+        """Return a direction in band number ``band`` of a map, with all known levels of a power."""
         level_dbfs = 10 * math.log10(power) if power else -math.inf
         levels: dict[str, float | None] = dict.fromkeys(LEVEL_UNITS)
         for name, unit in LEVEL_UNITS.items() if found.has_level else ():

@@ -27,15 +27,10 @@ _MAX_ABSORPTION_DB: Final = 60.0
 def level_offset_db(
     settings: Settings, frequency_hz: NDArray[np.float64], unit: LevelUnit
 ) -> NDArray[np.float64] | None:
-    """Return the level of a mean square of 1 at the array in a unit: (frequency,) float64.
+    """Return the level of a mean square of 1 at the array in a unit: (frequency,).
 
     None if ``array.sensitivity_dbfs``, or for the source level ``passive.focus_m``, is unknown. NaN for source levels
     at frequencies of which the air absorbs more than 60 dB over the distance.
-
-    Parameters
-    ----------
-    frequency_hz : (frequency,) float64
-    unit : {"dBFS", "dB re 20 µPa", "dB re 20 µPa at 1 m"}
     """
     sensitivity_dbfs, focus_m = settings.array.sensitivity_dbfs, settings.passive.focus_m
     if unit == "dBFS":
@@ -52,17 +47,10 @@ def level_offset_db(
 
 
 class LevelReference(NamedTuple):
-    """Unit of levels, and the level of a mean square of 1 at the array.
-
-    Attributes
-    ----------
-    unit : {"dBFS", "dB re 20 µPa", "dB re 20 µPa at 1 m"}
-    offset_db : (frequency,) float64
-        NaN where it is unknown.
-    """
+    """Unit of levels, and the level of a mean square of 1 at the array."""
 
     unit: LevelUnit
-    offset_db: NDArray[np.float64]
+    offset_db: NDArray[np.float64]  # (frequency,), NaN where it is unknown
 
     @classmethod
     def of(

@@ -12,13 +12,7 @@ _Frame = TypeVar("_Frame")
 
 
 def replaced(name: str, given: _Frame, changes: dict[str, Any]) -> _Frame:
-    """Return a copy of a dataclass with some fields changed.
-
-    Raises
-    ------
-    ArgumentError
-        There is no such field.
-    """
+    """Return a copy of a dataclass with some fields changed; raise ArgumentError for other fields."""
     known = [each.name for each in fields(given)]  # type: ignore[arg-type]  # a dataclass, which has no type of its own
     for field in sorted(changes.keys() - set(known)):
         near = difflib.get_close_matches(field, known, n=1)

@@ -73,21 +73,6 @@ class Stamp:
 
 
 def is_passive(settings: Settings, stamp: Stamp) -> bool:
-    """Return True if a measurement becomes an acoustic map, and False if it becomes an image of echoes.
-
-    Parameters
-    ----------
-    settings : Settings
-        Settings whose ``processing.mode`` decides if a measurement is passive.
-    stamp : Stamp
-        Stamp of the measurement; its ``behaviour`` decides in the mode ``auto``.
-
-    Examples
-    --------
-    >>> from ertis_numba import Settings, Stamp
-    >>> from ertis_numba.frames import is_passive
-    >>> is_passive(Settings(), Stamp(behaviour="passive")), is_passive(Settings(), Stamp())
-    (True, False)
-    """
+    """Return True if a measurement becomes an acoustic map, by its behaviour if processing.mode is auto."""
     mode = settings.processing.mode
     return mode == "passive" or (mode == "auto" and stamp.behaviour == "passive")

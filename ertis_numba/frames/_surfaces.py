@@ -17,49 +17,17 @@ _AT_ONCE: Final = 2**20  # Pairs of places and surfaces whose distances are comp
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surfaces:
-    """Points, spheres and rectangular faces of a simulated scene at one time.
+    """Points, spheres and rectangular faces of a simulated scene at one time."""
 
-    Attributes
-    ----------
-    centre_m : (target, axis) float64
-        Positions of points, and centres of spheres and discs.
-    radius_m : (target,) float64
-        Radius of spheres; 0 for others.
-    disc_m : (target,) float64
-        Radius of discs; 0 for others.
-    face_m : (face, axis) float64
-        Centres of the faces.
-    axes : (face, 3, axis) float64
-        Normal, width and height of each face as unit vectors.
-    half_size_m : (face, 2) float64
-        Half of width and height; infinite for unbounded faces.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ertis_numba.frames import Surfaces
-    >>> none = np.zeros((0, 3))
-    >>> wall = np.array([[3.0, 0.0, 0.0]]), np.array([[[-1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]]]), np.full((1, 2), 0.5)
-    >>> Surfaces(none, np.zeros(0), np.zeros(0), *wall).distance_m(np.array([[2.8, 0.1, 0.2]])).round(3)
-    array([0.2])
-    """
-
-    centre_m: Floats
-    radius_m: Floats
-    disc_m: Floats
-    face_m: Floats
-    axes: Floats
-    half_size_m: Floats
+    centre_m: Floats  # (target, axis) of points, spheres and discs
+    radius_m: Floats  # (target,) of spheres; 0 for others
+    disc_m: Floats  # (target,) radius of discs; 0 for others
+    face_m: Floats  # (face, axis) centres
+    axes: Floats  # (face, 3, axis) normal, width and height as unit vectors
+    half_size_m: Floats  # (face, 2) half of width and height; may be infinite
 
     def seen_from(self, position_m: Floats, rotation: Floats) -> Self:
-        """Return the surfaces in the frame of an object, from its pose.
-
-        Parameters
-        ----------
-        position_m : (3,) float64
-        rotation : (3, 3) float64
-            Rotation from the frame of the object to that of the surfaces.
-        """
+        """Return the surfaces in the frame of an object, from its position (3,) and rotation (3, 3) to theirs."""
         return type(self)(
             (self.centre_m - position_m) @ rotation,
             self.radius_m,

@@ -26,23 +26,10 @@ def data_array(
     settings: Settings,
     stamp: Stamp,
 ) -> "xarray.DataArray":
-    """Return a labelled array that shares memory with ``values``.
+    """Return a labelled array that shares memory with values; coords: (dimension, values, description, unit).
 
-    Parameters
-    ----------
-    coords : mapping of str to (dimension, values, description, unit)
-    about : str
-        Description of the values.
-    settings : Settings
-        Stored as TOML in the attribute ``settings``.
-    stamp : Stamp
-        Its time becomes the scalar coordinate ``time``, along which `xarray.concat` joins several arrays; the rest are
-        attributes.
-
-    Raises
-    ------
-    ArgumentError
-        xarray is not installed.
+    The settings become an attribute as TOML. The time of the stamp becomes the scalar coordinate ``time``, along which
+    `xarray.concat` joins several arrays; the rest are attributes.
     """
     with extra("xarray", "to_xarray needs xarray"):
         import xarray as xr  # noqa: PLC0415  an optional dependency

@@ -27,20 +27,8 @@ def tilt_note(rotation_xyzw: Floats, position_m: Floats) -> str | None:
     """Return a note if poses tilt the platform as those of other frames or orders do.
 
     Most poses tilt it by more than 30°, the path is steeper than 30°, it turns about its x or y axis only, or it is
-    level in the order w, x, y, z only.
-
-    Poses of a camera, with z forward and y down, lay the platform on its side. If the world has the axes of a camera as
-    well, the platform seems to climb.
-
-    Parameters
-    ----------
-    rotation_xyzw : (pose, 4) float64
-        Unit quaternions from the platform frame to the world frame.
-    position_m : (pose, 3) float64
-
-    Returns
-    -------
-    str or None
+    level in the order w, x, y, z only. Poses of a camera, with z forward and y down, lay the platform on its side. If
+    the world has the axes of a camera as well, the platform seems to climb.
     """
     up = _vertical_shares(rotation_xyzw)
     if (note := _order_note(rotation_xyzw, up)) is not None:
@@ -63,18 +51,7 @@ def tilt_note(rotation_xyzw: Floats, position_m: Floats) -> str | None:
 
 
 def turned_axes(rotation_xyzw: Floats, axes: str) -> tuple[Floats, Floats]:
-    """Return the rotations of a platform for those of a frame with other axes, and the rotation of the world.
-
-    Parameters
-    ----------
-    rotation_xyzw : (pose, 4) float64
-    axes : {"platform", "camera", "camera-world", "ned"}
-
-    Returns
-    -------
-    rotation_xyzw : (pose, 4) float64
-    world : (3, 3) float64
-    """
+    """Return rotations (pose, 4) of a platform for those of a frame with other axes, and that of the world (3, 3)."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  importing it takes longer than this package
 
     if axes == "platform":

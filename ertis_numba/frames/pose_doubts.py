@@ -29,13 +29,7 @@ _NEAR: Final = float(np.radians(10.0))
 
 
 def pose_doubts(poses: Trajectory) -> tuple[str, ...]:
-    """Return notes on poses that are hardly those of a platform.
-
-    Returns
-    -------
-    tuple of str
-        Empty if there is no doubt.
-    """
+    """Return notes on poses that are hardly those of a platform."""
     place_m = poses.position_m
     found = (
         _earth_note(place_m),

@@ -16,18 +16,10 @@ _MAX_EXPONENT = 20  # of two: squares, products and sums of samples from 1e-6 to
 
 
 class SampleFormat(NamedTuple):
-    """Type and shape of the words of one measurement.
+    """Type and shape of the words of one measurement."""
 
-    Attributes
-    ----------
-    dtype : numpy.dtype
-        Little-endian, as in files and messages.
-    shape : tuple of int
-        ``(sample,)``, or ``(sample, word)`` if a PDM sample has several words; ``(sample, channel)`` for PCM.
-    """
-
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
+    dtype: np.dtype[Any]  # little-endian, as in files and messages
+    shape: tuple[int, ...]  # (sample,), (sample, word) for several PDM words, or (sample, channel) for PCM
 
     @property
     def n_bytes(self) -> int:
@@ -40,13 +32,7 @@ class SampleFormat(NamedTuple):
         return self.shape[0], self.shape[1] if len(self.shape) > 1 else 1
 
     def from_bytes(self, content: bytes | bytearray | memoryview) -> NDArray[Any]:
-        """Return a view of bytes as words.
-
-        Raises
-        ------
-        DataError
-            Their number is wrong.
-        """
+        """Return a view of bytes as words; raise DataError if their number is wrong."""
         if len(content) != self.n_bytes:
             raise DataError(
                 f"measurement has {len(content)} bytes, but its settings describe {self.n_bytes}; use the settings "
@@ -55,13 +41,7 @@ class SampleFormat(NamedTuple):
         return np.frombuffer(content, self.dtype).reshape(self.shape)
 
     def validated(self, words: NDArray[Any], *, any_length: bool = False) -> NDArray[Any]:
-        """Return words of shape ``(sample, word)``, in the memory order and alignment that kernels are compiled for.
-
-        Raises
-        ------
-        DataError
-            The type or shape is wrong, or PCM contains a number that is not finite.
-        """
+        """Return finite words of shape (sample, word), in the memory order and alignment for kernels."""
         n_samples = len(words) if any_length else self.shape[0]
         shape, rows = (n_samples, *self.shape[1:]), (n_samples, self.shape_2d[1])
         if words.dtype != self.dtype or words.shape not in {shape, rows}:
@@ -77,15 +57,10 @@ class SampleFormat(NamedTuple):
         return np.require(words, requirements=["C", "A", "W"]).reshape(rows)
 
     def normalised(self, words: NDArray[Any]) -> tuple[NDArray[Any], int]:
-        """Return words scaled into the range of single precision, and the exponent n of the divisor 2^n.
+        """Return validated words in the range of single precision, and the exponent n of the divisor 2^n.
 
         Images are linear in the words, so that the caller multiplies the image by the same power of two. Only
         floating-point words are scaled, and only if their largest magnitude is far from 1.
-
-        Parameters
-        ----------
-        words : array
-            Words from `validated`.
         """
         if self.dtype.kind != "f" or not words.size:
             return words, 0
@@ -97,13 +72,7 @@ class SampleFormat(NamedTuple):
 
 
 def sample_format(settings: Settings) -> SampleFormat:
-    """Return the type and shape of measurements with these settings.
-
-    Raises
-    ------
-    ArgumentError
-        The layout is unknown or cannot be used.
-    """
+    """Return the type and shape of measurements; raise ArgumentError if the layout cannot be used."""
     layout, recording = microphones(settings.array), settings.recording
     if not recording.is_pdm:
         return SampleFormat(np.dtype(recording.encoding).newbyteorder("<"), (recording.n_samples, len(layout.enabled)))
