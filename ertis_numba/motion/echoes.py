@@ -36,37 +36,19 @@ _FOREIGN_LEVEL: Final = math.log(2.0)  # 6 dB
 
 
 class GroupEchoes(NamedTuple):
-    """Echoes of all sensors in one group of images, as arrays of equal length.
+    """Echoes of all sensors in one group of images; arrays are (echo,)."""
 
-    Attributes
-    ----------
-    sensor : (echo,) int64
-        Index of the sensor.
-    position_m : (echo, axis) float64
-        Position in the frame of the platform.
-    range_m, azimuth_rad : (echo,) float64
-        Distance and azimuth from the sensor, both along the axes of the platform.
-    range_sd_m, azimuth_sd_rad : (echo,) float64
-    level : (echo,) float64
-        Natural logarithm of the amplitude.
-    delay_s, arrival_s : (echo,) float64
-        Times after the start of the emission at which the platform was where the range and the azimuth apply.
-    sound_speed_m_s : (echo,) float64
-    may_be_behind : (echo,) bool
-        True if the reflector may be behind a flat array, which shows it ahead.
-    """
-
-    sensor: NDArray[np.int64]
-    position_m: Floats
-    range_m: Floats
-    azimuth_rad: Floats
+    sensor: NDArray[np.int64]  # index
+    position_m: Floats  # (echo, axis) in the frame of the platform
+    range_m: Floats  # from the sensor
+    azimuth_rad: Floats  # from the sensor, along the axes of the platform
     range_sd_m: Floats
     azimuth_sd_rad: Floats
-    level: Floats
-    delay_s: Floats
-    arrival_s: Floats
+    level: Floats  # natural logarithm of the amplitude
+    delay_s: Floats  # after the emission, when the platform was where the range applies
+    arrival_s: Floats  # after the emission, when the platform was where the azimuth applies
     sound_speed_m_s: Floats
-    may_be_behind: NDArray[np.bool_]
+    may_be_behind: NDArray[np.bool_]  # a flat array may show the reflector ahead
 
     def behind(self, sensors: tuple[MountedSensor, ...], chosen: NDArray[np.int64]) -> "GroupEchoes":
         """Return the echoes of which those of some sensors that may be behind their arrays are there."""
@@ -85,15 +67,8 @@ class EchoExtractor:
 
     Echoes of other sensors' calls are discarded if those sensors show the reflectors. Such echoes move differently from
     own echoes: their emitter is elsewhere, and a flat array shows reflectors behind it as if they were ahead. They may
-    be half of all echoes.
-
-    Parameters
-    ----------
-    sensors : tuple of MountedSensor
-        Sensors of the platform.
-    alone : bool, optional
-        True if no sensor emits except those of a group, and none radiates backwards to reflectors. By default, this is
-        assumed of a single piston that is the platform itself, with its origin and heading.
+    be half of all echoes. ``alone`` is True if no sensor emits except those of a group, and none radiates backwards to
+    reflectors; the default assumes this of a single piston with the origin and heading of the platform.
     """
 
     def __init__(self, sensors: tuple[MountedSensor, ...], *, alone: bool | None = None) -> None:
@@ -193,23 +168,12 @@ def _foreign(
     *,
     is_flat: bool,
 ) -> NDArray[np.bool_]:
-    """Return True for the echoes of a sensor that the calls of other sensors explain.
+    """Return True for echoes of sensor ``number`` that the calls of other sensors explain: (echo,).
 
     The other sensors show the reflectors closer to their own axes. At this sensor, the range of an echo of their calls
     is the mean of the distances of the reflector from both sensors. If their calls begin later, half of the way that
     sound travels meanwhile is added. Calls that differ do not count, since the matched filter suppresses them.
     Reflectors behind a flat array appear ahead of it.
-
-    Parameters
-    ----------
-    number : int
-        Index of the sensor.
-    calls : mapping of int to Call
-        Calls of the sensors with echoes.
-
-    Returns
-    -------
-    (echo,) bool
     """
     places_m = np.array([sensor.translation_m for sensor in sensors])[echoes.sensor]
     axes = np.array([sensor.rotation[:, 0] for sensor in sensors])[echoes.sensor]
@@ -242,7 +206,7 @@ def _deviations(cloud: PointCloud) -> Floats:
 
 
 def sweep_delay_s(call: Call) -> float:
-    """Return the Doppler coupling of a sweep: how long before the sound meets a reflector the measured range applies.
+    """Return the Doppler coupling of a sweep: how long before the reflection the measured range applies.
 
     It is ``D / (f_start / f_stop - 1)`` for the duration D. A hyperbolic sweep that motion stretches is the same sweep
     at another time. For a linear sweep, this holds in the mean over its frequencies. The coupling of own waveforms is

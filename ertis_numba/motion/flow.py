@@ -42,42 +42,18 @@ _INFLATION: Final = np.diag([1.25, 1.25, 1.6])
 
 
 class FlowFit(NamedTuple):
-    """Displacement of a platform between two groups of echoes.
+    """Displacement of a platform between two groups of echoes, with the echoes that it explains."""
 
-    Attributes
-    ----------
-    displacement : (3,) float64
-        x and y in metres and yaw in radians, in the frame of the platform at the first group.
-    covariance : (3, 3) float64
-    n_matches : int
-        Number of echoes that the displacement explains.
-    share : float
-        Share of echoes that the displacement explains.
-    score : float
-        Sum of the strengths of the strongest echoes of all places; the larger one of two fits to the same groups is
-        more likely.
-    ambiguity : float
-        Score of the strongest rival relative to this displacement.
-    other : (3,) float64
-        Displacement of this rival.
-    n_false_alarms : float
-        Expected number of displacements that explain as many echoes of unrelated groups, by accident.
-    n_places : int
-        Number of places, at least 0.7 m apart, of the echoes that the displacement explains.
-    has_places : bool
-        True if these places are more than those of one moving object.
-    """
-
-    displacement: Floats
-    covariance: Floats
-    n_matches: int
-    share: float
-    score: float
-    ambiguity: float
-    other: Floats
-    n_false_alarms: float
-    n_places: int
-    has_places: bool
+    displacement: Floats  # x, y in m and yaw in rad, in the platform's frame at the first group
+    covariance: Floats  # (3, 3)
+    n_matches: int  # explained echoes
+    share: float  # of echoes that are explained
+    score: float  # sum of the strengths of the strongest echoes of all places
+    ambiguity: float  # score of the strongest rival, relative to this
+    other: Floats  # displacement of this rival
+    n_false_alarms: float  # expected displacements that explain as many unrelated echoes
+    n_places: int  # of explained echoes, at least 0.7 m apart
+    has_places: bool  # more places than those of one moving object
 
     @property
     def is_significant(self) -> bool:
@@ -104,17 +80,9 @@ def fit_flow(
 ) -> FlowFit | None:
     """Return the displacement that explains most echoes, or None if there are too few.
 
-    Parameters
-    ----------
-    time_s : float
-        Time between both groups.
-    start, reach : (3,) float64, optional
-        Expected displacement, and the largest difference from it.
-    first_twist, second_twist : (3,) float64, optional
-        Velocities at both groups, x, y and yaw per second, each in the frame of the platform; by default, those of the
-        displacement.
-    suspects : sequence of (3,) float64
-        Other displacements that may be the right one, for example by the groups before.
+    All vectors are x, y in m and yaw in rad. ``reach`` is the largest difference from ``start``. Twists are velocities
+    at both groups in the frame of the platform, by default those of the displacement. ``suspects`` are other
+    displacements that may be right, for example by the groups before.
     """
     flow = EchoFlow(before, after, sensors, time_s, (first_twist, second_twist))
     centre = np.zeros(3) if start is None else start

@@ -27,25 +27,13 @@ _BESIDE_M: Final = 0.25
 
 
 class MotionHypothesis(NamedTuple):
-    """Displacement, and the echoes that it explains.
-
-    Attributes
-    ----------
-    displacement : (3,) float64
-    weight : (pair,) float64
-        Probability of each pair.
-    n_matches, n_places : int
-        Number of echoes, and of places at least 0.7 m apart, that the displacement explains. Places on one line
-        through the platform count as one.
-    support : float
-        Sum of the strengths of the strongest echoes of all places.
-    """
+    """Displacement, and the echoes that it explains."""
 
     displacement: Floats
-    weight: Floats
+    weight: Floats  # (pair,) probability of each pair
     n_matches: int
-    n_places: int
-    support: float
+    n_places: int  # at least 0.7 m apart; those on one line through the platform count as one
+    support: float  # sum of the strengths of the strongest echoes of all places
 
     def without(self, explained: NDArray[np.bool_], flow: EchoFlow, pairs: EchoPairs) -> "MotionHypothesis":
         """Return the hypothesis with its other pairs only."""

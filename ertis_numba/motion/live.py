@@ -15,15 +15,7 @@ _RESTART_S: Final = 1.0
 
 
 class LiveOdometry:
-    """Odometry that continues where recordings would be refused.
-
-    Parameters
-    ----------
-    on_note : callable
-        Called with a line for each group that cannot be used.
-    alone : bool, optional
-        True if no other sensor emits than those given, as for `Odometry`; False by default.
-    """
+    """Odometry that continues where recordings would be refused; on_note gets a line per unusable group."""
 
     def __init__(self, on_note: Callable[[str], None], *, alone: bool | None = None) -> None:
         self._note, self._alone = on_note, alone
@@ -38,17 +30,10 @@ class LiveOdometry:
         return self._odometry.trajectory if self._odometry is not None and self._odometry.poses else None
 
     def add(self, group: Mapping[str, Item], mountings: Mountings) -> tuple[PlanarPose, EgoVelocity | None] | None:
-        """Return the pose and velocity at a group, as `Odometry.add` does; None if it is not later than the last one.
+        """Return pose and velocity at a group as `Odometry.add` does; None if it is not later than the last one.
 
         An application that connects during a pulse misses images of it. If the second group has sensors that the first
         one lacks, the path therefore begins with the second.
-
-        Parameters
-        ----------
-        group : mapping of str to Energyscape or PointCloud
-            Images or point clouds of a SYNC pulse, by sensor.
-        mountings : mapping of str to (translation_m, rotation_xyzw)
-            Mountings of these and other sensors.
         """
         if self._has_restarted(group):
             self._odometry = None

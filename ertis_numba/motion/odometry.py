@@ -90,15 +90,12 @@ class PlanarPose(NamedTuple):
 
 
 class _View(NamedTuple):
-    """Echoes of a group, and the pose and twist of the platform; None if the twist is unknown.
-
-    ``change`` is the covariance of displacements from here, because the twist changed.
-    """
+    """Echoes of a group, and the pose and twist of the platform; None if the twist is unknown."""
 
     echoes: GroupEchoes
     pose: PlanarPose
     twist: Floats | None
-    change: Floats = np.zeros((3, 3))
+    change: Floats = np.zeros((3, 3))  # covariance of displacements from here, as the twist changed
 
 
 class Odometry:
@@ -372,7 +369,7 @@ def _significant(fit: FlowFit | None) -> FlowFit | None:
 
 
 def _of_change(before: Floats | None, after: Floats, echoes: GroupEchoes) -> Floats:
-    """Return the covariance of a displacement by a change of the velocity at an unknown instant: (3, 3) float64.
+    """Return the covariance (3, 3) of a displacement by a change of the velocity at an unknown instant.
 
     Echoes are compensated with the mean velocity before their group, not with the velocity at the group.
     """

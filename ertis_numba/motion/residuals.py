@@ -27,18 +27,7 @@ class EchoPairs(NamedTuple):
 
 
 def twist_of(displacement: Floats, time_s: float) -> Floats:
-    """Return the constant twists, forward, left and yaw per second, that produce displacements.
-
-    Parameters
-    ----------
-    displacement : (..., 3) float64
-        x, y and yaw.
-
-    Returns
-    -------
-    (..., 3) float64
-        x, y and yaw per second.
-    """
+    """Return the constant twists, forward, left and yaw per second, that produce displacements: (..., 3)."""
     x, y, yaw = np.moveaxis(displacement, -1, 0)
     half = yaw / 2
     # Inverse of the chord of an arc, turned back by half of the angle.
@@ -50,18 +39,10 @@ def twist_of(displacement: Floats, time_s: float) -> Floats:
 def _predicted(
     displacement: Floats, before: GroupEchoes, offset_m: Floats, first: Floats, second: Floats
 ) -> tuple[Floats, Floats]:
-    """Return range and azimuth of echoes after trial displacements: two (trial, echo) float64.
+    """Return range and azimuth of echoes after trial displacements (trial, 3): two (trial, echo).
 
     Echoes are placed where they were at the first emission, and then where they appear after the second one, as
-    `compensate_motion` describes.
-
-    Parameters
-    ----------
-    displacement : (trial, 3) float64
-    offset_m : (echo, axis) float64
-        Positions of the sensors on the platform.
-    first, second : (trial, 3) or (1, 3) float64
-        Twists at both groups.
+    `compensate_motion` describes. Twists at both groups are (trial, 3) or (1, 3).
     """
     from_sensor_m = before.position_m - offset_m
     x_m, y_m = _turned(from_sensor_m[:, 0], from_sensor_m[:, 1], first[:, 2:] * before.arrival_s)
@@ -123,14 +104,7 @@ class EchoFlow:
         return EchoPairs(*np.nonzero(near))
 
     def linear(self, displacement: Floats, pairs: EchoPairs) -> tuple[Floats, Floats]:
-        """Return residuals, and derivatives of the predictions.
-
-        Returns
-        -------
-        residual : (2, pair) float64
-            Observed minus predicted range and azimuth, in metres and radians.
-        slopes : (2, pair, 3) float64
-        """
+        """Return observed minus predicted ranges and azimuths (2, pair), and slopes of predictions (2, pair, 3)."""
         range_m, azimuth_rad = self._predicted(displacement + _TRIALS)
         residual = np.stack(
             [
@@ -147,7 +121,7 @@ class EchoFlow:
         return _predicted(displacement, self.before, self._offset_m, first, second)
 
     def strengths(self, pairs: EchoPairs) -> Floats:
-        """Return the weights of pairs in a comparison of displacements: (pair,) float64.
+        """Return the weights of pairs in a comparison of displacements: (pair,).
 
         Flat arrays hear the calls of neighbours from behind as if they came from ahead, and such echoes turn the other
         way. They are as many as others, but weaker, so strong echoes count more: the root of their amplitude.

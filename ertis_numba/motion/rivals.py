@@ -44,26 +44,12 @@ def worst_rival(
     by_accident: float,
     expected: tuple[Floats, Floats] | None,
 ) -> tuple[Floats, float]:
-    """Return the displacement that rivals the best one most, and its ambiguity.
+    """Return the displacement that rivals the best one most, and its score relative to the best one.
 
     A flat array shows echoes from behind ahead, mirrored at its plane. They move as if the platform moved backwards and
-    turned the other way. If all arrays face along one line, all such echoes agree, and nothing tells them from others,
-    so the mirrored motion is a rival as soon as it explains more echoes than by accident.
-
-    Parameters
-    ----------
-    found : sequence of MotionHypothesis
-        Other hypotheses.
-    by_accident : float
-        Expected number of matches of one displacement by accident.
-    expected : ((3,) float64, (3,) float64), optional
-        Displacement by the last motion, and the largest difference from it. Mirrored motions beyond it are no rivals.
-
-    Returns
-    -------
-    displacement : (3,) float64
-    ambiguity : float
-        Score relative to that of the best displacement; at least `MAX_AMBIGUITY` if the rival cannot be excluded.
+    turned the other way. If all arrays face along one line, all such echoes agree, and the mirrored motion, unless it
+    is far from the ``expected`` one, is a rival as soon as it explains more echoes than ``by_accident``. The ambiguity
+    is at least `MAX_AMBIGUITY` if the rival cannot be excluded.
     """
     mirrored = [_mirrored(best.displacement, sensor) for sensor in _facing(flow, pairs, sensors)]
     rivals = [*found, *(hypothesis(flow, pairs, each, NEAR_SCALES) for each in mirrored)]

@@ -152,15 +152,7 @@ def velocity_of(found: FlowFit, timestamp_ns: int, time_s: float) -> EgoVelocity
 
 
 def grouped(items: Iterable[Item], name: str) -> Mapping[str, Item]:
-    """Return the checked items of a SYNC pulse, by sensor.
-
-    Raises
-    ------
-    ArgumentError
-        There is no item, one of another type, or two of the same sensor.
-    DataError
-        The items are not of the same pulse.
-    """
+    """Return the items of a SYNC pulse, by sensor; raise ArgumentError or DataError if they do not form one."""
     if not isinstance(items, Iterable):
         raise ArgumentError(f"{name} is a {type(items).__name__}; pass a list of images or point clouds")
     group: dict[str, Item] = {}
@@ -199,15 +191,8 @@ def times_ns_of(group: Mapping[str, Item]) -> dict[str, int]:
 def time_after_ns(group: Mapping[str, Item], before: Mapping[str, int], before_ns: int) -> int:
     """Return the time of a group after another one, by the clocks of the sensors of both.
 
-    Clocks of sensors may differ by more than a period of SYNC, so the time between the groups is the median of those
-    by each clock.
-
-    Parameters
-    ----------
-    before : mapping of str to int
-        Times of the group before, by sensor.
-    before_ns : int
-        Time of that group.
+    Clocks of sensors may differ by more than a period of SYNC, so the time between the groups is the median of those by
+    each clock.
     """
     passed_ns = [time_ns - before[sensor] for sensor, time_ns in times_ns_of(group).items() if sensor in before]
     return before_ns + round(float(np.median(passed_ns))) if passed_ns else stamp_of(group).timestamp_ns
