@@ -22,14 +22,7 @@ class AttitudeCheck:
         self._watch = PoseWatch()
 
     def __call__(self, pose: Any, translation_m: NDArray[np.float64], rotation: NDArray[np.float64]) -> None:
-        """Issue a `PoseWarning` for doubtful poses, once for each trajectory.
-
-        Parameters
-        ----------
-        translation_m : (3,) float64
-        rotation : (3, 3) float64
-            Both are the pose of the pulse.
-        """
+        """Issue a `PoseWarning` for a doubtful pose of a pulse, once for each trajectory."""
         if not isinstance(pose, Trajectory):
             self._watch(translation_m, Rotation.from_matrix(rotation).as_quat(), stacklevel=_CALLER)
         elif pose is not self._trajectory:

@@ -21,30 +21,14 @@ _MOVED_M: Final = 0.1  # Motion of a sensor after which it sees from a new viewp
 
 
 class Window(NamedTuple):
-    """Part of a grid as a view.
+    """Part of a grid as a view; arrays are (layer, row, column)."""
 
-    Attributes
-    ----------
-    log_odds : (layer, row, column) float32
-        View of the grid.
-    first : (axis,) int64
-        Column, row and layer of the first cell, counted from the world's origin.
-    cell_m : float
-        Side of the cells.
-    is_planar : bool
-        True for a plane, which has one layer. All places are in its middle.
-    before : (layer, row, column) float32
-        View of the log-odds before the pulses from the present viewpoint.
-    shown : (layer, row, column) float32
-        View of the largest evidence of one of these pulses for an occupied cell.
-    """
-
-    log_odds: Singles
-    first: Counts
-    cell_m: float
-    is_planar: bool
-    before: Singles
-    shown: Singles
+    log_odds: Singles  # view of the grid
+    first: Counts  # column, row and layer of the first cell, from the world's origin
+    cell_m: float  # side of the cells
+    is_planar: bool  # one layer, all places in its middle
+    before: Singles  # log-odds before the pulses from the present viewpoint
+    shown: Singles  # largest evidence of one of these pulses for an occupied cell
 
     def cells_of(self, place_m: Floats) -> Floats:
         """Return places in cells from the centre of the first cell: (..., axis) float64."""
@@ -57,14 +41,7 @@ class Window(NamedTuple):
 class CellGrid:
     """Log-odds of square or cubic cells, whose corners are multiples of their side from the world's origin.
 
-    Parameters
-    ----------
-    cell_m : float
-        Side of the cells.
-    n_dimensions : int
-        2 for a plane, which has one layer; 3 for a space.
-    height_m : (float, float)
-        Lowest and highest height of cells in space.
+    A grid of two dimensions has one layer; in three, ``height_m`` limits the height of cells.
     """
 
     def __init__(self, cell_m: float, n_dimensions: int = 2, height_m: tuple[float, float] = (-np.inf, np.inf)) -> None:
@@ -84,18 +61,9 @@ class CellGrid:
         self._cells *= np.float32(factor)
 
     def view_from(self, place_m: Floats, rotation: Floats, radius_m: float) -> None:
-        """Begin a new viewpoint if sensors have moved away from the present one.
+        """Begin a new viewpoint if sensors, within radius_m of the platform, have moved away from the present.
 
         Ghosts repeat at the same places until the sensors move, so pulses from one viewpoint are one observation.
-
-        Parameters
-        ----------
-        place_m : (3,) float64
-            Position of the platform.
-        rotation : (3, 3) float64
-            Rotation from its frame to the world.
-        radius_m : float
-            Largest distance of a sensor from this position.
         """
         if self._viewpoint is not None:
             turned = math.sqrt(max(0.0, 3.0 - float(np.sum(rotation * self._viewpoint[1]))))  # Chord of the turn.
@@ -105,17 +73,7 @@ class CellGrid:
         self._cells[1], self._cells[2] = self._cells[0], 0.0
 
     def window(self, centre_m: Floats, radius_m: float) -> Window:
-        """Return the square or cube around a place, for which the grid grows if necessary.
-
-        Parameters
-        ----------
-        centre_m : (3,) float64
-
-        Raises
-        ------
-        ArgumentError
-            The grid would have too many cells.
-        """
+        """Return the square or cube around a place; the grid grows, up to an ArgumentError for too many cells."""
         low_m, high_m = centre_m - radius_m, centre_m + radius_m
         low_m[2], high_m[2] = np.clip([low_m[2], high_m[2]], *self._height_m)
         low, high = np.floor(low_m / self._cell_m).astype(np.int64), np.ceil(high_m / self._cell_m).astype(np.int64)
@@ -151,13 +109,7 @@ class CellGrid:
         self._first, self._cells = first, grown
 
     def used(self) -> tuple[Singles, tuple[float, ...]]:
-        """Return a copy of the smallest part with all known cells, and its outer corner.
-
-        Returns
-        -------
-        log_odds : (row, column) or (layer, row, column) float32
-        origin_m : (x, y) or (x, y, z)
-        """
+        """Return a copy of the smallest part with all known cells, and its outer corner (x, y) or (x, y, z)."""
         known = [np.flatnonzero(self.log_odds.any(axis=axes)) for axes in ((1, 2), (0, 2), (0, 1))]
         if not len(known[0]):
             known = [np.zeros(1, np.int64)] * 3

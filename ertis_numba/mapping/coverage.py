@@ -30,16 +30,9 @@ def directions_around(n_dimensions: int, reach_m: float, step_m: float) -> Polar
 
 
 def heard_m(emitters: Emitters, clear: float, floor: float, last_m: float) -> float:
-    """Return the distance from a sensor up to which a clear echo ahead exceeds the noise, at most that of its image.
+    """Return the distance to which a clear echo ahead, of amplitude ``clear`` at 1 m, exceeds the noise.
 
-    Parameters
-    ----------
-    clear : float
-        Amplitude of a clear echo at 1 m.
-    floor : float
-        Detection threshold: noise exceeds it anywhere in an image with a probability of 10⁻⁵.
-    last_m : float
-        Last range of the image.
+    ``floor``, the detection threshold, is exceeded by noise anywhere in an image with a probability of 10⁻⁵.
     """
     distance_m = np.asarray(last_m * _HEARD_STEP ** np.arange(_HEARD_STEPS), np.float64)
     is_heard = clear**2 * emitters.spreading(distance_m, distance_m) > floor**2
@@ -47,21 +40,11 @@ def heard_m(emitters: Emitters, clear: float, floor: float, last_m: float) -> fl
 
 
 class Coverage(NamedTuple):
-    """Part of the surroundings in which a clear echo would be heard.
-
-    Attributes
-    ----------
-    grid : PolarGrid
-        Directions and ranges.
-    weight : (direction, range) float64
-        0 where no sensor emits or listens, up to 1 ahead of a sensor.
-    silence : (direction, range) float64
-        The same where a clear echo would exceed the noise, and 0 elsewhere: silence shows nothing there.
-    """
+    """Part of the surroundings in which a clear echo would be heard; arrays are (direction, range)."""
 
     grid: PolarGrid
-    weight: Floats
-    silence: Floats
+    weight: Floats  # 0 where no sensor emits or listens, to 1 ahead of one
+    silence: Floats  # the same, but 0 where a clear echo is within noise: silence shows nothing
 
     @property
     def reach_m(self) -> float:
@@ -85,21 +68,9 @@ class Coverage(NamedTuple):
         heard_m: Sequence[float],
         height_m: float | None = None,
     ) -> Self:
-        """Return the coverage of sensors that emit.
+        """Return the coverage of sensors that emit, up to the distances ``heard_m``.
 
-        Parameters
-        ----------
-        limits_m : sequence of (first, last)
-            Ranges of their images.
-        settings : Settings
-            Settings with the call and the air.
-        diameters_m : sequence of float
-            Diameter of each sensor's emitter.
-        heard_m : sequence of float
-            Distance from each sensor up to which a clear echo exceeds the noise of its image.
-        height_m : float, optional
-            Height on the platform of the centre of the directions in space; by default, directions are those of a plane
-            through each sensor.
+        Directions in space are counted from ``height_m`` on the platform; without it, from each sensor in a plane.
         """
         emitters = Emitters(settings, diameters_m)
         reach_m = max(

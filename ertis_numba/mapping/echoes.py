@@ -27,16 +27,10 @@ _NEAREST_M: Final = 0.01  # Range below which directions have no meaning.
 
 
 def displaced_covariance(covariance: Floats, offset_m: Floats) -> Floats:
-    """Return the covariance of the pose of places that move with a platform: (place, 6, 6) float64.
+    """Return the covariance of the pose of places that move with a platform: (place, 6, 6).
 
-    A rotation by the small vector δ moves a place by δ × r, where r is its offset from the origin of the platform.
-
-    Parameters
-    ----------
-    covariance : (6, 6) float64
-        Covariance of x, y, z of the origin, and of the rotation about the world's x, y, z.
-    offset_m : (place, axis) float64
-        Offsets from the origin, in the world.
+    A rotation by the small vector δ moves a place by δ × r, where r is its offset from the origin of the platform, in
+    the world. Covariances are those of x, y, z, and of the rotation about the world's x, y, z.
     """
     x, y, z = offset_m.T
     slopes = np.zeros((len(offset_m), 6, 6))
@@ -48,30 +42,14 @@ def displaced_covariance(covariance: Floats, offset_m: Floats) -> Floats:
 
 
 class View(NamedTuple):
-    """Place from which a platform sees its surroundings.
+    """Place from which a platform sees its surroundings."""
 
-    Attributes
-    ----------
-    place_m : (axis,) float64
-        Position in the world of the point from which directions are counted.
-    rotation : (axis, axis) float64
-        Rotation from the frame of the directions to the world. In a plane, it is the heading.
-    covariance : (6, 6) float64
-        Covariance of x, y, z of this position, and of the rotation about the world's x, y, z.
-    """
-
-    place_m: Floats
-    rotation: Floats
-    covariance: Floats
+    place_m: Floats  # origin of the directions, in the world
+    rotation: Floats  # from the frame of directions to the world; in a plane, the heading
+    covariance: Floats  # (6, 6) of x, y, z, and of the rotation about the world's x, y, z
 
     def covariance_at_m2(self, offset_m: Floats) -> Floats:
-        """Return the covariance of places, which errors of the pose cause: (point, axis, axis) float64.
-
-        Parameters
-        ----------
-        offset_m : (point, axis) float64
-            Places relative to that of the view, in the world.
-        """
+        """Return the covariance of places (point, axis, axis) by errors of the pose; offsets in the world."""
         return displaced_covariance(self.covariance, offset_m)[:, :3, :3]
 
     @property
@@ -82,24 +60,12 @@ class View(NamedTuple):
 
 
 class LocatedEchoes(NamedTuple):
-    """Points of one pulse around the platform.
+    """Points of one pulse around the platform."""
 
-    Attributes
-    ----------
-    offset_m : (point, axis) float64
-        Positions in the frame of a `View`. In a plane, z is 0.
-    sd_m : (point, 2) float64
-        Standard deviations along and across the direction, without those of the pose.
-    strength : (point,) float64
-        Weight, at most 1: probability that the point is a reflector.
-    is_confirmed : (point,) bool
-        False for points that too few pairs of emitter and receiver confirm.
-    """
-
-    offset_m: Floats
-    sd_m: Floats
-    strength: Floats
-    is_confirmed: Flags
+    offset_m: Floats  # (point, axis) in the frame of a `View`; z is 0 in a plane
+    sd_m: Floats  # (point, 2) along and across the direction, without the pose
+    strength: Floats  # (point,) probability that the point is a reflector
+    is_confirmed: Flags  # (point,) False if too few pairs of emitter and receiver confirm it
 
     @property
     def range_m(self) -> Floats:
@@ -126,10 +92,7 @@ class UsualAmplitude:
         return 0.0 if self._usual is None else _CLEAR_AMPLITUDE * self._usual
 
     def strength(self, amplitude: Singles) -> Floats:
-        """Return the probability that the points of a pulse are reflectors: (point,) float64.
-
-        It is a² / (a² + g²) for the amplitude a, where g is that of ghosts.
-        """
+        """Return the probability a² / (a² + g²) of reflectors of amplitude a; g: ghosts: (point,)."""
         if not len(amplitude):
             return np.zeros(0)
         now = float(np.percentile(amplitude, _USUAL))
@@ -145,20 +108,7 @@ def echoes_of(
     n_dimensions: int = 2,
     is_confirmed: Flags | None = None,
 ) -> LocatedEchoes:
-    """Return points as echoes, whose uncertainties include errors that noise does not explain.
-
-    Parameters
-    ----------
-    offset_m : (point, axis) float64
-        Positions in the frame of a `View`.
-    uncertainty_m : (point, 2) float64
-        Standard deviations along and across the direction.
-    strength : (point,) float64
-    n_dimensions : int
-        Number of dimensions of the map.
-    is_confirmed : (point,) bool, optional
-        True for points that the fusion confirms; all by default.
-    """
+    """Return points as echoes, whose uncertainties (point, 2) include errors that noise does not explain."""
     range_m = np.linalg.norm(offset_m, axis=1)
     added_m = np.stack([np.full(len(range_m), _RANGE_SD_M), _ANGLE_SD_RAD[n_dimensions] * range_m], axis=1)
     sd_m = np.hypot(uncertainty_m, added_m)

@@ -41,42 +41,21 @@ _TOUCHED: Final = 0.1  # Evidence of an echo above which a cell does not become 
 
 
 class Trust(NamedTuple):
-    """Trust in echoes.
+    """Trust in echoes, in log-odds.
 
-    Log-odds of echoes come from a logistic regression of simulated reflectors and ghosts. ``cell`` and ``missed`` in
-    the plane were chosen to fit maps of simulated places.
-
-    Attributes
-    ----------
-    clear : float
-        Log-odds of an unobstructed echo ahead of a sensor, in addition to those of its amplitude.
-    strength : float
-        Factor of the log-odds of the amplitude.
-    hidden : float
-        Reduction of the log-odds, multiplied by the hidden share of an echo.
-    beside : float
-        Reduction of the log-odds for each unit of coverage below 0.4.
-    cell : float
-        Log-odds of a cell relative to those of the echo in it. Reflectors often repeat, and ghosts seldom do.
-    total : float
-        Log-odds of a certain echo, shared among the cells that may contain it.
-    unconfirmed : float
-        Reduction of the log-odds of points that the fusion does not confirm.
-    repeats : float
-        Evidence of all pulses from one viewpoint, relative to that of one.
-    missed : float
-        Log-odds that an occupied cell ahead of a sensor loses in a pulse without an echo there.
+    They come from a logistic regression of simulated reflectors and ghosts. ``cell`` and ``missed`` in the plane were
+    chosen to fit maps of simulated places.
     """
 
-    clear: float
-    strength: float
-    hidden: float
-    beside: float
-    cell: float
-    total: float
-    unconfirmed: float
-    repeats: float
-    missed: float
+    clear: float  # of an unobstructed echo ahead of a sensor, besides its amplitude
+    strength: float  # factor of the log-odds of the amplitude
+    hidden: float  # reduction, multiplied by the hidden share of an echo
+    beside: float  # reduction for each unit of coverage below 0.4
+    cell: float  # of a cell relative to the echo in it: reflectors repeat, ghosts seldom do
+    total: float  # of a certain echo, shared among the cells that may contain it
+    unconfirmed: float  # reduction for points that the fusion does not confirm
+    repeats: float  # evidence of all pulses from one viewpoint, relative to one
+    missed: float  # loss of an occupied cell ahead of a sensor in a pulse without an echo there
 
     @property
     def most(self) -> float:
@@ -112,15 +91,7 @@ _AHEAD: Final = 0.4  # Coverage above which echoes are equally reliable.
 
 
 def add_evidence(window: Window, view: View, echoes: LocatedEchoes, coverage: Coverage, *, near_m: float) -> None:
-    """Add the evidence of one pulse to a map.
-
-    Parameters
-    ----------
-    window : Window
-        Part of the map around the platform, which changes.
-    near_m : float
-        Radius of the platform, whose own place is free.
-    """
+    """Add the evidence of one pulse to a map; within near_m, the platform's own place is free."""
     grid, kernel = coverage.grid, kernels.load_mapping()
     ahead = np.asarray(grid.directions @ view.rotation.T)
     # Cosines between the direction of each echo and all directions.
@@ -176,7 +147,7 @@ def _first_clear_m(echoes: LocatedEchoes, cosine: Floats) -> Floats:
 def _end_m(
     echoes: LocatedEchoes, cosine: Floats, first_m: Floats, position_sd_m: float, rotation_sd_rad: float
 ) -> Floats:
-    """Return the end of free space in each direction: (direction,) float64.
+    """Return the end of free space in each direction: (direction,).
 
     An error of the pose moves an echo along its direction and across it.
     """
@@ -193,22 +164,11 @@ def _end_m(
 
 
 def _visible(echoes: LocatedEchoes, cosine: Floats, weight: Floats, hiding_m: Floats, wall_m: Floats) -> Floats:
-    """Return the share of the amplitude that passes the obstacles in front of echoes: (point,) float64.
+    """Return the share of the amplitude that passes the obstacles in front of echoes: (point,).
 
     The share of directions that are open passes on the way to the reflector, and again on the way back. Around an echo,
-    obstacles within the beam count: a wall fills it, and a post does not. In the direction of the echo, a wall of the
-    map hides everything behind it.
-
-    Parameters
-    ----------
-    cosine : (point, direction) float64
-        Cosines between echoes and directions.
-    weight : (direction,) float64
-        Solid angle of each direction.
-    hiding_m : (direction,) float64
-        Ranges of the first obstacles.
-    wall_m : (direction,) float64
-        Ranges of the first walls of the map.
+    obstacles within the beam, from ``hiding_m``, count: a wall fills it, and a post does not. In the direction of the
+    echo, a wall of the map, at ``wall_m``, hides everything behind it. ``weight`` is the solid angle of directions.
     """
     passed = []
     for first_m, angle_rad, behind_m in ((hiding_m, _HALF_BEAM_RAD, _BEHIND_M), (wall_m, _HALF_RAY_RAD, _DEPTH_M)):
@@ -242,7 +202,7 @@ def _log_odds(window: Window, view: View, offset_m: Floats) -> Singles:
 
 
 def _occupied(window: Window, view: View, echoes: LocatedEchoes, log_odds: Floats, trust: Trust) -> Singles:
-    """Return the evidence for occupied cells: (layer, row, column) float32.
+    """Return the evidence for occupied cells: (layer, row, column).
 
     Each echo is normally distributed, and the evidence of a cell is proportional to the density at its middle. An
     uncertain pose spreads the evidence of an echo: the sum over all cells remains, and the highest value falls.
