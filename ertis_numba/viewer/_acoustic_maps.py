@@ -134,10 +134,7 @@ def _chosen(bands: list[Edges], band_hz: float | None) -> Edges | None:
 
 
 def _power(found: AcousticMap, band: Edges | None, unit: Unit) -> NDArray[np.float64] | None:
-    """Return the power in a band, or in all, relative to the reference of a unit: (direction,) float64.
-
-    None if the map has no such band.
-    """
+    """Return the power (direction,) in a band, or in all, relative to a unit's reference; None without the band."""
     offset_db = level_offset_db(found.settings, found.centre_hz, "dBFS" if unit == "dB" else unit)
     assert offset_db is not None  # noqa: S101  _unit chooses a unit that all maps have
     gain = 10 ** (offset_db / 10)

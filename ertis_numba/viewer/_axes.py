@@ -34,17 +34,13 @@ _MIN_RATIO, _MAX_RATIO = 0.25, 1.0  # Height of the sector relative to its width
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Position of the sector in the picture.
+    """Position of the sector in the picture."""
 
-    ``sensor_px`` (x, y): position of the sensor from the upper left corner of the picture; it may lie outside.
-    ``box_px`` (left, top, right, bottom): bounds of the sector.
-    """
-
-    sensor_px: tuple[float, float]
+    sensor_px: tuple[float, float]  # (x, y) from the upper left corner; may lie outside
     scale_px_m: float
     width_px: int
     height_px: int
-    box_px: tuple[int, int, int, int]
+    box_px: tuple[int, int, int, int]  # (left, top, right, bottom) of the sector
 
     @classmethod
     def of(cls, fan: Fan, width_px: int) -> "Place":
@@ -100,16 +96,11 @@ class Place:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ink:
-    """Overlay of a picture.
+    """Overlay of a picture."""
 
-    - ``places`` (drawn,) intp: pixels of the flat picture.
-    - ``colours`` (drawn, 3) float32
-    - ``cover`` (drawn, 1) float32: opacity of each pixel, 0 to 1.
-    """
-
-    places: NDArray[np.intp]
-    colours: NDArray[np.float32]
-    cover: NDArray[np.float32]
+    places: NDArray[np.intp]  # (drawn,) pixels of the flat picture
+    colours: NDArray[np.float32]  # (drawn, 3)
+    cover: NDArray[np.float32]  # (drawn, 1) opacity, 0 to 1
 
     def onto(self, flat: NDArray[np.uint8]) -> None:
         """Draw over a flat picture: (pixel, 3) uint8."""

@@ -18,10 +18,7 @@ _BAR_PX: Final = 70
 
 
 class LevelControls:
-    """Controls of acoustic maps on the page.
-
-    ``choose``: called with the name and the value of a choice.
-    """
+    """Controls of acoustic maps on the page; choose gets the name and the value of a choice."""
 
     def __init__(self, gui: viser.GuiApi, choices: Choices, choose: Callable[[str, Any], None]) -> None:
         self._gui, self._choose = gui, choose

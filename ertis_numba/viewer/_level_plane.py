@@ -31,12 +31,11 @@ _GRID: Final[dict[str, Any]] = {
 
 
 class LevelPlane:
-    """Renderer of the levels of the same directions.
+    """Renderer of the levels of the same directions (direction,), in pictures of a width in pixels.
 
     Directions at several elevations have a plane of azimuth (positive to the left) and elevation, in which each point
     has the colour of the nearest direction. Directions in a horizontal plane have a polar plot, whose radius and colour
-    are the level. ``azimuth_rad``, ``elevation_rad`` (direction,). ``width_px``: width of the pictures; the height
-    follows from it.
+    are the level.
     """
 
     def __init__(
@@ -93,9 +92,9 @@ class LevelPlane:
         return x + float(right) * scale, y - float(ahead) * scale
 
     def picture(self, shades: NDArray[np.uint8], table: NDArray[np.uint8], scale: LevelScale) -> NDArray[np.uint8]:
-        """Return the picture with its axes, and a ring around the loudest direction: (row, column, 3) uint8.
+        """Return the picture with axes and a ring around the loudest direction: (row, column, 3).
 
-        ``shades`` (direction,) uint8: result of `LevelScale.shade`. ``table`` (256, 3) uint8: colours of levels.
+        ``shades`` (direction,) come from `LevelScale.shade`, and ``table`` (256, 3) has the colours of levels.
         """
         made = self._page.copy()
         flat = made.reshape(-1, 3)

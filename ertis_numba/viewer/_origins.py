@@ -34,7 +34,6 @@ def own_pages(host: str, token: str | None = None) -> Iterator[None]:
     """Make a server created in this block refuse pages of other sites, which a browser lets connect to any host.
 
     With a token, it also refuses browsers that have never opened an address with ``?token=``. A cookie keeps the token.
-
     A browser sends the site of a page (Origin, RFC 6454) and the server that it connects to (Host). For a page from
     here, both are the same. On loopback, the host must also be a loopback name, because another site may resolve its
     own name to this machine. viser accepts all of them, and has no option.

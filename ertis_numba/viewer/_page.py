@@ -46,15 +46,7 @@ Orders: TypeAlias = "SimpleQueue[ControlRequest | None]"
 
 
 class ViewerPage:
-    """Server of the page; choices made there go into a queue.
-
-    - ``port``: 0 selects a free one.
-    - ``n_time_steps``: length of the time line; there is none by default.
-    - ``shows_maps``: controls of acoustic maps instead of those of images.
-    - ``is_seen``: True once a browser has connected.
-
-    Raise NetworkError if the address cannot be used.
-    """
+    """Server of the page; choices made there go into a queue; raises NetworkError for an unusable address."""
 
     def __init__(
         self,

@@ -16,8 +16,7 @@ _TOGETHER: Final = 0.5  # Share of the shortest interval: images within it belon
 class Pause:
     """Latest image of each sensor during a pause, so that a step shows all sensors at once.
 
-    ``since_s``: start of the pause, by the clock of the source; None while it is not paused. ``n_held``: number of
-    images that arrived meanwhile and were not shown.
+    ``since_s`` is by the clock of the source; None while not paused. ``n_held`` images arrived and were not shown.
     """
 
     def __init__(self) -> None:

@@ -40,17 +40,12 @@ def cropped(image: Energyscape, range_m: tuple[float, float] | None) -> Energysc
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolarSampling:
-    """Interpolation of levels at points of a plane; call it to get the levels.
+    """Interpolation of levels at points of a plane, between two levels of `Polar.levels`; arrays are (shown,)."""
 
-    - ``places`` (shown,) intp: points within the image.
-    - ``first``, ``second`` (shown,) intp: flat indices into the levels of `Polar.levels`, on either side of the point.
-    - ``share`` (shown,) uint16: weight of the second, of 256.
-    """
-
-    places: NDArray[np.intp]
-    first: NDArray[np.intp]
-    second: NDArray[np.intp]
-    share: NDArray[np.uint16]
+    places: NDArray[np.intp]  # points within the image
+    first: NDArray[np.intp]  # flat index
+    second: NDArray[np.intp]  # flat index
+    share: NDArray[np.uint16]  # weight of the second, of 256
 
     def __call__(self, levels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the level of each point within the image: (shown,) uint8."""

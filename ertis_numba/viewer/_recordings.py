@@ -32,11 +32,7 @@ class RecordingReceiver(Protocol):
 
 
 class ToFile:
-    """File for a recording.
-
-    ``sources``: files on display, which are never overwritten. ``n_frames``: number of frames in the file; None until
-    it is written. Raise ArgumentError if the file cannot be written there.
-    """
+    """File for a recording; never overwrites the displayed sources; n_frames is None until it is written."""
 
     def __init__(
         self, path: Path, *, overwrite: bool, on_note: Callable[[str], None], sources: tuple[Path, ...] = ()
@@ -124,9 +120,7 @@ class _PageRecording:
 
 
 class Recordings:
-    """Recordings in progress, each from its beginning to its end.
-
-    All times are from one clock. Time starts when the first frame is drawn.
+    """Recordings in progress, by one clock; time starts when the first frame is drawn.
 
     A separate thread builds and delivers a page, because this takes seconds for a long recording and would stop a live
     view. ``serializer`` returns what viser keeps from now on, and ``finished`` the function that completes a page.

@@ -40,10 +40,7 @@ class ResultNotes:
                 yield f"sensor {sensor}: {text}"
 
     def of(self, item: Energyscape | AcousticMap, band_note: str | None = None) -> Iterator[str]:
-        """Yield the new notes on an image or a map.
-
-        ``band_note`` is on sound outside of the bands of the map.
-        """
+        """Yield the new notes on an image or a map; band_note is on sound outside of the bands of the map."""
         sensor = item.stamp.sensor
         if band_note and sensor not in self._with_band_note:
             self._with_band_note.add(sensor)

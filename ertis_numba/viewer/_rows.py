@@ -21,10 +21,7 @@ _NONE: Final = "–"
 
 
 class FrameCounts:
-    """Counts of frames.
-
-    ``latency_s`` is from the emission to the display; ``shown`` counts frames with a new image.
-    """
+    """Counts of frames, ``shown`` with a new image; ``latency_s`` is from the emission to the display."""
 
     def __init__(self) -> None:
         self.shown = 0

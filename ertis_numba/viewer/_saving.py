@@ -52,10 +52,7 @@ def picture_png(frame: DrawnFrame) -> bytes:
 
 
 def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> bytes:
-    """Return the points of images on the platform as PLY, from tuples as `ViewedScene.latest` returns them.
-
-    Points of a sensor with unknown mounting are in its own frame. With several sensors, all mountings must be known.
-    """
+    """Return points of `ViewedScene.latest` as PLY: of several mounted sensors, or of one, possibly unmounted."""
     mountings = validated(
         {image.stamp.sensor: (pose.translation_m, pose.rotation_xyzw) for image, _, pose in points if pose}
     )
@@ -70,11 +67,7 @@ def points_ply(points: list[tuple[Energyscape, PointCloud, Pose | None]]) -> byt
 
 
 def with_legend(page: str, title: str, frame: DrawnFrame | None) -> str:
-    """Return a saved page with a legend in its upper right corner.
-
-    ``page`` is HTML with a head and a body. Of ``frame``, the pictures of the first four sensors are shown; they have
-    colour bars.
-    """
+    """Return an HTML page with a legend in its upper right corner: pictures of the frame's first four sensors."""
     unit = "" if frame is None else frame.unit
     sensors = [] if frame is None else [*frame.sensors.items()][:_MAX_PICTURES]
     pictures = "".join(

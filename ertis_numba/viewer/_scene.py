@@ -171,7 +171,7 @@ class ViewedScene:
         )
 
     def _with_fused_points(self, joined: dict[str, Drawn], choices: Choices, now_s: float) -> dict[str, Drawn]:
-        """Return the drawn objects of fused sensors with the points of the fusion, all at the first sensor.
+        """Return objects of fused sensors with the points of the fusion, all at the first sensor.
 
         The points of a single sensor contain foreign echoes, where there is no reflector.
         """

@@ -20,26 +20,19 @@ _TOGETHER_NS: Final = 10_000_000  # measurements of several sensors that are sho
 
 @dataclass(frozen=True, slots=True)
 class TimeStep:
-    """Measurements shown together: at most one per sensor.
+    """Measurements shown together, as (sensor, number): at most one per sensor."""
 
-    ``time_s`` counts from the first time step; ``measurements`` are (sensor, number).
-    """
-
-    time_s: float
+    time_s: float  # from the first time step
     measurements: tuple[tuple[str, int], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class SensorTimeline:
-    """Measurements of a sensor along the time steps.
+    """Measurements of a sensor along the time steps."""
 
-    ``places``, ``numbers``: rising indices of the time steps, and indices of the measurements in the file.
-    ``interval_s``: typical interval between measurements; None for a single one.
-    """
-
-    places: tuple[int, ...]
-    numbers: tuple[int, ...]
-    interval_s: float | None
+    places: tuple[int, ...]  # rising indices of the time steps
+    numbers: tuple[int, ...]  # indices of the measurements in the file
+    interval_s: float | None  # typical; None for a single measurement
 
     @classmethod
     def of(cls, sensor: str, time_steps: tuple[TimeStep, ...]) -> Self:
