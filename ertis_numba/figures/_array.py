@@ -97,7 +97,7 @@ def pattern_db(
     azimuth_deg: float,
     elevation_deg: float,
 ) -> NDArray[np.float64]:
-    """Return the level of plane waves from each direction in the beam to one, 0 dB there: (direction,) float64.
+    """Return the level of plane waves from each direction in the beam to one, 0 dB there: (direction,).
 
     ``mean over f of |Σ_m w_m exp(jk p_m·(u − u₀)) / M|²``, the beam pattern of delay-and-sum with array weights w.
     """

@@ -63,10 +63,7 @@ class Canvas:
         axes.grid(color=self.style.faint, alpha=0.3, linewidth=0.6 * self.style.line_pt)
 
     def mark_peaks(self, axes: Axes, place: Callable[[Peak], tuple[float, float] | None]) -> None:
-        """Mark and number the reflectors at the positions from ``place``, the strongest on top.
-
-        Position and limits of the axes must be final.
-        """
+        """Mark and number reflectors at place, the strongest on top, once position and limits of axes are final."""
         style = self.style
         frame, stroke = axes.bbox.padded(1.0), [withStroke(linewidth=2.0 * style.line_pt, foreground=style.page)]
         places = [(number, at) for number, peak in enumerate(self.peaks, 1) if (at := place(peak)) is not None]

@@ -29,11 +29,7 @@ def name_points(
     colour: str,
     bold: bool = False,
 ) -> None:
-    """Write labels beside points, the first ones nearest; omit those without room.
-
-    The limits of the axes must be final. Existing texts are not covered. ``points`` sequence of (x, y): positions in
-    the coordinates of the axes. ``ring_pt``: radius around each point that names avoid.
-    """
+    """Write labels beside points, ring_pt away; omit those without room; the limits of axes must be final."""
     px_per_pt, size_pt, page = axes.figure.dpi / 72, style.tick_pt, axes.figure.bbox
     taken = [text.get_window_extent() for text in axes.texts if text.get_text()]
     places = [axes.transData.transform(point) for point in points]

@@ -22,16 +22,11 @@ _MAX_SAMPLES = 2**19  # of the record, 0.1 s of an eRTIS: what a picture can sho
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MicrophoneTraces:
-    """Values of each microphone over time or range.
+    """Values of each microphone over time or range."""
 
-    - ``values`` (mic, place) float32: full scale 1.
-    - ``axis`` (place,): seconds from the start of the emission, or metres.
-    - ``channels`` (mic,) int64: channel of each microphone.
-    """
-
-    values: NDArray[np.float32]
-    axis: NDArray[np.float64]
-    channels: NDArray[np.int64]
+    values: NDArray[np.float32]  # (mic, place), full scale 1
+    axis: NDArray[np.float64]  # (place,) seconds from the start of the emission, or metres
+    channels: NDArray[np.int64]  # (mic,) channel of each microphone
 
 
 def signals(measurement: Measurement) -> MicrophoneTraces:
@@ -42,9 +37,9 @@ def signals(measurement: Measurement) -> MicrophoneTraces:
 
 
 def echoes(measurement: Measurement) -> MicrophoneTraces:
-    """Return the envelope of each microphone's echoes at all samples of the range window.
+    """Return envelopes of echoes at all samples of the range window, without calibrated gains and delays.
 
-    An echo of the whole call at full scale is 1. Calibrated gains and delays are removed.
+    An echo of the whole call at full scale is 1.
     """
     given = measurement.settings
     step = given.decimation

@@ -29,16 +29,11 @@ _SHARE_ALONE = 0.8  # of its box that a colour bar takes which no list is under
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Picture that is drawn in two steps, because labels find their places only after the axes have theirs.
+    """Picture that is drawn in two steps, because labels find their places only after the axes have theirs."""
 
-    - ``paint``: draws into axes and returns the raster that the colour bar explains, or None.
-    - ``height``: returns the height of the axes from their width, both in points.
-    - ``finish``: draws what depends on the final position of the axes.
-    """
-
-    paint: Callable[[Axes], AxesImage | None]
-    height: Callable[[float], float]
-    finish: Callable[[Axes], None] = lambda _: None
+    paint: Callable[[Axes], AxesImage | None]  # draws, and returns the raster of the colour bar
+    height: Callable[[float], float]  # of the axes from their width, in points
+    finish: Callable[[Axes], None] = lambda _: None  # draws by the final position
     title: str = ""
     title_ems: float = 0.7
     box_aspect: float | None = None
@@ -56,9 +51,8 @@ def compose(
 ) -> Figure:
     """Return a page; Matplotlib's constrained layout places the pictures.
 
-    On a wide page, the pictures are beside each other, with colour bar and list on their right. On a narrow one, all
-    parts are below each other. ``width_pt`` applies if the style has none; ``stacked`` places pictures below each other
-    on a wide page, too.
+    On a wide page, the pictures are beside each other unless ``stacked``, with colour bar and list on their right. On a
+    narrow one, all parts are below each other. ``width_pt`` applies if the style has none.
     """
     style, em_pt, rows = canvas.style, canvas.style.em_pt, canvas.rows()
     width_pt = width_pt if style.width_pt is None else style.width_pt

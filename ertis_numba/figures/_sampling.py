@@ -61,10 +61,9 @@ def polar_raster(
     right_m: NDArray[np.float64],
     ahead_m: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return levels at points of the horizontal plane: (row, column), NaN outside of the image.
+    """Return levels (azimuth, range) at points of the horizontal plane: (row, column), NaN outside of the image.
 
-    Interpolation is bilinear between directions and ranges. The value is NaN if no direction is near. Levels in dB are
-    (azimuth, range) for the azimuths of ``fan``; ``range_m`` rises.
+    Interpolation is bilinear between directions and rising ranges. The value is NaN if no direction is near.
     """
     ahead_m = ahead_m[:, None]
     direction, near = fan.directions(right_m, ahead_m)
@@ -94,10 +93,9 @@ def sphere_raster(
     azimuth_rad: NDArray[np.float64],
     elevation_rad: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return levels over azimuth and elevation: (row, column), NaN where no direction is near.
+    """Return levels (direction,) over azimuth and elevation: (row, column), NaN where no direction is near.
 
-    The value is the mean of the four nearest directions, weighted by their inverse square distance. Directions may be
-    in any arrangement. Levels are (direction,), and ``directions`` unit vectors (direction, axis).
+    The value is the mean of the four nearest unit vectors, in any arrangement, weighted by inverse square distance.
     """
     looks = unit_vectors(*(grid.ravel() for grid in np.meshgrid(azimuth_rad, elevation_rad)))
     return look_raster(level_db, directions, looks.reshape(len(elevation_rad), len(azimuth_rad), 3))
@@ -106,10 +104,7 @@ def sphere_raster(
 def look_raster(
     level_db: NDArray[np.float32], directions: NDArray[np.float64], looks: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """Return levels in the directions of pixels, interpolated as by `sphere_raster`: (row, column).
-
-    Levels are (direction,); ``directions`` (direction, axis) and ``looks`` (row, column, axis) are unit vectors.
-    """
+    """Return levels in the directions of pixels, unit vectors (row, column, axis), as by `sphere_raster`."""
     place, weight = _around(directions, looks.reshape(-1, 3))
     return np.asarray(np.sum(weight * level_db[place], axis=1), np.float32).reshape(looks.shape[:2])
 
@@ -121,11 +116,9 @@ def volume_raster(
     *,
     points_m: NDArray[np.float64],
 ) -> NDArray[np.float32]:
-    """Return levels at points of space: (row, column), NaN outside of the image.
+    """Return levels (direction, range) at points of space: (row, column), NaN outside of the image.
 
-    Interpolation is linear between ranges, and that of `sphere_raster` between directions. Levels are
-    (direction, range), ``directions`` unit vectors (direction, axis), and ``points_m`` (row, column, axis). ``range_m``
-    rises.
+    Interpolation is linear between rising ranges, and that of `sphere_raster` between unit vectors (direction, axis).
     """
     flat_m = points_m.reshape(-1, 3)
     radius_m = np.linalg.norm(flat_m, axis=1)

@@ -114,7 +114,7 @@ def _row_ticks(axes: Axes, channels: NDArray[np.int64], *, em_pt: float) -> None
 def spectrogram(
     heard: MicrophoneTraces, settings: Settings
 ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the power of short spectra, mean over the microphones: (frequency, time) float32, frequencies and times.
+    """Return the power of short spectra, mean over microphones: (frequency, time), with frequencies and times.
 
     The length of the Hann window, ``2 √(T / B)``, is about the time for which the call stays within the bandwidth of
     the window: a sweep is sharpest there. In a long record, a column is the maximum of many spectra with an overlap of

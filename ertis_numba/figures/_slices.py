@@ -44,21 +44,15 @@ def draw(canvas: Canvas, image: Energyscape, *, height_m: float, left_m: float |
 
 @dataclass(frozen=True, slots=True)
 class _Cut:
-    """A plane through an image.
+    """A plane through an image; across, up and normal are axes of the sensor frame."""
 
-    - ``name``: name of the argument that sets its position.
-    - ``across``, ``up``, ``normal``: axes of the sensor frame.
-    - ``extent_m`` (left, right, bottom, top): limits of the picture; the left limit is the larger one if y increases to
-      the left.
-    """
-
-    name: str
+    name: str  # argument that sets its position
     at_m: float
     across: int
     up: int
     normal: int
     title: str
-    extent_m: tuple[float, float, float, float]
+    extent_m: tuple[float, float, float, float]  # (left, right, bottom, top); left > right if y increases to the left
 
     def sample(self, level_db: NDArray[np.float32], image: Energyscape) -> NDArray[np.float32]:
         """Return the levels in the plane, which the image must contain: (row, column), NaN where there are none."""

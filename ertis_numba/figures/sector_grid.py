@@ -18,11 +18,10 @@ _METRES = " m"
 def draw_grid(
     axes: Axes, style: Style, fan: Fan, *, first_m: float = 0.0, largest: int = 6, spare_m: float = 0.0
 ) -> None:
-    """Draw rings and rays with their labels in the present font of Matplotlib.
+    """Draw labelled rings, first from first_m, and rays on axes in m right and ahead, whose limits are final.
 
-    ``axes`` are in metres to the right of the sensor and ahead of it; their limits must be final. ``first_m`` is the
-    first range that a ring may have, and ``largest`` the largest number of parts between rings. ``spare_m``: distance
-    from the image at which a ring is still drawn.
+    ``largest`` is the largest number of parts between rings, and ``spare_m`` the distance from the image at which a
+    ring is still drawn.
     """
     line: dict[str, Any] = {"color": style.faint, "alpha": 0.35, "linewidth": 0.7 * style.line_pt}
     line |= {"clip_on": False, "scalex": False, "scaley": False}
@@ -57,10 +56,7 @@ def _name(
 
 
 def part_names(axes: Axes) -> None:
-    """Move names of rings into the figure, and remove those that overlap others; the last ring keeps its name.
-
-    The position of the axes must be final.
-    """
+    """Move names of rings into the figure; remove those that overlap; the position of the axes must be final."""
     right_px, px_per_pt = axes.figure.bbox.x1, axes.figure.dpi / 72
     rings = [text for text in axes.texts if isinstance(text, Annotation) and text.get_text().endswith(_METRES)]
     kept = [text.get_window_extent() for text in axes.texts if text not in rings]

@@ -61,11 +61,7 @@ class StyleOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Style:
-    """Colours, letters and sizes; ``colours`` is a perceptually uniform map of Matplotlib.
-
-    ``side_pt``: minimum width beside the pictures for the scale and the list. ``width_pt``: width of the page; None for
-    the width of the kind of picture.
-    """
+    """Colours, letters and sizes; ``colours`` is a perceptually uniform map of Matplotlib."""
 
     page: str
     ink: str
@@ -79,9 +75,9 @@ class Style:
     list_pt: float = 7.5
     line_pt: float = 1.0
     margin_pt: float = 30.0
-    side_pt: float = 166.0
+    side_pt: float = 166.0  # minimum width for scale and list
     dpi: int = 160
-    width_pt: float | None = None
+    width_pt: float | None = None  # of the page; None: by the kind of picture
 
     @property
     def rc(self) -> Any:
