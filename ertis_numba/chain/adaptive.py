@@ -16,26 +16,11 @@ _NEGLIGIBLE = 0.01  # share of the budget
 
 
 class AdaptiveBeamform:
-    """Adaptive beamformer: amplitude of every direction and range; implements `Beamform`.
+    """Adaptive beamformer: amplitude of every direction and range; implements `Beamform`, and is thread-safe.
 
-    An echo that reaches all microphones alike has the same level as with delay-and-sum. `kernels` defines the
-    computation of each beamformer. The object holds no buffers, so several threads may call it at the same time.
-
-    Parameters
-    ----------
-    processing : Processing
-        Settings with an adaptive beamformer or a weighting.
-    offsets : (direction, mic) int32
-        Index of each microphone's first sample in a flattened array of (mic, phase, sample).
-    weights : (direction, mic) complex64
-        Phase of the carrier and calibration; the magnitudes of a direction add up to about 1.
-    budget : float
-        Permitted error power of the image; by default 0, which requires the highest precision of the kernel.
-
-    Raises
-    ------
-    ArgumentError
-        The beamformer does not support the number of microphones.
+    An echo that reaches all microphones alike has the same level as with delay-and-sum. ``offsets`` (direction, mic)
+    index each microphone's first sample in a flattened (mic, phase, sample); ``weights`` (direction, mic) are the phase
+    of the carrier and the calibration, with magnitudes that add up to about 1. ``budget`` is the permitted error power.
     """
 
     def __init__(

@@ -17,22 +17,13 @@ __all__ = ["BeamChain", "beam_settings"]
 
 
 def beam_settings(settings: Settings, kernel_set: kernels.KernelSet, *, threads: int) -> Settings:
-    """Return settings with a plan of exact delays, which alone computes whole beams, and the same error budget.
-
-    Raises
-    ------
-    ArgumentError
-        No such plan keeps the budget.
-    """
+    """Return settings with a plan of exact delays, which alone computes whole beams, and the same error budget."""
     exact = Accuracy(max_error_db=settings.accuracy.max_error_db, delay_taps=0)
     return planner.complete(settings.replace(accuracy=exact), kernel_set, threads=threads)
 
 
 class BeamChain(FastChain):
-    """Signal chain of delay-and-sum beams on a processor; settings from `beam_settings`, all else as for `FastChain`.
-
-    `process` fills an array of (direction, range) complex64.
-    """
+    """Chain of delay-and-sum beams, (direction, range) complex64, on a CPU or GPU, for settings of `beam_settings`."""
 
     def new_image(self) -> NDArray[Any]:
         """Return an array for beams: (direction, range) complex64."""

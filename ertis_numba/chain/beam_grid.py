@@ -44,21 +44,11 @@ _FEWEST_EQUATIONS = 120  # Microphones times frequencies. With fewer equations, 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Aperture:
-    """Microphones and directions in the principal axes of the array.
+    """Microphones and directions in the principal axes of the array: one axis for a line, two for a plane.
 
-    Attributes
-    ----------
-    positions_m : (mic, axis) float64
-        Positions along the axes in which the array extends, longest axis first. A line has one axis, a plane two.
-    directions : (direction, axis) float64
-        Components of the unit vectors along these axes.
-    square_m2 : (mic,) float64
-        Squared distance from the array centre, in m².
-    axes : (axis, 3) float64
-        Axes of the array as unit vectors in the sensor frame.
-    is_turned : bool
-        True if images have other directions than these, because the array is tilted. A beam grid is then fitted to
-        directions anywhere between its points.
+    ``positions_m`` (mic, axis), longest axis first; ``directions`` (direction, axis), components of unit vectors;
+    ``square_m2`` (mic,), squared distance from the centre; ``axes`` (axis, 3) in the sensor frame. With ``is_turned``,
+    the array is tilted, and a beam grid is fitted to directions anywhere between its points.
     """
 
     positions_m: NDArray[np.float64]
@@ -79,15 +69,7 @@ class Aperture:
         return replace(self, directions=directions @ self.axes.T)
 
     def largest_delay_s(self, reach: float, own_s: NDArray[np.float64], *, sound_speed_m_s: float) -> float:
-        """Return an upper limit on the delays of all points within a distance from the centre, in seconds.
-
-        Parameters
-        ----------
-        reach : float
-            Distance in the array's plane, relative to the unit circle; at least 1.
-        own_s : (mic,) float64
-            Delay of each microphone, in seconds.
-        """
+        """Return an upper limit on delays within ``reach`` ≥ 1, relative to the unit circle, with own delays (mic,)."""
         # The difference of distances, r − √(r² − 2 r u·p + p²), is largest where the root vanishes. For directions,
         # whose magnitude u is 1, it is at most p.
         farthest = reach + math.sqrt(reach**2 - 1)
@@ -100,19 +82,15 @@ class Aperture:
 
     @property
     def supports_grid(self) -> bool:
-        """True if beams can be interpolated: for a line or a plane with an extent along each axis.
-
-        A single microphone beside the origin has an axis, but no extent along it.
-        """
+        """True for a line or a plane with an extent along each axis; a microphone beside the origin has none."""
         return self.n_axes in {1, 2} and bool(np.all(np.ptp(self.positions_m, axis=0) > _FLAT_M))
 
     def delays_s(
         self, points: NDArray[np.float64], *, sound_speed_m_s: float, range_m: float = math.inf
     ) -> NDArray[np.float64]:
-        """Return the delays of points in the array's plane, in seconds: (point, mic) float64.
+        """Return the delays of points in the array's plane: (point, mic), far-field or spherical at a finite range.
 
-        The delays are those of `geometry.far_field_delays` and, for a finite range, of `geometry.spherical_delays`. The
-        distance to a microphone, ``√(r² − 2 r u·p + p²)``, is defined for points outside the unit circle as well.
+        The distance to a microphone, ``√(r² − 2 r u·p + p²)``, is defined for points outside the unit circle as well.
         """
         along_m = points @ self.positions_m.T
         if math.isinf(range_m):
@@ -148,13 +126,7 @@ def _counted(aperture: Aperture, spacing: tuple[float, ...], n_taps: int) -> int
 
 
 def require_beam_grid(aperture: Aperture, n_ranges: int) -> None:
-    """Check that beams of the array and the image can be interpolated.
-
-    Raises
-    ------
-    ArgumentError
-        The array is neither a line nor a plane, or the image has fewer than `FEWEST_RANGES` ranges.
-    """
+    """Require an array on a line or a plane, and at least `FEWEST_RANGES` ranges, for beam interpolation."""
     if not aperture.supports_grid:
         extent = "is neither a line nor a plane" if aperture.n_axes == 3 else "has no extent along an axis"
         raise ArgumentError(
@@ -169,10 +141,7 @@ def require_beam_grid(aperture: Aperture, n_ranges: int) -> None:
 
 
 def _around(lowest: NDArray[np.int64], n_taps: int) -> NDArray[np.int64]:
-    """Return the grid points around directions: (direction, tap, axis).
-
-    Neighbours along the first axis are adjacent.
-    """
+    """Return the grid points around directions: (direction, tap, axis); neighbours of the first axis are adjacent."""
     steps = np.indices((n_taps,) * lowest.shape[1]).reshape(lowest.shape[1], -1)[::-1].T
     return lowest[:, None, :] + steps
 
@@ -187,30 +156,13 @@ def _numbers(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
 class BeamGrid:
     """Beam-grid points, and the weights that interpolate the beams of all directions from them.
 
-    With ``with_gain=False``, no filter has to apply a gain to the signals. The errors of an estimate are those at the
-    frequencies of ``spectrum``, or at ``judged_hz`` if these are given.
-
-    Attributes
-    ----------
-    is_curved : bool
-        True if the errors include those of spherical waves.
-    steering, wrong : (mic, wave, direction) complex128
-        Plane waves of some directions at some microphones, and their interpolation errors. Estimates only.
-    squares : float
-        Sum of a beam's squared weights, averaged over directions.
-    points : (node, axis) float64
-        Grid points in the array's plane.
-    rows : (direction,) int32
-        Directions in the order of computation; directions that share grid points are adjacent.
-    places : (direction, pair) int32
-        Lower grid point of each pair, in the order of ``rows``; the other point is the next one.
-    weights : (direction, pair, 2) float64
-        Weights of each pair, in the order of ``rows``.
-    reach : float
-        Upper limit on the distance of grid points from the centre, for any directions.
-    frequency_hz, errors : (wave,) float64
-        Frequencies in hertz, and the error power relative to the beam, averaged over uncorrelated microphones and over
-        directions. The errors exist for estimates only.
+    ``points`` (node, axis) lie in the array's plane. ``rows`` (direction,) is the order of computation, in which
+    directions that share grid points are adjacent; ``places`` (direction, pair) are the lower points of pairs in this
+    order, and ``weights`` (direction, pair, 2). ``squares`` is the mean sum of a beam's squared weights, ``reach`` an
+    upper limit on the distance of points from the centre, for any directions. Estimates alone have ``steering`` and
+    ``wrong`` (mic, wave, direction), plane waves and their interpolation errors, and ``errors`` (wave,), error power
+    relative to the beam, at the frequencies of ``spectrum`` or at ``judged_hz``. With ``with_gain=False``, no filter
+    applies a gain to the signals.
     """
 
     def __init__(
@@ -281,13 +233,7 @@ class BeamGrid:
         self._place(aperture.directions, load_steering("numpy"))
 
     def turned(self, directions: NDArray[np.float64], kernels: SteeringKernels) -> Self:
-        """Return the beam grid for other directions, with the same gain.
-
-        Parameters
-        ----------
-        directions : (direction, axis) float64
-            As those of `Aperture`.
-        """
+        """Return the beam grid for other directions (direction, axis) as in `Aperture`, with the same gain."""
         other = copy.copy(self)
         other._coefficients = self._short_coefficients  # noqa: SLF001
         other._place(directions, kernels)  # noqa: SLF001  of the same class
@@ -319,7 +265,7 @@ class BeamGrid:
         self.weights = weights.reshape(len(directions), -1, 2)
 
     def _coefficients_of(self, weights_at: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the coefficients of the polynomials of the weights in one grid cell: (degree, degree, tap).
+        """Return polynomial coefficients of the weights in one grid cell: (degree, degree, tap).
 
         A weight is a sum of waves over microphones and frequencies. Across a cell, these waves turn by at most half a
         period. Polynomials therefore reproduce the weights in double precision, in a fraction of the time.
@@ -360,10 +306,7 @@ class BeamGrid:
         return np.asarray(gain.reshape(shape[:2]))
 
     def passed(self, shift_hz: float) -> NDArray[np.float64]:
-        """Return the mean power, (wave,), of unit waves whose frequencies have been shifted before the interpolation.
-
-        The gain is that of the original frequencies. Estimates only.
-        """
+        """Return the mean power (wave,) of unit waves shifted before the interpolation. Estimates only."""
         patch, mics, weights, gain = self._estimated
         made = gain[:, None] * (self._waves(patch, mics, shift_hz=shift_hz) @ weights)
         return np.asarray(np.mean(np.abs(made.reshape(len(mics), len(self.frequency_hz), -1)) ** 2, axis=(0, 2)))

@@ -39,25 +39,9 @@ _Edges = list[tuple[int, int, float]]
 class BeamTables:
     """Fits of a complete plan, and the tables of its beamformer for some directions.
 
-    Parameters
-    ----------
-    grid : Grid
-        Directions.
-    threads : int
-        Number of threads for which the beamformer is made.
-
-    Attributes
-    ----------
-    aperture : Aperture
-        Microphones, and the directions of the settings.
-    own_s, ahead_s : (mic,) float64
-        Delay and fractional-delay offset of each microphone, in seconds.
-    streams : PlanStreams or None
-        Streams, if the beamformer is computed from them.
-    largest_delay_s : float
-        Upper limit on the delays, in seconds: for these directions, or for any directions if the sensor may be tilted.
-    margin_s : float
-        Time by which the delay interpolation extends beyond a delay, in seconds.
+    ``own_s`` and ``ahead_s`` (mic,) are delays and fractional-delay offsets. ``largest_delay_s`` limits the delays of
+    these directions, or of any if the sensor may be tilted; ``margin_s`` is the reach of the delay interpolation beyond
+    a delay.
     """
 
     def __init__(self, settings: Settings, grid: Grid, *, threads: int) -> None:
@@ -171,16 +155,11 @@ class BeamTables:
 
 
 class PlanStreams:
-    """Streams of a complete plan, with the points whose beams are summed.
+    """Streams of a complete plan, with the points (point, axis) of each whose beams are summed.
 
-    Attributes
-    ----------
-    points : list of (point, axis) float64
-        Beam-grid points of each stream, or the directions in the order of computation.
-    linear : int or None
-        Index of the stream of the signals themselves.
-    reach : float
-        Upper limit on the distance of points from the centre, relative to the unit circle, for any directions.
+    The points are those of a beam grid, or the directions in the order of computation; ``reach`` limits their distance
+    from the centre, relative to the unit circle. ``linear`` is the index of the stream of the signals themselves, or
+    None.
     """
 
     def __init__(self, settings: Settings, spectrum: Spectrum, aperture: Aperture, speed_m_s: float) -> None:

@@ -55,18 +55,7 @@ def beamform(
     threads: int,
     last_sample: int | None = None,
 ) -> "BeamformFloat32 | BeamformInt16":
-    """Return the delay-and-sum beamformer of a plan.
-
-    Parameters
-    ----------
-    precision : {"float32", "int16"}
-    kernels, memory, window, zones, nodes, threads
-        As for `BeamformFloat32`.
-    n_phases : int
-        Number of phases of the analytic signals.
-    last_sample : int, optional
-        Largest index of samples at the first range for which tiles have room; by default, that of these tables.
-    """
+    """Return the delay-and-sum beamformer of a plan in float32 or int16; ``last_sample`` sizes the tiles of int16."""
     if precision == "float32":
         return BeamformFloat32(kernels, memory, window, zones, nodes, threads=threads)
     return BeamformInt16(kernels, memory, zones, nodes, n_phases=n_phases, threads=threads, last_sample=last_sample)
@@ -83,15 +72,7 @@ class _NodeTables:
 class BeamformFloat32:
     """Delay-and-sum beamformer on float32 samples; implements `Beamform`.
 
-    Parameters
-    ----------
-    zones : sequence of Zone
-        Focal zones that together cover the range axis. Their beams are those of all directions, or of the beam-grid
-        points if there are any.
-    nodes : BeamGrid or None
-        Beam grid from which the beams of all directions are interpolated.
-    threads : int
-        Number of threads.
+    Focal zones together cover the range axis. Their beams are those of all directions, or of the points of ``nodes``.
     """
 
     def __init__(
@@ -146,13 +127,7 @@ class BeamformFloat32:
 
 
 def whole_limits(sum_of_weights: float) -> tuple[int, int]:
-    """Return the largest integers of weights and of samples.
-
-    Parameters
-    ----------
-    sum_of_weights : float
-        Sum of the magnitudes of a beam's weights, relative to the largest weight.
-    """
+    """Return the largest integers of weights and of samples, by a beam's sum of weights relative to the largest one."""
     bits = math.log2(_SAFE) + 31 - math.log2(sum_of_weights)
     # A sample has at most 15 bits. With few microphones, the remaining bits go to the weights.
     weight_bits = min(max(_WEIGHT_BITS, math.floor(bits) - 15), math.floor(bits / 2), 15)
@@ -161,25 +136,11 @@ def whole_limits(sum_of_weights: float) -> tuple[int, int]:
 
 
 class WholeWeights:
-    """Weights of delay-and-sum in 16 bits.
+    """Weights of delay-and-sum in 16 bits; ``last_sample`` is the largest index of a sample at the first range.
 
-    Parameters
-    ----------
-    tables : sequence of DelayTable
-        One for each focal zone.
-
-    Attributes
-    ----------
-    weights : list of (beam, term, 2, 2) int16
-        ``((re w, −im w), (im w, re w))`` of each table.
-    tap_weights : (direction, pair, 2) int16
-        Weights of the beam-grid points; empty without a beam grid.
-    limit : float32
-        Largest magnitude of samples for which no sum overflows.
-    unit : float32
-        Value of 1 in the sums, relative to that of a sample.
-    last_sample : int
-        Largest index of a sample at the first range.
+    ``weights`` (beam, term, 2, 2) of each table are ``((re w, −im w), (im w, re w))``; ``tap_weights`` (direction,
+    pair, 2) are empty without a beam grid. ``limit`` is the largest magnitude of samples for which no sum overflows,
+    and ``unit`` the value of 1 in the sums, relative to that of a sample.
     """
 
     def __init__(self, tables: Sequence[DelayTable], nodes: BeamGrid | None) -> None:

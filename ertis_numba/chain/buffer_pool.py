@@ -42,20 +42,9 @@ class BufferPool:
 
     @contextmanager
     def acquired(self, make: Callable[[], MeasurementBuffers]) -> Iterator[MeasurementBuffers]:
-        """Run the enclosed code with buffers that no other thread uses.
+        """Run the enclosed code with buffers that no other thread uses; call `release` after the lane has finished.
 
-        Call `release` after the lane has finished. If the enclosed code fails, the buffers are discarded, because
-        kernels may still use them.
-
-        Parameters
-        ----------
-        make : callable
-            Function that returns new buffers; called if no buffers are free.
-
-        Raises
-        ------
-        ArgumentError
-            The pool is closed.
+        If the enclosed code fails, the buffers are discarded, because kernels may still use them.
         """
         with self._change:
             if self._closed:

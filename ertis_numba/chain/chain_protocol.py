@@ -32,20 +32,7 @@ class Chain(Protocol):
         threads: int | None = None,
         grid: Grid | None = None,
     ) -> None:
-        """Compute the image of one measurement.
-
-        Parameters
-        ----------
-        words : (sample, word) unsigned integers
-            Recorded samples.
-        out : (direction, range) float32
-            Array to fill with amplitudes.
-        threads : int, optional
-            Number of threads; by default, that of the chain.
-        grid : Grid, optional
-            Directions in the sensor frame, if the settings have level directions; as many as those of the chain, which
-            are the default.
-        """
+        """Compute the image ``out`` (direction, range) of ``words`` (sample, word); ``grid`` has level directions."""
         ...
 
     def process_batch(

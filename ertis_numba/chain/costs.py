@@ -63,25 +63,10 @@ UNITS: Final = (*_FRONT_UNITS, *_SUM_UNITS, *_PAIR_UNITS, *_SHIFT_UNITS)
 class Work:
     """Amount of work of a plan for one image.
 
-    Attributes
-    ----------
-    n_mics, n_words, n_samples, n_taps, tap_bits : int
-        Demodulation: microphones, words per sample, samples of the signals, filter taps and bits of each tap.
-    n_fft, n_bins, n_phases, n_outputs : int
-        Matched filter: length of the transform, occupied bins, phases, and samples of each phase.
-    n_directions, n_ranges : int
-        Size of the image.
-    n_computed : int
-        Ranges of all tiles; focal zones and the end of the range axis leave some of them unused.
-    n_beams, n_terms, n_pairs : int
-        Beams that are summed, terms of each, and pairs of beam-grid points per direction; 0 without a beam grid.
-    precision : {"float32", "int16"}
-    n_shifted : int
-        Beams that are summed as spectra, one for each direction and focal zone; 0 (the default) if there are none.
-    n_streams : int
-        Streams of an adaptive beamformer; 0 (the default) if it has none.
-    term_cost : float
-        Time of a term relative to that of delay-and-sum; 1 by default.
+    ``n_words`` are those of a sample, ``tap_bits`` those of a filter tap; ``n_outputs`` are the samples of each phase.
+    ``n_computed`` counts the ranges of all tiles, some of which are unused. ``n_beams`` are summed from ``n_terms``
+    each; ``n_pairs`` of grid points per direction are 0 without a beam grid. ``n_shifted`` beams are summed as spectra,
+    one for each direction and focal zone. ``term_cost`` is the time of a term relative to that of delay-and-sum.
     """
 
     n_mics: int
@@ -107,13 +92,7 @@ class Work:
 
 @dataclass(frozen=True, slots=True)
 class Costs:
-    """Cost of each kernel.
-
-    Attributes
-    ----------
-    seconds : dict of str to float
-        Seconds per unit of work, by the names in `UNITS`; `stages_ms` defines the units.
-    """
+    """Seconds per unit of work of each kernel, by the names in `UNITS`; `stages_ms` defines the units."""
 
     seconds: dict[str, float]
 
@@ -164,10 +143,7 @@ def nominal_costs(kernels: KernelSet) -> Costs:
 
 
 def measured_costs(kernels: KernelSet, threads: int) -> Costs:
-    """Return the costs of a device on this machine; the first call measures them and stores them in `cache_file`.
-
-    Simulated devices have nominal costs.
-    """
+    """Return the costs of a device on this machine, measured once and stored in `cache_file`; nominal if simulated."""
     if kernels.simulated:
         return nominal_costs(kernels)
     key = (kernels.device, threads, kernels.hardware)
@@ -183,10 +159,7 @@ _KNOWN: dict[tuple[str, int, str], Costs] = {}
 
 
 def cache_file(device: str, threads: int, hardware: str = "") -> Path:
-    """Return the file with the measured costs of a device; delete it to measure them again.
-
-    Its name depends on the machine, the GPU named by ``hardware``, and the versions of the libraries.
-    """
+    """Return the file of measured costs by machine, GPU (``hardware``) and library versions; delete it to remeasure."""
     machine = [platform.machine(), platform.processor(), platform.node()]
     machine += [os.environ.get(name, "") for name in ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES")]
     with suppress(OSError):
@@ -244,13 +217,7 @@ def _first_of(costs: Costs, part: Path, path: Path) -> Costs:
 
 
 def measure(kernels: KernelSet, threads: int, units: Collection[str] = UNITS) -> Costs:
-    """Measure costs of a device and return them; it takes some tenths of a second.
-
-    Parameters
-    ----------
-    units : collection of str
-        Units to measure; all by default.
-    """
+    """Measure some or all costs of a device and return them; it takes some tenths of a second."""
     random = np.random.default_rng(1)
     small = 8 if kernels.device == "numpy" else 1
     seconds: dict[str, float] = {}

@@ -15,16 +15,9 @@ __all__ = ["DelayTable", "Zone"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DelayTable:
-    """Samples that contribute to the first range of each beam, and their weights.
+    """Samples that contribute to the first range of each beam, and their weights: (beam, term), one term per tap.
 
-    A term is one sample of one microphone. The number of terms of a microphone is the number of taps of the delay
-    interpolation.
-
-    Attributes
-    ----------
-    rows, samples : (beam, term) int64
-        Row of the sample, ``microphone · n_phases + phase``, and its index in that row.
-    weights : (beam, term) complex128
+    ``rows`` are ``microphone · n_phases + phase``, and ``samples`` the index in that row.
     """
 
     rows: NDArray[np.int64]
@@ -42,23 +35,7 @@ class DelayTable:
         n_phases: int,
         lead: int,
     ) -> Self:
-        """Return the delay table of given delays.
-
-        Parameters
-        ----------
-        delays_s : (beam, mic) float64
-            Delays in seconds.
-        amplitudes : (mic,) float64
-            Weight of each microphone.
-        fit : DelayFit
-            Fractional-delay filters.
-        steering : SteeringKernels, optional
-            Kernels that compute the weights on several threads.
-        n_phases : int
-            Number of phases of the analytic signals.
-        lead : int
-            Index of the sample at the first range.
-        """
+        """Return the delay table of ``delays_s`` (beam, mic); ``lead`` is the sample at the first range."""
         n_beams, n_mics = delays_s.shape
         first, fractions = fit.split(delays_s)
         samples, phases = np.divmod(first[:, :, None] + np.arange(fit.n_taps), n_phases)
@@ -68,13 +45,7 @@ class DelayTable:
         return cls(rows.reshape(flat), samples.reshape(flat) + lead, weights.reshape(flat))
 
     def offsets(self, width: int) -> NDArray[np.int32]:
-        """Return the indices of the first samples in a flattened array of (mic, phase, ``width``).
-
-        Raises
-        ------
-        ArgumentError
-            A delay reaches before the first sample, or the array has too many samples for 32-bit indices.
-        """
+        """Return the indices of first samples in a flattened (mic, phase, ``width``); raise if they leave 32 bits."""
         if self.samples.min() < 0:
             raise ArgumentError(
                 "delays reach before the first sample of the record; start processing.range_m at a larger range"
@@ -90,13 +61,7 @@ class DelayTable:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Zone:
-    """Focal zone: a part of the range axis whose ranges share one set of delays.
-
-    Attributes
-    ----------
-    first, stop : int
-        Index of the first range, and index after the last range.
-    """
+    """Focal zone: ranges from index ``first`` up to, but without, ``stop`` that share one set of delays."""
 
     first: int
     stop: int

@@ -20,13 +20,7 @@ Room = tuple[NDArray[np.float32], ...]
 
 
 class Demodulate(Protocol):
-    """Demodulation stage: computes signals from recorded samples.
-
-    Attributes
-    ----------
-    shape : (mic, sample)
-        Shape of the signals, including the zeros at the end.
-    """
+    """Demodulation stage: signals (mic, sample), with the zeros at the end, from recorded samples."""
 
     shape: tuple[int, int]
 
@@ -49,10 +43,7 @@ def demodulation(
     taps: NDArray[np.int16] | NDArray[np.int32],
     factor: int | None = None,
 ) -> Demodulate:
-    """Return the demodulation stage for the encoding of the recording, PDM or PCM.
-
-    ``factor`` is the number of recorded samples per signal sample, by default ``settings.decimation``.
-    """
+    """Return the demodulation stage for PDM or PCM; ``factor`` is the number of recorded samples per signal sample."""
     channels = np.flatnonzero(layout.enabled).astype(np.int32)
     recording, factor = settings.recording, factor or settings.decimation
     if recording.is_pdm:
@@ -61,17 +52,7 @@ def demodulation(
 
 
 class DemodulatePdm:
-    """Demodulation of PDM bits in one pass, with a full scale of 1; implements `Demodulate`.
-
-    Parameters
-    ----------
-    channels : (mic,) int32
-        Channels of the microphones.
-    taps : (tap,) int16 or int32
-        Integer taps of the low-pass filter; their sum corresponds to a gain of 1.
-    factor : int
-        Recorded samples per signal sample.
-    """
+    """Demodulation of PDM bits in one pass, with a full scale of 1; the sum of the integer taps is a gain of 1."""
 
     def __init__(
         self,
@@ -120,17 +101,7 @@ class DemodulatePdm:
 
 
 class FilterPcm:
-    """Low-pass filter and decimation of PCM samples; implements `Demodulate`.
-
-    PCM needs no demodulation, but its sample rate may exceed the signal rate.
-
-    Parameters
-    ----------
-    channels, window, kernels, memory, taps, factor
-        As for `DemodulatePdm`.
-    full_scale : float
-        Sample value that becomes 1; 1 by default.
-    """
+    """Low-pass filter and decimation of PCM, whose rate may exceed the signal rate; ``full_scale`` becomes 1."""
 
     def __init__(
         self,

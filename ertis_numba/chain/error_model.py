@@ -69,33 +69,18 @@ def decibels(power: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SignalModel:
-    """Signal statistics that the error of an image depends on, besides the settings.
+    """Statistics of signals after the matched filter that the error of an image depends on, besides the settings.
 
-    Attributes
-    ----------
-    shares : (wave,) float64
-        Distribution of the power after the matched filter over the frequencies of the model; the sum is 1.
-    gain : float
-        Mean power of the image, relative to the image of uncorrelated microphones.
-    crest : float
-        Largest sample power in a tile of ranges, averaged over tiles, relative to the mean sample power.
-    noise : (bin,) float64
-        Power density of the recorded samples from 0 to half the sample rate, relative to white bits.
-    level : float
-        Power after the matched filter in the ranges of the image, relative to white bits.
-    places : (quantile,) float64
-        Quantiles of the power of the image points in ascending order, relative to the mean.
-    covariance : (tile, wave, mic, mic) complex128, optional
-        Covariance of the signals of some microphones in each tile of ranges, at the frequencies of an estimate of
-        `BeamGrid`; None by default.
-    colour : float
-        Margin on interpolation errors computed from ``shares``; 1 (the default) if ``shares`` was measured.
-    loudness : float
-        Power of the signals before the matched filter, over all times and frequencies, relative to ``level``. Both are
-        relative to white bits. It is 0 (the default) if it was not measured.
-    record_level : float
-        Power after the matched filter over the whole record, relative to ``level``. It exceeds 1 if there is louder
-        sound at other ranges than those of the image. It is 0 (the default) if it was not measured.
+    - ``shares`` (wave,): distribution of the power over the frequencies of the model; the sum is 1.
+    - ``gain``: mean power of the image, relative to the image of uncorrelated microphones.
+    - ``crest``: largest sample power in a tile of ranges, averaged over tiles, relative to the mean sample power.
+    - ``noise`` (bin,): density of recorded samples up to half the sample rate, relative to white bits.
+    - ``level``: power in the ranges of the image, relative to white bits.
+    - ``record_level``: power of the whole record, relative to ``level``; 0 if not measured.
+    - ``loudness``: power before the matched filter, relative to ``level``; 0 if not measured.
+    - ``places`` (quantile,): quantiles of the power of image points in ascending order, relative to the mean.
+    - ``covariance`` (tile, wave, mic, mic): of signals of some microphones, at the frequencies of a `BeamGrid`.
+    - ``colour``: margin on interpolation errors computed from ``shares``; 1 if ``shares`` was measured.
     """
 
     shares: NDArray[np.float64]
@@ -129,13 +114,7 @@ class SignalModel:
 
 
 class ErrorModel:
-    """Predictor of the error power of each processing step, relative to the power of the exact image.
-
-    Parameters
-    ----------
-    signal_model : SignalModel, optional
-        Measured signal model; by default, `SignalModel.unknown`.
-    """
+    """Predictor of the error power of each step, relative to the exact image; safe without a signal model."""
 
     def __init__(self, settings: Settings, signal_model: SignalModel | None = None) -> None:
         self._settings = settings
@@ -154,17 +133,9 @@ class ErrorModel:
         """Return the error power of delay interpolation: the residual of the fit, weighted by the signal spectrum.
 
         The mean error over all delays acts as a filter on the image itself, whether or not echoes are coherent. The
-        remaining error differs between microphones, so its phase is independent of the beam. With few microphones, it
-        averages out less: the error of a single microphone is a filter on its own signal.
-
-        Parameters
-        ----------
-        n_mics : float
-            Effective number of microphones: see `ertis_numba.geometry.effective_count`.
-        fractions : (delay,) float64, optional
-            Fractional parts of the delays in steps, if there are too few delays to spread evenly over a step.
-        passed : (wave,) float64, optional
-            Share of the errors at beam-grid points that remains in the interpolated beams; 1 by default.
+        rest differs between microphones; among few, in effect ``n_mics``, it averages out less. ``fractions`` (delay,)
+        are in steps, if too few to spread evenly; ``passed`` (wave,) is the share that remains after beam
+        interpolation.
         """
         signal_model = self.signal_model
         if fractions is not None:
@@ -191,10 +162,9 @@ class ErrorModel:
         """Return the error power of beam interpolation, from an estimate of `BeamGrid`.
 
         Without a measured covariance, the signal spectrum weights the errors, as in `delays`. With a covariance R, the
-        error is computed for each tile: the beam ``b = hᵀx`` and its error ``e = dᵀx`` are sums of the same signals x.
-        The error power of the envelope is
-
-            Re(C_eb)² / C_bb + ½ (C_ee − |C_eb|² / C_bb),   C_eb = dᵀ R h*, and likewise C_bb and C_ee.
+        beam ``b = hᵀx`` and its error ``e = dᵀx`` are sums of the same signals x in each tile. The error power of the
+        envelope is ``Re(C_eb)² / C_bb + ½ (C_ee − |C_eb|² / C_bb)``, with ``C_eb = dᵀ R h*``, and likewise C_bb and
+        C_ee.
         """
         covariance = self.signal_model.covariance
         if covariance is None or nodes.is_curved:
@@ -215,17 +185,11 @@ class ErrorModel:
         return _UNLIKE * float(wrong.sum() / beams.sum())
 
     def zones(self, aperture: Aperture, curvature_2: float, *, sound_speed_m_s: float) -> float:
-        """Return the error power of focal zones, whose ranges share one set of delays.
+        """Return the error power of focal zones by the mean squared deviation of the curvature, in 1/m².
 
         A wavefront of curvature b = 1/r reaches a microphone at p with the extra delay ``b (p² − (u·p)²) / 2c``. The
         mean extra delay of all microphones turns the phase of the beam and shifts its envelope. Only the phase at the
         mean frequency has no effect on the image.
-
-        Parameters
-        ----------
-        curvature_2 : float
-            Mean squared deviation of the curvature from that of its focal zone, in 1/m²: see
-            `focal_zones.squared_curvature`.
         """
         along_m = aperture.directions @ aperture.positions_m.T
         across_m2 = np.maximum(aperture.square_m2 - along_m**2, 0.0)
@@ -244,40 +208,21 @@ class ErrorModel:
         return min(1.0, self.zones(aperture, max(range_m, NEAREST_M) ** -2, sound_speed_m_s=sound_speed_m_s))
 
     def samples(self, *, n_terms: int, terms: float, limit: float, weight_limit: float, taps: float) -> float:
-        """Return the error power of 16-bit samples and weights.
+        """Return the error power of rounding real and imaginary parts of samples and weights by up to half a step.
 
-        Rounding moves the real and imaginary parts of samples and weights by up to half a step. The step of samples is
-        the largest magnitude in the tile, divided by ``limit``. The step of weights is the largest weight, divided by
-        ``weight_limit``.
-
-        Parameters
-        ----------
-        n_terms : int
-            Number of terms of one microphone.
-        terms : float
-            Sum of the squared weights of these terms; 1 for a single term.
-        limit, weight_limit : float
-            Largest integer values of samples and of weights.
-        taps : float
-            Sum of the squared weights of the beam-grid points of a beam; 1 without a beam grid.
+        The step of samples is the largest magnitude in the tile, divided by ``limit``; that of weights is the largest
+        one, divided by ``weight_limit``. ``terms`` and ``taps`` are the sums of squared weights of a microphone's
+        terms, and of a beam's grid points; both are 1 without interpolation.
         """
         of_samples = terms * self.signal_model.crest / limit**2 / 6
         of_weights = n_terms / weight_limit**2 / 6
         return self._of(taps * (of_samples + of_weights))
 
     def nodes(self, *, n_mics: int, sum_of_terms: float, taps: float, filled: float) -> float:
-        """Return the error power of rounding beams at beam-grid points to 16 bits.
+        """Return the error power of rounding beams at grid points to 16 bits, steps of 2⁻¹⁵ of all terms at full scale.
 
-        The step is 2⁻¹⁵ of the sum of all terms at full scale.
-
-        Parameters
-        ----------
-        sum_of_terms : float
-            Sum of the magnitudes of one microphone's weights; 1 for a single weight.
-        taps : float
-            As for `samples`.
-        filled : float
-            Sum of all terms at full scale, relative to 2³¹; at most 1.
+        ``sum_of_terms`` is the sum of the magnitudes of a microphone's weights, ``filled`` that of all terms at full
+        scale relative to 2³¹, and ``taps`` is as in `samples`.
         """
         step_2 = self.signal_model.crest * n_mics * (sum_of_terms / filled) ** 2 / 2.0**30
         return self._of(taps * step_2 / 6)
@@ -285,8 +230,7 @@ class ErrorModel:
     def filter(self, taps: NDArray[np.int16] | NDArray[np.int32]) -> float:
         """Return the error power of noise that the decimation aliases into the band through the filter's stopband.
 
-        The integer taps of the filter are used, so the stopband includes the effect of rounding. Noise covers the whole
-        image. At image points darker than the noise, all of its power changes magnitudes.
+        Noise covers the whole image. At image points darker than the noise, all of its power changes magnitudes.
         """
         settings = self._settings
         low_hz, high_hz = matched_band_hz(settings)
@@ -301,17 +245,8 @@ class ErrorModel:
         """Return the error power of ringing beyond a time window: it is cut off at each end, and as much wraps around.
 
         The matched filter h rings before and after the call. At the first and the last range, the window lacks the
-        samples that h beyond the guard weights. Further inside it lacks less: the power of the cut, which extends
+        samples that h beyond ``guard_s`` weights. Further inside it lacks less: the power of the cut, which extends
         beyond the band and lets noise through, falls with the sixth power of the time.
-
-        Parameters
-        ----------
-        taps : (tap,) int16 or int32
-            Decimation filter.
-        guard_s : float
-            Time by which the window extends beyond the image and the call, at each end.
-        imaged_s : float
-            Duration of the image.
         """
         settings, model = self._settings, self.signal_model
         rate_hz, call_s = settings.signal_rate_hz, settings.call.end_s
@@ -363,11 +298,7 @@ class ErrorModel:
         return (_OF_IMAGE + _OF_SIGNALS * model.loudness) / model.gain + _OF_BAND * model.record_level
 
     def phases(self, n_bins: int) -> float:
-        """Return the error power of rounding the phase steps of a band of ``n_bins`` bins.
-
-        A step is wrong by up to half of 2⁻³² of a turn. This adds up from the middle of the band, where phases are
-        exact, to its edges.
-        """
+        """Return the error power of rounding phase steps to 2⁻³² of a turn, which adds up to the edges of the band."""
         return self._of(_PHASE_STEP**2 * n_bins**2 / 144)
 
     def _of(self, power: float) -> float:

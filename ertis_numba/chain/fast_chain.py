@@ -29,10 +29,7 @@ _TINY = 1e-30
 
 
 class FastChain(KernelChain):
-    """Signal chain that computes only the samples and beams of an image; parameters and errors as for `KernelChain`.
-
-    The settings have a complete plan: see `planner.complete`.
-    """
+    """Signal chain that computes only the samples and beams of an image, for settings of `planner.complete`."""
 
     def _make(self, settings: Settings) -> None:
         memory, kernels = self._memory, self._kernels
@@ -83,10 +80,7 @@ class FastChain(KernelChain):
         return tables.beamform(self._kernels, self._memory, self._window, self._matched_filter)
 
     def analytic(self, words: NDArray[np.unsignedinteger[Any]]) -> tuple[NDArray[np.complex64], int]:
-        """Return the analytic signals, (mic, phase, sample), and the index of the sample at the first range.
-
-        The gains and fractional-delay offsets of the plan are not applied.
-        """
+        """Return analytic signals, (mic, phase, sample), without plan gains, and the index of the first range."""
         heard = np.empty(self._matched_filter.shape, dtype=np.complex64)
         with self._taken(self._threads) as buffers:
             here = buffers.lane.send(words)

@@ -14,22 +14,10 @@ _MIN_M = 1e-9  # Minimum distance; it prevents a division by zero.
 
 
 def zone_edges(range_m: NDArray[np.float64], count: int) -> list[tuple[int, int, float]]:
-    """Return focal zones that divide the curvature into equal steps.
+    """Return focal zones (first, stop, distance in m of their mean curvature) in ``count`` equal steps of 1/r.
 
     The delay of a microphone at p differs from that of a plane wave by about ``p²/2rc``. Equal steps of 1/r, not of r,
-    therefore give every zone the same error. The delays of a zone are those of its mean curvature.
-
-    Parameters
-    ----------
-    range_m : (range,) float64
-        Ranges in metres, ascending.
-    count : int
-        Number of steps of the curvature between the ends. Steps without a range yield no zone.
-
-    Returns
-    -------
-    list of (first, stop, distance)
-        Ranges ``first … stop - 1`` of each zone, and the distance in metres for which its delays are computed.
+    therefore give every zone the same error. Steps without a range yield no zone.
     """
     bends = 1 / np.maximum(range_m, NEAREST_M)
     span = bends[0] - bends[-1]

@@ -16,19 +16,6 @@ def cached_in_instance(method: Callable[[_Self, *_Arguments], _Result]) -> Calla
 
     `functools.cache` of a bound method would refer to its instance, which then remains until the garbage collector
     runs. `functools.cache` of the function would never free an instance.
-
-    Examples
-    --------
-    >>> from ertis_numba.chain.instance_cache import cached_in_instance
-    >>> class Squares:
-    ...     @cached_in_instance
-    ...     def of(self, number):
-    ...         print("computing")
-    ...         return number**2
-    >>> squares = Squares()
-    >>> squares.of(3), squares.of(3)
-    computing
-    (9, 9)
     """
     attribute = f"_results_of_{method.__name__}"
 

@@ -53,15 +53,7 @@ _TARGETS = 65  # Number of targets over one step of the stored samples.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spectrum:
-    """Power spectrum of the output of the matched filter.
-
-    Attributes
-    ----------
-    frequency_hz : (wave,) float64
-        Frequencies in hertz.
-    power : (wave,) float64
-        Share of the power at each frequency; the sum is 1.
-    """
+    """Power spectrum of the output of the matched filter: shares (wave,) at frequencies in Hz, with the sum 1."""
 
     frequency_hz: NDArray[np.float64]
     power: NDArray[np.float64]
@@ -100,10 +92,7 @@ _ONE_THREAD = _OneThread()
 
 
 def one_thread() -> AbstractContextManager[None]:
-    """Limit BLAS to one thread inside the context.
-
-    The matrices of the planner are small, and on busy cores the threads of BLAS wait for each other.
-    """
+    """Limit BLAS to one thread: with the planner's small matrices, its threads wait for each other on busy cores."""
     return _ONE_THREAD
 
 
@@ -115,23 +104,10 @@ def fit(
     real: bool = False,
     min_power: float = _MIN_POWER,
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Return the gain and the weights that approximate ``targets`` by ``taps`` with the least error.
+    """Return the gain (wave,) and weights (tap, target) that approximate ``targets`` by ``taps`` with the least error.
 
-    Parameters
-    ----------
-    taps : (wave, tap) complex128
-    targets : (wave, target) complex128
-    power : (wave,) float64
-        Weight of each frequency.
-    real : bool
-        True to restrict the weights to real values; False by default.
-    min_power : float
-        Regularisation, added to the diagonal of the Gram matrix of the taps, relative to its mean diagonal.
-
-    Returns
-    -------
-    gain : (wave,) complex128
-    weights : (tap, target) complex128
+    ``taps`` (wave, tap), ``targets`` (wave, target), and ``power`` (wave,), the weight of each frequency. ``min_power``
+    is the regularisation, relative to the mean diagonal of the Gram matrix of the taps.
     """
     gain: NDArray[Any] = np.ones(len(taps), dtype=np.complex128)
     for _ in range(_TURNS):
@@ -183,26 +159,9 @@ def two_columns(places: NDArray[np.float64]) -> NDArray[np.float64]:
 class DelayFit:
     """Fractional-delay filters: interpolation of a sample at any time from samples stored at a fixed step.
 
-    Parameters
-    ----------
-    n_taps : int
-        Number of taps.
-    step_s : float
-        Time between stored samples, in seconds.
-    spectrum : Spectrum
-        Spectrum that weights the errors.
-    with_gain : bool
-        False if no filter can apply a gain, as for streams that are nonlinear functions of signals; True by default.
-
-    Attributes
-    ----------
-    fractions : (target,) float64
-        Delays spread evenly over one step, as `split` returns them.
-    errors : (wave,) float64
-        Error power relative to the sample at each frequency of the spectrum: the variance over delays spread evenly
-        over one step.
-    biases : (wave,) float64
-        Power of the mean error, which all microphones share.
+    ``fractions`` (target,) spread evenly over one step, over which ``errors`` (wave,) are the error power relative to
+    the sample, without ``biases`` (wave,), the power of the mean error, which all microphones share. ``with_gain`` is
+    False for streams, which are nonlinear functions of signals.
     """
 
     def __init__(self, n_taps: int, step_s: float, spectrum: Spectrum, *, with_gain: bool = True) -> None:
@@ -224,16 +183,13 @@ class DelayFit:
         self.errors, self.biases = np.var(wrong, axis=1), np.abs(np.mean(wrong, axis=1)) ** 2
 
     def errors_at(self, fractions: NDArray[np.float64], spectrum: Spectrum | None = None) -> NDArray[np.float64]:
-        """Return the mean error power, including the shared error, at given fractions: (wave,) float64.
-
-        The frequencies are those of another spectrum, if one is given.
-        """
+        """Return the mean error power (wave,), with the shared error, at given fractions, or in another spectrum."""
         found = np.unique(np.round(fractions, 4))
         return np.asarray(np.mean(np.abs(self._wrong(found, spectrum)) ** 2, axis=1))
 
     @functools.cached_property
     def images(self) -> dict[int, NDArray[np.float64]]:
-        """Share of the error in each image of the spectrum: (wave,) float64 by the number of the image.
+        """Share of the error, (wave,), in each image of the spectrum by its number.
 
         Relative to the wave, the error has the period of a step. It therefore consists of waves whose frequencies are
         those of the spectrum plus the number of the image times the rate of the stored samples.
@@ -257,10 +213,7 @@ class DelayFit:
         return first.astype(np.int64), steps - first
 
     def weights(self, fractions: NDArray[np.float64], kernels: SteeringKernels | None = None) -> NDArray[np.complex128]:
-        """Return the weights of the taps: (..., tap) complex128, for fractions as `split` returns them.
-
-        With kernels, several threads share the computation.
-        """
+        """Return the weights (..., tap) for fractions of `split`; kernels share the computation among threads."""
         places = 2 * (fractions - self._middle)
         if kernels is None:
             found = chebyshev.chebval(places, self._polynomials)

@@ -26,13 +26,7 @@ __all__ = ["Compress", "KernelChain"]
 
 
 class Compress(Protocol):
-    """Matched-filter stage: computes analytic signals from signals.
-
-    Attributes
-    ----------
-    shape : (mic, phase, sample)
-        Shape of the analytic signals.
-    """
+    """Matched-filter stage: computes analytic signals, (mic, phase, sample), from signals."""
 
     shape: tuple[int, int, int]
 
@@ -42,28 +36,9 @@ class Compress(Protocol):
 
 
 class KernelChain(ABC):
-    """Runs the stages of a measurement in buffers of its own, on lanes of the device; implements `Chain`.
+    """Runs the stages, which subclasses create in `_make`, in buffers of its own on lanes; implements `Chain`.
 
-    Subclasses create the stages once, in `_make`.
-
-    Parameters
-    ----------
-    threads : int
-        Default number of threads.
-    graphs : bool, optional
-        True to record the chain as a CUDA graph and replay it; by default on every GPU.
-
-    Attributes
-    ----------
-    grid : Grid
-        Directions of the image.
-    range_m : (range,) float64
-        Range axis in metres.
-
-    Raises
-    ------
-    DeviceError
-        The device has too little memory.
+    With ``graphs``, by default on every GPU, the chain is recorded as a CUDA graph and replayed.
     """
 
     grid: Grid
@@ -154,10 +129,7 @@ class KernelChain(ABC):
     def process_batch(
         self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]
     ) -> None:
-        """Process several measurements: on a GPU in lanes, on the CPU in parallel with one thread each.
-
-        If an item of ``outs`` is None, the image stays in GPU memory until the lane computes its next image.
-        """
+        """Process measurements in GPU lanes, or on one thread each; images stay on the GPU where ``outs`` has None."""
         pairs = list(zip(words, outs, strict=True))
         if self._memory.n_lanes == 1:
             self._side_by_side(pairs)

@@ -19,28 +19,12 @@ Gain = Callable[[NDArray[np.float64]], NDArray[np.complex128]]
 
 
 class MatchedFilter:
-    """Matched filter that returns analytic signals, sampled at the output rate in several phases.
+    """Matched filter that returns analytic signals, (mic, phase, sample), at the output rate in several phases.
 
     A beam is needed only at the output ranges, but its delays are much finer than their spacing. One inverse transform
     per phase therefore computes the samples: those of phase p lie ``p / n_phases`` of a step after those of phase 0.
-    The one-sided spectrum makes the signals analytic. The filter also divides by the gain of the decimation filter,
-    which is known exactly within the band. It applies the gains of the delay and beam interpolation as well.
-
-    Parameters
-    ----------
-    taps : (tap,) int16 or int32
-        Integer taps of the decimation filter.
-    gain : callable
-        Function of frequencies in hertz, (bin,) float64, that returns gains, (mic, bin) or (1, bin) complex128.
-
-    Attributes
-    ----------
-    shape : (mic, phase, sample)
-        Shape of the analytic signals.
-    first_bin : int
-        First bin of the band.
-    frequency_hz : (bin,) float64
-        Frequencies of the band in hertz.
+    The filter also divides by the gain of the decimation filter ``taps``, which is known exactly within the band, and
+    applies ``gain``, a function of frequencies (bin,) in Hz that returns (mic, bin) or (1, bin) complex128.
     """
 
     def __init__(
@@ -78,14 +62,7 @@ class MatchedFilter:
 def flat_spectrum(
     settings: Settings, taps: NDArray[np.int16] | NDArray[np.int32], *, n_fft: int
 ) -> tuple[int, NDArray[np.float64], NDArray[np.complex128]]:
-    """Return the matched filter, divided by the gain of the decimation filter.
-
-    Returns
-    -------
-    first_bin : int
-    frequency_hz : (bin,) float64
-    values : (bin,) complex128
-    """
+    """Return the first bin, frequencies (bin,) in Hz, and the matched filter (bin,) divided by decimation's gain."""
     matched = matched_filter_spectrum(settings, n_fft=n_fft)
     frequency_hz = (matched.first_bin + np.arange(len(matched.values))) * settings.signal_rate_hz / n_fft
     decimated = filter_response(taps / taps.sum(dtype=np.int64), frequency_hz / settings.recording.sample_rate_hz)

@@ -31,13 +31,7 @@ _OF_POINT: Final = 4  # Per image point.
 
 
 def available_bytes(meminfo: Path = Path("/proc/meminfo"), cgroup: Path = _CGROUP) -> int:
-    """Return the memory in bytes that this process can still allocate within its container; 0 if unknown.
-
-    Parameters
-    ----------
-    meminfo, cgroup : Path
-        File with the available memory of the system, and folder of the control group.
-    """
+    """Return the memory that this process can still allocate within its container (``cgroup``); 0 if unknown."""
     lines = _read(meminfo).splitlines()
     found = [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
     for limit, used in _CGROUP_FILES:
@@ -55,15 +49,7 @@ def _read(path: Path) -> str:
 
 
 def predicted_bytes(settings: Settings) -> int:
-    """Return the predicted memory for planning and processing, in bytes.
-
-    It does not include libraries and the tables of an unusually accurate plan.
-
-    Raises
-    ------
-    ArgumentError
-        The ranges lie outside the record, or the directions cannot be read.
-    """
+    """Return the memory of planning and processing, without libraries and the tables of unusually accurate plans."""
     count = grid_count(settings.processing.directions)
     n_directions = len(direction_grid(settings.processing)) if count is None else count
     n_mics = int(microphones(settings.array).enabled.sum())
@@ -73,13 +59,7 @@ def predicted_bytes(settings: Settings) -> int:
 
 
 def require_memory(settings: Settings, max_bytes: int) -> int:
-    """Check the memory of a pipeline against a limit, and return the bytes that remain for the tables of a plan.
-
-    Raises
-    ------
-    ArgumentError
-        The pipeline needs more than ``max_bytes``.
-    """
+    """Require at most ``max_bytes`` for a pipeline, and return the bytes that remain for the tables of a plan."""
     n_bytes = predicted_bytes(settings)
     if n_bytes > max_bytes:
         raise ArgumentError(
@@ -90,13 +70,7 @@ def require_memory(settings: Settings, max_bytes: int) -> int:
 
 
 def require_image_size(settings: Settings) -> None:
-    """Refuse images that are too large for a central node, before anything is allocated.
-
-    Raises
-    ------
-    ArgumentError
-        An image would have more than 256 MB.
-    """
+    """Refuse images above 256 MB, too large for a central node, before anything is allocated."""
     processing = settings.processing
     count = grid_count(processing.directions)
     if count is None:  # A list of directions is only as long as its text.
@@ -113,14 +87,7 @@ def require_image_size(settings: Settings) -> None:
 
 
 def require_images(settings: Settings) -> None:
-    """Refuse settings from which a central node computes no image; this takes milliseconds and little memory.
-
-    Raises
-    ------
-    ArgumentError
-        An image or its pipeline would be too large, the ranges lie outside the record, the array cannot be used, the
-        last stage yields no image, or directions depend on poses.
-    """
+    """Refuse settings from which a central node computes no image; this takes milliseconds and little memory."""
     settings.processing.require_image()
     settings.processing.require_sensor_frame("a central node does not know the poses of measurements in time")
     require_image_size(settings)

@@ -30,15 +30,7 @@ _DIRECTIONS = 64  # in a block, whose beams at the full rate stay in the caches
 
 
 class PaperChain(KernelChain):
-    """Signal chain of the paper's method; parameters and attributes as for `KernelChain`.
-
-    Raises
-    ------
-    ArgumentError
-        The range window extends beyond the record or contains no sample.
-    DeviceError
-        The device has too little memory.
-    """
+    """Signal chain of the paper's method; parameters, attributes and errors are those of `KernelChain`."""
 
     def _make(self, settings: Settings) -> None:
         layout, memory, kernels = microphones(settings.array), self._memory, self._kernels

@@ -31,18 +31,7 @@ _DIRECTIONS = 16  # Number of directions in a block, which stays in the caches.
 class ScipyPaperChain:
     """Signal chain of the paper, with tables computed once; implements `Chain`.
 
-    Attributes
-    ----------
-    grid : Grid
-        Directions of the image.
-    range_m : (range,) float64
-        Range axis in metres: ``c n / (2 · signal rate)`` for every ``output_decimation``-th sample n within the range
-        window.
-
-    Raises
-    ------
-    ArgumentError
-        The range window extends beyond the record or contains no sample.
+    Ranges are ``c n / (2 · signal rate)`` for every ``output_decimation``-th sample n within the range window.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -213,16 +202,11 @@ def _filtered_call(settings: Settings, demodulate: _Demodulate) -> NDArray[np.fl
 
 
 class _LowPass:
-    """Low-pass filter of rectified beams, decimated by ``output_decimation``.
+    """Low-pass filter of rectified beams, decimated by ``output_decimation``; its ``delay`` in samples is compensated.
 
     The paper states neither order nor bandwidth. This is a Butterworth filter of the same order as the others. Its
     cutoff is half the output rate, or the call's lowest frequency if that is lower. It removes the ripple at twice the
     carrier and keeps the range resolution that the output rate allows.
-
-    Attributes
-    ----------
-    delay : int
-        Group delay in samples, which is compensated.
     """
 
     def __init__(self, settings: Settings) -> None:

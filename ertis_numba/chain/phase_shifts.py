@@ -34,20 +34,10 @@ def rows_at_a_time(n_directions: int, n_outputs: int) -> int:
 
 
 class PhaseShifts:
-    """Delay-and-sum beamformer that delays spectra by phase shifts.
+    """Delay-and-sum beamformer that delays spectra by phase shifts; the filter's gains include microphone weights.
 
-    Parameters
-    ----------
-    matched_filter : MatchedFilter
-        Filter whose gains include the weights of the microphones.
-    zones : iterable of (first, stop, delays)
-        Focal zones that together cover the range axis: ranges ``first … stop - 1`` of each zone, and its delays in
-        seconds, (direction, mic) float64.
-
-    Attributes
-    ----------
-    shape : (direction, 1, sample)
-        Shape of the beams that are transformed at a time.
+    ``zones`` cover the range axis: ranges ``first … stop - 1``, and delays (direction, mic) in seconds. ``shape``
+    (direction, 1, sample) is that of the beams that are transformed at a time.
     """
 
     def __init__(
@@ -93,18 +83,7 @@ class PhaseShifts:
         *,
         threads: int,
     ) -> None:
-        """Fill ``out``, (direction, range) float32.
-
-        Parameters
-        ----------
-        transforms : Transforms
-            Transforms planned for the signals and ``beams``.
-        beams : (direction, 1, sample) complex64
-            Work array of the shape ``shape``.
-        buffers : tuple
-            Result of `new_buffers`.
-        out : (direction, range) float32
-        """
+        """Fill ``out`` (direction, range), with the work array ``beams`` of `shape` and buffers of `new_buffers`."""
         for part, (first, stop), rows in self._parts(transforms, beams, buffers, threads=threads):
             self._kernels.envelope_rows(part, self._lead, first, stop, out[rows])
 

@@ -85,15 +85,7 @@ def few_delays(
     *,
     sound_speed_m_s: float,
 ) -> NDArray[np.float64] | None:
-    """Return all delays in seconds, (delay,) float64; None if they spread evenly over a step, or change with a tilt.
-
-    Parameters
-    ----------
-    own_s, weights : (mic,) float64
-        Delay and array weight of each microphone.
-    step_s : float
-        Time between samples in seconds.
-    """
+    """Return all delays (delay,) in s; None if they spread evenly over a step, or change with a tilt."""
     reach_s = math.sqrt(float(np.max(aperture.square_m2, initial=0.0))) / sound_speed_m_s
     if aperture.is_turned or len(weights) * (1 + 2 * reach_s / step_s) > _MANY_FRACTIONS:
         return None
@@ -121,9 +113,8 @@ def chain_taps(settings: Settings) -> NDArray[np.int16] | NDArray[np.int32]:
 def ringing_db(settings: Settings) -> float:
     """Return the level below its peak at which the ringing of the matched filter may be cut off.
 
-    The noise of PDM bits masks ringing below the stopband. PCM has no such noise. Sound outside the window may exceed
-    the image by the whole dynamic range. Ringing that is cut off or wraps around must still stay below the error
-    budget.
+    The noise of PDM bits masks ringing below the stopband. PCM has no such noise: sound outside the window may exceed
+    the image by the whole dynamic range, and its ringing must still stay below the error budget.
     """
     if not settings.recording.is_pdm:
         return min(_MAX_RINGING_DB, _PCM_RANGE_DB - settings.accuracy.max_error_db)

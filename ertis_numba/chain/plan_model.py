@@ -65,10 +65,7 @@ class ImagePlan(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Nodes:
-    """Predicted properties of a beam grid: its size, its error, and the sum of a beam's squared weights.
-
-    ``grid`` is the estimate from a measured signal model, or None.
-    """
+    """Predicted size and error of a beam grid, and sum of a beam's squared weights; ``grid`` needs a measured model."""
 
     count: int
     n_pairs: int
@@ -100,15 +97,7 @@ class _Beams(NamedTuple):
 
 
 class PlanModel:
-    """Predictions about complete plans for one kind of measurement.
-
-    Parameters
-    ----------
-    signal_model : SignalModel or None
-        Measured signal model; None for safe values, as in `ErrorModel`.
-    tile_ranges : int
-        Number of ranges in a tile of 16-bit samples.
-    """
+    """Predictions about complete plans for one kind of measurement; without a signal model, they are safe values."""
 
     def __init__(self, settings: Settings, signal_model: SignalModel | None, *, tile_ranges: int) -> None:
         self.settings = settings

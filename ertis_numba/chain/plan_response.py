@@ -20,17 +20,7 @@ _WAVES = 9  # Number of frequencies; the errors of a plan are smooth between the
 
 
 class Deviation(NamedTuple):
-    """Relative error of each beam at each microphone, as a linear function of frequency.
-
-    Attributes
-    ----------
-    centre_hz : float
-        Centre frequency.
-    mean : (direction, mic) complex64
-        Error at the centre frequency.
-    slope_s : (direction, mic) complex64
-        Change of the error per hertz.
-    """
+    """Relative error (direction, mic) of beams as a linear function of frequency: mean at the centre, slope in 1/Hz."""
 
     centre_hz: float
     mean: NDArray[np.complex64]
@@ -38,15 +28,9 @@ class Deviation(NamedTuple):
 
 
 def deviation_of(settings: Settings, directions: NDArray[np.float64]) -> Deviation | None:
-    """Return the deviation of a complete plan of the fast method; None if the deviation is zero or unknown.
+    """Return the deviation of a fast plan for unit vectors (direction, axis) of the whole grid; None if 0 or unknown.
 
-    It includes interpolation between beam-grid points and between stored samples. With spherical wavefronts, the latter
-    depends on the range and is not included.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors of the whole grid.
+    With spherical wavefronts, interpolation between stored samples depends on the range and is not included.
     """
     plan = settings.accuracy
     unknown = None in {plan.oversampling, plan.delay_taps, plan.beam_taps}

@@ -20,13 +20,7 @@ _SMALL = 0.1  # Share of the budget for steps whose error costs little to reduce
 
 
 def open_plans(model: PlanModel, budget: float) -> list[ImagePlan]:
-    """Return the plans that the settings permit, except needlessly accurate ones.
-
-    Parameters
-    ----------
-    budget : float
-        Largest error power of a plan, relative to the exact image.
-    """
+    """Return the plans that the settings permit, except needlessly accurate ones; ``budget`` is their error power."""
     given = model.settings.accuracy
     adaptive = model.settings.processing.is_adaptive
     if adaptive and model.settings.processing.wavefront == "spherical":
@@ -57,10 +51,7 @@ def open_plans(model: PlanModel, budget: float) -> list[ImagePlan]:
 
 
 def _may_be_shifted(settings: Settings) -> bool:
-    """Return True if phase shifts of spectra can keep the given parts of a plan, and may be the fastest.
-
-    With spherical wavefronts they are not, because each focal zone takes its own transforms.
-    """
+    """Return True if phase shifts of spectra are permitted and may be fastest, as with plane wavefronts."""
     given = settings.accuracy
     if given.delay_taps is None and settings.processing.wavefront == "spherical":
         return False

@@ -24,16 +24,10 @@ class ImageErrors:
 
 
 class ErrorShares(NamedTuple):
-    """Error power of the image relative to that of a stream.
+    """Error power of the image relative to that of a stream; ``noise_share`` is that of noise in images of echoes.
 
-    Attributes
-    ----------
-    noise, coherent : float
-        For errors that differ between microphones, in noise and for an echo that reaches all microphones alike.
-    common : float
-        For errors that all microphones share, and such an echo.
-    noise_share : float
-        Share of noise in the power of an image of echoes.
+    ``noise`` and ``coherent`` hold for errors that differ between microphones, in noise and for an echo that reaches
+    all microphones alike; ``common`` for errors that all microphones share, and such an echo.
     """
 
     noise: float
@@ -42,14 +36,9 @@ class ErrorShares(NamedTuple):
     noise_share: float
 
     def errors(self, *, whole: float, varying: float, common: float) -> ImageErrors:
-        """Return the error powers of images.
+        """Return the error powers of images from those of a stream with its whole spectrum, and where it is bright.
 
-        Parameters
-        ----------
-        whole : float
-            Error power of the stream with the whole spectrum.
-        varying, common : float
-            Error power where the image is bright: the part that differs between microphones, and the rest.
+        The latter have a part that differs between microphones, ``varying``, and the rest, ``common``.
         """
         noise = _UNLIKE * self.noise * whole
         echoes = _UNLIKE * (self.coherent * varying + self.common * common) + self.noise_share * noise
@@ -58,15 +47,7 @@ class ErrorShares(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StreamGrid:
-    """Beam grid of a stream.
-
-    Attributes
-    ----------
-    n_points, n_pairs : int
-        Points of the grid, and pairs of points for each direction.
-    squares : float
-        Sum of a beam's squared weights.
-    """
+    """Beam grid of a stream: its points, pairs of points per direction, and sum of a beam's squared weights."""
 
     n_taps: int
     density: float
@@ -78,15 +59,7 @@ class StreamGrid:
 
 @dataclass(frozen=True, slots=True)
 class PlannedStream:
-    """Stream with its interpolation.
-
-    Attributes
-    ----------
-    high_hz : float
-        Frequency to which the density of its beam grid is relative.
-    grid : StreamGrid or None
-        Beam grid; None if every direction is summed itself.
-    """
+    """Stream with its interpolation; the density of its beam grid, if it has any, is relative to ``high_hz``."""
 
     stream: SignalStream
     spectrum: StreamSpectrum
@@ -98,16 +71,9 @@ class PlannedStream:
 
 @dataclass(frozen=True, slots=True)
 class PlannedStreams:
-    """Streams of a plan.
+    """Streams of a plan as in `Recipe`, of which ``n_powers`` are power sums; negligible ones are left out.
 
-    Attributes
-    ----------
-    streams : list of PlannedStream
-        As in `Recipe`, without the highest power sums if these are negligible.
-    n_powers : int
-        Number of power sums among them.
-    delays : ImageErrors
-        Errors due to interpolation of delays and power sums that are left out.
+    ``delays`` has the errors due to interpolation of delays and power sums that are left out.
     """
 
     streams: list[PlannedStream]

@@ -37,14 +37,8 @@ _ROUNDED_DB = 1e-6
 class Chosen:
     """Plan with its predicted error and time.
 
-    Attributes
-    ----------
-    settings : Settings
-        Settings with the complete plan in ``accuracy``.
-    parts : dict of str to float
-        Power of each part of the error relative to that of the exact image; see `accuracy.PARTS`.
-    stages_ms : dict of str to float
-        Predicted time of each stage in milliseconds.
+    ``parts`` is the power of each part of the error relative to that of the exact image, by the names of
+    `accuracy.PARTS`.
     """
 
     settings: Settings
@@ -70,13 +64,7 @@ def complete(
     max_bytes: int | None = None,
     plan: PlanCosts = "nominal",
 ) -> Settings:
-    """Return settings with a complete plan and wavefront; see `Planner.choose`.
-
-    Raises
-    ------
-    ArgumentError
-        No plan keeps the budget, or the given plan does not keep it.
-    """
+    """Return settings with a complete plan and wavefront; see `Planner.choose`."""
     if settings.processing.method == "paper":
         return settings.replace(processing=settings.processing.replace(wavefront="plane"))
     if settings.processing.delay_matrix:  # Only exact delays need no model of the distribution of delays.
@@ -99,20 +87,10 @@ def complete(
 
 
 class Planner:
-    """Planner for the measurements of one sensor on one device.
+    """Planner for the measurements of one sensor on one device; values that the settings' accuracy fixes are kept.
 
-    Parameters
-    ----------
-    settings : Settings
-        Values that their accuracy fixes are kept.
-    signal_model : SignalModel, optional
-        Signal model of a measurement; a safe one for any sound by default.
-    max_bytes : int, optional
-        Limit on the memory of a plan's signals and delays.
-    sensitivity : Sensitivity, optional
-        Sensitivity of the beamformer; by default, a safe estimate for any sound.
-    plan : {"nominal", "measured"}
-        Costs that decide between plans and predict times: published ones, or those measured on this machine.
+    The signal model and the sensitivity of the beamformer are safe for any sound unless they are passed. ``max_bytes``
+    limits the memory of signals and delays. ``plan`` selects published or measured costs.
     """
 
     def __init__(
@@ -160,13 +138,7 @@ class Planner:
         ]
 
     def choose(self) -> Chosen:
-        """Return the fastest plan that keeps the budget.
-
-        Raises
-        ------
-        ArgumentError
-            No plan keeps the budget; the message has the smallest possible error.
-        """
+        """Return the fastest plan that keeps the budget; otherwise, the error states the smallest possible one."""
         wanted_db = self.settings.accuracy.max_error_db
         allowed = 10 ** (wanted_db / 10) * _ROUNDED
         # If no plan keeps the budget for images of an adaptive beamformer, the most accurate plan is chosen, and the

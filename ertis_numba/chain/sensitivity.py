@@ -14,13 +14,8 @@ __all__ = ["Sensitivity"]
 class Sensitivity:
     """Error power of the image as a function of the error power p of the beams: ``linear · p + (quadratic · p)²``.
 
-    Attributes
-    ----------
-    linear : float
-        1 by default, as for delay-and-sum.
-    quadratic : float
-        Coefficient for the cancellation of an echo with delay errors by Capon; it increases as diagonal loading
-        decreases. 0 by default.
+    Delay-and-sum has 1 and 0. ``quadratic`` is for the cancellation of an echo with delay errors by Capon; it increases
+    as diagonal loading decreases.
     """
 
     linear: float = 1.0
@@ -28,10 +23,9 @@ class Sensitivity:
 
     @classmethod
     def of(cls, processing: Processing, n_mics: int) -> Self:
-        """Return a safe estimate for any sound.
+        """Return a safe estimate for any sound, declared in the registry of beamformers and weightings.
 
-        The registry of beamformers and weightings declares it. The estimates result from perturbed weights in noise and
-        in scenes of one echo and of 12 echoes.
+        The estimates result from perturbed weights in noise and in scenes of one echo and of 12 echoes.
         """
         beamformer = BEAMFORMERS[processing.beamformer]
         linear, quadratic = beamformer.sensitivity(n_mics, *beamformer.values(processing))

@@ -41,22 +41,7 @@ def signal_model_of(
     threads: int = 1,
     amplitude: NDArray[np.float32] | None = None,
 ) -> SignalModel:
-    """Return the signal model of a measurement for an image with given settings.
-
-    Parameters
-    ----------
-    settings : Settings
-        Settings of the image.
-    threads : int
-        Number of threads; 1 by default.
-    amplitude : (direction, range) float32, optional
-        Delay-and-sum image of the measurement, if one exists; by default, a rough image is computed.
-
-    Raises
-    ------
-    DataError
-        The samples do not match the settings.
-    """
+    """Return the signal model of a measurement; without its delay-and-sum image ``amplitude``, compute a rough one."""
     low_hz, high_hz = matched_band_hz(settings)
     processing = settings.processing.replace(beamformer="delay_and_sum", weighting="none", delay_matrix=())
     if amplitude is not None:

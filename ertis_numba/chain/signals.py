@@ -25,28 +25,10 @@ def signals_of(
     window: TimeWindow | None = None,
     max_samples: int | None = None,
 ) -> NDArray[np.float32]:
-    """Return the low-pass filtered and decimated signals of the enabled microphones.
+    """Return decimated signals (mic, sample) of the enabled microphones, divided by gains, with a full scale of 1.
 
-    Signals are divided by the calibrated gains. Calibrated delays are not compensated.
-
-    Parameters
-    ----------
-    settings : Settings, optional
-        Settings with the decimation and the stopband attenuation; by default, those of the measurement.
-    window : TimeWindow, optional
-        Window of samples; all samples by default.
-    max_samples : int, optional
-        Maximum number of recorded samples to read if there is no window; all by default.
-
-    Returns
-    -------
-    (mic, sample) float32
-        Signals with a full scale of 1. Sample n lies at the recorded sample n times the decimation.
-
-    Raises
-    ------
-    DataError
-        The samples do not match the settings.
+    Sample n lies at the recorded sample n times the decimation. Calibrated delays are not compensated. Without a
+    window, at most ``max_samples`` recorded samples are read.
     """
     settings = settings or measurement.settings
     layout = microphones(settings.array)
@@ -63,19 +45,9 @@ def signals_of(
 
 
 def matched(signals: NDArray[np.float32], settings: Settings) -> NDArray[np.complex64]:
-    """Return the signals of `signals_of` after the call's matched filter.
+    """Return signals from sample 0 on after the call's matched filter, analytic: (mic, sample).
 
-    Parameters
-    ----------
-    signals : (mic, sample) float32
-        Decimated signals from sample 0 on.
-    settings : Settings
-        Settings of the signals.
-
-    Returns
-    -------
-    (mic, sample) complex64
-        Analytic signals. An echo of amplitude 1 that starts at sample n has its peak there, with an envelope of 1.
+    An echo of amplitude 1 that starts at sample n has its peak there, with an envelope of 1.
     """
     count = signals.shape[1]
     # The filter rings for the call's duration and a guard on either side; the padding keeps its ends apart.

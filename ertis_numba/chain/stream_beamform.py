@@ -26,7 +26,7 @@ class StreamTables(NamedTuple):
 
 
 def amplitudes_of_stream(recipe: Recipe, place: int, n_mics: int) -> NDArray[np.float64]:
-    """Return the weight of each microphone in the sum of a stream: (mic,) float64.
+    """Return the weight of each microphone in the sum of a stream: (mic,).
 
     The products of an order are divided by their number, so that no sum overflows single precision.
     """
@@ -47,25 +47,11 @@ class _Zone:
 
 
 class StreamBeamform:
-    """Adaptive beamformer on 16-bit streams; implements `Beamform`.
+    """Adaptive beamformer on 16-bit streams, with tables for each; implements `Beamform`.
 
-    Parameters
-    ----------
-    tables : sequence of StreamTables
-        One for each stream. Tables without a beam grid have the directions in the order of ``rows``.
-    rows : (direction,) int32
-        Directions in the order of computation.
-    zones : sequence of (first, stop)
-        Ranges of the focal zones.
-    n_phases : int
-        Number of phases of the analytic signals.
-    last_sample : int, optional
-        As for `ertis_numba.chain.beamform.beamform`.
-
-    Attributes
-    ----------
-    linear : int
-        Index of the stream of the signals themselves, to which a filter may apply gains; −1 if there is none.
+    Tables without a beam grid have the directions in the order of ``rows`` (direction,). ``zones`` are (first, stop) of
+    ranges. ``linear`` is the index of the stream of the signals themselves, to which a filter may apply gains; −1 for
+    none.
     """
 
     def __init__(

@@ -56,15 +56,7 @@ _CORRELATED: Final = 2  # The beam of the coherence factor and the first power s
 
 
 class StreamPlanner:
-    """Planner of the streams of one sensor and one image.
-
-    Parameters
-    ----------
-    spectrum : Spectrum
-        Spectrum of the output of the matched filter.
-    sound_speed_m_s, nearest_m : float
-        Speed of sound, and the smallest distance of a reflector.
-    """
+    """Planner of the streams of one sensor and one image; ``nearest_m`` is the smallest distance of a reflector."""
 
     def __init__(
         self,
@@ -85,15 +77,7 @@ class StreamPlanner:
     def plan(
         self, n_phases: int, n_taps: int, beam_taps: int, density: float, delays_s: NDArray[np.float64] | None = None
     ) -> PlannedStreams:
-        """Return the streams of a plan.
-
-        Parameters
-        ----------
-        density : float
-            As in `ImagePlan`.
-        delays_s : (delay,) float64, optional
-            All delays in seconds, if they are too few to spread evenly over a step, see `few_delays`.
-        """
+        """Return the streams of a plan; ``delays_s`` (delay,) are all delays if few do not spread over a step."""
         step_s = 1 / (self._rate_hz * n_phases)
         _, first = self._delays(0, n_taps, step_s, delays_s)
         errors, small, order = first, _SMALL * first.echoes, self.recipe.order

@@ -12,16 +12,9 @@ LINEAR: Final = SignalStream(1.0, 1)
 
 
 class Recipe(NamedTuple):
-    """Streams of a beamformer and a weighting, and the numbers that `kernels` need to combine their sums.
+    """Streams of a beamformer and a weighting: power sums, then those of the coherence factor; −1 for no such stream.
 
-    Attributes
-    ----------
-    streams : tuple of SignalStream
-        Power sums, then the streams of the coherence factor.
-    order : int
-        Order of the product; 1 for delay-and-sum.
-    beam, total : int
-        Streams of the coherence factor; −1 for none.
+    ``order`` is that of the product, 1 for delay-and-sum.
     """
 
     streams: tuple[SignalStream, ...]
@@ -44,9 +37,6 @@ def recipe_of(processing: Processing) -> Recipe | None:
 
 
 def uses_streams(processing: Processing, accuracy: Accuracy) -> bool:
-    """Return True if a complete plan computes an adaptive beamformer from streams, not from all microphones at once.
-
-    The kernels of all microphones read one sample of each, in single precision and for each direction.
-    """
+    """Return True if a complete plan computes an adaptive beamformer from streams, not from all microphones at once."""
     plan = accuracy.precision, accuracy.delay_taps or 1, accuracy.beam_taps or 0
     return processing.is_adaptive and recipe_of(processing) is not None and plan != ("float32", 1, 0)

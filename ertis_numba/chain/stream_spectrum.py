@@ -37,7 +37,6 @@ def spectrum_of_stream(spectrum: Spectrum, stream: SignalStream) -> StreamSpectr
     Errors of ``|y|^a exp(ikφ)`` matter where y is strong. Weighted by ``|y|^(2 − 2a)``, the power of its derivative is
     that of ``|y|² (a² (ln |y|)'² + k² φ'²)``. Both terms of ``|y'|² = |y|² ((ln |y|)'² + φ'²)`` are equal on average.
     The bandwidth is therefore that of y times ``√((a² + k²) / 2)``, and the spectrum of y is stretched by this factor.
-
     The whole spectrum has no closed form for all powers, so it is estimated from noise of a fixed seed. It has wide
     tails, because phases jump at zeros of the noise, and magnitudes to a power below 1 have a cusp there.
     """

@@ -20,20 +20,8 @@ __all__ = ["TimeWindow", "time_window"]
 class TimeWindow:
     """Time window of an image: signal samples to demodulate, and samples after the matched filter.
 
-    Attributes
-    ----------
-    range_m : (range,) float64
-        Range axis in metres.
-    first_sample, n_samples : int
-        First signal sample to demodulate, and their number.
-    n_fft : int
-        Length of the transform: ``output_decimation`` times ``n_outputs``.
-    n_outputs : int
-        Number of samples of each phase.
-    lead : int
-        Index of the sample of phase 0 at the first range.
-    start_s : float
-        Time of sample 0 of phase 0, in seconds.
+    ``n_fft`` is ``output_decimation`` times ``n_outputs``, the samples of each phase. ``lead`` is the index of the
+    sample of phase 0 at the first range, and ``start_s`` the time of sample 0 of phase 0.
     """
 
     range_m: NDArray[np.float64]
@@ -62,22 +50,8 @@ def time_window(settings: Settings, *, largest_delay_s: float, n_taps: int, ring
     """Return the time window for beams with delays within ``± largest_delay_s``.
 
     An echo at time t needs the samples from t on for the duration of the call. The window adds the ringing of the
-    matched filter on both sides. The transform is slightly longer, so wrapped samples lie outside those that are read:
-    the convolution is linear.
-
-    Parameters
-    ----------
-    largest_delay_s : float
-        Largest magnitude of a beam's delays, in seconds.
-    n_taps : int
-        Length of the decimation filter, by which the filtered signals extend beyond the ends of the record.
-    ringing_db : float
-        Level below the peak at which the ringing of the matched filter is cut off; 60 by default.
-
-    Raises
-    ------
-    ArgumentError
-        The ranges lie outside the record.
+    matched filter to ``ringing_db`` on both sides. The transform is slightly longer, so wrapped samples lie outside
+    those that are read: the convolution is linear.
     """
     speed_m_s = sound_speed_m_s(settings.air)
     first_m, last_m = settings.processing.range_m

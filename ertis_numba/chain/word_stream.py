@@ -74,20 +74,10 @@ def foreign_stream() -> ArgumentError:
 
 
 class StreamedImage:
-    """Image of a measurement whose words arrive in pieces.
+    """Image (direction, range) of a measurement whose words (sample, word) arrive in pieces.
 
-    Parameters
-    ----------
-    image : callable
-        Function that computes an image from the signals in buffers: buffers, array for the image, and threads.
-    buffers : MeasurementBuffers
-        Buffers that nothing else uses.
-    words : (sample, word) unsigned integers
-        Array for a whole measurement.
-    amplitude : (direction, range) float32
-        Array for an image.
-    is_turned : bool
-        True if the directions of the image are known only when the measurement is complete.
+    ``image`` computes it from buffers, for an array and a number of threads; nothing else uses the buffers. With
+    ``is_turned``, the directions are known only when the measurement is complete.
     """
 
     def __init__(
@@ -109,10 +99,7 @@ class StreamedImage:
         self._begun_s, self._image_s = 0.0, math.inf if is_turned else self._time_s()
 
     def add(self, first: int, words: NDArray[Any]) -> None:
-        """Copy words, and compute signals that depend on no later ones.
-
-        Also compute the image once it has all signals, if it is finished before the last words arrive.
-        """
+        """Copy words, compute signals that depend on no later ones, and the image once it has all signals."""
         if first == 0:
             self._n_words = self._n_done = 0
             self._is_done = False
