@@ -273,9 +273,10 @@ class PipelinesBySensor:
         from ertis_numba.analysis.direction_spacing import spacing_warning
 
         image = self._image(measurement)
-        if not self.warnings and image.stamp.sensor not in self._checked:
+        if image.stamp.sensor not in self._checked:
             self._checked.add(image.stamp.sensor)
-            text = spacing_warning(image.settings, image)
+            options.note_unknown_places(image.stamp.sensor, image.settings, quiet=self._quiet)
+            text = None if self.warnings else spacing_warning(image.settings, image)
             if text is not None:
                 self.warnings.append(text)
                 options.warn(text)

@@ -161,6 +161,8 @@ def export(
             **chosen,
         )
     if known is not None:
+        for reader in readers if name != "batslam" else ():
+            options.note_unknown_places(reader.sensor, reader.settings, quiet=quiet)
         unknown = [reader.sensor for reader in readers if reader.sensor not in known]
         remedy = "the export uses the frame of the sensor; add --mounting FILE for the frame of the platform"
         _mountings.note_unknown(unknown, remedy, quiet=quiet)

@@ -69,6 +69,7 @@ __all__ = [
     "note_noise",
     "note_open_edges",
     "note_unknown_angles",
+    "note_unknown_places",
     "note_unlisted_directions",
     "note_when_slow",
     "output",
@@ -444,7 +445,9 @@ def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
     for name in sensors:
         with open_energyscapes(path, sensor=name) as images:
             note_missing_points(images)
-            if images.points_note is None and not images.has_points:
+            if images.has_points:
+                note_unknown_places(name, images.settings)
+            elif images.points_note is None:
                 note_unknown_angles(name, images.settings, images)
 
 
@@ -463,6 +466,15 @@ def note_unknown_angles(
     text = direction_note(settings.array, grid, is_passive=is_passive)
     if text is not None:
         note(f"sensor {sensor} {text}")
+
+
+def note_unknown_places(sensor: str, settings: "Settings", *, quiet: bool = False) -> None:
+    """Print a note if the places of a sensor's echoes are unknown, as with microphones on a line."""
+    from ertis_numba.geometry import observable_angles
+
+    text = observable_angles(settings.array).note
+    if text is not None:
+        note(f"sensor {sensor} {text}", quiet=quiet)
 
 
 def note_noise(sensor: str, count: int, *, quiet: bool = False) -> None:

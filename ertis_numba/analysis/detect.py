@@ -89,8 +89,6 @@ def find_peaks(
 
 def observed(image: Energyscape, peaks: list[Peak]) -> list[Peak]:
     """Return the peaks of an image without the angles that the array cannot observe."""
-    if image.points is not None:
-        return peaks  # The array of the settings is that of one sensor only.
     seen = observable_angles(image.settings.array)
     return [_observed(peak, seen, is_planar=image.is_planar) for peak in peaks]
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from ertis_numba.analysis.points import MIN_LEVEL_DB, TOP, PointExtractor
 from ertis_numba.frames import AcousticMap, Energyscape, PointCloud
-from ertis_numba.geometry import Grid
+from ertis_numba.geometry import Grid, observable_angles
 
 __all__ = ["PointFinder", "same_directions"]
 
@@ -29,7 +29,10 @@ class PointFinder:
         """Return the points of an image, in the coordinate frame of its sensor; those of a fusion if it has them."""
         if image.points is not None:
             chosen = {"top": TOP, "min_level_db": MIN_LEVEL_DB} | self._finding
-            return image.points.strongest(chosen["top"], chosen["min_level_db"])
+            cloud = image.points.strongest(chosen["top"], chosen["min_level_db"])
+            if cloud.uncertainty_m is not None and not all(observable_angles(cloud.settings.array)[:2]):
+                cloud = cloud.replace(uncertainty_m=cloud.uncertainty_m * np.float32([1, np.inf]))
+            return cloud
         known = self._extractors.get(image.stamp.sensor)
         if known is None or not _suits(known[0], image):
             grid = Grid(image.azimuth_rad, image.elevation_rad)

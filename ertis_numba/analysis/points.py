@@ -44,8 +44,8 @@ class PointExtractor:
     beside strong ones at the same range, which this class discards.
 
     Each point has standard deviations of its position: see
-    `ertis_numba.analysis.uncertainty.PositionUncertainty`. Microphones in one place observe no directions, and hence
-    yield no points.
+    `ertis_numba.analysis.uncertainty.PositionUncertainty`. That across the range is infinite if the array does not
+    observe azimuth and elevation, as with microphones on a line. Those in one place yield no points.
 
     Parameters
     ----------
@@ -90,7 +90,8 @@ class PointExtractor:
         false_alarm: float | None = FALSE_ALARM,
     ) -> None:
         checks.instance("settings", settings, Settings, "an image or a recording contains")
-        self._has_directions = any(observable_angles(settings.array)[:2])
+        seen = observable_angles(settings.array)
+        self._has_directions, self._has_places = any(seen[:2]), self._noise_only or all(seen[:2])
         self._top = checks.integer("top", top, 1)
         self._smallest = 10 ** (checks.between("min_level_db", min_level_db, -1000.0, 0.0) / 20)
         if false_alarm is not None:
@@ -127,7 +128,8 @@ class PointExtractor:
         order = np.argsort(-levels, kind="stable")
         width_rad = np.where(self._are_open(image, tops), math.pi, tops.width_rad)
         found = self._uncertainty(image, tops._replace(width_rad=width_rad), noise=noise)
-        uncertainty_m = np.stack([found.range_m, np.abs(tops.range_m) * found.across_rad], axis=1).astype(np.float32)
+        across_rad = found.across_rad if self._has_places else math.inf
+        uncertainty_m = np.stack([found.range_m, np.abs(tops.range_m) * across_rad], axis=1).astype(np.float32)
         return PointCloud(
             position_m[order], levels[order], image.settings, image.stamp, uncertainty_m=uncertainty_m[order]
         )
@@ -189,7 +191,8 @@ class EchoPointExtractor(PointExtractor):
     """Extractor for fusion and odometry, whose uncertainties are those of noise only.
 
     Both model the interference of echoes themselves. With the misfit to a single echo as well, they would accept echoes
-    of other reflectors as those of one. Both also compare all maxima with the noise.
+    of other reflectors as those of one. Both also compare all maxima with the noise. Images of one elevation are those
+    of reflectors at this elevation.
     """
 
     _noise_only = True

@@ -16,6 +16,7 @@ from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.pulses import is_same_pulse
 from ertis_numba.fusion.rig import USUAL_DIAMETER_M, Mountings, emitter_diameter_m, mounted_sensors
 from ertis_numba.fusion.tables import FusionTables, PulseReflectors
+from ertis_numba.geometry import require_places
 from ertis_numba.settings import MAX_EMITTER_M
 
 __all__ = ["Fused", "Fuser", "fuse"]
@@ -96,7 +97,8 @@ class Fused:
 
         Amplitudes are those that a single sensor would measure if the reflector were at 1 m on the axis of its emitter.
         Where the calls of two sensors arrive together, with unknown phases, they may be 3 dB too high, or up to 13 dB
-        too low where the calls cancel each other.
+        too low where the calls cancel each other. If microphones are on a line, positions and uncertainties apply to
+        reflectors at the height of the sensors.
         """
         return self._locate(self._solve())
 
@@ -222,8 +224,8 @@ class Fuser:
         Raises
         ------
         ArgumentError
-            There is no image, two images of the same sensor, an image without a mounting, or a mixture of planar and
-            other images.
+            There is no image, two images of the same sensor, an image without a mounting, a mixture of planar and
+            other images, or an image whose array observes no places: see `ertis_numba.geometry.observable_angles`.
         DataError
             The images are not from the same pulse.
         """
@@ -336,6 +338,7 @@ class Fuser:
         for image in checks.items("images", images, Energyscape, "Pipeline.process returns"):
             number = self._number(image.stamp.sensor, "images")
             image.settings.processing.require_sensor_frame("fusion needs directions of each sensor")
+            require_places(image.settings.array, image.stamp.sensor, is_planar=image.is_planar)
             if number in found:
                 raise ArgumentError(f"images has two of sensor {image.stamp.sensor!r}; use one image of each sensor")
             if not np.isfinite(image.amplitude).all():

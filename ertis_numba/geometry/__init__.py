@@ -21,7 +21,7 @@ from ertis_numba.geometry.layouts import (
 from ertis_numba.geometry.levelling import levelled_grid
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
-from ertis_numba.geometry.observable import ObservableAngles, direction_note, observable_angles
+from ertis_numba.geometry.observable import ObservableAngles, direction_note, observable_angles, require_places
 from ertis_numba.geometry.position_files import SENSOR_FRAME
 from ertis_numba.geometry.sector import Fan, plan_m, round_step
 from ertis_numba.geometry.shipped_layouts import layout_names, layout_text
@@ -60,6 +60,7 @@ __all__ = [
     "plane_delays",
     "reach_rad",
     "received_settings",
+    "require_places",
     "require_plausible_size",
     "round_step",
     "self_contained",

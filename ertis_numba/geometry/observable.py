@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.base.angles import DegreesFromRadians
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry.delays import unit_vectors
 from ertis_numba.geometry.layouts import microphones
 from ertis_numba.settings import Array
 
-__all__ = ["ObservableAngles", "direction_note", "observable_angles"]
+__all__ = ["ObservableAngles", "direction_note", "observable_angles", "require_places"]
 
 _FLAT: Final = 1e-3  # Width of an array relative to its length, below which it has no width.
 _SAME: Final = 1e-9  # Largest distance of equal unit vectors.
@@ -135,6 +136,30 @@ def direction_note(array: Array, grid: DegreesFromRadians, *, is_passive: bool =
     if is_passive and not sides and _normal(microphones(array).enabled_positions_m) is not None:
         sides = f"{_IN_PLANE}, so sound from behind this plane appears in front of it"
     return "; it also ".join(filter(None, (_of_grid(grid), sides))) or None
+
+
+def require_places(array: Array, sensor: str, *, is_planar: bool) -> None:
+    """Raise ArgumentError if an array observes no places of echoes, not even of those at the elevation of its images.
+
+    Parameters
+    ----------
+    array : Array
+    sensor : str
+        Name for the message.
+    is_planar : bool
+        True if all directions lie at one elevation.
+
+    Examples
+    --------
+    >>> from ertis_numba.geometry import require_places
+    >>> from ertis_numba.settings import Array
+    >>> require_places(Array(), "sensor", is_planar=False)
+    """
+    seen = observable_angles(array)
+    if seen.azimuth and (seen.elevation or is_planar):
+        return
+    remedy = "process with 2d:N directions" if seen.azimuth else "use an array with microphones in a plane"
+    raise ArgumentError(f"sensor {sensor} {seen.note}, so its echoes have no places; {remedy}")
 
 
 def _of_grid(grid: DegreesFromRadians) -> str | None:

@@ -12,7 +12,7 @@ from ertis_numba.analysis.points import EchoPointExtractor
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.rig import MountedSensor, emitter_diameter_m
-from ertis_numba.geometry import Grid, microphones
+from ertis_numba.geometry import Grid, microphones, require_places
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Array, Call
 
@@ -95,6 +95,7 @@ class EchoExtractor:
                 f"sensor {item.stamp.sensor!r} has no mounting; add its mounting, or use one of "
                 f"{', '.join(self._sensors)}"
             )
+        require_places(item.settings.array, item.stamp.sensor, is_planar=not np.any(item.elevation_rad))
         number, mounted = self._sensors[item.stamp.sensor]
         local_m = cloud.position_m.astype(np.float64)
         off_axis = _off_axis_rad(local_m)

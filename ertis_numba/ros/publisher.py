@@ -256,8 +256,7 @@ class RosPublisher:
             if fused.points is None:
                 continue
             if "points" in self._wanted:
-                cloud = fused.points.strongest(self._top, self._settings.min_level_db)
-                count += self._publish_fused_points(self._within_limits(cloud))
+                count += self._publish_fused_points(self._within_limits(self._find(fused)))
             if "scan" in self._wanted:
                 count += self._publish_fused_scans(fused, fused.points, images)
         return count
