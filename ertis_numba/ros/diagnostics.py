@@ -12,11 +12,7 @@ _NS: Final = 1_000_000_000
 
 
 def diagnostics_message(status: Status) -> dict[str, Any]:
-    """Return the diagnostics of a central node and of each of its sensors.
-
-    A node with a fault is an error. A sensor that is not connected is stale, and one with missing measurements is a
-    warning.
-    """
+    """Return diagnostics of a central node (fault: error) and its sensors (absent: stale, missing: warning)."""
     sec, nanosec = divmod(status.time_ns, _NS)
     node = f"ertis {status.address}"
     values = {

@@ -14,22 +14,15 @@ _MAX_SAMPLES: Final = 1000
 
 @dataclass(frozen=True, slots=True)
 class FoundSubscriber:
-    """Subscriber of a ROS 2 topic.
+    """Subscriber of a ROS 2 topic."""
 
-    - ``topic``, ``message``: ROS name, as in ``/front/points``, and type of the messages.
-    - ``is_reliable``: it receives nothing from best-effort publishers.
-    """
-
-    topic: str
+    topic: str  # ROS name, as in /front/points
     message: str
-    is_reliable: bool
+    is_reliable: bool  # receives nothing from best-effort publishers
 
 
 def discover(participant: Participant, wait_s: float = 2.0) -> tuple[int, list[FoundSubscriber]]:
-    """Return the number of other participants, and the subscribers of ROS 2 topics.
-
-    ``participant`` is open; others announce themselves within ``wait_s``.
-    """
+    """Return the number of other participants that announce themselves, and the subscribers of ROS 2 topics."""
     from cyclonedds.builtin import (  # noqa: PLC0415  an extra
         BuiltinDataReader,
         BuiltinTopicDcpsParticipant,

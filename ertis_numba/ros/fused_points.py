@@ -29,10 +29,7 @@ class FusedPoints:
         self._groups: PulseGroups[PointCloud] = PulseGroups(on_note)
 
     def add(self, cloud: PointCloud) -> list[PointCloud]:
-        """Add the points of a sensor with a known mounting, and return the groups that are complete now, joined.
-
-        Points that come after their group was returned are left out.
-        """
+        """Add points of a mounted sensor; return groups that are complete now, joined; later points are left out."""
         return [joined(group) for group in self._groups.add(cloud)]
 
 
@@ -54,11 +51,10 @@ class FusedImages:
         self._n_fused, self._unshown = 0, frozenset[str]()
 
     def add(self, image: Energyscape, mountings: Mapping[str, Mounting]) -> list[PulseImages]:
-        """Add an image, and return the pulses that are complete now.
+        """Add an image; return the pulses that are complete now, with an origin in whole metres, as `joined`.
 
         Images that are planar, unlike the first one of their pulse, or the reverse, are left out. A pulse that cannot
-        be fused is left out with a note. The frame of the result is that of `joined`, with an origin in whole metres.
-        ``mountings`` are those of all sensors with a known pose.
+        be fused is left out with a note. ``mountings`` are those of all sensors with a known pose.
         """
         fused = []
         for group in self._groups.add(image):
@@ -114,10 +110,10 @@ class FusedImages:
 
 
 def joined(clouds: Mapping[str, PointCloud]) -> PointCloud:
-    """Return the points of several sensors as one cloud in the frame of the platform, with the earliest time.
+    """Return the points of several mounted sensors in the frame of the platform, with the earliest time.
 
     If a sensor is more than 1 km from the origin of this frame, the points are in the frame ``base_link_local``, and
-    ``translation_m`` is its origin in whole kilometres. ``clouds`` have known mountings.
+    ``translation_m`` is its origin in whole kilometres.
     """
     each = list(clouds.values())
     stamp = min((cloud.stamp for cloud in each), key=lambda stamp: stamp.timestamp_ns)

@@ -21,10 +21,8 @@ _Group = dict[str, _Item]
 class OdometryPublisher:
     """Publisher of nav_msgs/msg/Odometry and the transform from ``odom`` to ``base_link``.
 
-    - ``on_note``: called by any thread with a line for each sensor without mounting, and for each pulse that cannot be
-      used.
-    - ``is_paused``: returns True while nothing is to be published; the pose is still computed.
-    - ``alone``: True if no other sensor emits than those given, as for `Odometry`; False by default.
+    Any thread calls ``on_note`` with a line for each sensor without mounting, and each unusable pulse. While
+    ``is_paused`` returns True, the pose is computed but not published. ``alone`` is as for `Odometry`.
     """
 
     def __init__(
@@ -67,10 +65,7 @@ class OdometryPublisher:
             self._put(group)
 
     def close(self) -> None:
-        """Publish the poses of all waiting pulses, and end the thread.
-
-        Raise ErtisError if the computation has failed.
-        """
+        """Publish the poses of all waiting pulses, and end the thread; raise ErtisError if it has failed."""
         while group := self._groups.close():
             self._put(group)
         self._queue.end()

@@ -143,11 +143,7 @@ class Participant:
 
 
 class Topic:
-    """Topic on which messages are published.
-
-    ``name``, ``message``: ROS name, and type of the messages. ``published``, ``dropped``: number of published messages,
-    and of those dropped because a reliable subscriber did not keep up.
-    """
+    """Topic with counts of published messages, and of those dropped because a reliable subscriber was slow."""
 
     def __init__(self, name: str, message: str, kind: Any, writer: Any) -> None:
         self.name, self.message = name, message
