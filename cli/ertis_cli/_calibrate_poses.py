@@ -35,15 +35,7 @@ def write_poses(
     quiet: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Calibrate the poses of sensors from recordings of one or several runs, print them, and write a mounting file.
-
-    - ``sensors``: names of the sensors in the order of the SYNC chain; those of the recordings by default.
-    - ``target``: mounting file (TOML) to write, for ``--mounting``.
-    - ``reference``: sensor whose frame the poses refer to; the first by default.
-
-    Raise ArgumentError if the target cannot be written, or no recording contains a sensor. Raise DataError if the
-    recordings do not determine the poses; nothing is written.
-    """
+    """Calibrate the poses of sensors of one or several runs, print them, and write a mounting file."""
     from ertis_numba.base.atomic_files import atomic_write, check_target
     from ertis_numba.base.errors import ArgumentError, DataError
     from ertis_numba.calibration.poses import calibrate_poses

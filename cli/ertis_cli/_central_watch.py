@@ -85,10 +85,7 @@ def require_use(*, stores: bool, as_json: bool) -> None:
 
 
 class CentralWatch:
-    """Reporter of a central node: JSON lines on stdout, log lines and, on a terminal, a progress line on stderr.
-
-    ``recordings``: sealed recordings.
-    """
+    """Reporter of a node: JSON lines on stdout, log lines and, on a terminal, a progress line on stderr."""
 
     def __init__(self, life: "Life", *, quiet: bool, as_json: bool) -> None:
         from ertis_numba.network.log import logger, show
@@ -183,11 +180,7 @@ def run(
     metrics: "Metrics | None",
     duration_s: float | None,
 ) -> None:
-    """Run a central node until it is asked to end.
-
-    ``made``, from `ertis_cli._saving.withdrawn`, is cleared once the node runs. Raise ErtisError if the node cannot
-    start.
-    """
+    """Run a central node until it is asked to end; clear ``made``, from `withdrawn`, once it runs."""
     with stopped_by_signals() as signals, ExitStack() as stack:
         stack.callback(watch.close)
         signals.obey(node.stop)  # before the central node reports that it listens

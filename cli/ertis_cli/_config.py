@@ -44,10 +44,7 @@ def variable(path: Iterable[str], option: str) -> str:
 
 
 def add_variables(command: click.Command, path: tuple[str, ...]) -> None:
-    """Let environment variables set the options of a command and its subcommands.
-
-    ``path``: names of the groups that contain the command, then its own name.
-    """
+    """Let environment variables set the options of a command, at a path of groups, and its subcommands."""
     for option, parameter in _options(command).items():
         if parameter.envvar is None:
             general = [variable((), option)] if option in _GENERAL else []

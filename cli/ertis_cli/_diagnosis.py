@@ -56,10 +56,7 @@ _INSTRUCTION_SETS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class InstallationFinding:
-    """Finding about one part of an installation.
-
-    - ``state`` {"good", "note", "bad"}: ``bad`` if something does not work.
-    """
+    """Finding about one part of an installation; the state is bad if something does not work."""
 
     check: str
     state: State

@@ -26,11 +26,7 @@ _SUFFIXES: Final = {".toml", ".py", ".rviz", ".yaml"}
 
 
 def examples() -> dict[str, Traversable]:
-    """Return the sources of examples by name, in alphabetical order.
-
-    The source of a recording and of a WAV file is its scene. A file ``NAME.json`` beside the scene of a recording has
-    the checksums of its samples.
-    """
+    """Return the sources of examples by name: scenes of recordings and WAV files, NAME.json with their checksums."""
     found = {}
     for package, parts in _FOLDERS:
         folder = resources.files(package).joinpath(*parts)

@@ -100,12 +100,7 @@ def drive_of(
     beam_azimuth_deg: float,
     quiet: bool,
 ) -> "Drive":
-    """Return the poses, the odometry and the scene of a drive.
-
-    ``readers`` are of all sensors, and the microphones of ``ears`` act as ears; ``chosen`` are its measurements with a
-    call. ``known`` has the mountings that are known. Raise ArgumentError if there are no true poses, or a mounting is
-    needed but unknown. Raise DataError if a file cannot be read, or no motion could be measured.
-    """
+    """Return the true poses, the odometry and the scene of a drive, for chosen measurements of the ears."""
     from ertis_numba import load_scene
     from ertis_numba.base.errors import ArgumentError
     from ertis_numba.interop import Drive

@@ -54,12 +54,10 @@ def listen_pulses(
     quiet: bool,
     as_json: bool,
 ) -> None:
-    """Show each pulse until a signal, a count or a duration ends the command.
+    """Show each pulse until a signal, a count or a duration ends the command; no sensors means all.
 
-    - ``sensors``: requested sensors; empty for all.
-    - ``head``: line above the lines of pulses; omitted with ``as_json``.
-    - ``of`` (str, str): what is shown, in the singular, and what the central node may drop, in the plural.
-    - ``at_end``: called with the subscriber at the end, also after an error.
+    ``of`` names the shown item in the singular, and the items that may be dropped in the plural; at_end is always
+    called.
     """
     notes: deque[str] = deque()
     heard = MicrophoneTable(as_json=as_json, quiet=quiet)

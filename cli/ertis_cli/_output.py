@@ -66,10 +66,7 @@ def open_closed_streams() -> None:
 
 
 def replace_unencodable() -> None:
-    """Let stdout and stderr print readable texts for characters that their encoding lacks, instead of failing.
-
-    The user's choice in PYTHONIOENCODING, such as ``cp932:replace``, remains in force.
-    """
+    """Let stdout and stderr replace unencodable characters by readable texts, unless PYTHONIOENCODING does."""
     codecs.register_error("ertis", _replaced)
     for stream in (sys.stdout, sys.stderr):
         if getattr(stream, "errors", None) in {"strict", "surrogateescape"} and hasattr(stream, "reconfigure"):
@@ -104,10 +101,7 @@ def _readable(char: str) -> str:
 
 
 def escape_names(arguments: Iterable[str]) -> None:
-    """Let stdout and stderr print file names with control characters in one line, escaped as in Python.
-
-    Names come from the command line. Names of results contain the stem of a file, so stems are replaced.
-    """
+    """Let stdout and stderr escape control characters in file names, and in the stems that results keep."""
     parts = (part for argument in arguments for each in argument.split("=", 1) for part in Path(each).parts)
     stems = {stem: _without_controls(stem) for stem in (Path(part).stem for part in parts) if stem.strip()}
     _ESCAPED.update({stem: readable for stem, readable in stems.items() if stem != readable})
@@ -133,7 +127,7 @@ def _without_controls(text: str) -> str:
 
 
 def draw_without_display() -> None:
-    """Let Matplotlib ignore MPLBACKEND, which may name a window system or a package of a notebook that is missing.
+    """Let Matplotlib ignore MPLBACKEND, which may name a missing window system or notebook.
 
     Commands only write files. Scripts of users get the variable back by `restore_display`.
     """

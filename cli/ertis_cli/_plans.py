@@ -36,10 +36,7 @@ def report_lines(sensor: str, reported: dict[str, Any]) -> Iterator[str]:
 
 
 def wavefront_note(whose: str, error_db: float, range_m: float) -> str:
-    """Return a line on the largest error of plane wavefronts, and its range.
-
-    ``whose`` is a sensor, or a number of recordings.
-    """
+    """Return a line on the largest error of plane wavefronts of a sensor or recordings, and its range."""
     return (
         f"{whose}: the error of plane wavefronts is up to {error_db:.1f} dB at {range_m:g} m, in addition to other "
         "errors; use --wavefront auto (capon and method paper support only plane wavefronts), or a larger first range"

@@ -88,10 +88,7 @@ def _is_one_terminal() -> bool:
 
 
 class StatusLine:
-    """Line on stderr that is drawn again in its place; nothing is drawn if ``quiet`` or off a terminal.
-
-    ``write`` writes text to stderr.
-    """
+    """Line on stderr that is drawn again in its place; nothing is drawn if ``quiet`` or off a terminal."""
 
     def __init__(self, write: Callable[[str], object], *, quiet: bool) -> None:
         self.is_drawn = not quiet and is_drawn_on(sys.stderr)

@@ -70,10 +70,7 @@ def note_without_own_echo(counts: "Mapping[str, int]", n_pulses: int, *, quiet: 
 
 
 def open_sensors(paths: "Sequence[Path]", stack: ExitStack, *, images: bool = False) -> "list[Any]":
-    """Open the recordings of all sensors until a stack closes, and with ``images`` also energyscape files.
-
-    Raise UsageError if a sensor occurs twice, or images are fused already.
-    """
+    """Open recordings, and energyscape files with images, of different sensors until a stack closes."""
     from ertis_numba.fusion import PLATFORM
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording, sensor_names
 
@@ -105,10 +102,7 @@ def mountings_of(readers: "Sequence[RecordingReader]", file: "Path | None") -> "
 def platform_mountings(
     readers: "Sequence[RecordingReader]", file: "Path | None", *, quiet: bool
 ) -> "dict[str, Mounting]":
-    """Return the mountings of sensors as `mountings_of` does, and of those that the file has in addition.
-
-    These emit as well, so that the others hear their calls.
-    """
+    """Return the mountings of sensors, and of others in the file, which emit as well, so that all hear them."""
     found = mountings_of(readers, file)
     others = {name: each for name, each in (_mountings.mountings(file, None) or {}).items() if name not in found}
     if others:
@@ -169,7 +163,7 @@ def pulse_groups(readers: "Sequence[RecordingReader]") -> "list[dict[str, Stampe
 
 
 def _require_one_chain(places: "Sequence[StampedIndex]", groups: "Sequence[dict[str, StampedIndex]]") -> None:
-    """Raise DataError if two sensors share a pulse, but have another SYNC count in common at different times.
+    """Raise DataError if two sensors share a pulse, but have another SYNC count at different times.
 
     Only counts that each sensor has once in a session are compared, since others do not identify a pulse.
     """
@@ -211,8 +205,7 @@ def active_groups(
     """Return the measurements of each pulse in which a sensor emitted its call, by sensor.
 
     A sensor that was silent in such a pulse hears the echoes of the others, so its measurement belongs to the pulse. A
-    note states the number of other pulses. With the ``processing.mode`` of the settings that ``changed`` returns,
-    `is_passive` decides.
+    note states the number of other pulses. `is_passive` decides with the changed settings.
     """
     from ertis_numba.base.errors import DataError
     from ertis_numba.frames import is_passive
@@ -266,10 +259,7 @@ class PipelinesBySensor:
         return self._changed(reader.settings)
 
     def image(self, measurement: "Measurement | Energyscape") -> "Energyscape":
-        """Return the image of a measurement, or the given image, and warn once if its directions are too far apart.
-
-        Raise UsageError if settings are given for an image of a file.
-        """
+        """Return the image of a measurement, or the given one, and warn once if directions are too far apart."""
         from ertis_numba.analysis.direction_spacing import spacing_warning
 
         image = self._image(measurement)

@@ -49,11 +49,7 @@ def write_results(
     as_json: bool,
     **device: Any,
 ) -> None:
-    """Write the results of the last stage for all measurements of one sensor.
-
-    ``changed`` returns the settings to use from those of the recording. ``device`` is as for `options.pipeline`.
-    ``sensor`` is None if there is only one.
-    """
+    """Write the results of the last stage for all measurements of one sensor; None if there is only one."""
     from ertis_numba.interop import export
     from ertis_numba.storage import check_target, open_recording
 

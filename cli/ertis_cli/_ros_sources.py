@@ -39,11 +39,7 @@ def publish_node(
     on_ready: Callable[[], None],
     signals: Signals,
 ) -> None:
-    """Publish the products of a central node, until the program is to end.
-
-    Without ``images``, points are received, which are smaller. A central node sends its status each second, also
-    without sensors. If nothing arrives, a NetworkError is raised at the end.
-    """
+    """Publish products of a central node, points unless images; raise NetworkError at the end if none came."""
     from ertis_numba.base.errors import NetworkError
     from ertis_numba.network.status import Status
     from ertis_numba.network.subscriber import Subscriber
@@ -94,11 +90,10 @@ def publish_file(
     on_ready: Callable[[], None],
     signals: Signals,
 ) -> None:
-    """Publish the images of a file at the speed of the publisher's settings.
+    """Publish images of a file at the publisher's speed; on_passive gets the number of those without a call.
 
     With ``sim_time``, the stamps are those of the file, and ``/clock`` has the same time; otherwise the stamps are the
-    present. Measurements of a recording without a call are left out, and ``on_passive`` is called with their number. A
-    DataError is raised if no others remain.
+    present. A DataError is raised if no measurement has a call.
     """
     from dataclasses import replace
 
@@ -190,10 +185,7 @@ def publish_ports(
 
 
 class _ImageSink:
-    """Destination of measurements that publishes their images, of each sensor the newest.
-
-    ``superseded``: number of measurements without an image, because newer ones had arrived.
-    """
+    """Publisher of each sensor's newest image; superseded counts measurements that newer ones replaced."""
 
     def __init__(
         self,

@@ -24,9 +24,9 @@ Write = Callable[["Arrival"], None]
 
 @contextmanager
 def withdrawn(*folders: Path | None) -> Iterator[list[Path]]:
-    """Yield the folders that do not exist yet; if the block raises an error, remove them.
+    """Yield the folders that do not exist yet; if the block raises an error, remove those left in the list.
 
-    Clear the list once the folders are in use. A folder that contains more than a central node's own files stays.
+    A folder that contains more than a central node's own files stays.
     """
     missing = [each for folder in folders if folder for each in (folder, *folder.parents) if not each.exists()]
     try:

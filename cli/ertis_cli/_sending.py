@@ -58,12 +58,9 @@ class _Watch(Watch):
 
 
 class Sending:
-    """A capture whose measurements go to a central node.
+    """Capture whose measurements go to a central node, with limits of spool and memory in MB or None.
 
-    - ``limits_mb`` tuple of (float or None): limits of the spool and of the memory, in MB; None for the defaults of
-      `SensorNode`.
-    - ``is_fixed``: True to refuse new settings from admins.
-    - ``report``: summary for JSON output, complete once `run` has returned.
+    ``is_fixed`` refuses new settings from admins; ``report`` is complete once `run` has returned.
     """
 
     def __init__(

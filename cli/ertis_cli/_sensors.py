@@ -94,10 +94,7 @@ def named_sensors(
 
 
 class ConfiguredSensors:
-    """Sensors of a capture, which can be configured again.
-
-    ``checks``: check of each sensor's bits; empty if they are not checked.
-    """
+    """Sensors of a capture, which can be configured again, with checks of their bits, if any."""
 
     def __init__(
         self,

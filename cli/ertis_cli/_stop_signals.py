@@ -30,14 +30,12 @@ _ENDED = 128  # plus the number of the signal
 
 
 class Interruption:
-    """Signal handler that ends the command like Ctrl-C, and repeats the signal if a library swallows the exception.
+    """Signal handler that ends the command like Ctrl-C, and repeats the signal if a library swallows it.
 
     Python raises the exception in whatever code runs when a signal arrives. A library's callback, a finaliser, or a
     bare ``except`` clause may catch it and continue. A thread therefore checks that the main thread is still unwinding,
-    and sends the signal again otherwise.
-
-    The handler raises nothing in Python's own code for imports, which would keep its locks, so that an import in
-    another thread would wait forever. The signal is sent again a moment later.
+    and sends the signal again otherwise. The handler raises nothing in Python's own code for imports, which would keep
+    its locks, so that an import in another thread would wait forever. The signal is sent again a moment later.
     """
 
     def __init__(self) -> None:
@@ -67,10 +65,7 @@ class Interruption:
         return int(str(error.code)) if isinstance(error, SystemExit) else _ENDED + signal.SIGINT
 
     def end(self) -> None:
-        """Stop repeating signals, because the command has ended; a later signal ends the process at once.
-
-        No handler and no thread of this object remains, so that none runs while the interpreter is finalised.
-        """
+        """Stop repeating signals; a later one ends the process, and no handler runs during finalisation."""
         self._over.set()
         for thread in self._threads:
             thread.join()
@@ -118,10 +113,7 @@ interruption: Final = Interruption()
 
 
 def obey_signals() -> None:
-    """Let signals end the command like Ctrl-C, so that no half-written file is left behind.
-
-    A signal stays ignored if the process was started with that signal ignored, as ``nohup`` does.
-    """
+    """Let signals end the command like Ctrl-C, unless ignored as by ``nohup``; no half-written file remains."""
     for number in _SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, interruption)
@@ -144,10 +136,9 @@ def leave(code: int) -> NoReturn:
 
 
 class Signals:
-    """Signals that have arrived, and the function that stops the program.
+    """Signals that have arrived, and the function that stops the program, given to `obey` even afterwards.
 
     A signal never interrupts running code, because a library that is loading would swallow the exception or fail.
-    `obey` acts on earlier signals; later signals call the function that `obey` was given.
     """
 
     def __init__(self) -> None:
@@ -189,10 +180,7 @@ def stopped_by_signals() -> Iterator[Signals]:
 
 @contextmanager
 def broken_off_by_signals() -> Iterator[None]:
-    """Let signals that ask this program to end interrupt the block, so that it cleans up.
-
-    This includes signals that the program was started to ignore, as a shell script starts its background jobs.
-    """
+    """Let signals interrupt the block for its cleanup, even if ignored, as by shells for background jobs."""
     with _handled_by(interruption):
         yield
 

@@ -33,19 +33,13 @@ _allowed = False
 
 
 class Life(NamedTuple):
-    """One process of a central node.
+    """One process of a central node."""
 
-    - ``restarts``: processes before it.
-    - ``reason``: end of the process before it, such as SIGABRT.
-    - ``addresses``: addresses of the former process: ``address`` for sensors, and ``publish`` for applications.
-    - ``report_fd``: descriptor to the supervisor; -1 if there is none.
-    """
-
-    restarts: int = 0
-    reason: str = ""
-    addresses: Mapping[str, str] = MappingProxyType({})
+    restarts: int = 0  # processes before it
+    reason: str = ""  # end of the process before it, such as SIGABRT
+    addresses: Mapping[str, str] = MappingProxyType({})  # former ones: address for sensors, publish for applications
     elapsed_s: float = 0.0
-    report_fd: int = -1
+    report_fd: int = -1  # descriptor to the supervisor; −1: none
 
     def note(self, event: dict[str, Any]) -> None:
         """Report to the supervisor that the central node listens."""
@@ -67,7 +61,7 @@ def allow() -> None:
 
 
 def supervised() -> Life:
-    """Return in a child process, once per start; the parent waits, and exits with the code of the last child.
+    """Return in a child process, once per start; the parent waits, and exits with the last child's code.
 
     On other systems than Linux, and in other programs, this returns in the calling process.
     """

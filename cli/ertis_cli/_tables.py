@@ -23,15 +23,11 @@ _FOLDED = 16  # minimum width of a text column in a narrow terminal
 
 @dataclass(frozen=True, slots=True)
 class TextTable:
-    """Rows of cells under headings, which rich can draw.
+    """Rows of cells under headings, which rich can draw."""
 
-    ``columns``: headings and the alignment of their cells; numbers are aligned right. ``styles``: styles of cells by
-    their text, as in ``{"failed": "red"}``; empty by default.
-    """
-
-    columns: Mapping[str, Side]
+    columns: Mapping[str, Side]  # headings, with the alignment of their cells
     rows: Sequence[Sequence[str]]
-    styles: Mapping[str, str] = field(default_factory=dict)
+    styles: Mapping[str, str] = field(default_factory=dict)  # of cells by their text, as in {"failed": "red"}
 
     def print(self, *, err: bool = False) -> None:
         """Print the table, drawn on a terminal and as plain text elsewhere."""

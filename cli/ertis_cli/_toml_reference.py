@@ -37,53 +37,27 @@ _PARTS: Final = re.compile(r"\(.*\)|\{.*\}")
 
 @dataclass(frozen=True, slots=True)
 class KeyReference:
-    """Description of one key.
-
-    Attributes
-    ----------
-    about : str
-        Meaning of the key.
-    shape : str
-        Type of the value in words.
-    unit : str
-        Unit of the value; empty if it has none.
-    default : str
-        Default as TOML; "required", or "none" if the key may be left out and has no value then.
-    example : str
-        Line of TOML that gives the key a value; empty if the file of examples has none.
-    """
+    """Description of one key."""
 
     name: str
-    about: str
-    shape: str
-    unit: str
-    default: str
-    example: str
+    about: str  # meaning
+    shape: str  # type of the value in words
+    unit: str  # empty if the value has none
+    default: str  # as TOML, "required", or "none" for no value
+    example: str  # line of TOML; empty if the file of examples has none
 
 
 @dataclass(frozen=True, slots=True)
 class TableReference:
-    """Keys of one table.
+    """Keys of one table."""
 
-    Attributes
-    ----------
-    header : str
-        Header of the table as in a file, such as ``[array]`` or ``[[points]]``; empty for keys before any table.
-    """
-
-    header: str
+    header: str  # such as [array] or [[points]]; empty for keys before any table
     about: str
     keys: tuple[KeyReference, ...]
 
 
 def reference(document: str) -> tuple[TableReference, ...]:
-    """Return the tables of a kind of file.
-
-    Parameters
-    ----------
-    document : str
-        A name in `DOCUMENTS`.
-    """
+    """Return the tables of a kind of file, a name in `DOCUMENTS`."""
     examples = _read(f"every_{document}_key.toml")
     if document == "settings":  # A call has an own waveform or the other keys, so no file holds all of them.
         examples["call"] = _read("own_waveform.toml")["call"] | examples["call"]

@@ -24,10 +24,7 @@ _ALIVE = 0.05  # minimum share of ones, and of zeros, of a working microphone
 
 
 class Watch:
-    """Reporter of a capture: JSON lines, notes, and a progress line.
-
-    Several threads may use one reporter.
-    """
+    """Reporter of a capture for several threads: JSON lines, notes, and a progress line."""
 
     word = "stored"  # state of a reported measurement
 
@@ -44,10 +41,7 @@ class Watch:
     def run(
         self, session: "CaptureSession", sink: "MeasurementSink", checks: "dict[str, BitCheck]", *, where: str
     ) -> Exception | None:
-        """Run a session; return the error that ended it early, or None.
-
-        ``where`` is printed on an interruption, and states where the measurements are.
-        """
+        """Run a session; return the error that ended it early, or None; where names the measurements' place."""
         self._session, self._checks = session, checks
         begun_s, cpu_s = time.monotonic(), time.process_time()
         try:
@@ -143,10 +137,7 @@ def report(
     more: dict[str, Any] | None = None,
     n_lost: int = 0,
 ) -> None:
-    """Report the results of a capture.
-
-    ``more`` is added to the JSON output, and ``n_lost`` measurements were lost after they had been captured.
-    """
+    """Report the results of a capture, with more for JSON, and n_lost measurements lost after they were captured."""
     counts = session.counts
     several = len(counts) > 1
     stored, lost = (sum(getattr(each, name) for each in counts.values()) for name in ("stored", "lost"))

@@ -148,10 +148,7 @@ class _DemoRun:
 
     @contextmanager
     def node(self, *words: object, output: Path) -> Iterator[dict[str, Any]]:
-        """Run a command until the block ends; yield the first object that it prints.
-
-        Raise ClickException if the command has ended before it was ready.
-        """
+        """Run a command until the block ends; yield its first object; raise ClickException if it ends before."""
         typed = self._printed(words)
         with output.open("wb") as file:
             # This is a command as a user types it, with its output in a file, rather than a `processes.Child`.

@@ -266,9 +266,9 @@ def _render_all(renderer: "SceneRenderer", names: "Sequence[str]", *, quiet: boo
 
 
 class _Estimate:
-    """Estimate of the time and the memory of a long task, derived from its first steps and reported once.
+    """Estimate of time and memory of a long task from its first steps, reported once.
 
-    ``n_first``: number of first steps whose time does not count, because they also prepare the following ones.
+    The time of the first ``n_first`` steps does not count, because they also prepare the following ones.
     """
 
     def __init__(self, n_steps: int, *, n_first: int, clock: "Callable[[], float]" = time.monotonic) -> None:

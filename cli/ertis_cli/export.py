@@ -231,10 +231,7 @@ def _known(
 
 
 class _Items:
-    """Measurements or images to export, one sensor after the other, under a progress bar.
-
-    With ``process``, recordings become images. With ``echoes``, measurements with a call are exported.
-    """
+    """Measurements, or images with process, to export under a progress bar; with echoes, those with a call."""
 
     def __init__(
         self,

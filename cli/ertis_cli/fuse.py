@@ -100,12 +100,7 @@ def _write_fused(
     as_json: bool,
     **device: Any,
 ) -> None:
-    """Write the fused image of each SYNC pulse.
-
-    ``paths`` are recordings of sensors of one platform, and ``target`` is an energyscape file. ``changed`` returns the
-    settings to use from those of the recording. A file with the mountings of all sensors, and an emitter diameter,
-    replace those of the recordings. ``device`` is as for `options.pipeline`.
-    """
+    """Write the fused image of each SYNC pulse; mountings and emitter diameter replace those recorded."""
     from ertis_numba.fusion import PLATFORM, Fuser
     from ertis_numba.storage import EnergyscapeWriter, check_target
     from ertis_numba.storage.placed_truth import PlacedTruth

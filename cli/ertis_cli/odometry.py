@@ -118,7 +118,6 @@ def odometry_of(
     """Return the odometry of pulses, under a progress bar.
 
     A sensor without a call hears the echoes of others, whose paths begin elsewhere. Its images are left out.
-    ``groups``: measurements of each pulse, by sensor. ``alone``: as for `Odometry`.
     """
     from ertis_numba.base.errors import DataError
     from ertis_numba.frames import is_passive

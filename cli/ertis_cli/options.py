@@ -169,7 +169,6 @@ def beamforming(default: str = "") -> Decorator:
     """Return the options of all registered beamformers and weightings, named like the fields of `Processing`.
 
     ``default`` ends the help of each option, unless a heading above them states the default.
-    The command receives them by those names, and None where an option is not given.
     """
     declared = (option for beamformer in BEAMFORMERS.values() for option in beamformer.options)
     added = [
@@ -333,11 +332,10 @@ def settings_with(
     elevation: tuple[float, float] | float | None = None,
     **options: Any,
 ) -> "Settings":
-    """Return the settings of a recording, updated from a settings file, a processing preset and then from options.
+    """Return recorded settings, updated from a file, a preset and then options named as in `Processing`.
 
-    A settings file changes the keys that it contains; a layout or positions replace the whole array. ``elevation`` is
-    that of a grid of one elevation, or limits. Other options are named like the fields of `Processing`; None changes
-    nothing.
+    A layout or positions in the file replace the whole array. ``elevation`` is that of a grid of one elevation, or
+    limits.
     """
     from ertis_numba.settings import preset_tables
 
@@ -415,10 +413,7 @@ def complete_layouts(ctx: click.Context, param: click.Parameter, incomplete: str
 
 
 def note_layout(array: "Array", *, recorded: "Array | None" = None) -> None:
-    """Print the notes about the layout file of an array, once per command and unless it is quiet.
-
-    There are none if the positions are those of the recording, because its import printed them.
-    """
+    """Print notes about an array's layout file once, unless its import into the recording printed them."""
     import numpy as np
 
     from ertis_numba.geometry import microphones
@@ -545,10 +540,7 @@ def progress(items: Iterable[Item], *, length: int, label: str, quiet: bool) -> 
 
 @contextmanager
 def note_when_slow(text: str, *, quiet: bool, after_s: float = 1.0) -> Iterator[threading.Timer]:
-    """Print ``text`` if the block takes longer than ``after_s``; yield the timer.
-
-    If the block compiles kernels, print a message, once per command.
-    """
+    """Print text if the block takes over after_s, and a message once if it compiles kernels; yield the timer."""
     from ertis_numba.kernels import on_compiling
 
     timer = threading.Timer(after_s, say, args=(text,), kwargs={"quiet": quiet})

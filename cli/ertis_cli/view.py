@@ -254,10 +254,7 @@ def _is_address(location: str) -> bool:
 
 
 def _require_use(kind: str, contents: tuple[str, ...]) -> None:
-    """Raise an error for options without effect, unless they come from a configuration file.
-
-    ``contents`` has the possible contents of the view.
-    """
+    """Raise an error for options without effect on possible contents, unless from a configuration file."""
     context = click.get_current_context()
     names = {each.name: each.opts[0] for each in context.command.params}
     for name, kinds in _ONLY.items():
@@ -322,10 +319,10 @@ def _ended(source: "Live | Playback", signals: Signals, *, quiet: bool) -> Itera
 
 @contextmanager
 def _compiling(note: str, signals: Signals, *, quiet: bool, ending: bool = False) -> Iterator[None]:
-    """Print a message if the block takes long, and delay signals until its end; a second signal ends the process.
+    """Print a message if the block takes long, and delay signals until its end; the second one ends the process.
 
-    An exception inside the compiler may crash it or get lost, and the interpreter crashes if it exits meanwhile.
-    If ``ending`` is True, the first signal counts as the second.
+    An exception inside the compiler may crash it or get lost, and the interpreter crashes if it exits meanwhile. If
+    ``ending`` is True, the first signal counts as the second.
     """
     first_s = math.inf if not ending else time.monotonic() if signals.came else -math.inf
 
