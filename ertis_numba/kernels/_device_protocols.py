@@ -13,10 +13,7 @@ Array = TypeVar("Array", bound=NDArray[Any])
 
 
 class Lane(Protocol):
-    """Queue that processes one measurement at a time: copy the samples in, run kernels, copy the image out.
-
-    Operations on one lane run in order. Lanes run concurrently if the device supports it.
-    """
+    """Queue that processes one measurement at a time, in order: copy samples in, run kernels, copy the image out."""
 
     stream: Any
     """Stream of the GPU; None on the host."""
@@ -26,17 +23,11 @@ class Lane(Protocol):
         ...
 
     def send(self, array: Array) -> Array:
-        """Start to copy an array of the host to the device, and return the copy.
-
-        A later array of the same shape and type overwrites the copy.
-        """
+        """Start to copy an array to the device; a later array of the same shape and type overwrites the copy."""
         ...
 
     def target(self, out: Array) -> Array:
-        """Return the array of the device that `fetch` copies to ``out``.
-
-        Arrays ``out`` of the same shape and type share it.
-        """
+        """Return the device array that `fetch` copies to ``out``, shared by arrays of the same shape and type."""
         ...
 
     def run(self, steps: Callable[[], None]) -> None:
@@ -80,11 +71,7 @@ class Memory(Protocol):
 
 
 class NewMemory(Protocol):
-    """Creates the memory of a pipeline.
-
-    With ``graphs``, `Lane.run` records its steps as a CUDA graph and replays it. This is the default on devices that
-    support graphs. Raise ArgumentError if ``graphs`` is True, but the device does not support graphs.
-    """
+    """Creates the memory of a pipeline; with ``graphs``, the default where supported, lanes replay CUDA graphs."""
 
     def __call__(self, *, graphs: bool | None = None) -> Memory: ...
 

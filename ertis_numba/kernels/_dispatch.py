@@ -30,12 +30,9 @@ DEVICES: Final = {
 
 @functools.cache
 def load(device: str = "auto") -> KernelSet:
-    """Return the kernels of a device.
+    """Return the kernels of a device; "auto" is "cuda" if a GPU and its libraries are available, otherwise "cpu".
 
-    ``device`` {"auto", "cpu", "cuda", "numpy"}: ``cpu`` is Numba on all cores, ``cuda`` is Numba on an NVIDIA GPU, and
-    ``numpy`` is plain NumPy for comparison. ``auto``, the default, is ``cuda`` if a GPU and its libraries are
-    available, otherwise ``cpu``. Raise ArgumentError if the device is unknown. Raise DeviceError if the device is known
-    but cannot be used on this machine.
+    Raise ArgumentError for an unknown device, and DeviceError for one that cannot be used on this machine.
     """
     checks.choice("device", device, ("auto", *DEVICES))
     if device == "auto":
@@ -81,11 +78,7 @@ def load_points() -> PointKernels:
 
 @functools.cache
 def load_steering(device: str = "auto") -> SteeringKernels:
-    """Return the kernels of steering, which compute tables on the host, also for a GPU.
-
-    ``device`` {"auto", "numpy"}: ``auto``, the default, selects compiled kernels, or those of NumPy if none can be
-    compiled on this machine. ``numpy`` always selects those of NumPy.
-    """
+    """Return the steering kernels of the host, also for a GPU; "auto" falls back to NumPy without a compiler."""
     checks.choice("device", device, ("auto", "numpy"))
     kernels: SteeringKernels = _compiled("steering") if device == "auto" else _in_numpy("steering")
     return kernels

@@ -58,10 +58,7 @@ class HostMemory:
         self._images = ImagePool(lambda shape: np.empty(shape, np.float32))
 
     def table(self, array: Array) -> Array:
-        """Return ``array`` on the device. Callers must not modify it afterwards.
-
-        It is contiguous in the order of C, because Numba compiles a kernel again for each other order.
-        """
+        """Return ``array``, not to be modified, in C order: Numba compiles a kernel again for each other order."""
         return cast("Array", np.ascontiguousarray(array).reshape(array.shape))
 
     def zeros(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:

@@ -14,19 +14,11 @@ __all__ = ["CONTRACTS", "KERNEL_NAMES", "KernelSet", "twins_in"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KernelSet(AdaptiveKernels):
-    """Kernels of one device, and properties of the device.
+    """Kernels of one device, each documented by its contract, and properties of the device.
 
-    Every attribute that is not listed below is a kernel; its contract documents it.
-
-    - ``device``: name of the device, as accepted by `load`.
-    - ``hardware``: name of the GPU; empty for the CPU.
-    - ``transforms`` {"scipy", "cufft"}: library of the Fourier transforms, see `fft`.
-    - ``max_threads``: maximum number of threads.
-    - ``tile_ranges``: ranges in a tile of the 16-bit kernels.
-    - ``instruction_set``: vector instructions of the CPU's kernels, such as "AVX2"; empty for other devices.
-    - ``simulated``: True if the CPU simulates the device, which is fast enough only for tests.
-    - ``memory``: returns a `Memory`. See `NewMemory`.
-    - ``threads``: context manager that limits the number of threads, see `Threads`.
+    ``hardware`` names the GPU, and ``instruction_set`` the CPU's vector instructions, such as "AVX2"; empty for others.
+    ``tile_ranges`` counts the ranges in a tile of the 16-bit kernels. With ``simulated``, the CPU simulates the device,
+    which is fast enough only for tests.
     """
 
     device: str

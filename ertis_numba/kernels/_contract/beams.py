@@ -21,49 +21,27 @@ __all__ = [
 
 
 class DelayAndSum(Protocol):
-    """Sum the delayed and weighted signals of all microphones for every direction and range.
+    """Sum the delayed and weighted signals (mic, phase, sample) of all microphones for every direction and range.
 
-    ``out[direction, range] = Σ_mic weights[direction, mic] · signals.flat[offsets[direction, mic] + range]``.
-    The offset selects microphone, phase and first sample at once. The weight corrects the phase of the carrier for the
+    ``out[direction, range] = Σ_mic weights[direction, mic] · signals.flat[offsets[direction, mic] + range]``. The
+    offset selects microphone, phase and first sample at once. The weight corrects the phase of the carrier for the
     rounding of the delay.
-
-    Parameters
-    ----------
-    signals : (mic, phase, sample) complex64
-    offsets : (direction, mic) int32
-    weights : (direction, mic) complex64
-    out : (direction, range) complex64
     """
 
     def __call__(self, signals: Complex, offsets: Index, weights: Complex, out: Complex) -> None: ...
 
 
 class Envelope(Protocol):
-    """Compute the magnitude of every ``step``-th sample of analytic beams: ``out[:, n] = |beams[:, n · step]|``.
-
-    Parameters
-    ----------
-    beams : (direction, sample) complex64
-    out : (direction, range) float32
-    """
+    """Compute the magnitude of every ``step``-th sample of analytic beams: ``out[:, n] = |beams[:, n · step]|``."""
 
     def __call__(self, beams: Complex, step: int, out: Real) -> None: ...
 
 
 class DelayAndSumEnvelope(Protocol):
-    """`DelayAndSum` and `Envelope` in one pass over some ranges, without writing beams to memory.
+    """`DelayAndSum` and `Envelope` in one pass over ranges ``first … stop - 1``, without writing beams to memory.
 
     ``out[direction, range] = |Σ_term weights[direction, term] · signals.flat[offsets[direction, term] + range]|``.
     A term is one sample of one microphone. If delays are interpolated, each microphone has several terms.
-
-    Parameters
-    ----------
-    signals : (mic, phase, sample) complex64
-    offsets : (direction, term) int32
-    weights : (direction, term) complex64
-    first, stop : int
-        Ranges to fill.
-    out : (direction, range) float32
     """
 
     def __call__(
@@ -76,24 +54,9 @@ class InterpolatedBeamsEnvelope(Protocol):
 
     ``grid[point, range] = Σ_term weights[point, term] · signals.flat[offsets[point, term] + range]`` and
     ``out[rows[direction], range] = |Σ_pair,k tap_weights[direction, pair, k] · beam|`` with the beam
-    ``grid[places[direction, pair] + k, range]``, for k = 0 and 1.
-
-    Parameters
-    ----------
-    signals : (mic, phase, sample) complex64
-    offsets : (point, term) int32
-    weights : (point, term) complex64
-    places : (direction, pair) int32
-        The lower beam-grid point of each pair.
-    tap_weights : (direction, pair, 2) float32
-    rows : (direction,) int32
-        Row of each direction in ``out``. Directions that share beam-grid points should be adjacent here.
-    first, stop : int
-        Ranges to fill.
-    n_blocks : int
-        Number of blocks of directions; several are useful if there are more threads than tiles of ranges.
-    out : (direction, range) float32
-        At least 64 ranges, because signals are read that far.
+    ``grid[places[direction, pair] + k, range]``, for k = 0 and 1. Directions that share grid points should be adjacent.
+    Several blocks of directions, ``n_blocks``, are useful if there are more threads than tiles of ranges. ``out`` needs
+    at least 64 ranges, because signals are read that far.
     """
 
     def __call__(
@@ -117,37 +80,17 @@ class QuantiseTiles(Protocol):
     ``tiles[tile, mic, phase, k] ≈ signals[mic, phase, starts[tile] + k] / scales[tile]``, rounded, as pairs of real and
     imaginary part. The largest magnitude of a tile becomes ``limit``. Beyond the end of the signals, tiles are 0. A
     tile spans decimetres, so an echo keeps its 16 bits regardless of stronger reflectors at other ranges.
-
-    Parameters
-    ----------
-    signals : (mic, phase, sample) complex64
-    starts : (tile,) int32
-    tiles : (tile, mic, phase, k, 2) int16
-    scales : (tile,) float32
     """
 
     def __call__(self, signals: Complex, starts: Index, limit: np.float32, tiles: Short, scales: Real) -> None: ...
 
 
 class DelayAndSumEnvelopeInt16(Protocol):
-    """`DelayAndSumEnvelope` on the tiles of `QuantiseTiles`, with integer sums.
+    """`DelayAndSumEnvelope` on the tiles of `QuantiseTiles`, with integer sums, for ranges below ``stop``.
 
-    ``out[direction, starts[tile] + k] = scales[tile] · weight_scale · |Σ_term w · x|`` with
-    ``x = tiles[tile].flat[offsets[direction, term] + k]``, for k below the device's ``tile_ranges``.
-
-    Parameters
-    ----------
-    tiles, scales, starts
-        As in `QuantiseTiles`; starts are ``tile_ranges`` apart.
-    stop : int
-        End of the ranges to fill.
-    offsets : (direction, term) int32
-        Offsets into one tile, in complex samples.
-    weights : (direction, term, 2, 2) int16
-        ``((re w, −im w), (im w, re w))``.
-    weight_scale : float32
-        Value of an integer weight of 1.
-    out : (direction, range) float32
+    ``out[direction, starts[tile] + k] = scales[tile] · weight_scale · |Σ_term w · x|`` with ``x =
+    tiles[tile].flat[offsets[direction, term] + k]``, for k below the device's ``tile_ranges``, by which starts are
+    apart. ``weights`` (direction, term, 2, 2) are ``((re w, −im w), (im w, re w))``.
     """
 
     def __call__(
@@ -164,24 +107,10 @@ class DelayAndSumEnvelopeInt16(Protocol):
 
 
 class InterpolatedBeamsEnvelopeInt16(Protocol):
-    """`InterpolatedBeamsEnvelope` on the tiles of `QuantiseTiles`, with integer sums.
+    """`InterpolatedBeamsEnvelope` on the tiles of `QuantiseTiles`, with integer sums as in `DelayAndSumEnvelopeInt16`.
 
-    BeamErrors on the beam grid keep the upper 16 bits of their sums, rounded: ``(sum + 2¹⁵) >> 16``.
-
-    Parameters
-    ----------
-    tiles, scales, starts, stop
-        As in `DelayAndSumEnvelopeInt16`.
-    offsets : (point, term) int32
-    weights : (point, term, 2, 2) int16
-        As there, for beam-grid points.
-    places : (direction, pair) int32
-        The lower beam-grid point of each pair.
-    tap_weights : (direction, pair, 2) int16
-    rows : (direction,) int32
-    weight_scale : float32
-        Value of 1 in the interpolated sums, in units of the tile's scale.
-    out : (direction, range) float32
+    Beams on the grid keep the upper 16 bits of their sums, rounded: ``(sum + 2¹⁵) >> 16``. ``weight_scale`` is the
+    value of 1 in the interpolated sums, in units of the tile's scale.
     """
 
     def __call__(
@@ -205,20 +134,9 @@ class CombineDelayed(Protocol):
     """Combine the delayed real signals of all microphones for every direction and sample.
 
     For order 1, ``out[direction, n] = Σ x`` over the microphones, with
-    ``x = signals[mic, first + n + delays[direction, mic]]``. For a higher order, it is the sum of the products of all
+    ``x = signals[mic, first + n + delays[direction, mic]]``. For orders up to 5, it is the sum of the products of all
     combinations of ``order`` values of ``roots``, delayed alike. With ``coherent``, the result is multiplied by
     ``(Σ x)² / (n_mics Σ x²)``, or by 0 where all x are 0.
-
-    Parameters
-    ----------
-    signals, roots : (mic, sample) float32
-        Roots are used above order 1 only.
-    delays : (direction, mic) int32
-        At least 0.
-    order : int
-        1 to 5.
-    coherent : {0, 1}
-    out : (direction, n) float32
     """
 
     def __call__(
@@ -227,19 +145,10 @@ class CombineDelayed(Protocol):
 
 
 class SumDelayedInt16(Protocol):
-    """Sum the delayed 16-bit signals of all microphones for every direction and sample.
+    """Sum the delayed 16-bit signals of all microphones; the sums fit into 16 bits.
 
     ``out[direction, tile · size + n] = units[tile] · Σ_mic tiles[tile, mic, delays[direction, mic] + n]`` for n below
-    ``size``, the number of samples of a tile: that of ``out``, divided by the number of tiles. The sums fit into 16
-    bits.
-
-    Parameters
-    ----------
-    tiles : (tile, mic, sample) int16
-        A tile has more samples than ``size``, because signals are delayed.
-    units : (tile,) float32
-    delays : (direction, mic) int32
-    out : (direction, sample) float32
+    ``size``, the number of samples of ``out`` divided by the number of tiles, whose delayed signals are longer.
     """
 
     def __call__(self, tiles: Short, units: Real, delays: Index, out: Real) -> None: ...
@@ -249,15 +158,8 @@ class RectifyAndDecimate(Protocol):
     """Rectify real beams, filter them, and keep every factor-th sample.
 
     ``out[direction, r] = scale · Σ_t taps[t] · |beams[direction, first + r · factor + t]|``. The CPU rounds magnitudes
-    to 15 bits of the largest one in 2048 samples.
-
-    Parameters
-    ----------
-    beams : (direction, sample) float32
-    taps : (tap,) int16
-        Their pairs have four classes: the number of a pair modulo 4. In each, the sum of the magnitudes is at most
-        65,535, so that sums of products fit into 32 bits on every processor.
-    out : (direction, r) float32
+    to 15 bits of the largest one in 2048 samples. Pairs of taps have four classes: the number of a pair modulo 4. In
+    each, the sum of the magnitudes is at most 65,535, so that sums of products fit into 32 bits on every processor.
     """
 
     def __call__(self, beams: Real, taps: Short, scale: float, factor: int, first: int, out: Real) -> None: ...

@@ -54,26 +54,11 @@ Places = NDArray[np.int64]
 class CoarsenImage(Protocol):
     """Reduce an image to the highest power of each coarse step, and separate noise and side lobes.
 
-    Parameters
-    ----------
-    amplitude : (direction, range) float32
-    first : (step + 1,) uint32
-        First range of each step; equal ones for a step without ranges.
-    is_deaf : (step,) bool
-        Steps without audible echoes, whose power is 0.
-    close : (direction, neighbour) uint32
-        Directions within the error of a direction.
-    side_lobes : float32
-        Power of side lobes, relative to the strongest direction of a step and of both adjacent steps, because a pulse
-        covers several steps.
-    least : float32
-        Least floor.
-    floor : (step,) float32
-        Output: power that noise and side lobes may reach.
-    highest : (direction, step) float32
-        Output: highest power of the close directions at a step and beside it.
-    out : (direction, step) float32
-        Power above the floor, 0 below it.
+    ``first`` (step + 1,) are the first ranges, equal for a step without ranges; ``is_deaf`` (step,) steps have the
+    power 0. ``close`` (direction, neighbour) lie within the error of a direction. ``side_lobes`` are relative to the
+    strongest direction of a step and of both adjacent steps, because a pulse covers several steps. Outputs: ``floor``
+    (step,), the power that noise and side lobes may reach, at least ``least``; ``highest`` (direction, step), the power
+    of close directions at a step and beside it; ``out`` (direction, step), the power above the floor, 0 below it.
     """
 
     def __call__(
@@ -91,37 +76,17 @@ class CoarsenImage(Protocol):
 
 
 class SpreadCells(Protocol):
-    """Return the highest value of each cell and its neighbours.
-
-    Parameters
-    ----------
-    values : (row, azimuth, range) float32
-    reach : int
-        Number of neighbouring azimuths on each side, which are cyclic; ranges have one.
-    out : (row, azimuth, range) float32
-    """
+    """Compute the highest value of each cell and its neighbours: one range and ``reach`` cyclic azimuths each side."""
 
     def __call__(self, values: Real, reach: int, out: Real) -> None: ...
 
 
 class PredictEchoes(Protocol):
-    """Predict the power of the echoes of reflectors, within a main lobe around each direction.
+    """Predict the power of the echoes of reflectors, within a main lobe around each direction: (direction, step).
 
-    Parameters
-    ----------
-    begin : (direction,) uint32
-        First half-step of each direction with an entry. A step has three: its start, its middle and its end, which is
-        the start of the next one. The highest echo counts.
-    bounds : (direction + 1,) uint32
-        Bounds of the entries of each direction, one for each half-step.
-    cell : (entry,) uint32
-        Cell that causes an echo.
-    gain : (entry,) float32
-        Gain of this echo; 0 for none.
-    reflectivity : (cell,) float32
-    lobe : (direction, neighbour) uint32
-        Directions within the main lobe of each direction.
-    out : (direction, step) float32
+    Entries from ``bounds[direction]`` on, for half-steps from ``begin[direction]`` on, state the ``cell`` that causes
+    an echo and its ``gain``. A step has three: its start, its middle and its end, the start of the next one. The
+    highest counts. ``lobe`` (direction, neighbour) are the directions in the main lobe.
     """
 
     def __call__(
@@ -130,29 +95,12 @@ class PredictEchoes(Protocol):
 
 
 class ShareEchoes(Protocol):
-    """Compute the share of each pixel's power that belongs to one hypothesis.
+    """Compute the share (pixel,) of each pixel's power that belongs to hypothesis ``number``.
 
     With the rivals' predicted power R, the share is ``1 − suppression · R / power``, limited to 0 to 1. With the
     predicted own power P, a pixel whose reflector other pairs confirm has a share of at least ``(P / (P + R))³``. The
-    share is multiplied by ``part``.
-
-    Parameters
-    ----------
-    predicted : (hypothesis, pixel) float32
-    total : (pixel,) float32
-        Sum over hypotheses.
-    same_pixel, same_hypothesis : (entry,) uint32
-        Hypotheses that lead to the same place in a pixel, and are no rivals there.
-    power : (pixel,) float32
-    part : (pixel,) float32
-        Factor of the result.
-    confirmed : (pixel,) float32
-        Power of echoes that other pairs confirm; empty if unknown.
-    number : int
-        Index of the hypothesis.
-    suppression, least_confirmed : float32
-        Factor of rivals, and confirmed power relative to a pixel from which its reflector is confirmed.
-    out : (pixel,) float32
+    share is multiplied by ``part``. ``same_pixel`` and ``same_hypothesis`` (entry,) lead to one place and are no
+    rivals. ``confirmed`` is empty if unknown; ``least_confirmed`` is relative to a pixel.
     """
 
     def __call__(
@@ -172,20 +120,10 @@ class ShareEchoes(Protocol):
 
 
 class GatherEvidence(Protocol):
-    """Gather the floor, the highest power and the weight of the echoes of a pair.
+    """Gather the floor, the highest power and the weight of the echoes of a pair: (3, entry).
 
-    Parameters
-    ----------
-    first, second : (entry,) uint32
-        Pixels of two neighbouring directions.
-    between : (entry,) float32
-        Weight of the second pixel.
-    step : (entry,) uint32
-    gain, weight : (entry,) float32
-        Gain of the echo, and weight of the pair. The weight of an echo is ``weight · (gain / floor)²``.
-    highest : (pixel,) float32
-    floor : (step,) float32
-    out : (3, entry) float32
+    ``first`` and ``second`` are pixels of two neighbouring directions, ``between`` the weight of the second one. The
+    weight of an echo is ``weight · (gain / floor)²``.
     """
 
     def __call__(
@@ -203,21 +141,10 @@ class GatherEvidence(Protocol):
 
 
 class AddEchoes(Protocol):
-    """Add the weighted reflectivities that a pair shows, and the weights.
+    """Add the weighted reflectivities that a pair shows, and the weights, to ``out`` (2, cell).
 
-    Parameters
-    ----------
-    cell, first, second : (entry,) uint32
-    between : (entry,) float32
-    weight, lifted : (entry,) float32
-        Weight and gain of each echo.
-    power : (pixel,) float32
-    share : (pixel,) float32
-        Share of the power that belongs to the pair; empty for all of it.
-    is_foreign : bool
-        True if shares are also factors of the weights.
-    out : (2, cell) float32
-        Sums of weighted reflectivities and of weights, to which the kernel adds.
+    Pixels are those of `GatherEvidence`; ``lifted`` (entry,) is the gain of an echo. ``share`` (pixel,) of the power
+    belongs to the pair, all if it is empty; with ``is_foreign``, shares are also factors of the weights.
     """
 
     def __call__(
@@ -236,36 +163,16 @@ class AddEchoes(Protocol):
 
 
 class AddLobes(Protocol):
-    """Add the products of the lobes and the pulses of echoes.
+    """Add the products of lobes (echo, direction), 0 up to `NEGLIGIBLE`, and pulses (echo, step) to (direction, step).
 
     Matrix products of BLAS take several times as long, because lobes are narrow, and some use all cores.
-
-    Parameters
-    ----------
-    lobe : (echo, direction) float32
-        Values up to `NEGLIGIBLE` count as 0.
-    pulse : (echo, step) float32
-    out : (direction, step) float32
-        Sums, to which the kernel adds.
     """
 
     def __call__(self, lobe: Real, pulse: Real, out: Real) -> None: ...
 
 
 class LimitCells(Protocol):
-    """Limit cells to the reflectivity that a pair shows.
-
-    Parameters
-    ----------
-    cell : (entry,) uint32
-    is_used : (entry,) bool
-    gain : (entry,) float32
-    evidence : (3, entry) float32
-        Result of `GatherEvidence`.
-    margin : float32
-        Factor of the highest power and the floor.
-    out : (cell,) float32
-    """
+    """Limit cells to the reflectivity that a pair shows in the result of `GatherEvidence`, times ``margin``."""
 
     def __call__(
         self, cell: Turns, is_used: Truths, gain: Real, evidence: Real, margin: np.float32, out: Real
@@ -273,19 +180,10 @@ class LimitCells(Protocol):
 
 
 class ConfirmCells(Protocol):
-    """Limit cells to the reflectivity that a pair confirms, where its echo must be visible.
+    """Limit cells (row, cell) to the reflectivity that a pair confirms, where its echo must be visible.
 
-    Parameters
-    ----------
-    cell, is_used, gain, evidence
-        As in `LimitCells`.
-    reflectivity : (cell,) float32
-        Expected reflectivity.
-    visible : float32
-        Power of a visible echo relative to the floor.
-    skipped : int
-        Row that the pair does not limit; −1 for none.
-    out : (row, cell) float32
+    ``reflectivity`` is the expected one, ``visible`` the power of a visible echo relative to the floor, and ``skipped``
+    the row that the pair does not limit, −1 for none.
     """
 
     def __call__(
@@ -302,17 +200,7 @@ class ConfirmCells(Protocol):
 
 
 class CompareEchoes(Protocol):
-    """Add the reflectivity that a pair shows, and the expected one, over the cells with visible echoes.
-
-    Parameters
-    ----------
-    cell, is_used, gain, evidence, reflectivity, visible
-        As in `ConfirmCells`.
-    strong : float32
-        Expected reflectivity above which a cell counts.
-    out : (2,) float64
-        Sums, to which the kernel adds.
-    """
+    """Add the shown and the expected reflectivity (2,) of cells above ``strong`` with echoes as in `ConfirmCells`."""
 
     def __call__(
         self,
@@ -328,32 +216,14 @@ class CompareEchoes(Protocol):
 
 
 class LocateReflector(Protocol):
-    """Locate a reflector by the paths and directions of its echoes.
+    """Locate a reflector by the paths and directions of its echoes; ``position_m`` starts at a first estimate.
 
     Least squares with the weights of a Cauchy distribution (P. J. Huber, E. M. Ronchetti, Robust Statistics, 2009),
-    because echoes that overlap at one sensor shift its direction or range by far more than noise does.
-
-    Parameters
-    ----------
-    emitter_m, receiver_m : (echo, axis) float64
-    path_m : (echo,) float64
-        Path of the sound.
-    axes : (echo, 3, axis) float64
-        Direction from the receiver, and two unit vectors across.
-    deviation : (echo, 2) float64
-        Standard deviations of the path in metres and of the direction in radians.
-    information : float
-        Information about each coordinate in 1/m² that is known beforehand.
-    nearest_m : float
-        Least distance from emitters and receivers.
-    outlier : float
-        Residual, in standard deviations, that has half of the weight; infinite for plain least squares.
-    n_rounds : int
-        Iterations; at least 1.
-    position_m : (axis,) float64
-        Position, from a first estimate.
-    out : (axis, axis) float64
-        Covariance before the last update: the inverse of the weighted normal matrix.
+    because echoes that overlap at one sensor shift its direction or range by far more than noise does. ``axes`` (echo,
+    3, axis): direction from the receiver, and two unit vectors across; ``deviation`` (echo, 2): of the path in m and of
+    the direction in rad. ``information`` in 1/m² about each coordinate is known beforehand. ``outlier``: residual in
+    standard deviations that has half of the weight; infinite for plain least squares. ``out`` (axis, axis): covariance
+    before the last update.
     """
 
     def __call__(
@@ -375,24 +245,10 @@ class LocateReflector(Protocol):
 class PredictedPlaces(NamedTuple):
     """Possible reflectors as the sensors see them.
 
-    Attributes
-    ----------
-    apart_m : (place, sensor) float64
-        Distances.
-    seen : (place, sensor, axis) float64
-        Directions in which the echoes appear.
-    depth : (place, sensor) float64
-        Cosines of the angles to the axes of the sensors; those behind are negative.
-    slope_m : (place, sensor) float64
-        Change of the distances over one standard deviation of the place, …
-    across_m2 : (place,) float64
-        … and its square, across the direction.
-    expected : (place, receiver, emitter) float64
-        Expected powers.
-    extra_m2 : (place, emitter) float64
-        Variances of paths in addition to those of the echoes.
-    is_flat : (sensor,) bool
-        Receivers that hear echoes from behind.
+    Distances ``apart_m``, directions ``seen`` in which echoes appear, and cosines ``depth`` to the axes of the sensors,
+    negative behind: (place, sensor, …). ``slope_m``: change of distances over one standard deviation of the place;
+    ``across_m2``: its square across the direction. ``expected`` (place, receiver, emitter): powers. ``extra_m2``
+    (place, emitter): variances of paths beside those of the echoes. ``is_flat`` receivers hear echoes from behind.
     """
 
     apart_m: Doubles
@@ -406,17 +262,9 @@ class PredictedPlaces(NamedTuple):
 
 
 class HeardEchoes(NamedTuple):
-    """Echoes in the images of all receivers.
+    """Echoes in the images of all receivers; ``path_m`` (echo, emitter) is NaN if its call did not cause the echo.
 
-    Attributes
-    ----------
-    receiver : (echo,) int64
-    direction : (echo, axis) float64
-    path_m : (echo, emitter) float64
-        Length of the path if the emitter's call caused the echo; NaN if it did not.
-    gate_rad2, gate_m2 : (echo,) float64
-        Variances of directions and of paths.
-    power : (echo,) float64
+    ``gate_rad2`` and ``gate_m2`` are the variances of directions and of paths.
     """
 
     receiver: Places
@@ -428,25 +276,11 @@ class HeardEchoes(NamedTuple):
 
 
 class MatchEchoes(Protocol):
-    """Find the echoes that reflectors at given places explain, by path, direction and power.
+    """Find the echoes that reflectors at given places explain, by path, direction and power; return their number.
 
-    Parameters
-    ----------
-    chosen : (some,) int64
-        Echoes to match.
-    gate : float
-        Largest sum of squares, in units of variances.
-    alike : float
-        Largest ratio of the power to the expected one. Echoes from behind may be weaker.
-    found : (3, count) int64
-        Output: place, echo and emitter of the first matches.
-    out : (count,) float64
-        Output: their sums of squares.
-
-    Returns
-    -------
-    int
-        Number of all matches, which may exceed the space for them.
+    The number may exceed the space for them. ``chosen``: echoes to match. ``gate``: largest sum of squares, in
+    variances. ``alike``: largest ratio of the power to the expected one; echoes from behind may be weaker. Outputs:
+    ``found`` (3, count), place, echo and emitter of the first matches, and their sums of squares.
     """
 
     def __call__(
@@ -462,20 +296,11 @@ class MatchEchoes(Protocol):
 
 
 class ViewingSensors(NamedTuple):
-    """Sensors of a platform, and the sound that their emitters radiate.
+    """Sensors of a platform, and the sound that their emitters radiate; ``is_flat`` receivers hear echoes from behind.
 
-    Attributes
-    ----------
-    sensor_m, ahead : (sensor, axis) float64
-        Positions and axes.
-    is_flat : (sensor,) bool
-        Receivers that hear echoes from behind.
-    model : (receiver,) int64
-        Model of the emitters in the air of each receiver; -1 for receivers without an image.
-    patterns : (model, emitter, cosine) float64
-        Power that each emitter radiates, relative to that ahead, for evenly spaced cosines from -1 to 1.
-    lost : (model, path) float64
-        Logarithm of the power after evenly spaced paths from 0 to `LAST_PATH_M`, without spreading.
+    ``model`` (receiver,): that of the emitters in its air, -1 without an image. ``patterns`` (model, emitter, cosine):
+    power relative to ahead for evenly spaced cosines from -1 to 1. ``lost`` (model, path): logarithm of the power after
+    evenly spaced paths from 0 to `LAST_PATH_M`, without spreading.
     """
 
     sensor_m: Doubles
@@ -489,23 +314,11 @@ class ViewingSensors(NamedTuple):
 class SeenPlaces(NamedTuple):
     """Places seen from all sensors.
 
-    Attributes
-    ----------
-    apart_m : (place, sensor) float64
-        Distances.
-    toward : (place, sensor, axis) float64
-        Unit vectors to the places.
-    depth : (place, sensor) float64
-        Cosines of the angles to the axes of the sensors.
-    seen : (place, sensor, axis) float64
-        Directions in which the echoes appear: a flat array shows those from behind in front.
-    radiated : (place, emitter) float64
-        Power of each call towards the places, relative to ahead.
-    gain : (place, receiver, emitter) float64
-        Power of echoes relative to 1 m ahead, 0 where they are inaudible.
-    beside_m : (place, emitter) float64
-        Errors of paths from emitters beside their beams. There, what a piston radiates depends on the frequency, and
-        echoes come early or late.
+    ``apart_m`` (place, sensor) are distances, ``toward`` unit vectors to the places, ``depth`` cosines to the axes of
+    the sensors, and ``seen`` directions in which echoes appear: a flat array shows those from behind in front.
+    ``radiated`` (place, emitter) is relative to ahead, and ``gain`` (place, receiver, emitter) to 1 m ahead, 0 where
+    echoes are inaudible. ``beside_m`` (place, emitter): errors of paths from emitters beside their beams. There, what a
+    piston radiates depends on the frequency, and echoes come early or late.
     """
 
     apart_m: Doubles
@@ -522,42 +335,17 @@ class SeenPlaces(NamedTuple):
 
 
 class SeePlaces(Protocol):
-    """Compute how the sensors of a platform see places.
-
-    Parameters
-    ----------
-    place_m : (place, axis) float64
-    """
+    """Compute how the sensors of a platform see places (place, axis)."""
 
     def __call__(self, place_m: Doubles, sensors: ViewingSensors, out: SeenPlaces) -> None: ...
 
 
 class FindArrivals(Protocol):
-    """Find the echoes that fit sound from given places, by path and direction.
+    """Find the echoes that fit sound from given places, by path and direction; return their number.
 
-    Parameters
-    ----------
-    origin_m : (source, emitter, axis) float64
-        Place from which the call of each emitter arrives; NaN for none.
-    sent_m : (source, emitter) float64
-        Path of the call to this place.
-    sensor_m, ahead : (sensor, axis) float64
-        Positions and axes of the sensors.
-    is_flat : (sensor,) bool
-        Receivers that hear echoes from behind.
-    receiver : (echo,) int64
-    direction : (echo, axis) float64
-    path_m : (echo, emitter) float64
-        Length of the path if the emitter's call caused the echo; NaN if it did not.
-    within_m, within_rad : float
-        Largest differences of paths, and of directions ahead of the receiver.
-    found : (3, count) int64
-        Output: source, emitter and echo of the first matches, in ascending order.
-
-    Returns
-    -------
-    int
-        Number of all matches, which may exceed the space for them.
+    The number may exceed the space for them. ``origin_m`` (source, emitter, axis): place from which a call arrives, NaN
+    for none, after the path ``sent_m``. ``path_m`` (echo, emitter) is NaN if the call did not cause the echo. Output
+    ``found`` (3, count): source, emitter and echo of the first matches, in ascending order.
     """
 
     def __call__(

@@ -20,25 +20,9 @@ Doubles = NDArray[np.float64]
 
 
 class FindWalls(Protocol):
-    """Find the first occupied cell in each direction.
+    """Count the ranges, from half a step on, before the first cell above ``wall`` in each direction: (direction,).
 
-    Places outside of the map have the values of the cells at its edge.
-
-    Parameters
-    ----------
-    log_odds : (layer, row, column) float32
-    place : (axis,) float64
-        Start of the directions.
-    direction : (direction, axis) float64
-        Unit vectors.
-    step : float
-        Spacing of the ranges in cells; the first one is half a step.
-    wall : float32
-        Log-odds above which a cell is occupied.
-    n_steps : int
-        Number of ranges.
-    out : (direction,) int64
-        Number of ranges before the first occupied cell.
+    ``place`` and ``step`` are in cells. Places outside of the map have the values of the cells at its edge.
     """
 
     def __call__(
@@ -54,22 +38,10 @@ class FindWalls(Protocol):
 
 
 class SpreadEchoes(Protocol):
-    """Add the density of normally distributed echoes to the cells around them.
+    """Add the density of normally distributed echoes to the cells (layer, row, column) around them.
 
-    Parameters
-    ----------
-    place : (echo, axis) float64
-        Means.
-    precision : (echo, axis, axis) float64
-        Inverse covariances.
-    reach : (echo, axis) float64
-        Distances along the axes within which cells change.
-    peak : (echo,) float64
-        Density at the mean.
-    most : (echo,) float64
-        Limit of the density.
-    out : (layer, row, column) float32
-        Sum, to which the densities are added.
+    ``place`` (echo, axis) are means, ``precision`` inverse covariances, ``reach`` the distances within which cells
+    change, ``peak`` the density at the mean, and ``most`` the limit of the density.
     """
 
     def __call__(
@@ -78,33 +50,12 @@ class SpreadEchoes(Protocol):
 
 
 class AddEvidence(Protocol):
-    """Add the evidence of one pulse to a map.
+    """Add the evidence of one pulse to the log-odds of a map, (layer, row, column), within ±``limit``.
 
-    Parameters
-    ----------
-    occupied : (layer, row, column) float32
-        Evidence for occupied cells.
-    touched : float32
-        Evidence from which a cell is not free.
-    most : float32
-        Limit of the evidence for occupied cells.
-    free : (elevation, azimuth, range) float32
-        Evidence for free cells, which lowers their log-odds. The magnitude of a negative value lowers the log-odds of
-        occupied cells, but not below 0.
-    place : (axis,) float64
-        Centre of the polar grid.
-    rotation : (axis, axis) float64
-        Rotation from the frame of the polar grid to that of the map.
-    step : float
-        Spacing of the ranges in cells.
-    near : float
-        Distance in cells within which cells are free.
-    near_free : float32
-        Evidence for free cells there.
-    limit : float32
-        Limit of the log-odds of the map.
-    out : (layer, row, column) float32
-        Log-odds of the map, which change.
+    Evidence ``occupied`` of cells is limited to ``most``; from ``touched`` on, a cell is not free. ``free`` (elevation,
+    azimuth, range) lowers log-odds; the magnitude of a negative value lowers those of occupied cells, but not below 0.
+    ``place`` and ``rotation`` lead from the polar grid to the map; ``step`` and ``near``, within which ``near_free``
+    counts, are in cells.
     """
 
     def __call__(

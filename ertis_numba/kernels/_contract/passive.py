@@ -31,17 +31,9 @@ CLEAN_HOLLOW_ROUNDS: Final = 12
 
 
 class CrossSpectra(Protocol):
-    """Sum the products of the spectra of each two microphones over blocks of samples.
+    """Sum the products of the spectra of each two microphones over blocks of samples: (bin, mic, mic), Hermitian.
 
     ``out[bin, i, j] = Σ_block spectra[i, block, first + bin] · conj(spectra[j, block, first + bin])``
-
-    Parameters
-    ----------
-    spectra : (mic, block, bin) complex64
-    first : int
-        First bin of the matrices.
-    out : (bin, mic, mic) complex64
-        Hermitian matrices, to within rounding.
     """
 
     def __call__(self, spectra: Complex, first: int, out: Complex) -> None: ...
@@ -51,16 +43,9 @@ class SteerPower(Protocol):
     """Compute the power that Hermitian matrices have for the wave from each direction.
 
     ``out[k, direction] = Σ_ij conj(v_i) · matrices[k, i, j] · v_j`` with ``v_i = exp(−2πi · bins[k] · steps[i,
-    direction] / 2³²)``. Only the real parts of the diagonal and the elements above it are read.
-
-    Parameters
-    ----------
-    matrices : (bin, mic, mic) complex64
-    steps : (mic, direction) uint32
-        Phase by which a microphone lags, for each bin, in 2⁻³² of a turn.
-    bins : (bin,) uint32
-        Number of each matrix's bin: its frequency relative to the spacing of bins.
-    out : (bin, direction) float32
+    direction] / 2³²)``. Only the real parts of the diagonal and the elements above it are read. ``steps`` (mic,
+    direction) are the phases by which a microphone lags for each bin, and ``bins`` (bin,) the frequencies relative to
+    their spacing.
     """
 
     def __call__(self, matrices: Complex, steps: Turns, bins: Turns, out: Real) -> None: ...
@@ -71,15 +56,6 @@ class SteerVectors(Protocol):
 
     ``out[k, direction] = Σ_n |Σ_i conj(vectors[k, n, i]) · v_i|²`` with the waves ``v`` of `SteerPower`. This is the
     power of the matrix ``Σ_n x_n x_n^H`` of the vectors ``x_n``, and takes fewer operations if they are few.
-
-    Parameters
-    ----------
-    vectors : (bin, n, mic) complex64
-    steps : (mic, direction) uint32
-        As for `SteerPower`.
-    bins : (bin,) uint32
-        As for `SteerPower`.
-    out : (bin, direction) float32
     """
 
     def __call__(self, vectors: Complex, steps: Turns, bins: Turns, out: Real) -> None: ...
@@ -89,30 +65,14 @@ class CleanSources(Protocol):
     """Find the sources of each bin, by subtracting all sound that is coherent with the loudest direction.
 
     This is CLEAN-SC (P. Sijtsma, CLEAN based on spatial source coherence, 2007). With the waves ``v`` of `SteerPower`
-    and M microphones, ``norm`` is M², or M² − M if the diagonal is left out. Each round takes the first direction with
-    the largest power P, adds ``CLEAN_LOOP_GAIN · P`` to its element of ``out``, and subtracts a component c from matrix
-    and powers: ``matrix −= CLEAN_LOOP_GAIN · P · c c^H`` and ``powers −= CLEAN_LOOP_GAIN · P · |v^H c|² / norm``.
-
-    With ``w = v / sqrt(norm)``, the component is ``matrix · w / P``. If the diagonal is left out, it is the solution of
-    ``c = (matrix · w / P + |c|² w) / sqrt(1 + Σ |w|² |c|²)``, and ``|v^H c|² − Σ |c|²`` replaces ``|v^H c|²``.
-
-    The rounds of a bin end if P is not positive or exceeds that of `CLEAN_GROWTH` rounds before, apart from the first
-    rounds, or after `CLEAN_ROUNDS_PER_MICROPHONE` · M rounds.
-
-    Parameters
-    ----------
-    matrices : (bin, mic, mic) complex64
-        Hermitian matrices.
-    steps : (mic, direction) uint32
-        As for `SteerPower`.
-    bins : (bin,) uint32
-        As for `SteerPower`.
-    powers : (bin, direction) float32
-        Map of the matrices, ``v^H matrix v / norm``, with the diagonal or without it.
-    hollow : bool
-        Leave out the diagonal of the matrices.
-    out : (bin, direction) float32
-        Sum of the shares of each direction.
+    and M microphones, ``norm`` is M², or M² − M if the diagonal is left out (``hollow``); ``powers`` is the map ``v^H
+    matrix v / norm``. Each round takes the first direction with the largest power P, adds ``CLEAN_LOOP_GAIN · P`` to
+    its element of ``out``, and subtracts a component c from matrix and powers: ``matrix −= CLEAN_LOOP_GAIN · P · c
+    c^H`` and ``powers −= CLEAN_LOOP_GAIN · P · |v^H c|² / norm``. With ``w = v / sqrt(norm)``, the component is
+    ``matrix · w / P``. If the diagonal is left out, it is the solution of ``c = (matrix · w / P + |c|² w) / sqrt(1 + Σ
+    |w|² |c|²)``, and ``|v^H c|² − Σ |c|²`` replaces ``|v^H c|²``. The rounds of a bin end if P is not positive or
+    exceeds that of `CLEAN_GROWTH` rounds before, apart from the first rounds, or after `CLEAN_ROUNDS_PER_MICROPHONE` ·
+    M rounds.
     """
 
     def __call__(

@@ -53,23 +53,11 @@ Singles = NDArray[np.complex64]
 
 
 class Pulse(NamedTuple):
-    """Compressed pulse, tabulated over differences of paths, and the microphones that hear it.
+    """Compressed pulse, tabulated over differences of paths, and the microphones (mic,) that hear it.
 
-    Attributes
-    ----------
-    table : (path,) complex128
-        Pulse relative to its carrier; at negative differences, it is the complex conjugate.
-    tilted_hz : (path,) complex128
-        The same with the spectrum weighted by the frequency relative to the carrier.
-    step_m : float
-        Spacing of the differences.
-    carrier_1_m : float
-        Wave number of the carrier.
-    positions_m : (mic, axis) float64
-    weights : (mic,) float64
-        Array weights, with a mean of 1.
-    speed_m_s : float
-        Sound speed of the table.
+    ``table`` (path,) is relative to the carrier, and conjugate at negative differences; ``tilted_hz`` is the same with
+    the spectrum weighted by the frequency relative to the carrier, whose wave number is ``carrier_1_m``. Array weights
+    have a mean of 1; ``speed_m_s`` is that of the table.
     """
 
     table: Complexes
@@ -84,16 +72,9 @@ class Pulse(NamedTuple):
 class Quadrics(NamedTuple):
     """Fits of quadrics to directions and their neighbours, over the plane or the line that contains them.
 
-    Attributes
-    ----------
-    axes : (fit, 2, axis) float64
-        Axes of the plane; the first one is that of the line.
-    inverse : (fit, 5, neighbour) float64
-        Matrix from values to the coefficients of x, y, x², xy and y².
-    n_axes : (fit,) int64
-        Axes along which maxima are interpolated: 2, 1 or 0.
-    reach : (fit,) float64
-        Distance of the farthest neighbour; 0 without a fit.
+    ``axes`` (fit, 2, axis), the first of which is that of the line; ``inverse`` (fit, 5, neighbour) from values to the
+    coefficients of x, y, x², xy and y²; ``n_axes`` along which maxima are interpolated, 2, 1 or 0; ``reach``, the
+    distance of the farthest neighbour, 0 without a fit.
     """
 
     axes: Doubles
@@ -103,15 +84,7 @@ class Quadrics(NamedTuple):
 
 
 class BeamErrors(NamedTuple):
-    """Directions of a grid, and the errors of their beams.
-
-    Attributes
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
-    gain, slope_s : (direction, mic) complex64
-        Gain at each microphone at the carrier, and its change per hertz; empty without errors.
-    """
+    """Directions of a grid, and gain (direction, mic) and its slope of their beams at the carrier; empty for none."""
 
     directions: Doubles
     gain: Singles
@@ -119,17 +92,9 @@ class BeamErrors(NamedTuple):
 
 
 class SpreadAmplitudes(Protocol):
-    """Compute the amplitudes of the image of a reflector, relative to that at its place.
+    """Compute the amplitudes (place,) of a reflector's image, relative to that at its place.
 
-    Parameters
-    ----------
-    direction_offset : (place, axis) float64
-        Differences of unit vectors.
-    offset_m : (place,) float64
-        Differences of ranges.
-    scale : float
-        Sound speed of the table, relative to that of the image.
-    out : (place,) float64
+    Offsets are differences of unit vectors and of ranges; ``scale`` is the table's sound speed relative to the image's.
     """
 
     def __call__(
@@ -138,17 +103,7 @@ class SpreadAmplitudes(Protocol):
 
 
 class FindTops(Protocol):
-    """Find the maxima of quadrics.
-
-    Parameters
-    ----------
-    fit : (place,) int64
-        Quadric of each place.
-    rises : (place, neighbour) float64
-        Values of the neighbours, relative to that of the direction.
-    out : (place, 4) float64
-        Offset of the maximum, and its rise; 0 if there is none within reach.
-    """
+    """Compute the offset of the maximum of each place's quadric, and its rise: (place, 4), 0 for none within reach."""
 
     def __call__(self, quadrics: Quadrics, fit: Places, rises: Doubles, out: Doubles) -> None: ...
 
@@ -156,36 +111,19 @@ class FindTops(Protocol):
 class InterpolateTops(Protocol):
     """Interpolate the maxima of the logarithm of an image by parabolas.
 
-    Parameters
-    ----------
-    fit : (place,) int64
-        Quadric of each place.
-    logs : (place, sample) float64
-        Logarithms of the amplitudes: those at the range before the maximum, of the maximum, and at the range after it;
-        then those of its neighbours.
-    out : (place, 5) float64
-        Shift along the range in steps, offset of the direction, and logarithm of the amplitude.
+    ``logs`` (place, sample): at the range before the maximum, at the maximum, and at the range after it; then those of
+    its neighbours. ``out`` (place, 5): shift along the range in steps, offset of the direction, logarithm of the
+    amplitude.
     """
 
     def __call__(self, quadrics: Quadrics, fit: Places, logs: Doubles, out: Doubles) -> None: ...
 
 
 class EchoSamples(NamedTuple):
-    """Samples of an image around its maxima.
+    """Samples (place, sample) of an image around its maxima; the first ``row`` is the direction of the maximum.
 
-    Attributes
-    ----------
-    row : (place, sample) int64
-        Directions; the first one is that of the maximum.
-    is_used : (place, sample) bool
-        False for samples that are equal to others or have no amplitude.
-    amplitude : (place, sample) float64
-    offset_m : (place, sample) float64
-        Ranges relative to that of the maximum.
-    range_m : (place,) float64
-        Ranges of the maxima.
-    is_coarse : (place,) bool
-        True if the grid is so coarse that several echoes may explain the samples.
+    ``is_used`` is False for samples that are equal to others or have no amplitude. ``offset_m`` is relative to the
+    range of the maximum. With ``is_coarse``, several echoes may explain the samples.
     """
 
     row: Places
@@ -200,29 +138,12 @@ class FitEchoes(Protocol):
     """Fit range, direction and amplitude of single echoes to samples of an image, weighted by their noise.
 
     White noise in the signals correlates the noise of neighbouring samples as the image of an echo does. Half of its
-    power changes amplitudes. The errors of the model are independent. If the misfit is too large for both, the errors
-    of the model are larger, and the fit is repeated with these.
-
-    Parameters
-    ----------
-    pulse : Pulse
-        With the tilted table.
-    starts : (place, start, 4) float64
-        Range offset in metres, offsets of the direction along both axes, and logarithm of the amplitude. The first one
-        serves alone, unless the grid is coarse or the misfit is large.
-    axes : (place, 2, axis) float64
-        Axes across the direction of the maximum; the second one is 0 if the grid has one.
-    noise : float
-        Root mean square of the noise of the image.
-    model : float
-        Errors of the model relative to the amplitude.
-    is_focused : bool
-        True if beams assume spherical wavefronts.
-    scale : float
-        As for `SpreadAmplitudes`.
-    out : (place, 22) float64
-        The four values of the best fit, its misfit, their covariance, (4, 4), and the errors of the model. Other minima
-        that fit nearly as well are part of the covariance.
+    power changes amplitudes. The errors of the model, relative to the amplitude, are independent. If the misfit is too
+    large for both, the errors of the model are larger, and the fit is repeated with these. ``starts`` (place, start,
+    4): range offset in m, offsets along both ``axes`` across the direction, and logarithm of the amplitude; the first
+    one serves alone, unless the grid is coarse or the misfit is large. ``noise`` is the RMS of the image, and
+    ``is_focused`` is True for spherical wavefronts. ``out`` (place, 22): the four values of the best fit, its misfit,
+    their covariance, and the errors of the model. Other minima that fit nearly as well widen the covariance.
     """
 
     def __call__(

@@ -11,22 +11,12 @@ __all__ = ["AddPaths", "ModulatePdm"]
 
 
 class AddPaths(Protocol):
-    """Add delayed and filtered copies of a call to the spectrum of each microphone.
+    """Add delayed and filtered copies of a call, (1 or mic, bin), to the spectrum of each microphone.
 
     ``out[mic, k] += Σ_path a · call[k] · exp(-2πi turns[path, mic] (first_bin + k))``. The gain ``a`` is linearly
-    interpolated between the frequencies of ``amplitude[path, mic]``, the first of which is bin 0.
-
-    Parameters
-    ----------
-    call : (1, bin) or (mic, bin) complex128
-        One spectrum for all microphones, or one for each.
-    turns : (path, mic) float64
-        Delay in cycles per bin: seconds times the spacing of the bins in hertz.
-    amplitude : (path, mic, frequency) float64
-        The last amplitude also applies above its frequency.
-    nodes_per_bin : float
-        Spacing of the bins / spacing of the frequencies of ``amplitude``.
-    out : (mic, bin) complex128
+    interpolated between the frequencies of ``amplitude[path, mic]``, the first of which is bin 0, and constant above
+    the last. ``turns`` are seconds times the spacing of the bins; ``nodes_per_bin`` is that spacing / that of the
+    frequencies.
     """
 
     def __call__(
@@ -56,25 +46,10 @@ class ModulatePdm(Protocol):
     ``width · ((k + ½) / 2¹⁶ − ½)``. The four 12-bit fields below yield the noise: their sum minus its mean of 8190,
     divided by its RMS of ``√((2²⁴ − 1) / 3)``. The noise is nearly Gaussian, and at most 3.5 times its RMS.
 
-    Parameters
-    ----------
-    signals : (mic, sample) float64
-        Full scale 1; finite, and below 2³¹. At least as long as ``out``; additional samples are ignored.
-    mics : (octet, 8) int32
-        Row of ``signals`` for each bit of the words, least significant bit first; −1 for a bit that stays 0. A row must
-        not occur twice.
-    keys : (mic,) uint64
-        Seed of each microphone's noise and dither.
-    noise_rms : (mic,) float64
-        RMS of each microphone's noise, full scale 1. If all are 0, noise takes no time.
-    states : (mic, 4) float64
-        Integrators s1 to s4, carried over from block to block.
-    loop : (8,) float64
-        c1, c2, c3, c4, r1, r2, the width of the dither and the limit.
-    first : int
-        Index of the block's first sample.
-    out : (sample, octet) uint8
-        Bytes of little-endian PDM words; a bit is 1 if v is +1.
+    ``signals`` (mic, sample) have a full scale of 1. ``mics`` (octet, 8): row of each bit, least significant first; −1
+    for a bit that stays 0, no row twice. ``noise_rms`` (mic,) takes no time if all are 0. ``states`` (mic, 4) carry
+    over. ``loop``: c1, c2, c3, c4, r1, r2, the width of the dither and the limit. ``out`` (sample, octet): a bit is 1
+    for v = +1.
     """
 
     def __call__(

@@ -20,15 +20,9 @@ __all__ = [
 
 
 class UnpackBits(Protocol):
-    """Convert the bits of PDM words to signals of +1 and −1.
+    """Convert the bits of PDM words to signals of +1 and −1: (mic, sample).
 
-    Parameters
-    ----------
-    words : (sample, word) uint8, uint16, uint32 or uint64
-        Channel m is bit ``m % word_bits`` (least significant first) of word ``m // word_bits``.
-    channels : (mic,) int32
-        Channel of each microphone.
-    out : (mic, sample) float32
+    Channel m is bit ``m % word_bits`` (least significant first) of word ``m // word_bits``.
     """
 
     def __call__(self, words: Words, channels: Index, out: Real) -> None: ...
@@ -38,15 +32,6 @@ class UnpackPcm(Protocol):
     """Convert PCM samples to signals: ``out[mic, n] = scale · words[first + n, channels[mic]]``, 0 elsewhere.
 
     Samples with a magnitude below ``silence`` become 0 first, because arithmetic with denormal numbers is slow.
-
-    Parameters
-    ----------
-    words : (sample, channel) int16 or float32
-    channels : (mic,) int32
-        Channel of each microphone.
-    first : int
-        First sample of the record to convert; may be negative.
-    out : (mic, sample) float32
     """
 
     def __call__(
@@ -55,34 +40,17 @@ class UnpackPcm(Protocol):
 
 
 class Decimate(Protocol):
-    """Filter signals and keep every ``factor``-th sample.
+    """Filter signals with symmetric taps and keep every ``factor``-th sample.
 
     ``out[mic, n] = Σ_t taps[t] · signals[mic, n · factor + t − (n_taps − 1)]``; samples before the first are 0. The
     result is delayed by the group delay of the taps, ``(n_taps − 1) / 2`` input samples.
-
-    Parameters
-    ----------
-    signals : (mic, sample) float32
-    taps : (tap,) float32
-        Symmetric filter taps.
-    factor : int
-        Decimation factor.
-    out : (mic, n) float32
     """
 
     def __call__(self, signals: Real, taps: Real, factor: int, out: Real) -> None: ...
 
 
 class RemoveGroupDelay(Protocol):
-    """Advance signals in time: ``out[mic, n] = signals[mic, n + delay]``, 0 beyond the end.
-
-    Parameters
-    ----------
-    signals : (mic, sample) float32
-    delay : int
-        Number of samples, at least 0.
-    out : (mic, n) float32
-    """
+    """Advance signals in time: ``out[mic, n] = signals[mic, n + delay]``, 0 beyond the end."""
 
     def __call__(self, signals: Real, delay: int, out: Real) -> None: ...
 
@@ -92,15 +60,8 @@ class DemodulateWords(Protocol):
 
     ``out[mic, n] = scale · Σ_t taps[t] · x[mic, (first + n) · factor + t − (n_taps − 1) / 2]``. Here x is ±1 from the
     bits, and 0 outside the record. Samples of ``out`` beyond ``n_outputs`` are set to 0. The sum is over integers, so
-    every device yields the same bits.
-
-    Parameters
-    ----------
-    words, channels
-        As in `UnpackBits`.
-    taps : (tap,) int16 or int32
-        Symmetric filter taps, an odd number. The sum of their magnitudes must not exceed the maximum of their type.
-    out : (mic, sample) float32
+    every device yields the same bits. The odd number of taps is symmetric, and the sum of their magnitudes fits their
+    type.
     """
 
     def __call__(
@@ -120,13 +81,6 @@ class MultiplySpectra(Protocol):
     """Multiply the spectrum of each microphone by a filter: ``out[mic, bin] = spectra · response``.
 
     Further bins of ``out`` become 0. If these are the negative frequencies, the inverse transform is analytic.
-
-    Parameters
-    ----------
-    spectra : (mic, bin) complex64
-    response : (bin,) complex64
-    out : (mic, n) complex64
-        At least as many bins as the spectra.
     """
 
     def __call__(self, spectra: Complex, response: Complex, out: Complex) -> None: ...
@@ -137,14 +91,7 @@ class MultiplyAndFold(Protocol):
 
     ``out[mic, phase, k] = Σ spectra[mic, first_bin + b] · responses[mic, phase, b]`` over all b with
     ``(first_bin + b) mod n_out = k``. An inverse transform of ``n_out`` points then samples the filtered signal at the
-    output rate, once per phase. This is the polyphase form of one long transform.
-
-    Parameters
-    ----------
-    spectra : (mic, bin) complex64
-    responses : (mic, phase, b) or (1, phase, b) complex64
-        One filter per microphone, or one for all.
-    out : (mic, phase, k) complex64
+    output rate, once per phase: the polyphase form of one long transform. ``responses`` (1, phase, b) serve all.
     """
 
     def __call__(self, spectra: Complex, responses: Complex, first_bin: int, out: Complex) -> None: ...
@@ -155,16 +102,8 @@ class SumSpectra(Protocol):
 
     ``out[direction, 0, (first_bin + b) mod n_out] = Σ_mic spectra[mic, 0, (first_bin + b) mod n_in] · exp(2πi φ)`` with
     ``φ = (starts[direction, mic] + b · steps[direction, mic]) / 2³²``, for b below ``n_bins``. Bins that share a place
-    of ``out`` are added, and places without a bin become 0. Integer phases wrap around, as turns do.
-
-    Parameters
-    ----------
-    spectra : (mic, 1, k) complex64
-        Result of `MultiplyAndFold` with as many places as ``out`` or a multiple, and at least ``n_bins``. Places
-        without a bin hold 0.
-    starts, steps : (direction, mic) uint32
-        Phase at the first bin, and its change from bin to bin, in 2⁻³² of a turn.
-    out : (direction, 1, k) complex64
+    of ``out`` are added, and places without a bin become 0. Integer phases wrap around, as turns do. n_in is n_out or a
+    multiple, and at least ``n_bins``; places of ``spectra`` without a bin hold 0.
     """
 
     def __call__(
@@ -173,17 +112,6 @@ class SumSpectra(Protocol):
 
 
 class EnvelopeRows(Protocol):
-    """Compute the magnitude of successive samples: ``out[row, range] = |beams[row, 0, lead + range]|``.
-
-    Parameters
-    ----------
-    beams : (row, 1, sample) complex64
-        At least as many rows as ``out``.
-    lead : int
-        Sample at the first range.
-    first, stop : int
-        Ranges to fill.
-    out : (row, range) float32
-    """
+    """Compute the magnitude of successive samples: ``out[row, range] = |beams[row, 0, lead + range]|``."""
 
     def __call__(self, beams: Complex, lead: int, first: int, stop: int, out: Real) -> None: ...

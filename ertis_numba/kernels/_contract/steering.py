@@ -14,15 +14,9 @@ Doubles = NDArray[np.float64]
 
 
 class SumPolynomials(Protocol):
-    """Sum Chebyshev polynomials of two variables, ``Σ c[i, j] T_i(x) T_j(y)``.
+    """Sum Chebyshev polynomials ``Σ c[i, j] T_i(x) T_j(y)`` of (place, 2) from −1 to 1: (place, value).
 
-    Parameters
-    ----------
-    places : (place, 2) float64
-        Variables x and y, from −1 to 1.
-    coefficients : (degree, degree, value) float64
-        Coefficients of each value. With one degree along the second axis, the sum does not depend on y.
-    out : (place, value) float64
+    With one degree along the second axis of ``coefficients`` (degree, degree, value), the sum does not depend on y.
     """
 
     def __call__(self, places: Doubles, coefficients: Doubles, out: Doubles) -> None: ...
@@ -30,15 +24,7 @@ class SumPolynomials(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringKernels:
-    """Kernels that compute tables for other directions.
-
-    Attributes
-    ----------
-    sum_polynomials : callable
-        See `SumPolynomials`.
-    threads : callable
-        Context manager that limits the number of threads; see `Threads`. Kernels run within it.
-    """
+    """Kernels that compute tables for other directions, within the context manager ``threads``."""
 
     sum_polynomials: SumPolynomials
     threads: Threads

@@ -12,26 +12,14 @@ __all__ = ["CombineStreamsInt16", "QuantiseStreams"]
 
 
 class QuantiseStreams(Protocol):
-    """Compute streams of analytic signals, and store them like `QuantiseTiles`.
+    """Compute streams ``first … stop - 1`` of analytic signals, and store them like `QuantiseTiles`.
 
     ``tiles[tile, stream, mic, phase, k] ≈ y · units[stream] / scales[tile, stream]``, rounded, as pairs of real and
     imaginary part. y is the stream ``|x|^powers[stream] · exp(i turns[stream] φ)`` of the sample
     ``x = signals[mic, phase, starts[tile] + k]``, and 0 for x = 0. The largest magnitude X of a tile becomes
     ``limits[stream]``. Beyond the end of the signals, tiles are 0.
-
     A stream without turns is real. Its imaginary part is ``limits[stream] · (|x| / X)^(power / 2)``, so that weak
     signals also have some digits.
-
-    Parameters
-    ----------
-    signals : (mic, phase, sample) complex64
-    starts : (tile,) int32
-    limits, units, powers : (stream,) float32
-    turns : (stream,) int32
-    first, stop : int
-        Streams to compute.
-    tiles : (tile, stream, mic, phase, k, 2) int16
-    scales : (tile, stream) float32
     """
 
     def __call__(
@@ -59,33 +47,10 @@ class CombineStreamsInt16(Protocol):
     In 16 bits, s is coarse for weak signals. It is therefore at least ``M t² / (bound · scale)`` with the imaginary
     part t of that sum, by the inequality of Cauchy and Schwarz for weights with a sum of 1 / M.
 
-    A stream is summed for each direction, or for the points of a beam grid, as in `DelayAndSumEnvelopeInt16` and in
-    `InterpolatedBeamsEnvelopeInt16`. Tables of all streams follow one another in flat arrays.
-
-    Parameters
-    ----------
-    tiles, scales
-        As in `QuantiseStreams`.
-    starts : (tile,) int32
-        First range of each tile; starts are ``tile_ranges`` apart.
-    stop : int
-        End of the ranges to fill.
-    shapes : (stream, 3) int32
-        Numbers of points, of terms of each point, and of pairs of each direction. Without pairs, each direction is its
-        own point. This array is always in the memory of the host.
-    offsets : (entry,) int32
-        Offsets into one tile, in complex samples: points by terms of each stream.
-    weights : (entry, 2, 2) int16
-        ``((re w, −im w), (im w, re w))``.
-    places : (pair,) int32
-        The lower beam-grid point of each pair: directions by pairs of each stream.
-    tap_weights : (pair, 2) int16
-    rows : (direction,) int32
-        Row of each direction in ``out``.
-    recipe : (n_powers, order, beam, total, bound)
-        Number of power sums, and order of the product; 1 and 1 for the magnitude of a beam. Then the streams of b and
-        s; −1 for no coherence factor. Last, the limit of the stream of s relative to its unit.
-    out : (direction, range) float32
+    A stream is summed as in `DelayAndSumEnvelopeInt16` or, with pairs, in `InterpolatedBeamsEnvelopeInt16`. Tables of
+    all streams follow one another in flat arrays. ``shapes`` (stream, 3), always in the memory of the host: numbers of
+    points, of terms of each point, and of pairs of each direction. ``recipe``: number of power sums, order of the
+    product, streams of b and s (−1 for no coherence factor), and the limit of the stream of s relative to its unit.
     """
 
     def __call__(

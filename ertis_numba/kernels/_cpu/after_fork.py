@@ -23,10 +23,7 @@ _is_forked = ctypes.c_int32(0)  # 1 in a process that inherited threads which do
 
 
 def run_kernels_after_forks() -> None:
-    """Let kernels run in processes that are forked after Numba has started its threads; call before the first kernel.
-
-    Numba's other threading layers work after a fork, and Windows has no forks.
-    """
+    """Let kernels run in processes that are forked after Numba's threads have started; call before the first one."""
     if not hasattr(os, "register_at_fork"):
         return
     try:

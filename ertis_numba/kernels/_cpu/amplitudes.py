@@ -116,8 +116,7 @@ def _coherence(rows, sums, beam, total, n_mics, least, vector):
 def amplitudes_of(typing_context, sums, n_powers, order, beam, total, n_mics, least, work, levels, place):
     """Fill ``levels.flat[place : place + RANGES]`` from the sums of all streams, (stream, part, range).
 
-    ``least`` is ``M / (bound · scale)``. The other arguments are those of `CombineStreamsInt16`; ``work`` is an array
-    of (order, part, range).
+    ``least`` is ``M / (bound · scale)`` of `CombineStreamsInt16`; ``work`` is an array of (order, part, range).
     """
     size = types.intp
     signature = types.void(sums, size, size, size, size, types.float32, types.float32, work, levels, size)

@@ -125,10 +125,7 @@ def _subtract_mean(beams, n_mics, n_snapshots, width, power, lags):
 
 @njit(nogil=True, cache=True)
 def _solve(beams, power, lags, width, begin, end, centre, n_snapshots, loading, matrix, levels):
-    """Set the levels at range ``centre`` of the windows from ``begin`` to ``end``.
-
-    With the centre last, elimination alone yields its solution. The factors are L and L D of ``ε I + D = L D Lᴴ``.
-    """
+    """Set the levels at range ``centre`` of windows, by elimination with the centre last: ``ε I + D = L D Lᴴ``."""
     lanes = _PAIR * REGISTER_BYTES // lags.itemsize
     one, scaled = splat(lags, 1.0, _PAIR), n_snapshots * n_snapshots * 2 * lanes
     for first in range(begin, end, lanes):

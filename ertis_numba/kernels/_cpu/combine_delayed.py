@@ -79,10 +79,7 @@ def _combine_short(signals, roots, starts, order, coherent, out):
 
 @njit(nogil=True, cache=True)
 def _combine_tile(signals, roots, starts, order, low, high, out, direction):
-    """Write the samples from ``low`` to ``high`` of a direction.
-
-    The last vector overlaps the one before it, and computes some samples again.
-    """
+    """Write the samples from ``low`` to ``high`` of a direction; the last vector computes some samples again."""
     n_samples = out.shape[1]
     width = (_SUMMED if order == 1 else _MULTIPLIED) * _LANES
     row = direction * n_samples

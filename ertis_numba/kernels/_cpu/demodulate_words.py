@@ -28,9 +28,8 @@ _TILE = 32  # outputs collected before they are transposed from (sample, mic) to
 def _sum_masked_taps(typing_context, words, first, step, taps, tile, row):
     """Fill rows ``row … row + _GROUP`` of ``tile`` (output, lane) with the sums of the masked taps.
 
-    ``tile[row + g, lane] = Σ_t taps[t] · bit_of(words.flat[first + g · step + t · n_words])`` for the bit of `_lane`;
-    n_words is the last axis of ``words``. The code uses LLVM's vector types, because no loop over bits keeps the sums
-    of a whole word in registers.
+    ``tile[row + g, lane] = Σ_t taps[t] · bit_of(words.flat[first + g · step + t · n_words])`` for the bit of `_lane`.
+    The code uses LLVM's vector types, because no loop over bits keeps the sums of a whole word in registers.
     """
     signature = types.void(words, types.intp, types.intp, taps, tile, types.intp)
 

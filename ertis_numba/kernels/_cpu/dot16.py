@@ -34,11 +34,7 @@ def add_products(builder, total, x, weight):
 
 
 class Dot16:
-    """Emits the instructions of one tile.
-
-    As many ranges as registers can hold the sums of are summed in one pass. ``n_beams`` is the number of beams that are
-    summed at a time.
-    """
+    """Emits the instructions of one tile: ``n_beams`` beams at a time, and as many ranges as registers hold sums of."""
 
     def __init__(self, builder, n_beams=1):
         self._builder = builder

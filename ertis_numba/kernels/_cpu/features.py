@@ -14,8 +14,8 @@ __all__ = ["INSTRUCTION_SET", "InstructionSet", "host", "passes", "target_featur
 def target_features() -> frozenset[str]:
     """Return the names of the target's features, as spelled by LLVM.
 
-    The target may differ from this processor. NUMBA_CPU_FEATURES and NUMBA_CPU_NAME select another one, for example the
-    oldest of several machines that share a cache. An instruction that the target lacks would abort the compiler.
+    NUMBA_CPU_FEATURES and NUMBA_CPU_NAME select another target than this processor, for example the oldest of several
+    machines that share a cache. An instruction that the target lacks would abort the compiler.
     """
     if config.CPU_FEATURES is not None:
         flags = str(config.CPU_FEATURES).split(",")
@@ -35,13 +35,11 @@ def host() -> tuple[str, dict[str, bool]]:
 
 @dataclass(frozen=True, slots=True)
 class InstructionSet:
-    """Vector instructions of a processor.
+    """Vector instructions of a processor, with 32-bit lanes; ``sums`` vectors stay in registers.
 
-    - ``lanes``: numbers of 32 bits in a vector register.
-    - ``sums``: vectors of sums that stay in registers; the other registers hold weights and samples.
-    - ``multiply_pairs``: LLVM's name of the instruction that multiplies 16-bit numbers and adds the products of each
-      pair. If it is empty, each product has a sum of its own. LLVM then emits ``smlal`` for NEON.
-    - ``has_masks``: True if registers of one bit per lane select lanes.
+    ``multiply_pairs`` is LLVM's name of the instruction that multiplies 16-bit numbers and adds the products of each
+    pair. If it is empty, each product has a sum of its own, and LLVM emits ``smlal`` for NEON. ``has_masks``: registers
+    of one bit per lane select lanes.
     """
 
     name: str

@@ -27,10 +27,7 @@ def _address(typing_context, array):
 
 @intrinsic
 def _node_tile(typing_context, tiles, tile, offsets, weights, node, n_used, rows, row):
-    """Fill ``n_used`` ranges or more of ``rows[row]``, (part, range) int16, with a beam of a grid point.
-
-    The beam is that of the contract: the rounded upper 16 bits of its sums.
-    """
+    """Fill ``n_used`` ranges or more of ``rows[row]``, (part, range), with a point's rounded upper 16 bits of sums."""
     signature = types.void(tiles, types.intp, offsets, weights, types.intp, types.intp, rows, types.intp)
 
     def codegen(context, builder, signature, arguments):
@@ -49,10 +46,7 @@ def _node_tile(typing_context, tiles, tile, offsets, weights, node, n_used, rows
 
 @intrinsic
 def _pair_rows(typing_context, rows, lower, pairs, node):
-    """Fill ``pairs[node]`` with row ``lower`` in the low bits and the other row in the high bits.
-
-    The code uses LLVM's vector types, because LLVM does not vectorise such a loop.
-    """
+    """Fill ``pairs[node]`` with two rows, ``lower`` in the low bits, by LLVM's vector types, as loops give none."""
     signature = types.void(rows, types.intp, pairs, types.intp)
 
     def codegen(context, builder, signature, arguments):
@@ -89,10 +83,9 @@ def new_pairs(count):
 
 @njit(nogil=True, cache=True)
 def fill_pairs(tiles, tile, offsets, weights, first, last, n_used, pairs):
-    """Fill ``pairs``, (point, part, range), with the beams of the grid points ``first … last`` and their successors.
+    """Fill ``pairs``, (point, part, range), with beams of points ``first … last``, the next ones in the high 16 bits.
 
-    Each number holds a grid point in its low 16 bits and the next one in its high 16 bits. Ranges from ``n_used``
-    on are arbitrary.
+    Ranges from ``n_used`` on are arbitrary.
     """
     both = np.empty((2, 2 * RANGES), np.int16)
     for node in range(first, last + 1):

@@ -39,10 +39,7 @@ def _interpolation(n_beams):
 
     @intrinsic
     def interpolate(typing_context, rows, skipped, places, weights, direction, out, place, next_place):
-        """Fill ``out.flat[place : place + TILE]``, and for a second direction ``next_place …``.
-
-        ``rows`` is (point, part, range), and its first point is ``skipped``.
-        """
+        """Fill a tile of ``out.flat`` at ``place`` and, of a second direction, at ``next_place``."""
         signature = types.void(rows, types.intp, places, weights, types.intp, out, types.intp, types.intp)
 
         def codegen(context, builder, signature, arguments):

@@ -23,11 +23,7 @@ def _interpolation(n_beams):
 
     @intrinsic
     def interpolate(typing_context, pairs, skipped, places, weights, direction, scale, n_used, out, place, next_place):
-        """Fill ``out.flat[place : place + n_used]`` or more, up to `RANGES`; a second direction has ``next_place …``.
-
-        ``pairs`` is (point, part, range) int32, and its first point is ``skipped``. Each number holds a grid point in
-        its low 16 bits and the next one in its high 16 bits.
-        """
+        """Fill ``n_used`` to `RANGES` ranges of ``out.flat`` at ``place`` and ``next_place`` from `fill_pairs`."""
         integer = types.intp
         numbers = (integer, types.float32, integer)
         signature = types.void(pairs, integer, places, weights, *numbers, out, integer, integer)

@@ -21,8 +21,7 @@ _LOG: Final = logging.getLogger("ertis_numba")
 def load_without_compiler(kernels: Iterable[Any]) -> None:
     """Let kernels load from Numba's cache without preparing its compiler.
 
-    Kernels that are not cached are compiled as usual. If a future version of Numba loads functions in another way,
-    kernels load as Numba does it by default.
+    If a future version of Numba loads functions in another way, kernels load as Numba does it by default.
     """
     for kernel in kernels:
         cache = getattr(kernel, "_cache", None)

@@ -24,10 +24,7 @@ _POWER = tuple(map(np.float32, (1.0, 0.69312102, 0.2402235, 0.055921976, 0.00966
 
 @njit(nogil=True, cache=True)
 def _polar(source, inverse, real, imag, logarithm, bits):
-    """Fill the direction of each complex number and the logarithm of its magnitude times ``inverse``.
-
-    The logarithm is to base 2, at least −63. ``bits`` is a work array of int32.
-    """
+    """Fill the direction of each number and log2 of its magnitude times ``inverse``, at least −63; ``bits`` is work."""
     mantissa = bits.view(np.float32)
     for k in range(len(real)):
         x, y = source[2 * k] * inverse, source[2 * k + 1] * inverse

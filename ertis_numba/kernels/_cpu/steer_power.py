@@ -18,10 +18,7 @@ _ZERO, _TWO = np.float32(0), np.float32(2)
 
 @njit(nogil=True, cache=True)
 def _pack(matrix, numbers):
-    """Fill the coefficients of two rows, in the order in which they are read, and return the trace.
-
-    Those left of the diagonal and those of a row beyond the last are 0.
-    """
+    """Fill two rows' coefficients in reading order, 0 left of the diagonal and beyond the last; return the trace."""
     n_mics, k, trace = len(matrix), 0, _ZERO
     for i in range(n_mics):
         trace += matrix[i, i].real

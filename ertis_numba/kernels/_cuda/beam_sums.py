@@ -96,7 +96,7 @@ def _sum_terms(signals, offsets, weights, n_terms, direction, place):
 
 @cuda.jit(device=True)
 def fill_beams(value_of, signals, offsets, weights, n_terms, origin, first, stop, end, out):
-    """Write ``value_of(real, imag)`` of a thread's beams from ``first`` to ``stop``, and of 0 from there to ``end``.
+    """Write ``value_of(real, imag)`` of a thread's beams from ``first`` to ``stop``, and of 0 to ``end``.
 
     The grid begins at ``first``. ``origin`` is the position in the signals of the first range of ``out``.
     """

@@ -57,19 +57,12 @@ def _load(samples, turns, first, out):
 
 
 def multiply_add(turns: int, out: NDArray[np.float32]) -> None:
-    """Run float32 multiply-adds in registers, a thread per element of ``out``, (thread,) float32.
-
-    There are at most 256 threads, or a multiple of 256.
-    """
+    """Run float32 multiply-adds in registers, a thread per element of ``out``: at most 256, or a multiple of it."""
     launch(_multiply_add, *_shape(len(out)), turns, np.float32(0.5), np.float32(1), out)
 
 
 def load(samples: NDArray[np.uint64], turns: int, first: int, out: NDArray[np.uint64]) -> None:
-    """Load samples from the L1 cache, with a thread per element of ``out``, (thread,) uint64.
-
-    ``samples`` is an array of 2048 + 256 uint64. ``first``, below 16, is the number of samples between the begin of a
-    cache line and the first sample of a warp.
-    """
+    """Load ``samples`` (2304,) from the L1 cache, a thread per element of ``out``, ``first`` < 16 off a cache line."""
     launch(_load, *_shape(len(out)), samples, turns, first, out)
 
 
@@ -95,7 +88,6 @@ def ceilings(
 
     The result has ``copy_gb_s`` (bytes read and written), ``float32_gop_s`` (a multiply-add is two operations),
     ``load_gb_s`` (L1 cache, warps aligned to cache lines) and ``load_unaligned_gb_s`` (an offset of one sample).
-    ``turns``, ``copy_bytes``, ``threads``: amount of work; enough to fill a GPU by default.
     """
     threads = threads or _BLOCK * _BLOCKS_PER_MULTIPROCESSOR * properties()["multiprocessors"]
     source, target = (cuda.to_device(np.ones(copy_bytes // 4, np.float32)) for _ in range(2))

@@ -17,10 +17,7 @@ def _fill(signals, offsets, weights, n_terms, first, n_ranges, out):
 
 
 def beams_from(signals, offsets, weights, first, n_ranges, out):
-    """Run `delay_and_sum` for ``n_ranges`` ranges starting at ``first``.
-
-    ``out`` is (direction, range) uint64. It may be longer by less than a tile; the additional ranges become 0.
-    """
+    """Run `delay_and_sum` for ``n_ranges`` from ``first`` on; the rest of the tile in ``out`` becomes 0."""
     grid, tables = beam_grid(out.shape[0], n_ranges), (offsets.reshape(-1), complexes(weights))
     launch(_fill, grid, BLOCK, complexes(signals), *tables, offsets.shape[1], first, n_ranges, out)
 

@@ -14,11 +14,7 @@ TILE_RANGES = 3 * WARP
 
 @cuda.jit(device=True)
 def sum_short_terms(samples, offsets, weights, n_terms, direction, place):
-    """Return the real and imaginary parts of a beam at ``place``, and one and two warps further.
-
-    ``samples`` and ``weights`` are flat arrays of pairs of int16 as uint32; weights are
-    ``((re w, −im w), (im w, re w))``.
-    """
+    """Return both parts of a beam at ``place``, and one and two warps further, from flat pairs of int16 as uint32."""
     a_real = a_imag = b_real = b_imag = c_real = c_imag = np.int32(0)
     entry = direction * n_terms
     end = entry + n_terms

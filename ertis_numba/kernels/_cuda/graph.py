@@ -11,10 +11,7 @@ __all__ = ["Graph"]
 
 
 class Graph:
-    """Replayable graph of steps that launch the same kernels on the same arrays at each call.
-
-    ``stream`` is not the default stream, which cannot be recorded.
-    """
+    """Replayable graph of launches on the same arrays; ``stream`` is not the default one, which cannot be recorded."""
 
     def __init__(self, stream: Any) -> None:
         import cupy  # noqa: PLC0415 - the import takes half a second, and only graphs need it

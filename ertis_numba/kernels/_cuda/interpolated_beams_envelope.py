@@ -30,10 +30,7 @@ def _add_node(nodes, at, weight, sums):
 
 @cuda.jit(cache=True)
 def _interpolate(nodes, width, places, n_pairs, tap_weights, rows, first, stop, out):
-    """Fill ranges of ``out``; ``nodes`` and all tables are flat.
-
-    ``nodes`` is (point, range) uint64, with ``width`` ranges, which is a multiple of the tile.
-    """
+    """Fill ranges of ``out`` from flat tables and nodes (point, ``width``), which is a multiple of the tile."""
     direction = np.uint64(cuda.blockIdx.x * DIRECTIONS + cuda.threadIdx.y)
     if direction >= np.uint64(rows.size):
         return

@@ -31,10 +31,7 @@ def fill_nodes(samples, per_tile, offsets, weights, n_terms, nodes):
 
 @cuda.jit(device=True)
 def sum_short_nodes(nodes, n_nodes, places, n_pairs, tap_weights, direction):
-    """Return the real and imaginary parts of an interpolated beam, and those one and two warps further.
-
-    ``nodes``, ``places`` and ``tap_weights`` are flat; ``nodes`` and ``tap_weights`` have pairs of int16 as uint32.
-    """
+    """Return both parts of an interpolated beam, and those one and two warps further, from pairs of int16 as uint32."""
     first = np.uint64(cuda.blockIdx.y * np.int64(n_nodes) * TILE_RANGES + cuda.threadIdx.x)
     a_real = a_imag = b_real = b_imag = c_real = c_imag = np.int32(0)
     entry = direction * np.uint64(n_pairs)

@@ -28,16 +28,11 @@ Allocate = Callable[[tuple[int, ...], DTypeLike], Any]
 
 
 class Lane:
-    """Lane of the GPU, which also provides kernels with workspace. See `kernels.Lane`.
+    """Lane of the GPU, which also provides kernels with workspace under unique names. See `kernels.Lane`.
 
-    A kernel requests workspace for intermediate results from `workspace`, under a unique name. Launches on one stream
-    run in order, so the next measurement can reuse the workspace.
-
-    - ``stream``: 0 is the default stream, which synchronises with all others.
-    - ``allocate``, ``pin``: return a new array of a given shape and type: of the device, and of pinned memory of the
-      host.
-    - ``graphs``: True if `run` records its steps as a CUDA graph. Without graphs, a launch takes the CPU about 50
-      microseconds per kernel.
+    Launches on one stream run in order, so the next measurement can reuse the workspace. ``stream`` 0 is the default
+    stream, which synchronises with all others. With ``graphs``, `run` records its steps as a CUDA graph; without, a
+    launch takes the CPU about 50 microseconds per kernel.
     """
 
     def __init__(

@@ -19,30 +19,7 @@ def plan(
     zeros: Callable[[tuple[int, ...], DTypeLike], NDArray[Any]],
     stream: Any,
 ) -> Transforms:
-    """Return the forward and inverse transforms for two arrays.
-
-    Parameters
-    ----------
-    library : {"scipy", "cufft"}
-        Library that computes the transforms.
-    signals : (mic, n) float32
-        Input of the forward transform.
-    analytic : (mic, phase, n_out) complex64
-        Input and output of the inverse transform.
-    zeros : callable
-        Returns a new array of zeros of a given shape and type on the device.
-    stream : numba.cuda.Stream or None
-        Stream of the GPU; None on the host.
-
-    Returns
-    -------
-    Transforms
-
-    Raises
-    ------
-    DeviceError
-        The GPU has too little memory.
-    """
+    """Return the transforms of ``signals`` (mic, n) and ``analytic`` (mic, phase, n_out) in memory of ``zeros``."""
     if library == "scipy":
         from ertis_numba.kernels.fft._scipy import ScipyTransforms  # noqa: PLC0415 - scipy.fft takes long to import
 

@@ -14,24 +14,9 @@ __all__ = ["CufftTransforms"]
 
 
 class CufftTransforms:
-    """Transforms with cuFFT. See `Transforms`.
+    """Transforms with cuFFT, with plans, work areas and views created once, and no copies. See `Transforms`.
 
-    Plans, work areas and views of the arrays are created once, and arrays are not copied.
-
-    Parameters
-    ----------
-    signals : (mic, n) float32
-    analytic : (mic, phase, n_out) complex64
-        With phase shifts, the beams: (direction, 1, n_out).
-    zeros : callable
-        Returns a new array of zeros of a given shape and type on the device.
-    stream : numba.cuda.Stream
-        Stream on which the transforms run.
-
-    Raises
-    ------
-    DeviceError
-        The GPU has too little memory for the work areas.
+    With phase shifts, ``analytic`` are the beams: (direction, 1, n_out).
     """
 
     def __init__(

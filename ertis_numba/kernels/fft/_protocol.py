@@ -9,10 +9,7 @@ __all__ = ["Transforms"]
 
 
 class Transforms(Protocol):
-    """Transforms of the signal chain along the last axis, in single precision, for two fixed arrays.
-
-    Neither transform is normalised: a forward and an inverse transform scale a signal by its length.
-    """
+    """Transforms of two fixed arrays along the last axis, in single precision, not normalised in either direction."""
 
     def forward(self, *, threads: int) -> NDArray[np.complex64]:
         """Return the one-sided spectra of the real signals: (mic, n // 2 + 1) complex64."""

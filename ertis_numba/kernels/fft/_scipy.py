@@ -10,10 +10,7 @@ __all__ = ["ScipyTransforms"]
 
 
 class ScipyTransforms:
-    """Transforms with SciPy. See `Transforms`.
-
-    They also serve the simulated GPU, whose arrays are NumPy arrays underneath and are modified in place as well.
-    """
+    """Transforms with SciPy, also of the simulated GPU, whose arrays are NumPy arrays underneath. See `Transforms`."""
 
     def __init__(self, signals: NDArray[np.float32], analytic: NDArray[np.complex64]) -> None:
         self._signals, self._analytic = np.asarray(signals), np.asarray(analytic)
