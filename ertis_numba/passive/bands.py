@@ -15,28 +15,10 @@ _ROUNDING = 1e-6  # relative, so that limits include the bands whose edges they 
 
 
 def octave_bands(low_hz: float, high_hz: float, *, fraction: int = 3) -> NDArray[np.float64]:
-    """Return the octaves, or fractions of them, that lie between two frequencies.
+    """Return the edges in Hz of the octaves or thirds that lie between two frequencies: (band, 2).
 
     Exact centres are ``1000 · G^(k / fraction)`` with ``G = 10^0.3``, and edges lie half of a band away (IEC
     61260-1:2014, equations 2 and 4).
-
-    Parameters
-    ----------
-    low_hz, high_hz : float
-        Limits in hertz.
-    fraction : {1, 3}
-        Bands per octave.
-
-    Returns
-    -------
-    (band, 2) float64
-        Edges in hertz.
-
-    Examples
-    --------
-    >>> from ertis_numba.passive import octave_bands
-    >>> octave_bands(30e3, 50e3).round().tolist()
-    [[35481.0, 44668.0]]
     """
     step = 0.3 / fraction
     lowest = math.ceil((math.log10(low_hz / 1e3) - _ROUNDING) / step + 0.5)
@@ -46,21 +28,9 @@ def octave_bands(low_hz: float, high_hz: float, *, fraction: int = 3) -> NDArray
 
 
 def band_edges(passive: Passive, recording: Recording) -> NDArray[np.float64]:
-    """Return the edges of the bands that settings describe.
+    """Return edges (band, 2) of possible named bands, or of all listed ones; raise ArgumentError if one is too high.
 
-    Parameters
-    ----------
-    recording : Recording
-        Named bands beyond 0.8 of half of its sample rate are left out.
-
-    Returns
-    -------
-    (band, 2) float64
-
-    Raises
-    ------
-    ArgumentError
-        A listed band reaches beyond the highest frequency, or no named band remains.
+    Named bands beyond 0.8 of half of the recording's sample rate are left out.
     """
     given, highest_hz = passive.bands_hz, HIGHEST_SHARE * recording.sample_rate_hz / 2
     if isinstance(given, str):
@@ -92,12 +62,7 @@ def _widened(bands_hz: NDArray[np.float64], low_hz: float, high_hz: float) -> ND
 
 
 def shaped_noise_warning(settings: Settings, bands_hz: NDArray[np.float64]) -> str:
-    """Return a line on bands in which the noise of one-bit microphones dominates; empty if there are none.
-
-    Parameters
-    ----------
-    bands_hz : (band, 2) float64
-    """
+    """Return a line on bands in which the noise of one-bit microphones dominates; empty if there are none."""
     limit_hz = SHAPED_NOISE_SHARE * settings.recording.sample_rate_hz
     noisy = bands_hz[bands_hz[:, 1] > limit_hz]
     if not settings.recording.is_pdm or not len(noisy):
@@ -116,14 +81,7 @@ def typed_hz(frequency_hz: float) -> str:
 
 
 def bin_shares(bands_hz: NDArray[np.float64], frequency_hz: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the share of each bin that lies within each band: (band, bin) float32.
-
-    Parameters
-    ----------
-    bands_hz : (band, 2) float64
-    frequency_hz : (bin,) float64
-        Centres of bins with equal spacing, two or more.
-    """
+    """Return the share of each bin, of two or more with equal spacing, that lies within each band: (band, bin)."""
     spacing_hz = frequency_hz[1] - frequency_hz[0]
     low_hz, high_hz = bands_hz[:, :1], bands_hz[:, 1:]
     inside = np.minimum(high_hz, frequency_hz + spacing_hz / 2) - np.maximum(low_hz, frequency_hz - spacing_hz / 2)

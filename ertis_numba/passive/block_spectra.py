@@ -20,44 +20,19 @@ _CHANNELS: Final = 16  # Largest number of channels whose frequencies are measur
 
 
 class Products(NamedTuple):
-    """Sums over the blocks of a measurement.
+    """Sums over the blocks of a measurement."""
 
-    Attributes
-    ----------
-    matrix : (bin, mic, mic) complex64
-        Products of the spectra.
-    slopes : (bin, n, n) complex64
-        Products of the spectra under the slope of the window with those under the window, of some channels.
-    squares : (bin,) float64
-        Mean power of these channels under the slope of the window.
-    """
-
-    matrix: NDArray[np.complex64]
-    slopes: NDArray[np.complex64]
-    squares: NDArray[np.float64]
+    matrix: NDArray[np.complex64]  # (bin, mic, mic) products of the spectra
+    slopes: NDArray[np.complex64]  # (bin, n, n) products under the slope of the window with those under the window
+    squares: NDArray[np.float64]  # (bin,) mean power under the slope of the window
     n_blocks: int
 
 
 class BlockSpectra:
     """Sums of the products of spectra over the blocks of measurements.
 
-    Attributes
-    ----------
-    bands_hz : (band, 2) float64
-        Edges of the bands.
-    frequency_hz : (bin,) float64
-        Frequencies of the bins that the bands need.
-    bins : (bin,) uint32
-        Their numbers; bin 1 has the frequency ``spacing_hz``.
-    spacing_hz : float
-        Spacing of the bins in hertz.
-    channels : (n,) intp
-        Microphones whose frequencies within bins are measured.
-
-    Raises
-    ------
-    ArgumentError
-        The bands exceed the record, or a block is longer than it.
+    The needed bins are ``bins``, with the frequencies ``frequency_hz``; bin 1 has the frequency ``spacing_hz``. The
+    frequencies within bins are measured at the microphones ``channels``.
     """
 
     def __init__(self, settings: Settings, kernels: KernelSet, *, threads: int) -> None:
@@ -86,18 +61,7 @@ class BlockSpectra:
         self._sums = self._memory.zeros((len(self.bins), n_mics, n_mics), np.complex64)
 
     def products(self, measurement: Measurement, *, masked: bool) -> Products:
-        """Return the sums of the products over the blocks of a measurement.
-
-        Parameters
-        ----------
-        masked : bool
-            Leave out the time of the call.
-
-        Raises
-        ------
-        DataError
-            The measurement is not of this sensor, or is too short.
-        """
+        """Return the sums over a measurement of this sensor, without the time of the call if masked."""
         heard = self._read(measurement, out=self._heard)
         hop = self._n_block // 2
         first = self._read.n_masked if masked else 0
@@ -122,7 +86,7 @@ class BlockSpectra:
         return Products(out, *self._slopes(pieces[self.channels, : n_blocks * hop : hop]), n_blocks)
 
     def _slopes(self, pieces: NDArray[np.float32]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
-        """Return the products of blocks, (channel, block, sample), under the slope of the window, and their powers.
+        """Return products of blocks (channel, block, sample) under the slope of the window, and powers.
 
         With the window w, a tone has the spectrum X in a bin, and X′ with the slope of the window: -Im X′ / X is its
         frequency relative to the centre of the bin.

@@ -21,10 +21,6 @@ def gathered(found: AcousticMap) -> AcousticMap:
     The bins of a source between directions of the grid yield components in several of them. From the strongest
     direction of a band on, the components of a direction and its neighbours are summed there. The power of a source in
     the map is therefore its level, and the sum over all directions remains.
-
-    Returns
-    -------
-    AcousticMap
     """
     if found.settings.passive.method not in COMPONENT_METHODS:
         return found

@@ -12,50 +12,29 @@ __all__ = ["CrossSpectrum", "FrequencyMoments"]
 
 
 class FrequencyMoments(NamedTuple):
-    """Moments of the frequency of the sound within bins.
+    """Moments of the frequency of the sound within bins, at some microphones, ``channels``.
 
-    Attributes
-    ----------
-    channels : (n,) intp
-        Some of the microphones.
-    first : (bin, n, n) complex128
-        Matrix F of these channels. For a wave v, ``-Im(v^H F v) / v^H C v`` is the mean frequency of its sound relative
-        to the centre of the bin, in hertz. It lies outside of the bin if the sound is louder outside.
-    width_hz : (bin,) float64
-        Standard deviation of the frequency.
+    For a wave v and ``first``, the matrix F (bin, n, n), ``-Im(v^H F v) / v^H C v`` is the mean frequency of its sound
+    relative to the centre of the bin, in Hz. It lies outside of the bin if the sound is louder outside.
     """
 
     channels: NDArray[np.intp]
     first: NDArray[np.complex128]
-    width_hz: NDArray[np.float64]
+    width_hz: NDArray[np.float64]  # (bin,) standard deviation of the frequency
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CrossSpectrum:
     """Mean products of the spectra of each pair of microphones (P. D. Welch, 1967).
 
-    Attributes
-    ----------
-    matrix : (bin, mic, mic) complex64
-        One-sided spectrum: element i, j is the mean of ``X_i · conj(X_j)``, and the diagonal is the mean square of each
-        microphone within a bin. Calibrated gains are removed; calibrated delays are not.
-    frequency_hz : (bin,) float64
-        Centres of the bins in hertz, with equal spacing.
-    n_blocks : int
-        Number of blocks, of which each shares half of its samples with the next one.
-    moments : FrequencyMoments, optional
-        Frequencies within the bins; unknown by default.
-
-    Raises
-    ------
-    ArgumentError
-        The shapes do not agree.
+    The matrix (bin, mic, mic) is one-sided: element i, j is the mean of ``X_i · conj(X_j)``, and the diagonal is the
+    mean square of each microphone within a bin. Calibrated gains are removed; calibrated delays are not.
     """
 
     matrix: NDArray[np.complex64]
-    frequency_hz: NDArray[np.float64]
-    n_blocks: int
-    moments: FrequencyMoments | None = None
+    frequency_hz: NDArray[np.float64]  # (bin,) centres, with equal spacing
+    n_blocks: int  # each shares half of its samples with the next
+    moments: FrequencyMoments | None = None  # within the bins; unknown by default
 
     def __post_init__(self) -> None:
         n_mics = self.matrix.shape[-1]

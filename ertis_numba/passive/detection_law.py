@@ -20,43 +20,18 @@ LAGS: Final = 4
 
 
 def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: ScanExtent) -> float:
-    """Return the probability that, in noise alone, the beam of any direction has at least a share of all power.
+    """Return the probability that noise alone gives the beam of any direction at least a share of all power.
 
-    In white noise of unknown power, the share R of one direction in the power of D dimensions has the Beta distribution
-    ``R ~ Beta(K, K (D − 1))``, where K is the number of independent samples. For many dimensions, this is nearly a
-    Gamma distribution. The expected Euler characteristic of the directions of a connected set that exceed R is
-
-    ``E = P(R) + L₁ g / √(2πn) + L₂ g′ / (2πn)`` with ``n = 2K (D − 1)``
-
-    (K. J. Worsley, Local maxima and the expected Euler characteristic of excursion sets of χ², F and t fields, 1994).
-    Here g is the density of ``φ = arccos √R``, ``g′`` its derivative, and L₁ and L₂ are the length and the area of the
-    set in units of the array's resolution: see `ScanMesh.extent`. At high levels, this is the expected number of
-    places that exceed R. These are rare and independent in cells as large as the distance π/2 of orthogonal waves (D.
-    J. Aldous, Probability approximations via the Poisson clumping heuristic, 1989). With N cells, the probability of
-    at least one place is therefore ``1 − (1 − E / N)^N``.
-
-    Parameters
-    ----------
-    share : float
-        Share R, 0 to 1.
-    n_samples : float
-        Number K of independent complex samples.
-    n_dimensions : int
-        Number D of dimensions: the number of microphones minus that of other sources.
-    extent : ScanExtent
-        Directions that are searched, at the frequency of the noise.
-
-    Returns
-    -------
-    float
-        Probability; 1 if the share is not above its mean.
-
-    Examples
-    --------
-    >>> from ertis_numba.passive.detection_law import exceedance
-    >>> from ertis_numba.passive.scan_extent import ScanExtent
-    >>> round(exceedance(0.5, n_samples=1, n_dimensions=4, extent=ScanExtent(1, 0, 0)), 6)  # (1 − R)³
-    0.125
+    In white noise of unknown power, the share R of one direction in the power of D dimensions (microphones minus other
+    sources) has the Beta distribution ``R ~ Beta(K, K (D − 1))`` for K independent complex samples. For many
+    dimensions, this is nearly a Gamma distribution. The expected Euler characteristic of the directions of a connected
+    set that exceed R is ``E = P(R) + L₁ g / √(2πn) + L₂ g′ / (2πn)`` with ``n = 2K (D − 1)`` (K. J. Worsley, Local
+    maxima and the expected Euler characteristic of excursion sets of χ², F and t fields, 1994). Here g is the density
+    of ``φ = arccos √R``, ``g′`` its derivative, and L₁ and L₂ are the length and the area of the set in units of the
+    array's resolution: see `ScanMesh.extent`. At high levels, this is the expected number of places that exceed R.
+    These are rare and independent in cells as large as the distance π/2 of orthogonal waves (D. J. Aldous, Probability
+    approximations via the Poisson clumping heuristic, 1989). With N cells, the probability of at least one place is
+    therefore ``1 − (1 − E / N)^N``. It is 1 if the share is not above its mean.
     """
     if n_dimensions < 2 or share <= 1 / n_dimensions:
         return 1.0
@@ -77,31 +52,11 @@ def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: Sca
 def independent_samples(
     shares: NDArray[np.floating], n_blocks: int, similarity: NDArray[np.floating] | None = None
 ) -> float:
-    """Return the number of independent samples with the same variance of their mean power as bins of blocks.
+    """Return the number of independent samples whose mean power varies as that of bins of blocks.
 
     Hann windows that overlap by half leave 0.47 independent samples of each bin and block: neighbouring bins and blocks
-    are correlated (P. D. Welch, 1967).
-
-    Parameters
-    ----------
-    shares : (bin,) float
-        Weights of neighbouring bins.
-    n_blocks : int
-        Number of blocks, of which each shares half of its samples with the next one.
-    similarity : (LAGS + 1,) float, optional
-        Squared cosine of the angle between the beams of two bins, for distances from 0 bins on. It reduces the
-        correlation of their powers; see `ScanMesh.similarity`. 1 by default, as for a microphone.
-
-    Returns
-    -------
-    float
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from ertis_numba.passive.detection_law import independent_samples
-    >>> round(independent_samples(np.ones(1000), 1000) / 1e6, 3)
-    0.474
+    are correlated (P. D. Welch, 1967). ``similarity``, (LAGS + 1,), is the squared cosine of the angle between the
+    beams of two bins, from 0 bins apart on, which reduces their correlation; 1 by default, as for a microphone.
     """
     same, next_one = _correlations()
     products = np.correlate(shares, shares, "full")[len(shares) - 1 :][: LAGS + 1].astype(np.float64)

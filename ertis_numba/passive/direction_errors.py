@@ -22,19 +22,10 @@ _OF_WIDTH: Final = 0.3  # Uncertain share of the power that the width of a bin c
 
 
 def powers_in_noise(beside: BandLikelihood, place: Floats, width: Floats | None = None) -> tuple[Floats, Floats]:
-    """Return the power of a source without noise, and that of the noise in each dimension, both (bin,).
+    """Return the power of a source given all others, and the noise in each dimension, both (bin,).
 
     Blocks of distant microphones hear slightly different sound, which changes the wave like a change of its frequency.
-    This is no noise of the microphones, if the width of the frequencies in a bin is given.
-
-    Parameters
-    ----------
-    beside : BandLikelihood
-        Given all other sources.
-    place : (axis,) float64
-        Unit vector.
-    width : (bin,) float64, optional
-        Standard deviation of the angular frequency in each bin.
+    This is no noise of the microphones, if the width, (bin,) rad/s, of the frequencies in a bin is given.
     """
     powers, size = beside.beams(place[None])
     rest, n = beside.power - powers[:, 0], beside.dimensions - 1
@@ -49,21 +40,10 @@ def powers_in_noise(beside: BandLikelihood, place: Floats, width: Floats | None 
 
 
 def covariance_of(likelihood: BandLikelihood, places: Floats, k: int, band: HeardBand, *, level: bool) -> Floats:
-    """Return the covariance of a direction's errors, sideways and upwards, infinite if not resolved: (2, 2) rad².
+    """Return the covariance (2, 2) of direction k's errors sideways and upwards, infinite if not resolved.
 
     The gradient of the likelihood has the variance of products of the beam with the noise outside of it. Sources that
     are not separated leave more power in the changes of the wave than this noise, which shows how far they are apart.
-
-    Parameters
-    ----------
-    likelihood : BandLikelihood
-        Without other sources.
-    places : (source, axis) float64
-        Directions of all sources.
-    k : int
-        Number of the source.
-    level : bool
-        The elevation is given.
     """
     place, beside = places[k], band.beside(likelihood, places, k)
     powers, noise = powers_in_noise(beside, place, band.width)

@@ -26,27 +26,10 @@ class DirectionFilter:
     """Kalman filter of a direction and its velocity in the plane that touches the sphere there.
 
     The velocity changes by white noise (Y. Bar-Shalom, X. Li and T. Kirubarajan, Estimation with Applications to
-    Tracking and Navigation, 2001, section 6.2.2). After each bearing, the plane moves to the new direction.
-
-    Parameters
-    ----------
-    bearing : Bearing
-        First bearing.
-    acceleration_deg_s : float
-        Root of the power density of the acceleration, in degrees per second in a second.
-    speed_deg_s : float
-        Standard deviation of the velocity at the start, in degrees per second.
-    array_error_deg : float
-        Standard deviation of errors of bearings that their uncertainty does not include, in degrees.
-
-    Attributes
-    ----------
-    direction : (axis,) float64
-        Unit vector.
-    velocity_rad_s : (2,) float64
-        Velocity sideways and upwards.
-    covariance : (4, 4) float64
-        Covariance of the offsets sideways and upwards, in radians, and of the velocity.
+    Tracking and Navigation, 2001, section 6.2.2), with the root of the power density ``acceleration_deg_s`` in °/s in a
+    second. After each bearing, the plane moves to the new direction. ``array_error_deg`` is the standard deviation that
+    bearings do not state. ``speed_deg_s`` is that of the first velocity. The covariance (4, 4) is that of offsets
+    sideways and upwards in radians, and of the velocity.
     """
 
     def __init__(

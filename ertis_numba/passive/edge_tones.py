@@ -41,18 +41,8 @@ class EdgeTones:
     """Spectra at the edges of bands, at the microphones and in the loudest directions of the bands, over all maps.
 
     Directions show a tone that is weaker than noise at the microphones. Beams of grids coarser than the main lobe
-    distort its spectrum, so that of the microphones has priority if it shows the tone.
-
-    Parameters
-    ----------
-    band_hz : (band, 2) float64
-    frequency_hz : (bin,) float64
-        Centres of bins with equal spacing.
-    highest_hz : float
-        Highest frequency of bands.
-    method : MapMethod
-        Powers of methods other than ``delay_and_sum`` and ``functional`` do not follow the window. Tones are then
-        found at the microphones only.
+    distort its spectrum, so that of the microphones has priority if it shows the tone. Powers of methods other than
+    ``delay_and_sum`` and ``functional`` do not follow the window: their tones are found at the microphones only.
     """
 
     def __init__(self, band_hz: Floats, frequency_hz: Floats, highest_hz: float, method: MapMethod) -> None:
@@ -72,18 +62,7 @@ class EdgeTones:
         return _Edge(edge_hz, tuple(np.flatnonzero(near.any(axis=1)).tolist()), np.where(known, places, -1))
 
     def add(self, powers: NDArray[np.float32], power: NDArray[np.float32], heard: Floats, count: int) -> None:
-        """Add a map.
-
-        Parameters
-        ----------
-        powers : (bin, direction) float32
-        power : (direction, band) float32
-            Map of these powers.
-        heard : (bin,) float64
-            Mean power of the microphones.
-        count : int
-            Number of its measurements.
-        """
+        """Add powers (bin, direction), their map (direction, band), and the mean power (bin,) of the microphones."""
         loudest = power.argmax(axis=0)
         self._bands += count * power[loudest, np.arange(power.shape[1])]
         for number, edge in enumerate(self._edges):
@@ -94,13 +73,7 @@ class EdgeTones:
         self._count += count
 
     def note(self, *, within: bool = False) -> str | None:
-        """Return a note on the loudest tone of whose power a band shows only a part; None without any.
-
-        Parameters
-        ----------
-        within : bool
-            Leave out tones at edges of one band only, beyond which other sound is louder.
-        """
+        """Return a note on the loudest tone that a band shows partly; within: if a band beyond the edge shows it."""
         tones = [
             (edge, tone)
             for number, edge in enumerate(self._edges)

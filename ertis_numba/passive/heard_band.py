@@ -26,34 +26,17 @@ class HeardBand(NamedTuple):
 
     A bin contains sound of other bins, which the window spreads, and sound off its centre. The phases of its wave are
     those of the mean frequency of the sound. Bins whose sound is beyond the band are left out.
-
-    Attributes
-    ----------
-    matrix : (bin, mic, mic) complex128
-        Matrices with a mean power of 1.
-    level : (bin,) float64
-        Mean power of each bin.
-    shares, weights : (bin,) float64
-        Share of each bin in the band, and the same with a sum of 1.
-    omega : (bin,) float64
-        Mean angular frequencies of the sound outside of the sources.
-    omegas : (bin, source) float64
-        Mean angular frequencies of the sound of each source.
-    width : (bin,) float64
-        Standard deviations of the angular frequency.
-    is_beyond : bool
-        The mean frequency of the sound of the last source lies beyond the band.
     """
 
-    matrix: NDArray[np.complex128]
-    level: Floats
-    shares: Floats
-    weights: Floats
-    omega: Floats
-    omegas: Floats
-    width: Floats
+    matrix: NDArray[np.complex128]  # (bin, mic, mic) with a mean power of 1
+    level: Floats  # (bin,) mean power
+    shares: Floats  # (bin,) share in the band
+    weights: Floats  # (bin,) the same with a sum of 1
+    omega: Floats  # (bin,) mean angular frequencies outside of the sources
+    omegas: Floats  # (bin, source) mean angular frequencies of each source
+    width: Floats  # (bin,) standard deviations of the angular frequency
     n_blocks: int
-    is_beyond: bool
+    is_beyond: bool  # the mean frequency of the last source lies beyond the band
 
     @classmethod
     def of(cls, heard: CrossSpectrum, places: Floats, shares: Floats, delays: Delays) -> Self | None:
@@ -100,7 +83,7 @@ class HeardBand(NamedTuple):
 
 
 class _Frequencies(NamedTuple):
-    """Moments of the frequencies of sources relative to the bins, powers, noise: (bin, source); and those of the rest.
+    """Moments of the frequencies of sources relative to the bins, powers, noise: (bin, source); and the rest.
 
     The powers are without noise, which is that of their estimates in one block.
     """

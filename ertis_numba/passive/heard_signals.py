@@ -28,13 +28,7 @@ _MAX_FACTOR: Final = 40  # Largest decimation; 16 bits cannot hold the filters o
 
 
 def heard_bands(settings: Settings) -> NDArray[np.float64]:
-    """Return the edges of the bands of ``settings.passive`` in hertz: (band, 2) float64.
-
-    Raises
-    ------
-    ArgumentError
-        The bands exceed the highest frequency of the record.
-    """
+    """Return the edges of the bands of settings.passive in Hz (band, 2); raise ArgumentError if one is too high."""
     return band_edges(settings.passive, settings.recording)
 
 

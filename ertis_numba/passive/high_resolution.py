@@ -24,26 +24,16 @@ _HOLLOW_ROUNDS: Final = 12  # Each leaves about a sixteenth of the error, as in 
 
 
 class _Found(NamedTuple):
-    """Sources of several bins, each with the same number.
-
-    Attributes
-    ----------
-    bins : (bin,) intp
-    places : (bin, source) intp
-        Numbers of their directions.
-    powers : (bin, source) float64
-    rest : (bin, mic, mic) complex128
-        Matrices without their components.
-    """
+    """Sources of several bins, each with the same number."""
 
     bins: Places
-    places: Places
-    powers: Floats
-    rest: Complex
+    places: Places  # (bin, source) numbers of their directions
+    powers: Floats  # (bin, source)
+    rest: Complex  # (bin, mic, mic) without their components
 
 
 class HighResolutionClean:
-    """Search for the components of sources by markers beside their peaks.
+    """Search for the components of sources in matrices (bin, mic, mic) by markers beside their peaks.
 
     This is HR-CLEAN-SC (P. Sijtsma, R. Merino-Martinez, A. Malgoezar and M. Snellen, High-resolution CLEAN-SC: Theory
     and experimental validation, 2017). The component of a source is the sound coherent with its marker u, a direction
@@ -53,17 +43,10 @@ class HighResolutionClean:
     ``F(u) = |Σ_k p_k (v_k^H u) v_k|² / |v^H u|²``,
 
     where v is the wave of the source, and p_k and v_k are the powers and waves of the others. The source moves to the
-    maximum of its component's map. The component is subtracted before those of weaker sources are computed.
-
-    Sources are added one by one: each at the peak of the map without all components, after which all markers are
-    chosen again. The paper starts with all sources at once, and with equal weights, which requires their exact number.
-
-    Parameters
-    ----------
-    matrices : (bin, mic, mic) complex
-        Cross-spectral matrices.
-    hollow : bool
-        Leave out the diagonal of the matrices.
+    maximum of its component's map. The component is subtracted before those of weaker sources are computed. Sources are
+    added one by one: each at the peak of the map without all components, after which all markers are chosen again. The
+    paper starts with all sources at once, and with equal weights, which requires their exact number. If ``hollow``, the
+    diagonal of the matrices is left out.
     """
 
     def __init__(self, matrices: NDArray[np.complexfloating], waves: Waves, *, hollow: bool) -> None:

@@ -33,17 +33,7 @@ def tangents(direction: Floats) -> Floats:
 
 
 def moved(direction: Floats, offsets_rad: Floats, *, level: bool) -> Floats:
-    """Return directions beside a direction: (n, axis) float64.
-
-    Parameters
-    ----------
-    direction : (axis,) float64
-        Unit vector.
-    offsets_rad : (n, 2) float64
-        Offsets sideways and upwards.
-    level : bool
-        Keep the elevation, and ignore offsets upwards.
-    """
+    """Return directions (n, axis) beside a direction, by offsets sideways and, unless level, upwards: (n, 2) rad."""
     if level:
         radius = float(np.hypot(direction[0], direction[1]))
         azimuth = np.arctan2(direction[1], direction[0]) + offsets_rad[:, 0] / max(radius, 1e-12)
@@ -56,37 +46,13 @@ def moved(direction: Floats, offsets_rad: Floats, *, level: bool) -> Floats:
 class BandLikelihood:
     """Likelihood of a further source in a band, given others.
 
-    Sources have unknown signals, and noise has an unknown power in each bin. The likelihood of a direction is then
-    ``Σ −w log(p − b^H C b)``, where p is the power of the matrix C outside of the other sources, and b the wave of unit
+    Sources have unknown signals, and noise has an unknown power in each bin. The likelihood of a direction is then ``Σ
+    −w log(p − b^H C b)``, where p is the power of the matrix C outside of the other sources, and b the wave of unit
     power outside of them (I. Ziskind and M. Wax, Maximum likelihood localization of multiple sources by alternating
-    projection, 1988).
-
-    Parameters
-    ----------
-    matrix : (bin, mic, mic) complex128
-        Cross-spectral matrix of whitened signals.
-    whitening : (bin, mode, mic) float64 or None
-        None if the signals are those of the microphones.
-    omega : (bin,) float64
-        Angular frequencies.
-    weights : (bin,) float64
-        Share of each bin in the band, with a sum of 1.
-    delays : callable
-        Returns the delays of the sound from unit vectors, (direction, mic).
-    others : (source, axis) float64
-        Directions of the other sources; none by default.
-    others_omega : (bin, source) float64, optional
-        Angular frequencies of the other sources; ``omega`` by default.
-
-    Attributes
-    ----------
-    matrix : (bin, mode, mode) complex128
-    power : (bin,) float64
-        Trace of the matrix outside of the other sources.
-    dimensions : int
-        Number of dimensions outside of the other sources.
-    omega : (bin,) float64
-        Angular frequencies.
+    projection, 1988). ``whitening`` (bin, mode, mic) is that of the matrix (bin, mic, mic), None for microphones; the
+    weights (bin,) have a sum of 1; ``delays`` returns those from unit vectors, (direction, mic); ``others`` are
+    (source, axis), with frequencies (bin, source). As attributes, the matrix is (bin, mode, mode), and its trace and
+    number of dimensions outside of the other sources are ``power`` (bin,) and ``dimensions``.
     """
 
     def __init__(
@@ -130,10 +96,7 @@ class BandLikelihood:
         return np.asarray(waves - self._basis @ (self._basis.conj().transpose(0, 2, 1) @ waves))
 
     def beside(self, others: Floats, others_omega: Floats | None = None, omega: Floats | None = None) -> Self:
-        """Return the likelihood given other sources in some directions, (source, axis).
-
-        Frequencies of the other sources, (bin, source), and those of the likelihood, (bin,), are its own by default.
-        """
+        """Return the likelihood given others (source, axis); frequencies are its own by default."""
         omega = self.omega if omega is None else omega
         return type(self)(self.matrix, self._whitening, omega, self.weights, self._delays, others, others_omega)
 
@@ -144,10 +107,7 @@ class BandLikelihood:
         return np.asarray(self._whitening.transpose(0, 2, 1) @ matrices @ self._whitening)
 
     def waves(self, directions: Floats, omega: Floats | None = None, *, order: int = 0) -> NDArray[np.complex128]:
-        """Return the whitened waves from directions, or a derivative by angular frequency: (bin, mode, direction).
-
-        Angular frequencies, (bin, direction), are those of the likelihood by default.
-        """
+        """Return whitened waves, or derivatives by angular frequency: (bin, mode, direction)."""
         waves = self.unwhitened_waves(directions, omega, order=order)
         if self._whitening is None:
             return waves
@@ -176,21 +136,10 @@ class BandLikelihood:
         return waves
 
     def separated(self, directions: Floats, omega: Floats | None = None) -> tuple[Floats, Floats]:
-        """Return the powers of sources without noise, each outside of the others, and the noise in each dimension.
+        """Return powers (bin, source) without noise, each outside of others, and noise per dimension (bin,).
 
-        Each row of the pseudoinverse of the waves is orthogonal to the waves of the other sources.
-
-        Parameters
-        ----------
-        directions : (source, axis) float64
-            All sources, one or more. This likelihood must have no other sources.
-        omega : (bin, source) float64, optional
-            Angular frequencies of the sources; by default, those of the likelihood.
-
-        Returns
-        -------
-        powers : (bin, source) float64
-        noise : (bin,) float64
+        Each row of the pseudoinverse of the waves is orthogonal to the waves of the other sources. ``directions`` has
+        all sources: this likelihood must have no others.
         """
         waves = self.waves(directions, omega)
         products = waves.conj().transpose(0, 2, 1) @ waves
@@ -223,15 +172,7 @@ class BandLikelihood:
         return np.asarray(-self.weights @ np.log(left))
 
     def slopes(self, direction: Floats) -> tuple[NDArray[np.complex128], NDArray[np.complex128], Floats]:
-        """Return the wave of a direction outside of other sources, its changes outside of itself, and its size.
-
-        Returns
-        -------
-        wave : (bin, mode, 1) complex128
-        changes : (bin, mode, 2) complex128
-            Per radian sideways and upwards.
-        size : (bin,) float64
-        """
+        """Return a wave outside of others (bin, mode, 1), changes per rad (bin, mode, 2), and size (bin,)."""
         offsets = np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)]) * _STEP_RAD
         waves = self.outside(self.waves(moved(direction, offsets, level=False)))
         wave, changes = waves[..., :1], (waves[..., 1:3] - waves[..., 3:]) / (2 * _STEP_RAD)
@@ -244,21 +185,7 @@ class BandLikelihood:
         return np.asarray((vectors.conj().transpose(0, 2, 1) @ (self.matrix @ others)).real)
 
     def maximum(self, start: Floats, *, reach_rad: float, level: bool) -> Floats:
-        """Return the direction of the maximum next to a direction, by a Gauss-Newton method.
-
-        Parameters
-        ----------
-        start : (axis,) float64
-            Unit vector.
-        reach_rad : float
-            Largest distance from the start.
-        level : bool
-            Keep the elevation.
-
-        Returns
-        -------
-        (axis,) float64
-        """
+        """Return the maximum within reach_rad of a direction, by a Gauss-Newton method: (axis,)."""
         here, value = start, float(self(start[None])[0])
         for _ in range(_MAX_STEPS):
             step = self._step(here, longest_rad=reach_rad / 2, level=level)
@@ -276,7 +203,7 @@ class BandLikelihood:
         return here
 
     def _step(self, here: Floats, *, longest_rad: float, level: bool) -> Floats:
-        """Return a step towards the maximum: (2,) float64, sideways and upwards.
+        """Return a step towards the maximum: (2,) rad, sideways and upwards.
 
         For the power r of the rest, the gradient of ``-log r`` is ``2 Re(u^H C d) / N r`` with the wave u, its size N,
         and its changes d. The curvature of r is that of the wave's power, without changes of the changes.

@@ -30,13 +30,6 @@ class NoiseModel:
     Measurement of correlation coefficients in reverberant sound fields, 1955). A bin measures its mean over the
     frequency response of the Hann window, which is smaller: the blocks of distant microphones hear different parts of
     the sound.
-
-    Parameters
-    ----------
-    positions_m : (mic, axis) float64
-    frequency_hz : (bin,) float64
-    spacing_hz : float
-        Spacing of the bins of the blocks.
     """
 
     def __init__(
@@ -63,16 +56,9 @@ class NoiseModel:
         weights: NDArray[np.float64],
         sources: NDArray[np.complex128] | None = None,
     ) -> float:
-        """Return the most likely share of the diffuse field, 0 to 1.
+        """Return the most likely share of the diffuse field, 0 to 1, outside of sources (bin, mic, n).
 
-        Parameters
-        ----------
-        matrix : (bin, mic, mic) complex128
-            Cross-spectral matrix.
-        weights : (bin,) float64
-            Number of samples of each bin.
-        sources : (bin, mic, n) complex128, optional
-            Waves of sources, outside of which there is noise alone.
+        The weights (bin,) are numbers of samples.
         """
         modes: NDArray[np.complex128] = self._modes.astype(np.complex128)
         if sources is not None and sources.shape[2]:
@@ -106,33 +92,17 @@ class NoiseFluctuations(NamedTuple):
     Products of different microphones have random phases in noise, so the sum of their squares is the variance of this
     power. In noise of a part of the band, of a short time, or in tones of random phases, it is larger than in white
     noise, as if there were fewer samples.
-
-    Attributes
-    ----------
-    n_samples : float
-        Number of independent samples of white noise with the same variance.
-    values : (n,) float64
-        Eigenvalues of the mean matrix, with a mean of 1, if some are larger than in white noise; else empty.
     """
 
-    n_samples: float
-    values: Floats
+    n_samples: float  # of white noise with the same variance
+    values: Floats  # eigenvalues of the mean matrix, with mean 1; empty as in white noise
 
     @classmethod
     def of(cls, matrix: Matrices, outside: Matrices, wave: Matrices, weights: Floats, of_white: float) -> Self:
-        """Return the fluctuations outside of sources.
+        """Return fluctuations outside of sources; of_white is the number of samples in white noise.
 
-        Parameters
-        ----------
-        matrix : (bin, mic, mic) complex128
-        outside : (bin, mic, mic) complex128
-            Projections outside of the waves of the sources.
-        wave : (bin, mic, 1) complex128
-            Wave of the beam.
-        weights : (bin,) float64
-            Shares of the bins, with a sum of 1.
-        of_white : float
-            Number of independent samples in white noise.
+        ``outside`` (bin, mic, mic) projects outside of the sources, ``wave`` (bin, mic, 1) is that of the beam, and the
+        weights (bin,) have a sum of 1.
         """
         n_mics, none = matrix.shape[1], np.zeros(0)
         n = round(float(np.trace(outside[0]).real))
@@ -156,7 +126,7 @@ class NoiseFluctuations(NamedTuple):
         return cls(n_samples, values if values.max() - 1 > _LARGER * (largest - 1) else none)
 
     def samples_at(self, share: float, n_dimensions: int) -> float:
-        """Return the number of samples of white noise whose beams exceed a share of the power as often.
+        """Return the number of white-noise samples whose beams exceed a share as often.
 
         In noise of a random orientation with the eigenvalues a, a beam has the share of ``Σ a |x|² / Σ |x|²`` with
         complex Gaussian x. This exceeds s with a probability of at most ``Π 1 / (1 − t (a − s))`` for any t (H.

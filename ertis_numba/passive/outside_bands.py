@@ -29,10 +29,6 @@ class OutsideBands:
     note if its power per hertz, or its loudest bin, exceeds that inside by 3 dB. White noise never does. One-bit
     microphones have noise of their own beyond the bands, so that PDM yields no note; neither do bands and limits of
     your own, and measurements with a call.
-
-    Parameters
-    ----------
-    bands_hz : (band, 2) float64
     """
 
     def __init__(self, settings: Settings, bands_hz: NDArray[np.float64]) -> None:

@@ -15,15 +15,9 @@ _MIN_BINS: Final = 8  # Matrices of fewer bins take less time than the start of 
 
 
 def in_parts(function: Callable[..., NDArray[Number]], *of_bins: NDArray[Any], threads: int) -> NDArray[Number]:
-    """Return the results of a function that is called once per thread, each time with a part of the bins.
+    """Return the rows of a function of bins, called once per thread with a part of each array.
 
     NumPy computes linear algebra without holding the lock of the interpreter, so the parts run in parallel.
-
-    Parameters
-    ----------
-    function : callable
-        Accepts a part of each array, and returns an array with one row for each bin of the part.
-    of_bins : (bin, …) arrays
     """
     n_bins = len(of_bins[0])
     count = max(1, min(threads, n_bins // _MIN_BINS))

@@ -16,45 +16,20 @@ Places = NDArray[np.intp]
 
 
 class ScanExtent(NamedTuple):
-    """Sizes of a set of directions, measured by how much the whitened wave of unit power changes between them.
+    """Sizes of a set of directions, measured by how much the whitened wave of unit power changes between them."""
 
-    Attributes
-    ----------
-    n_parts : float
-        Euler characteristic of the set: 1 for a connected set without holes, the number of directions if they are
-        separate.
-    length : float
-        Length of directions on a line, or half of the perimeter of an area.
-    area : float
-        Area; 0 on a line.
-    """
-
-    n_parts: float
-    length: float
-    area: float
+    n_parts: float  # Euler characteristic: 1 if connected without holes, or number of separate directions
+    length: float  # on a line, or half of the perimeter of an area
+    area: float  # 0 on a line
 
 
 def is_level(directions: NDArray[np.float64]) -> bool:
-    """Return True if all directions have one elevation.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
-    """
+    """Return True if all directions, unit vectors (direction, axis), have one elevation."""
     return bool(np.ptp(directions[:, 2]) < 1e-9)
 
 
 class ScanMesh:
-    """Mesh of a grid of directions: triangles on a sphere, or steps along a line.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
-    delay_s : (direction, mic) float64
-        Delays of the sound from them.
-    """
+    """Mesh of unit vectors (direction, axis): triangles on a sphere, or steps along a line."""
 
     def __init__(self, directions: Floats, delay_s: Floats) -> None:
         self._delay_s = delay_s
@@ -71,20 +46,11 @@ class ScanMesh:
             self._triangles, self._steps = _area(directions)
 
     def extent(self, omega_rad_s: float, whitening: Floats | None = None) -> ScanExtent:
-        """Return the extent at an angular frequency.
+        """Return the extent at an angular frequency; whitening is (mode, mic), None if noise is white.
 
-        With the whitened wave u and its changes ``∂u`` between two near directions, their squared distance is
-        ``∂u^H (I − u u^H / u^H u) ∂u / u^H u``. Without whitening, it is ω² times the variance of the changes of the
-        delays over the microphones.
-
-        Parameters
-        ----------
-        whitening : (mode, mic) float64
-            None if noise is white.
-
-        Returns
-        -------
-        ScanExtent
+        With the whitened wave u and its changes ``∂u`` between two near directions, their squared distance is ``∂u^H (I
+        − u u^H / u^H u) ∂u / u^H u``. Without whitening, it is ω² times the variance of the changes of the delays over
+        the microphones.
         """
         area = length = 0.0
         for first in range(0, len(self._triangles), _BATCH):
@@ -96,18 +62,11 @@ class ScanMesh:
         return ScanExtent(self._n_parts, length / 2 if len(self._triangles) else length, area)
 
     def similarity(self, omega_rad_s: float, spacing_rad_s: float, n: int, whitening: Floats | None = None) -> Floats:
-        """Return the mean similarity of the waves of a direction at frequencies with equal spacing: (n,) float64.
+        """Return the mean similarity of a direction's waves at equally spaced frequencies: (n,).
 
         The similarity of the whitened waves u at the first frequency and v at another is the squared cosine of their
         angle, ``|u^H v|² / (u^H u · v^H v)``. It is less than 1 for directions whose sound takes a considerable time to
         cross the array.
-
-        Parameters
-        ----------
-        omega_rad_s : float
-            First angular frequency.
-        whitening : (mode, mic) float64
-            None if noise is white.
         """
         waves = np.exp(-1j * (omega_rad_s + spacing_rad_s * np.arange(n)[:, None, None]) * self._delay_s)
         if whitening is not None:

@@ -11,13 +11,7 @@ __all__ = ["WaveDelays"]
 
 
 class WaveDelays:
-    """Delays of the sound from directions at each enabled microphone, with those of the calibration.
-
-    Parameters
-    ----------
-    settings : Settings
-        Waves are plane, or spherical around sources at ``passive.focus_m``.
-    """
+    """Delays of plane waves, or of those around passive.focus_m, at each enabled microphone, with the calibration."""
 
     def __init__(self, settings: Settings) -> None:
         layout = microphones(settings.array)
@@ -25,13 +19,7 @@ class WaveDelays:
         self._speed_m_s, self._focus_m = sound_speed_m_s(settings.air), settings.passive.focus_m
 
     def __call__(self, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return delays relative to the centroid of the enabled microphones in seconds: (direction, mic) float64.
-
-        Parameters
-        ----------
-        directions : (direction, axis) float64
-            Unit vectors towards the sources.
-        """
+        """Return delays in s relative to the enabled microphones' centroid: (direction, mic)."""
         if self._focus_m is None:
             delay_s = far_field_delays(self._positions_m, directions, sound_speed_m_s=self._speed_m_s)
         else:

@@ -17,20 +17,7 @@ _TURN: Final = 2.0**32
 
 
 class Waves:
-    """Waves from each direction at the frequencies of a spectrum.
-
-    Parameters
-    ----------
-    delay_s : (direction, mic) float64
-        Delays of the sound from each direction.
-    numbers : (bin,) uint32
-        Frequencies relative to the spacing of bins.
-
-    Attributes
-    ----------
-    threads : int
-        Number of threads of the host.
-    """
+    """Waves from each direction, with delays (direction, mic), at frequencies in multiples of the bin spacing."""
 
     def __init__(
         self,
@@ -52,40 +39,16 @@ class Waves:
         self._powers = self._memory.zeros((len(numbers), turns.shape[1]), np.float32)
 
     def vectors(self, bins: NDArray[np.intp], directions: NDArray[np.intp]) -> NDArray[np.complex128]:
-        """Return the waves from directions, with an element of magnitude 1 for each microphone: (…, mic) complex128.
-
-        Parameters
-        ----------
-        bins, directions : (…) intp
-            Numbers of the bins and of the directions.
-        """
+        """Return the waves of numbered bins and directions (…), of magnitude 1 at each microphone: (…, mic)."""
         turns = self._numbers[bins][..., None] * self._turns.T[directions]
         return np.asarray(np.exp(-2j * np.pi / _TURN * turns))
 
     def steer(self, matrices: Matrices, bins: NDArray[np.intp] | None = None) -> Powers:
-        """Return the quadratic form of matrices for the wave v from each direction, ``v^H C v``: (n, direction).
-
-        Parameters
-        ----------
-        matrices : (n, mic, mic) complex64
-            Hermitian matrices.
-        bins : (n,) intp
-            Numbers of their bins; all bins by default.
-        """
+        """Return the quadratic form ``v^H C v`` of matrices for the wave v of each direction: (n, direction)."""
         return self._powers_of(self._kernels.steer_power, matrices, bins)
 
     def steer_vectors(self, vectors: NDArray[np.complex64]) -> Powers:
-        """Return the sum of ``|x^H v|²`` over the vectors x of each bin, for the wave v from each direction.
-
-        Parameters
-        ----------
-        vectors : (bin, n, mic) complex64
-            Vectors of all bins.
-
-        Returns
-        -------
-        (bin, direction) float32
-        """
+        """Return the sum of ``|x^H v|²`` over the vectors x, (bin, n, mic), of each bin: (bin, direction)."""
         return self._powers_of(self._kernels.steer_vectors, vectors)
 
     def _powers_of(
@@ -101,17 +64,7 @@ class Waves:
         return out
 
     def clean(self, matrices: Matrices, powers: Powers, *, hollow: bool) -> Powers:
-        """Return the sources of CLEAN-SC: (bin, direction) float32.
-
-        Parameters
-        ----------
-        matrices : (bin, mic, mic) complex64
-            Hermitian matrices of all bins.
-        powers : (bin, direction) float32
-            Map of the powers by delay-and-sum.
-        hollow : bool
-            Leave out the diagonal of the matrices.
-        """
+        """Return the sources of CLEAN-SC: (bin, direction), from their delay-and-sum powers; hollow: no diagonal."""
         out: NDArray[Any] = np.empty_like(powers)
         with self._kernels.threads(self.threads), self._lane.entered():
             here = self._lane.send(np.ascontiguousarray(matrices)), self._steps, self._bins, self._lane.send(powers)
