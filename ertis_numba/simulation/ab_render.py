@@ -31,8 +31,8 @@ _KEPT_BYTES = 2**28  # total size of the stored images; for large grids it allow
 class ABRender:
     """Renders and processes measurements of a scene with two different sets of effects.
 
-    Modulators and converters are included only if a signal comes within 6 dB of full scale. Otherwise they are left
-    out, because any change of their input changes their noise. A different noise does not count as a changed image.
+    Modulators and converters are left out unless a signal comes within 6 dB of full scale, because any change of their
+    input changes their noise, which does not count as a changed image.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -46,10 +46,7 @@ class ABRender:
         self._noise = functools.lru_cache(maxsize=1)(_noise)
 
     def change_db(self, index: int, name: str, others: frozenset[str], effect: str) -> float | None:
-        """Return the greatest change of a sensor's image by an effect, in decibels.
-
-        The result is None if the sensor's settings yield no image. ``others`` are the other simulated effects.
-        """
+        """Return the greatest change of a sensor's image by an effect, given the others; None without an image."""
         sensor, both = self._scene.sensor(name), (others, others | {effect})
         try:
             self._chain(sensor.settings())
@@ -103,15 +100,12 @@ def image_change_db(
     floor: float,
     noise: Image | float = 0.0,
 ) -> float:
-    """Return the greatest difference of two images in decibels.
+    """Return the greatest difference of two images (direction, range) in decibels.
 
-    The difference at each point is ``20 log10(1 + |Δ| / reference)``. The reference is the strongest amplitude that
-    both images have over all directions and 5 cm of range, but at least ``floor``. A change that is masked by the side
-    lobes of a stronger echo therefore hardly counts.
-
-    - ``before``, ``after`` (direction, range) float32
-    - ``floor``: amplitude of the weakest reflector to be preserved.
-    - ``noise`` float or (range,) float32: difference that noise alone causes; it is subtracted.
+    The difference at each point, less that of ``noise`` alone, is ``20 log10(1 + |Δ| / reference)``. The reference is
+    the strongest amplitude that both images have over all directions and 5 cm of range, but at least ``floor``, that of
+    the weakest reflector to be preserved. A change that is masked by side lobes of a stronger echo therefore hardly
+    counts.
     """
     beside = np.maximum(_local(np.minimum(before, after), spacing_m), floor)
     change = np.maximum(np.abs(after - before) - noise, 0.0)

@@ -56,13 +56,10 @@ class CallFilter(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arrivals:
-    """Copies of one call, or of one frame of noise, at the microphones.
+    """Copies of one call, or of one frame of noise, at the microphones, with their own delays and sensitivities.
 
-    - ``delay_s`` (path, mic): delay from the start of the record, including the microphone's own delay.
-    - ``amplitude`` (path, mic, frequency) float64 or complex128: amplitude at each frequency, or one value for all,
-      including the microphone's sensitivity.
-    - ``stretch`` (path, mic) or None: received duration relative to the emitted duration; None if nothing moves and
-      clocks agree.
+    ``delay_s`` (path, mic) from the start of the record; ``amplitude`` (path, mic, frequency), or one value for all;
+    ``stretch`` (path, mic): received / emitted duration, None if nothing moves and clocks agree.
     """
 
     call: Call | NoiseFrame
@@ -84,10 +81,9 @@ class Arrivals:
 
 
 def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, clock: CostStopwatch) -> list[Arrivals]:
-    """Return all copies of calls that arrive at the microphones.
+    """Return all copies of calls that arrive at the microphones, with filters evaluated at ``frequency_hz``.
 
     Delays are rounded to picoseconds, which hides the last digits of sines and roots. These differ between processors.
-    Filters are evaluated at ``frequency_hz`` (frequency,).
     """
     gain, _ = gains(shot, active, clock)
     found: list[Arrivals] = []
@@ -114,11 +110,7 @@ def travelled(
     *,
     propagation: str = "propagation",
 ) -> tuple[Floats, Floats | None]:
-    """Return the arrival time of sound that leaves at ``sent_s``, and its stretch: both (path, mic) float64.
-
-    The stretch is None if motion is not simulated. Times are relative to the snapshot. The cost of propagation is
-    attributed to the effect named ``propagation``.
-    """
+    """Return the arrival time of sound that leaves at ``sent_s``, and its stretch, None without motion: (path, mic)."""
     times: tuple[Floats, Floats | None] = np.full(paths.second_m.shape, sent_s), None
     for name, act in acting("times", active):
         with clock(propagation if name == "propagation" else name):
@@ -143,11 +135,7 @@ def transmitter_of(shot: Snapshot, active: AbstractSet[str], number: int) -> Tra
 def echoes(
     shot: Snapshot, active: AbstractSet[str], number: int, clock: CostStopwatch, *, n_frequencies: int = 1
 ) -> list[Paths]:
-    """Return the paths of an emitter's call over targets and walls.
-
-    The direct path is included only for the emitter of another sensor. ``number`` is the index of the emitting sensor.
-    Raise ArgumentError if there are too many paths or amplitudes.
-    """
+    """Return the paths of the call of sensor ``number`` over targets and walls; direct ones for other sensors only."""
     firsts, seconds, specular = views_of(shot, active, number, transmitter_of(shot, active, number), clock)
     over = by_targets
     for _, act in acting("turns", active):
@@ -169,10 +157,7 @@ def echoes(
 def views_of(
     shot: Snapshot, active: AbstractSet[str], number: int, transmitter: Transmitters, clock: CostStopwatch
 ) -> Views:
-    """Return the emitter and the microphones as seen from the targets, and the emitter from the microphones.
-
-    The emitter is without mirror images; ``number`` is unique within the snapshot.
-    """
+    """Return the emitter and the microphones as seen from the targets, and the emitter from the microphones."""
     views: Views = (
         images(transmitter, shot.targets.positions_m, shot.mirrors, 0),
         images(shot.receiver, shot.targets.positions_m, shot.mirrors, 0),
@@ -194,7 +179,7 @@ def responses(
 ) -> Floats | Complexes:
     """Return the gain of a call due to distance, air, walls, targets and directivity: (path, mic, frequency).
 
-    The type is float64, or complex128 if a target shifts the phase. `emitted` returns the transducer's own response.
+    It is complex if a target shifts the phase. `emitted` returns the transducer's own response.
     """
     strength = _strength(paths, spreads="spreading" in active)
     amplitude = (paths.reflection * strength)[:, None, None] * np.ones((*paths.second_m.shape, 1))
@@ -219,10 +204,7 @@ def emitted(active: AbstractSet[str], emitter: Emitter, frequency_hz: Floats) ->
 
 
 def gains(shot: Snapshot, active: AbstractSet[str], clock: CostStopwatch | None = None) -> tuple[Floats, Floats]:
-    """Return the sensitivity and the delay of each microphone: both (mic,) float64.
-
-    Both include the calibration of the settings and the uncalibrated spread. Processing corrects only the calibration.
-    """
+    """Return the sensitivity and the delay of each microphone (mic,): its calibration and its uncalibrated spread."""
     clock = clock or CostStopwatch()
 
     def found() -> tuple[Floats, Floats]:
@@ -236,7 +218,7 @@ def gains(shot: Snapshot, active: AbstractSet[str], clock: CostStopwatch | None 
 
 
 def _strength(paths: Paths, *, spreads: bool) -> Floats:
-    """Return the reflected amplitude of each target: (path,) float64.
+    """Return the reflected amplitude of each target: (path,).
 
     In the far field a sphere acts as a point whose strength is half of the radius. The spreading law of spheres already
     includes this factor.
@@ -258,11 +240,8 @@ def arrived(
 ) -> Arrivals:
     """Return copies of the call of sensor ``number``, timed by the clock of the receiving sensor.
 
-    Copies that end before the record begins are left out; clocks that differ can cause them.
-
-    - ``delay_s`` (path, mic): delay of the sound.
-    - ``amplitude`` (path, mic, frequency) float64 or complex128: amplitude, including the microphone's sensitivity.
-    - ``stretch`` (path, mic): received duration relative to the emitted duration.
+    Copies that end before the record begins are left out; clocks that differ can cause them. ``delay_s`` and
+    ``stretch`` are (path, mic), and ``amplitude`` (path, mic, frequency).
     """
     sensor = shot.scene.sensors[number]
     for _, act in acting("clock_times", active):

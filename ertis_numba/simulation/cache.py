@@ -15,10 +15,7 @@ _KEY_BYTES = 1000  # of a key, which contains a set of effects
 
 
 class Cache:
-    """Results by key; the least recently used are discarded if all exceed ``max_bytes``.
-
-    Sizes are those of results and keys. A larger result is kept alone.
-    """
+    """Results by key; beyond ``max_bytes``, the least recently used are discarded, but one result is always kept."""
 
     def __init__(self, max_bytes: int = _MAX_BYTES) -> None:
         self._max_bytes = max_bytes

@@ -13,12 +13,7 @@ QUANTISATION_DBFS = {"int16": -20 * np.log10(2.0**15 * np.sqrt(12)), "float32": 
 
 
 class Converter:
-    """Converts the signals of some microphones to PCM samples, block by block.
-
-    - ``recording``: recording settings; the encoding selects the converter.
-    - ``keys`` (mic,) uint64: seed of each microphone's noise.
-    - ``noise_rms``: RMS of the white noise added to each signal, full scale 1.
-    """
+    """Converts the signals of some microphones, plus white noise, to PCM samples block by block."""
 
     def __init__(self, recording: Recording, keys: NDArray[np.uint64], noise_rms: float) -> None:
         checks.choice("recording.encoding", recording.encoding, QUANTISATION_DBFS)
@@ -28,11 +23,7 @@ class Converter:
         self._noise = [np.random.Generator(np.random.Philox(key=int(key))) for key in keys]
 
     def process(self, signals: NDArray[np.float64], *, out: NDArray[np.int16] | NDArray[np.float32]) -> None:
-        """Write the samples of the next block; values beyond full scale are clipped.
-
-        ``signals`` (mic, sample): full scale 1, finite. They may extend beyond the block. ``out`` (sample, mic) int16
-        or float32.
-        """
+        """Write the samples (sample, mic) of the next block; values beyond full scale, 1, are clipped."""
         for mic, noise in enumerate(self._noise):
             heard = signals[mic, : len(out)]
             if self._noise_rms:

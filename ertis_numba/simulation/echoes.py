@@ -19,11 +19,9 @@ Floats = NDArray[np.float64]
 class Echoes:
     """Echoes in an image, one per path.
 
-    - ``gain`` (path, frequency) float64 or complex128
-    - ``delay_s`` (path,): delay at the centre of the array.
-    - ``direction`` (path, axis): unit vector towards the source of the sound, in the sensor frame.
-    - ``coverage`` (path,): gain of the best beam for a wave from this direction, at most 1.
-    - ``power`` (frequency,): fraction of the matched call's power at each frequency.
+    ``gain`` (path, frequency); ``delay_s`` (path,) at the centre of the array; ``direction`` (path, axis) towards the
+    source, in the sensor frame; ``coverage`` (path,): gain of the best beam, at most 1; ``power`` (frequency,):
+    fraction of the matched call's power.
     """
 
     names: tuple[str, ...]
@@ -58,11 +56,7 @@ class Echoes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ways:
-    """Paths of one emitter's call to the centre of the array.
-
-    All but ``paths`` have one entry per path, one after the other, as in `Echoes`: ``delay_s`` (path,), ``direction``
-    (path, axis) and ``coverage`` (path,).
-    """
+    """Paths of one emitter's call to the centre of the array; all but ``paths`` are (path, …) as in `Echoes`."""
 
     paths: list[Paths]
     names: tuple[str, ...]

@@ -34,12 +34,10 @@ _ROUNDS = 6  # two usually suffice; effects that depend on each other take more
 class Verdict:
     """Decision about one effect.
 
-    - ``estimate_db``: change of the image in decibels. None if the effect cannot be left out or applies to nothing in
-      the scene.
-    - ``forced``: True if the scene overrides the estimate: by ``effects``, by a key that requests the effect, or by a
-      tolerance of 0.
-    - ``ab_rendered``: True if an A/B render measured the change, because the estimate was too close to the tolerance.
-    - ``coupled``: True if the decisions about this and another effect depend on each other. Both are then on.
+    ``estimate_db`` is None if the effect cannot be left out or applies to nothing in the scene. ``forced`` by the
+    scene: by ``effects``, by a key that requests the effect, or by a tolerance of 0. ``ab_rendered``: the estimate was
+    too close to the tolerance. ``coupled``: the decisions about this and another effect depend on each other; both are
+    then on.
     """
 
     name: str
@@ -53,10 +51,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class EffectPlan:
-    """Effects that are simulated for a scene, with reasons.
-
-    ``notes``: validity limits of the models that the scene exceeds.
-    """
+    """Effects that are simulated for a scene, with reasons, and ``notes`` on validity limits that the scene exceeds."""
 
     verdicts: tuple[Verdict, ...]
     notes: tuple[str, ...] = ()
@@ -75,16 +70,15 @@ class EffectPlan:
 def make_plan(scene: Scene) -> EffectPlan:
     """Decide for each effect whether it changes any image by more than the scene's tolerance.
 
-    Effects that a key of the scene requests are on, see `effects.ASKED_FOR`. With a tolerance of 0, all effects that
-    apply to something in the scene are on.
+    Effects that a key of the scene requests are on, see `effects.ASKED_FOR`. With a tolerance of 0, all that apply are
+    on. The others are estimated for all sensors at the beginning, at the end, in between and at waypoints. The greatest
+    change counts. Effects are estimated one after the other, each given those before it: geometry first, then filters
+    of echoes, then additional sound. Estimation repeats, given all other effects, until no decision changes. An effect
+    that changes the recorded sound of a source by more than the tolerance is on, even if no image shows it.
 
-    The other effects are estimated for all sensors at the beginning, at the end, in between and at waypoints. The
-    greatest change counts. Effects are estimated in the order of the registry, each given those before it, and then
-    given all others until no decision changes. An effect that changes the recorded sound of a source is on as well.
-
-    If an estimate is not certain enough, A/B renders of the measurements with the greatest estimates measure the
-    change, and of the loudest one, because estimates do not model converters. Raise ArgumentError if a surface touches
-    or encloses a microphone or an emitter, or the scene exceeds a limit.
+    If an estimate is not certain enough, A/B renders measure the change in the measurements with the greatest
+    estimates, and in the loudest one, because estimates do not model converters. Raise ArgumentError if a surface
+    touches or encloses a microphone or an emitter, or the scene exceeds a limit.
     """
     indices = _indices(scene)
     cache = Cache()
@@ -123,11 +117,7 @@ def _kept_on(verdict: Verdict) -> Verdict:
 
 
 def _indices(scene: Scene) -> list[int]:
-    """Return the indices of the measurements for which effects are estimated.
-
-    These are the first; in a moving scene, several more and those at its waypoints; with clock drift, the last
-    before a SYNC.
-    """
+    """Return the measurements to estimate: the first, some in motion, and the last before a SYNC if clocks drift."""
     last = scene.count - 1
     indices = [0]
     if scene.moves and scene.count > 1:

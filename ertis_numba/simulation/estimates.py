@@ -17,10 +17,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """Estimated change of an image by an effect.
-
-    ``change_db`` is the greatest change of the image; it may be wrong by the factor ``sure``.
-    """
+    """Estimated greatest change of an image by an effect, which may be wrong by the factor ``sure``."""
 
     change_db: float
     reason: str

@@ -42,10 +42,7 @@ _MODULATOR_DBFS, _MAX_NOISE_DBFS = {1: -22.0, 2: -44.0, 3: -48.0, 4: -58.0}, -10
 
 
 class Sight:
-    """Estimated image of one sensor at one time, with given effects.
-
-    ``power`` has the fraction of the matched call's power at each ``frequency_hz``: both (frequency,), the sum is 1.
-    """
+    """Estimated image of one sensor at one time; ``power`` (frequency,) is the share of the matched call's, sum 1."""
 
     def __init__(self, shot: Snapshot, active: frozenset[str]) -> None:
         self.shot = shot
@@ -154,11 +151,7 @@ class Sight:
         return np.asarray(self._outside_s(delay_s) == 0)
 
     def reach(self, delay_s: Floats) -> Floats:
-        """Return the fraction of each echo that reaches into the range window: (path,) float64.
-
-        It is 1 for echoes in the window. For others it is the highest range side lobe of the call at their distance
-        from the window or beyond.
-        """
+        """Return the fraction (path,) of each echo, by its range side lobes, that reaches into the range window."""
         return self._lobe(self._outside_s(delay_s))
 
     def _outside_s(self, delay_s: Floats) -> Floats:
@@ -166,10 +159,7 @@ class Sight:
         return np.maximum(np.maximum(first_s - delay_s, delay_s - last_s), 0.0)
 
     def surroundings(self, after: Echoes | None = None) -> Surroundings:
-        """Return the highest amplitudes of the image.
-
-        If ``after`` has the echoes of `heard` under another effect, the weaker of the two counts.
-        """
+        """Return the highest amplitudes of the image, or of the weaker of both if ``after`` has other effects."""
         level, floor = self.heard.level, self.floor
         if after is not None:
             level = np.minimum(level, after.level)
@@ -233,10 +223,9 @@ class Sight:
     ) -> float:
         """Return the highest amplitude that white noise, or noise with a spectrum, reaches in the image.
 
-        - ``dbfs``: RMS of the noise in dBFS, over the whole band up to half of the sample rate or over ``band``.
-        - ``coherent``: True if the noise comes from one place; a beam then does not reduce it.
-        - ``band`` (frequency_hz, power): equally spaced frequencies, and the power at each on an arbitrary scale; white
-          noise by default.
+        ``dbfs`` is the RMS over the whole band up to half of the sample rate, or over ``band``: equally spaced
+        frequencies, and the power at each on an arbitrary scale. ``coherent`` noise comes from one place, and beams do
+        not reduce it.
         """
         matched, rate_hz, n_fft = pulse.match(self.settings)
         heard_hz = (matched.first_bin + np.arange(len(matched.values))) * rate_hz / n_fft
@@ -258,20 +247,13 @@ class Sight:
         return float(amplitude / 2 * (response[place] if inside else _CUT * response.max()))
 
     def likeness(self, call: Call) -> float:
-        """Return the amplitude in the image of another call that has amplitude 1 at the microphones.
-
-        It is relative to the sensor's own call.
-        """
+        """Return another call's amplitude in the image relative to the own call, both 1 at the microphones."""
         if call.sounds_like(self.settings.call):
             return 1.0
         return float(np.abs(pulse.matched(self.settings, call)).max())
 
     def near_field(self, amplitude: Floats, delay_s: Floats) -> tuple[Floats, Floats]:
-        """Return the highest amplitude in any beam of a sound from within the array, after the image begins.
-
-        ``amplitude`` and ``delay_s`` are (mic,). The result has times after the start of the record, and the highest
-        amplitude at each: both (time,).
-        """
+        """Return times in the record, and the highest amplitude in any beam of sound from within the array: (time,)."""
         begin_s = 2 * self.settings.processing.range_m[0] / self.shot.speed_m_s
         time_s = begin_s + np.linspace(0.0, self.settings.call.duration_s, _LAGS)
         every = max(1, len(self._directions) // _LAG_DIRECTIONS)
@@ -283,10 +265,7 @@ class Sight:
         return time_s, np.asarray(np.max(np.abs(heard @ amplitude) / len(amplitude), axis=1))
 
     def beam_change(self, directions: Floats, weight: Floats | NDArray[np.complex128]) -> float:
-        """Return the greatest change of beams relative to the reflector, when weights apply to the microphones.
-
-        ``directions`` (path, axis): unit vectors towards the reflectors. ``weight`` (mic, frequency) complex128.
-        """
+        """Return the greatest change of beams at reflectors (path, axis) by microphone weights (mic, frequency)."""
         nodes = slice(pulse.N_NODES % 8 // 2, None, 8)
         power = self.power[nodes] / self.power[nodes].sum()
         every = max(1, len(self._directions) // _BEAM_DIRECTIONS)
@@ -314,16 +293,11 @@ class Sight:
         turn_s: Floats | None = None,
         aside: Floats | float = 0.0,
     ) -> tuple[int, float]:
-        """Return the path that changes most relative to the image around it, and the ratio.
+        """Return the path that changes most relative to the image ``around`` it, and the ratio.
 
         The envelope of each path changes. Where a path overlaps the side lobes of others, the phase of its carrier also
-        matters.
-
-        - ``before``, ``after``: the same paths with different effects.
-        - ``around``: the image to which each change is relative.
-        - ``reach`` (path,): fraction of each echo that reaches into the range window.
-        - ``turn_s`` (path,): time by which each carrier is shifted; the change of the delay by default.
-        - ``aside`` (path,): other changes of each path; 0 by default.
+        matters: it is shifted by ``turn_s`` (path,), by default the change of the delay. ``reach`` is as in `reach`,
+        and ``aside`` are other changes.
         """
         shift_s = after.delay_s - before.delay_s
         turn_s = np.abs(shift_s) if turn_s is None else turn_s

@@ -30,10 +30,7 @@ def may_be_loud(shot: Snapshot, active: frozenset[str]) -> bool:
 
 
 def peak_bound(shot: Snapshot, active: frozenset[str]) -> float:
-    """Return an upper bound on the amplitude at all microphones, relative to full scale.
-
-    The bound adds the full amplitudes of calls that overlap in time, and the crest of the noise.
-    """
+    """Return an upper bound on the amplitude at all microphones, from overlapping calls and crests of the noise."""
     return shot.once(("peak", active), lambda: _calls(shot, active) + _steady(shot, active))
 
 

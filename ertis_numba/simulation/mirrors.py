@@ -28,10 +28,8 @@ _NO_WALL = -1
 class Seen(Generic[End]):
     """Ways from one end of sound paths to some places, direct or mirrored in walls.
 
-    - ``image``, ``place`` (way,) int: the image and the place that each way joins.
-    - ``mirrors`` (wall, way) int: the wall at each mirror point, starting at the end; `_NO_WALL` beyond the last.
-    - ``corners_m`` (corner, way, axis): corners of each way from the end to the place, both included. The place repeats
-      beyond the last wall.
+    ``image`` and ``place`` (way,) are joined. ``mirrors`` (wall, way) are the walls from the end on, `_NO_WALL` beyond
+    the last; ``corners_m`` (corner, way, axis) include both ends, and repeat the place beyond the last wall.
     """
 
     ends: End
@@ -78,8 +76,7 @@ def images(end: End, places_m: Floats, mirrors: Mirrors, largest: int) -> Seen[E
 
     The image of an image is ``p' = p - 2 ((p - q)·n) n`` (J. B. Allen, D. A. Berkley, Image method for efficiently
     simulating small-room acoustics, JASA 65, 1979). It is valid where every mirror point lies within its wall (J.
-    Borish, Extension of the image model to arbitrary polyhedra, JASA 75, 1984). ``end`` is without images; ``places_m``
-    is (place, axis). Raise ArgumentError if there are too many chains of walls.
+    Borish, Extension of the image model to arbitrary polyhedra, JASA 75, 1984).
     """
     n_places = len(places_m)
     require_few_mirrors(len(mirrors), largest, n_places)
@@ -111,10 +108,7 @@ def images(end: End, places_m: Floats, mirrors: Mirrors, largest: int) -> Seen[E
 
 
 def blocked(seen: Seen[End], mirrors: Mirrors) -> NDArray[np.bool_]:
-    """Return True for ways that a wall blocks: (way,) bool.
-
-    A leg is blocked by every wall that it crosses, except the walls at which it begins or ends.
-    """
+    """Return True for ways (way,) of which a leg crosses a wall, except the walls at which it begins or ends."""
     stopped = np.zeros(len(seen), dtype=np.bool_)
     touched = np.pad(seen.mirrors, ((1, 1), (0, 0)), constant_values=_NO_WALL)
     for leg, (start_m, stop_m) in enumerate(zip(seen.corners_m[:-1], seen.corners_m[1:], strict=True)):
@@ -131,11 +125,7 @@ def _parts(n_chains: int, n_places: int) -> Iterator[slice]:
 
 
 def _longer(chains: Indices, tips_m: Floats, mirrors: Mirrors) -> tuple[Indices, Floats]:
-    """Extend every chain by one more image, in each wall except its last.
-
-    ``chains`` (wall, chain) int. ``tips_m`` (image, chain, axis): positions of the end and its images in the walls of
-    the chain.
-    """
+    """Extend chains (wall, chain) and their images (image, chain, axis) by one more wall, except their last."""
     number = np.tile(np.arange(len(mirrors)), chains.shape[1])
     chain = np.repeat(np.arange(chains.shape[1]), len(mirrors))
     if len(chains):
@@ -147,11 +137,7 @@ def _longer(chains: Indices, tips_m: Floats, mirrors: Mirrors) -> tuple[Indices,
 
 
 def _traced(chains: Indices, tips_m: Floats, mirrors: Mirrors, places_m: Floats) -> tuple[Indices, Indices, Floats]:
-    """Trace the sound back from the places over the walls to the end itself.
-
-    ``chain``, ``place`` (way,) int: the chains that are visible from each place. ``corners_m`` (corner, way, axis): the
-    corners of these ways, starting at the end.
-    """
+    """Trace the sound back from the places to the end: chain and place (way,), and corners (corner, way, axis)."""
     chain = np.repeat(np.arange(chains.shape[1]), len(places_m))
     place = np.tile(np.arange(len(places_m)), chains.shape[1])
     corners_m = places_m[place][None]
@@ -229,10 +215,7 @@ def _repeated(corners_m: list[Floats], n_corners: int) -> Floats:
 
 
 def _crossing(start_m: Floats, stop_m: Floats, mirrors: Mirrors, number: Indices | int) -> tuple[Floats, Floats]:
-    """Return the crossings of lines with the planes of walls: (way,) and (way, axis) float64.
-
-    The first array holds the fraction of the line, −1 for lines parallel to the plane. The second holds the points.
-    """
+    """Return crossings of lines with walls' planes: fraction of a line (way,), −1 if parallel; point (way, axis)."""
     points_m, normal = mirrors.points_m[number], mirrors.axes[number, 0]
     before = _along(start_m - points_m, normal)
     apart = before - _along(stop_m - points_m, normal)

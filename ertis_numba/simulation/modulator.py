@@ -22,14 +22,9 @@ _GAIN_STEP = 2.0**-20  # gains are rounded, so that differences between processo
 class Modulator:
     """One modulator per enabled microphone; its state carries over from block to block.
 
-    The bits do not depend on the number of threads.
-
-    - ``keys`` (mic,) uint64: seed of each microphone's noise and dither.
-    - ``noise_rms`` (mic,): RMS of the white noise added to each signal, full scale 1; 0 adds none and takes no time.
-    - ``order``: order of the loop, 1 to 4.
-    - ``dither``: width of the uniform dither at the quantiser, full scale 1. It breaks up idle tones. Values above 0.5
-      reduce the dynamic range.
-    - ``band``: upper edge of the band in which noise is minimised, in cycles per sample.
+    ``dither`` is the width of the uniform dither at the quantiser, full scale 1. It breaks up idle tones. Values above
+    0.5 reduce the dynamic range. ``order`` is 1 to 4; ``band`` is the upper edge in which noise is minimised, in cycles
+    per sample. ``noise_rms`` 0 adds none and takes no time.
     """
 
     def __init__(
@@ -55,10 +50,10 @@ class Modulator:
         self._threads = self._kernels.max_threads if threads is None else threads
 
     def process(self, signals: NDArray[np.float64], *, out: NDArray[np.unsignedinteger]) -> None:
-        """Write the words of the next block; bits without an enabled microphone are set to 0.
+        """Write the words of the next block, with 0 for bits without an enabled microphone.
 
-        ``signals`` (mic, sample): full scale 1, finite. The bits follow them up to about 0.6; above, the loop overloads
-        and recovers. They may extend beyond the block. ``out`` (sample, word) uint8, uint16, uint32 or uint64.
+        The bits follow finite signals (mic, sample) up to about 0.6 of full scale, 1; above, the loop overloads and
+        recovers.
         """
         octets = out.view(np.uint8)  # words are little-endian, like the processors that this package supports
         checks.shape("signals", (len(signals), min(signals.shape[1], len(out))), (len(self._states), len(out)))

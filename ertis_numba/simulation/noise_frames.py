@@ -25,10 +25,7 @@ _OVERSAMPLING = 32  # samples per period before spline interpolation, whose erro
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseFrame:
-    """One frame of the noise of a source, with an RMS of 1 before its window.
-
-    Frames overlap by half, and the squares of their windows add up to 1.
-    """
+    """One frame of a source's noise, RMS 1 before its window; frames overlap by half, their powers add up to 1."""
 
     noise: Noise
     seed: tuple[int, ...]
@@ -54,10 +51,7 @@ def frames_between(begin_s: float, end_s: float) -> range:
 
 
 def frame_of(noise: Noise, seed: tuple[int, ...], number: int) -> NoiseFrame:
-    """Return a frame of a source's noise by its number.
-
-    It depends on neither sensor, measurement nor sample rate: all sensors receive the same noise.
-    """
+    """Return a frame of a source's noise by its number, the same for all sensors, measurements and sample rates."""
     return NoiseFrame(noise, (*seed, number + _EARLIEST))
 
 
@@ -67,10 +61,7 @@ def top_hz(noise: Noise) -> float:
 
 
 def spectrum_of(noise: Noise) -> tuple[Floats, Floats]:
-    """Return the frequencies of a noise and the fraction of its power at each: both (frequency,) float64.
-
-    Frequencies are multiples of the inverse duration of a frame; there is at least one.
-    """
+    """Return multiples of the inverse duration of a frame, and the shares of a noise's power: (frequency,)."""
     low, high = (math.ceil(noise.band_hz[0] * FRAME_S), math.floor(noise.band_hz[1] * FRAME_S))
     frequency_hz = np.arange(low, max(low, high) + 1) / FRAME_S
     density = noise.density(frequency_hz)

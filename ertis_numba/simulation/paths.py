@@ -17,16 +17,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Paths between emitters and sets of microphones, or between their mirror images.
+    """Paths between emitters and sets of microphones, or between their mirror images, one image of both per path.
 
-    - ``receiver``: one image of the emitter and of the microphones per path.
     - ``targets``: one per path, or none: paths without targets are direct, counted as the second leg.
     - ``first_m``, ``second_m`` (path, mic): lengths of the legs before and after the target.
-    - ``leaving``, ``arriving`` (path, mic, axis): unit vectors along the first and the last leg, in the direction of
-      the sound, between the mirror images.
-    - ``transmitter_corners_m``, ``receiver_corners_m`` (wall, path): distances of the mirror points from either end,
-      along the path.
-    - ``surface``: True if legs end on the surface of spheres; False, the default, if they end at the centres.
+    - ``leaving``, ``arriving`` (path, mic, axis): unit vectors of the sound along the legs, between the mirror images.
+    - ``transmitter_corners_m``, ``receiver_corners_m`` (wall, path): distances of mirror points along the path.
+    - ``surface``: True if legs end on the surface of spheres, not at the centres.
     """
 
     transmitter: Transmitters
@@ -64,10 +61,9 @@ class Paths:
 def pairs(
     firsts: Seen[Transmitters], seconds: Seen[Receivers], largest: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the ways to and from each place that form a path of up to ``largest`` walls: (path,) int each.
+    """Return the ways (path,) to and from each place that form a path of up to ``largest`` walls.
 
-    Paths are in the order of the emitter's images, then the microphones' images, then the places. Raise ArgumentError
-    if there are too many paths.
+    Paths are in the order of the emitter's images, then the microphones' images, then the places.
     """
     rank = seconds.place * (largest + 1) + seconds.n_mirrors
     sorted_ways = np.argsort(rank, kind="stable")
@@ -84,21 +80,14 @@ def pairs(
 
 
 def by_targets(first: Seen[Transmitters], second: Seen[Receivers], targets: Targets) -> Paths:
-    """Return the paths over some targets, at least one.
-
-    The arguments have one way per path, from the emitter and from the microphones to the same target of all
-    ``targets``.
-    """
+    """Return the paths over some targets, at least one; both arguments have one way per path to the same target."""
     return turning(first, second, targets, targets.positions_m[first.place, None, :], surface=False)
 
 
 def turning(
     first: Seen[Transmitters], second: Seen[Receivers], targets: Targets, turns_m: Floats, *, surface: bool
 ) -> Paths:
-    """Return the paths that turn at the places ``turns_m``, (path, mic, axis).
-
-    The other arguments are those of `by_targets`.
-    """
+    """Return the paths of `by_targets` that turn at the places ``turns_m``, (path, mic, axis)."""
     transmitter, receiver = first.images, second.images
     there_m = turns_m - transmitter.position_m[:, None]
     back_m = receiver.positions_m - turns_m
@@ -120,11 +109,7 @@ def turning(
 def without_target(
     transmitter: Transmitters, receiver: Receivers, targets: Targets, corners_m: Floats | None = None
 ) -> Paths:
-    """Return the direct paths from an emitter or its mirror images to the microphones.
-
-    ``transmitter`` has one image per path, ``receiver`` none. ``corners_m`` (wall, path): distances of the mirror
-    points from the emitter, along the path.
-    """
+    """Return direct paths from an emitter or its images, with mirror points at ``corners_m`` (wall, path) from it."""
     n_paths = len(transmitter.position_m)
     none = np.zeros((0, n_paths))
     way_m = receiver.positions_m - transmitter.position_m[:, None]

@@ -22,12 +22,7 @@ _NS_PER_S = 10**9
 
 
 class MovingPose(NamedTuple):
-    """Pose and motion in the world frame at one instant.
-
-    - ``position_m``, ``velocity_m_s`` (axis,)
-    - ``rotation`` (3, 3): rotation from the frame of the object to the world frame.
-    - ``spin_rad_s`` (axis,): angular velocity.
-    """
+    """Pose and motion in the world frame at one instant; ``rotation`` (3, 3) is from the object to the world frame."""
 
     position_m: Floats
     velocity_m_s: Floats
@@ -35,11 +30,7 @@ class MovingPose(NamedTuple):
     spin_rad_s: Floats
 
     def at(self, offset_m: Floats, rotation: Floats) -> "MovingPose":
-        """Return the pose of an object that is fixed to this one.
-
-        ``p' = p + R o`` and ``v' = v + ω × R o`` for an offset o. ``offset_m`` (axis,) and ``rotation`` (3, 3) are the
-        pose of the object in the frame of this one.
-        """
+        """Return the pose of an object at an offset o fixed to this one: ``p' = p + R o`` and ``v' = v + ω × R o``."""
         arm_m = self.rotation @ offset_m
         return MovingPose(
             self.position_m + arm_m,
@@ -119,11 +110,7 @@ class Platform(TomlTable, frozen=True, kw_only=True):
         )
 
     def trajectory(self, time_s: Floats, time_ns: NDArray[np.int64] | None = None) -> Trajectory:
-        """Return the poses at times of the scene.
-
-        The source of the trajectory is "scene". Its times are ``time_ns``, and those of the scene, ``time_s``, by
-        default; both are (pose,).
-        """
+        """Return the poses at times of the scene, with the source "scene" and time stamps ``time_ns`` if given."""
         times_s = np.asarray(time_s, np.float64)
         x, y, z, yaw_deg = (np.interp(times_s, *pair) for pair in self._axes())
         half_rad = np.radians(np.remainder(yaw_deg + 180.0, 360.0) - 180.0) / 2

@@ -27,10 +27,7 @@ def match(settings: Settings) -> tuple[MatchedFilterSpectrum, float, int]:
 
 
 def matched(settings: Settings, call: Call, filters: tuple[CallFilter, ...] = ()) -> NDArray[np.complex128]:
-    """Return a call of amplitude 1 after the sensor's matched filter: (lag,) complex128, starting at lag 0.
-
-    The call includes the given filters of its emitter.
-    """
+    """Return a call of amplitude 1, with filters of its emitter, after the matched filter from lag 0 on: (lag,)."""
     rate_hz = settings.signal_rate_hz
     rings_s = sum(each.rings_s for each in filters)
     n_fft = 2 ** math.ceil(math.log2(4 * (call.end_s + settings.call.end_s + rings_s) * rate_hz))
@@ -54,10 +51,7 @@ def baseband(settings: Settings, filters: tuple[CallFilter, ...] = ()) -> tuple[
 
 @functools.lru_cache(maxsize=16)
 def envelope(settings: Settings, filters: tuple[CallFilter, ...] = ()) -> tuple[Floats, Floats]:
-    """Return lags of at least 0 and the envelope of the matched call: both (lag,) float64.
-
-    With filters that ring, the envelope is relative to its peak.
-    """
+    """Return lags from 0 on and the envelope of the matched call, with filters relative to its peak: (lag,)."""
     lag_s, pulse = baseband(settings, filters)
     middle = len(lag_s) // 2
     after = np.abs(pulse[middle:])

@@ -102,10 +102,7 @@ def render(scene: Scene, index: int = 0, *, sensor: str | None = None) -> Measur
 
 
 def compile_kernels() -> None:
-    """Compile the kernels for rendering, on a scene with one point.
-
-    Callers can then report the reason for the delay. Kernels for A/B renders, which few scenes need, are not compiled.
-    """
+    """Compile the kernels for rendering, but not those for A/B renders, so that callers can report the delay."""
     sensor = Sensor(
         array=Array(layout="one", positions_m=((0.0, 0.0, 0.0),)),
         recording=Recording(n_samples=20_000),

@@ -212,10 +212,7 @@ class Sensor(Settings, frozen=True, kw_only=True):
                 checks.integer(f"electronics.{name}", channel, 0, 1023)
 
     def require_microphones(self) -> None:
-        """Raise an error for faults of channels without a microphone.
-
-        The check is separate because it needs the layout.
-        """
+        """Raise an error for faults of channels without a microphone, once the layout is read."""
         enabled = microphones(self.array.replace(disabled=None)).enabled
         for channel in self.electronics.faulty_channels:
             if channel >= len(enabled) or not enabled[channel]:

@@ -21,14 +21,11 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transmitters:
-    """Poses of an emitter and of its mirror images in walls.
+    """Poses (image, axis) of an emitter and of its mirror images in walls.
 
-    - ``position_m``, ``velocity_m_s`` (image, axis)
-    - ``facing`` (image, axis): unit vectors along the emitter's axis.
-    - ``sways_m_s`` (wall, image, axis): velocity that the motion of each wall adds to the image, starting at the
-      emitter; 0 beyond an image's last wall.
-    - ``walls``: names of each image's walls in the order in which the sound meets them.
-    - ``reflection`` (image,): amplitude reflection factor of these walls.
+    ``facing`` is along the emitter's axis. ``sways_m_s`` (wall, image, axis) is the velocity that the motion of each
+    wall adds to the image, 0 beyond its last wall. ``walls`` are in the order in which the sound meets them, and
+    ``reflection`` (image,) is their amplitude factor.
     """
 
     position_m: Floats
@@ -50,14 +47,10 @@ class Transmitters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Receivers:
-    """Poses of the microphones of a sensor and of their mirror images in walls.
+    """Poses (image, mic, axis) of a sensor's microphones and of their mirror images in walls, as for `Transmitters`.
 
-    - ``positions_m`` (image, mic, axis); ``sways_m_s``, ``walls`` and ``reflection`` are as for `Transmitters`,
-      starting at the microphones.
-    - ``centre_m``, ``velocity_m_s`` (image, axis): centre of the microphones, and its velocity.
-    - ``spin_rad_s`` (image, axis): angular velocity about the centre.
-    - ``axes`` (image, 3, axis): the sensor's x, y and z as unit vectors. An odd number of reflections makes them
-      left-handed.
+    ``centre_m`` and ``velocity_m_s`` are those of the centre, about which ``spin_rad_s`` turns. ``axes`` (image, 3,
+    axis) are the sensor's x, y and z; an odd number of reflections makes them left-handed.
     """
 
     positions_m: Floats
@@ -76,13 +69,10 @@ class Receivers:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Targets:
-    """Points, discs and spheres of a scene.
+    """Points, discs and spheres (target,) of a scene.
 
-    - ``positions_m``, ``velocities_m_s`` (target, axis)
-    - ``strength`` (target,): amplitude of the echo at 1 m from a point, or amplitude reflection factor of a sphere.
-    - ``radius_m`` (target,): radius of spheres, 0 for points.
-    - ``diameter_m`` (target,): diameter of discs, 0 for others.
-    - ``normals`` (target, axis): unit normals of discs.
+    ``strength`` is the amplitude of the echo at 1 m from a point, or the amplitude reflection factor of a sphere.
+    ``radius_m`` is 0 but for spheres, and ``diameter_m`` but for discs, whose unit normals are ``normals``.
     """
 
     names: tuple[str, ...]
@@ -104,12 +94,9 @@ class Targets:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mirrors:
-    """Walls that reflect sound.
+    """Walls (wall,) that reflect sound, with their centres, velocities and amplitude reflection factors.
 
-    - ``points_m``, ``velocities_m_s`` (wall, axis): centres of the walls, and their velocities.
-    - ``axes`` (wall, 3, axis): normal, width and height as unit vectors.
-    - ``half_sizes_m`` (wall, 2): half of width and height; infinite for an unbounded wall.
-    - ``reflection`` (wall,): amplitude reflection factor.
+    ``axes`` (wall, 3, axis) are normal, width and height; ``half_sizes_m`` (wall, 2) are infinite without bounds.
     """
 
     names: tuple[str, ...]
@@ -125,13 +112,10 @@ class Mirrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Snapshot:
-    """Scene at the start of one measurement of one sensor.
+    """Scene at the start ``time_s`` of one emission of one sensor, without mirror images.
 
-    - ``time_s``: start of the emission.
-    - ``channels`` (mic,) int64: channels of the microphones.
-    - ``receiver``: the microphones, without mirror images.
-    - ``transmitters``: emitters without mirror images, one per sensor of the scene.
-    - ``token``: identity of the snapshot in the cache.
+    ``channels`` (mic,) are those of the microphones, ``transmitters`` one per sensor of the scene, and ``token`` is the
+    identity in the cache.
     """
 
     scene: Scene

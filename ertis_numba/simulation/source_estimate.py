@@ -20,12 +20,11 @@ _MAX_FREQUENCIES = 64
 
 
 def change_of_sources(name: str, shot: Snapshot, active: frozenset[str]) -> Estimate | None:
-    """Return the greatest change of the sound of any source at the centre of the array by an effect.
+    """Return the greatest change by an effect of any source's sound at the array centre; None if there is none.
 
     The change is ``20 log10(1 + |after - before| / level)``, where the level is the higher of both. Amplitudes of paths
     are compared one by one; a delay that changes during the record turns their phases. Sound below the resolution of
-    recordings does not count. ``active`` are the other simulated effects. The result is None if the effect changes no
-    source.
+    recordings does not count.
     """
     scene = shot.scene
     if name not in _ON_SOURCES or scene.effects.get("interference") is False or not EFFECTS[name].may_apply(scene):
@@ -64,10 +63,7 @@ def _ratio(before: SourceInScene[AnySource], after: SourceInScene[AnySource]) ->
 def _heard(
     source: SourceInScene[AnySource], frequency_hz: Floats
 ) -> tuple[dict[str, Floats], dict[str, tuple[float, float]]]:
-    """Return the amplitude of each path, and its delays at the beginning and at the end of the sound.
-
-    Sound lasts for the duration of a call, or of the record.
-    """
+    """Return the amplitude of each path, and its delays at the beginning and at the end of the call or the record."""
     if not len(source.paths):
         return {}, {}
     response = np.abs(source.response(frequency_hz)[:, 0])

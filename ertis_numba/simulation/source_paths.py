@@ -27,11 +27,7 @@ _CALL_NODES = 17  # frequencies at which the response to a call is averaged
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceInScene(Generic[Kind]):
-    """Source of sound, as one sensor receives it under given effects.
-
-    Its sound travels directly and over walls. It moves with a constant velocity during a measurement. Its ``name`` is
-    like ``tones[0]``; ``number`` counts the sources of its kind.
-    """
+    """Source of sound, direct and over walls, as one sensor receives it; its ``name`` is like ``tones[0]``."""
 
     name: str
     number: int
@@ -65,18 +61,12 @@ class SourceInScene(Generic[Kind]):
         return np.asarray(np.broadcast_to(found.real, (*found.shape[:2], len(frequency_hz))))
 
     def arrival(self, sent_s: float) -> tuple[Floats, Floats | None]:
-        """Return the arrival of sound that leaves at a time after the snapshot, and its stretch.
-
-        Both are (path, mic) float64; the stretch is None if motion is not simulated.
-        """
+        """Return arrival and stretch (None without motion) of sound that leaves after the snapshot: (path, mic)."""
         return travelled(self.shot, self.active, self.paths, sent_s, self.clock)
 
     @property
     def spectrum(self) -> tuple[Floats, Floats]:
-        """Frequencies of the sound, and the mean square at each at 1 m: both (frequency,) float64.
-
-        The mean square of a call is that during the call.
-        """
+        """Frequencies, and the mean square at each at 1 m, of a call during the call: (frequency,)."""
         source = self.source
         if isinstance(source, Tone):
             frequency_hz, amplitude = source.partials()

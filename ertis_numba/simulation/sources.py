@@ -106,10 +106,10 @@ class Tone(SoundSource, frozen=True, kw_only=True):
             )
 
     def partials(self) -> tuple[Floats, NDArray[np.complex128]]:
-        """Return the frequencies of the tone, and their amplitudes at 1 m: (partial,) float64 and complex128.
+        """Return frequencies and amplitudes (partial,) of the sound ``Im Σ a exp(2πi f t)`` at 1 m.
 
-        The sound at the source is ``Im Σ a exp(2πi f t)``. A modulated tone ``(1 + m sin 2πgt) sin 2πft`` has two more
-        partials at ``f ± g``, with the amplitudes ``∓ i m / 2``.
+        A modulated tone ``(1 + m sin 2πgt) sin 2πft`` has two more partials at ``f ± g``, with the amplitudes ``∓ i m /
+        2``.
         """
         order = np.arange(1, 2 + len(self.harmonics_db))
         frequency_hz = self.frequency_hz * order.astype(np.float64)
@@ -181,7 +181,7 @@ class Noise(SoundSource, frozen=True, kw_only=True):
         return math.nan if self.orifice_m is None else _STROUHAL * _SONIC_JET_M_S / self.orifice_m
 
     def density(self, frequency_hz: Floats) -> Floats:
-        """Return the power density at frequencies within the band, on an arbitrary scale: (frequency,) float64.
+        """Return the power density within the band, on an arbitrary scale: (frequency,).
 
         The noise of a turbulent jet is ``x² / (1 + x²)²`` with ``x = f d / (0.2 U)``: the density rises with the square
         of the frequency and falls with it (A. Powell, Similarity and turbulent jet noise, JASA 31, 1959), and is

@@ -17,16 +17,11 @@ _ROUNDED = 1 + 1e-9  # rounding of bounds
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """Highest amplitudes of an image over all directions.
+    """Highest amplitudes of an image over all directions, with side lobes of echoes inside and outside the window.
 
-    Range side lobes count, including those of echoes outside of the window. Echoes below the floor never exceed it, and
-    are left out.
-
-    - ``floor``: amplitude of the weakest reflector that the image shows.
-    - ``level``, ``delay_s`` (path,): louder echoes.
-    - ``window_s`` (first, last): delays at which the image begins and ends.
-    - ``same_s``: difference of delays that counts as the same range.
-    - ``lobe``: returns the highest range side lobe of the call at a lag or beyond.
+    ``floor`` is the amplitude of the weakest reflector that the image shows; only louder echoes, ``level`` (path,), are
+    kept. Delays that differ by ``same_s`` count as one range. ``lobe`` returns the highest side lobe at a lag or
+    beyond.
     """
 
     floor: float
@@ -52,10 +47,9 @@ def change_db(part: Floats, beside: Floats) -> float:
 
 
 def greatest(bounds: Floats, exact: Callable[[NDArray[np.intp]], Floats]) -> tuple[int, float]:
-    """Return the index of the greatest of some numbers, and the number; 0 and 0 if none is positive.
+    """Return the index of the greatest number, and the number; 0 and 0 if none is positive.
 
-    Numbers are computed only while their upper bounds exceed the greatest number so far. ``bounds`` are (path,);
-    ``exact`` returns the numbers at some indices.
+    ``exact`` computes numbers only while their upper bounds (path,) exceed the greatest number so far.
     """
     order = np.argsort(-bounds, kind="stable")
     bounds = bounds[order] * _ROUNDED

@@ -39,10 +39,7 @@ def node_frequencies(top_hz: float) -> Floats:
 
 
 def highest_hz(call: Call | NoiseFrame, rate_hz: float) -> float:
-    """Return the upper end of the spectrum of a call or a frame, 90 dB below its maximum.
-
-    It is at most half of the sample rate.
-    """
+    """Return the upper end of a spectrum, 90 dB below its maximum, at most half of the sample rate."""
     if isinstance(call, NoiseFrame):
         return min(noise_frames.top_hz(call.noise), rate_hz / 2)
     return _highest_hz(call, rate_hz)
@@ -58,13 +55,11 @@ def _highest_hz(call: Call, rate_hz: float) -> float:
 def signals(
     arrived: Sequence[Arrivals], *, n_samples: int, rate_hz: float, n_mics: int, threads: int, clock: CostStopwatch
 ) -> Iterator[Floats]:
-    """Yield the signals of the record block by block: (mic, sample) float64.
+    """Yield the signals of the record block by block: (mic, sample).
 
     Each block synthesises the calls that begin in it as one spectrum, ``X(f) = S(f) Σ a(f) exp(-2πi f τ)``. Delays are
-    therefore exact, and filters are products. Only the bins that a call occupies are computed.
-
-    The remainder of a call that extends beyond its block is added to the next blocks. Yielded arrays are reused, and
-    they may extend beyond the `BLOCK` samples of the block.
+    therefore exact, and filters are products. The remainder of a call that extends beyond its block is added to the
+    next blocks. Yielded arrays are reused, and they may extend beyond the `BLOCK` samples of the block.
     """
     delay_samples = [entry.delay_s * rate_hz for entry in arrived]
     # Sound that begins before the record wraps to the end of the first transform, which is never read.
@@ -183,7 +178,7 @@ def _framed(frame: NoiseFrame, rate_hz: float, n_fft: int) -> NDArray[np.complex
 def _stretched(
     call: Call | NoiseFrame, stretch: Floats, rate_hz: float, n_fft: int, n_bins: int
 ) -> NDArray[np.complex128]:
-    """Return the spectra of a stretched call: (mic, bin) complex128.
+    """Return the spectra of a stretched call: (mic, bin).
 
     The stretch is almost the same at all microphones. If the final phases of their calls lie within 1.2 rad, four
     spectra suffice. Lagrange interpolation through Chebyshev nodes yields all others with an error of −100 dB.

@@ -59,10 +59,7 @@ def _near_discs(shot: Snapshot) -> list[str]:
 
 
 def require_clear(shot: Snapshot) -> None:
-    """Raise an error for spheres that enclose a microphone or an emitter, or are closer than 1 mm to one.
-
-    Points cannot enclose anything. The echo of a close point is limited, and `notes` reports it.
-    """
+    """Raise an error for spheres around or within 1 mm of a microphone or an emitter; `notes` reports close points."""
     targets = shot.targets
     places = {f"emitter of {other.name}": place for other, place in _emitters(shot)}
     places |= {

@@ -22,12 +22,10 @@ _LOWEST = 1e-30  # mean square of −300 dBFS
 def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
     """Return the echoes of a sensor's own call, then those of other sensors' calls, strongest first.
 
-    The range of a reflector is half of the length of its sound path. Its direction is that from which the sound
-    arrives. For an echo over walls, this is the position of the mirror image.
-
-    Its level is that of the mean amplitude over the microphones and the call's band, relative to the strongest echo of
-    the sensor's own call. Its velocity is relative to the sensor; for echoes over walls it is only the component along
-    the line of sight. Calls of other sensors are included if cross-emission is simulated.
+    The range is half of the length of the sound path, and the direction that from which the sound arrives: over walls,
+    that of the mirror image. The level is that of the mean amplitude over the microphones and the call's band, relative
+    to the strongest own echo. The velocity is relative to the sensor, for echoes over walls only along the line of
+    sight.
     """
     sight = Sight(shot, active)
     levels = {number: _levels(shot, sight, number) for number in sight.emitters(active)}
@@ -110,11 +108,7 @@ def _true_source(shot: Snapshot, source: SourceInScene[AnySource]) -> TrueSource
 
 
 def _mean_square(source: SourceInScene[AnySource]) -> float:
-    """Return the mean square of a source's sound at the microphones.
-
-    The paths of a tone interfere. Powers of other sounds are added, because their paths interfere constructively at
-    some frequencies and destructively at others.
-    """
+    """Return the mean square of a source's sound at the microphones: paths of tones interfere, others add powers."""
     if not len(source.paths):
         return 0.0
     frequency_hz, power = source.spectrum

@@ -67,10 +67,8 @@ class Effect:
 
     - ``example``: small scene that the effect changes at each of its places, as TOML.
     - ``places``: functions of the module that the rendering calls.
-    - ``keys``: keys of a scene without which the effect applies to nothing; ``*`` stands for every key. Empty if the
-      effect may apply to every scene.
-    - ``requested``: True if these keys request the effect, so that it is simulated even if no image shows it.
-      Recordings contain it.
+    - ``keys``: without them the effect applies to nothing; ``*`` stands for every key, none for every scene.
+    - ``requested``: True if these keys request the effect even if no image shows it, because recordings contain it.
     - ``indispensable``: reason for which every scene needs the effect; empty if it can be left out.
     - ``weakens``: True if the effect only lowers the amplitude of calls.
     """

@@ -18,11 +18,7 @@ _SHARED = 3  # frames that extend from one block into the next
 
 
 class OverlappingFrames:
-    """Sums frames that overlap by half; with `window`, their powers add up to 1.
-
-    ``seed``: seed of the noise, combined with the number of the frame. ``make``: returns the signals of one frame at
-    the microphones, (mic, sample) float64, from a random generator.
-    """
+    """Sums frames (mic, sample) from ``make`` that overlap by half; with `window`, their powers add up to 1."""
 
     def __init__(self, seed: tuple[int, ...], make: Callable[[np.random.Generator], Floats]) -> None:
         self._seed, self._make = seed, make
@@ -58,10 +54,7 @@ def band_bins(band_hz: tuple[float, float], rate_hz: float) -> NDArray[np.int64]
 
 
 def drawn(random: np.random.Generator, bins: NDArray[np.int64], mix: NDArray[np.float64]) -> Floats:
-    """Return frames of noise with an RMS of 1 in some bins: (row, sample) float64.
-
-    ``mix`` (bin, row, source): mixing matrix from independent sources to rows at each frequency.
-    """
+    """Return frames (row, sample) of noise with an RMS of 1 in some bins, mixed from sources by (bin, row, source)."""
     n_sources = mix.shape[2]
     parts = random.standard_normal((2, len(bins), n_sources, 1))
     spectra = np.zeros((mix.shape[1], FRAME // 2 + 1), dtype=np.complex128)

@@ -16,10 +16,9 @@ __all__ = ["estimate", "gain"]
 
 
 def gain(shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the amplitude gain of each frequency after absorption: (path, mic, frequency) float64.
+    """Return the gain ``10 ** (-α(f) (r₁ + r₂) / 20)`` with α from ISO 9613-1: (path, mic, frequency).
 
-    The gain is ``10 ** (-α(f) (r₁ + r₂) / 20)`` with α from ISO 9613-1. The associated dispersion, about 1e-4 of the
-    speed of sound, is neglected, as in the standard.
+    The associated dispersion, about 1e-4 of the speed of sound, is neglected, as in the standard.
     """
     from_air = absorption_db_m(shot.sensor.air, frequency_hz)
     return np.asarray(10 ** (-paths.length_m[..., None] * (from_air / 20)))

@@ -20,11 +20,7 @@ __all__ = ["arrivals", "estimate"]
 def arrivals(
     shot: Snapshot, active: AbstractSet[str], frequency_hz: NDArray[np.float64], found: list[Arrivals]
 ) -> list[Arrivals]:
-    """Return the arrivals, and the direct sound of the sensor's own emitter.
-
-    Its level is a separate setting, ``direct_sound_db``. The sound travels along the housing, so the emitter's
-    directivity does not apply.
-    """
+    """Return the arrivals, and the direct sound of the own emitter, along the housing and without its directivity."""
     emitter = shot.sensor.emitter
     if emitter.direct_sound_db is None or emitter.silent:
         return found

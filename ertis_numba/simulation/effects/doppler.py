@@ -28,13 +28,12 @@ def times(
 
 
 def emission(shot: Snapshot, paths: Paths, received_s: Floats) -> Floats:
-    """Return the times at which sound that arrives at given times left its source: (path, mic, time) float64.
+    """Return the times at which sound that arrives at ``received_s`` (mic, time) left its source: (path, mic, time).
 
     The source is at ``s(t)`` and a microphone at ``m(t)``, both with constant velocity. Sound that arrives at t left u
     earlier, with ``|m(t) - s(t - u)| = c u``. With ``d = m(t) - s(t)`` and the velocity v of the source, u is the
     positive root of ``(c² - v²) u² - 2 (d·v) u - d² = 0``. The sound meets a moving wall after the same fraction of the
-    path as without motion, which is accurate to first order in v / c. ``paths`` have no targets; ``received_s``
-    (mic, time) is relative to the snapshot.
+    path as without motion, which is accurate to first order in v / c.
     """
     source, receiver, speed_m_s = paths.transmitter, paths.receiver, shot.speed_m_s
     # A wall moves the image from t - u until the time of reflection, so only a part of its velocity counts in v.
@@ -57,15 +56,13 @@ def _dot(one: Floats, other: Floats) -> Floats:
 
 
 def _moved(paths: Paths, speed_m_s: float, sent_s: float = 0.0) -> tuple[Floats, Floats]:
-    """Return the arrival time of sound that leaves at ``sent_s``, and its stretch: both (path, mic) float64.
+    """Return the arrival time of sound that leaves at ``sent_s``, and its stretch: both (path, mic).
 
     All velocities are constant. Sound that leaves at t₀ meets the moving target at t₁ and the moving microphone at t₂:
     ``c (t₁ - t₀) = |p + v t₁ - s(t₀)|``, and similarly for t₂. A microphone at r from the centre of a turning array
-    moves at ``v + ω × r``. The position of a wall is that at the time of
-    reflection, accurate to first order in v / c for oblique incidence. Amplitudes are those of objects at rest.
-
-    The stretch is dt₂/dt₀ at the beginning of the call. It equals the product of the Doppler factors of all moving
-    objects (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, chapter 11).
+    moves at ``v + ω × r``. The position of a wall is that at the time of reflection, accurate to first order in v / c
+    for oblique incidence. Amplitudes are those of objects at rest. The stretch dt₂/dt₀ equals the product of the
+    Doppler factors of all moving objects (P. M. Morse, K. U. Ingard, Theoretical Acoustics, 1968, chapter 11).
     """
     earlier_s, arrival_s, later_s = (
         _arrival_s(paths, sent_s + step_s, speed_m_s) for step_s in (-_STEP_S, 0.0, _STEP_S)
@@ -104,11 +101,10 @@ def _arrival_s(paths: Paths, start_s: float, speed_m_s: float) -> Floats:
 
 
 def _met_s(from_m: Floats, left_s: Floats, place_m: Floats, velocity_m_s: Floats, speed_m_s: float) -> Floats:
-    """Return the times at which sound meets objects in uniform motion: (path, mic) float64.
+    """Return the times (path, mic) at which sound meets objects at ``place_m`` at time 0, in uniform motion.
 
     Sound that leaves ``a`` at t₀ meets ``p + v t`` at ``t = t₀ + u``. With ``d = p + v t₀ - a``, u is the positive root
-    of ``(c² - v²) u² - 2 (d·v) u - d² = 0``. Times are (path, mic); places and velocities (path, mic, axis). Here a is
-    ``from_m``, t₀ is ``left_s``, and p is ``place_m`` at time 0.
+    of ``(c² - v²) u² - 2 (d·v) u - d² = 0``.
     """
     apart_m = place_m + velocity_m_s * left_s[..., None] - from_m
     along = np.sum(apart_m * velocity_m_s, axis=-1)
@@ -133,10 +129,7 @@ def _own_m_s(end: Transmitters | Receivers) -> Floats:
 
 
 def _swayed_m(end: Transmitters | Receivers, met_s: Floats) -> Floats:
-    """Return the displacement of each image by moving walls: (path, 1, axis) float64.
-
-    ``met_s`` holds the times at which the sound meets the walls, (wall, path).
-    """
+    """Return the displacement of images by walls moving until the sound meets them, (wall, path): (path, 1, axis)."""
     return np.asarray(np.sum(met_s[..., None] * end.sways_m_s, axis=0)[:, None])
 
 
@@ -200,10 +193,7 @@ def _reported_m_s(stretch: float, speed_m_s: float) -> str:
 
 
 def _aside_rad(paths: Paths, speed_m_s: float) -> NDArray[np.float64]:
-    """Return the angle by which directions change until the sound arrives: (path,) float64.
-
-    Targets move across the line of sight until the sound meets them, and the microphones turn until it arrives.
-    """
+    """Return the angle (path,) by which targets and turning microphones change directions until the sound arrives."""
     turned_rad = np.linalg.norm(paths.receiver.spin_rad_s, axis=-1) * paths.length_m[:, 0] / speed_m_s
     if not len(paths.targets):
         return np.asarray(turned_rad)

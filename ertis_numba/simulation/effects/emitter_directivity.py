@@ -18,10 +18,9 @@ __all__ = ["estimate", "gain"]
 def gain(
     shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: NDArray[np.float64]
 ) -> NDArray[np.float64] | float:
-    """Return the emitter's directivity towards the paths: (path, mic, frequency) float64.
+    """Return the emitter's directivity: (path, mic or 1, frequency), 0 behind it.
 
-    The model is a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``, and 0 behind it. The
-    second axis has length 1 if all microphones share the direction to the target.
+    The model is a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``.
     """
     if not emitter.diameter_m:
         return 1.0

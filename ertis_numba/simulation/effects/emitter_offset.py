@@ -12,11 +12,7 @@ __all__ = ["estimate", "transmitter"]
 
 
 def transmitter(shot: Snapshot, number: int, transmitter: Transmitters) -> Transmitters:
-    """Return a sensor's emitter at its mounting position, ``o + R p``.
-
-    ``o`` is the sensor's origin, ``R`` its rotation and ``p`` the setting ``emitter.position_m``. A path is then
-    bistatic: its length is ``|x - (o + R p)| + |x - m|`` for a target x and a microphone m.
-    """
+    """Return a sensor's emitter at its mounting position ``o + R p``, which makes paths bistatic."""
     sensor = shot.scene.sensors[number]
     pose = shot.scene.pose_of(sensor, shot.time_s).at(np.array(sensor.emitter.position_m), np.eye(3))
     return replace(transmitter, position_m=pose.position_m[None], velocity_m_s=pose.velocity_m_s[None])

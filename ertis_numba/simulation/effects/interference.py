@@ -37,10 +37,7 @@ def arrivals(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats, fou
 
 
 def frames(shot: Snapshot, active: AbstractSet[str], frequency_hz: Floats) -> list[Arrivals]:
-    """Return the frames of all noises that arrive during the record.
-
-    A frame travels like a call, with the velocities at its centre.
-    """
+    """Return the frames of noises during the record; they travel like calls, with the velocities at their centres."""
     found = []
     for noise in sources_of(shot, active, Noise):
         if not len(noise.paths):
@@ -84,12 +81,7 @@ def _received(
     centre_s: float,
     response: Floats,
 ) -> Arrivals:
-    """Return the copies of a call or a frame that arrive during the record.
-
-    - ``start_s``: time at which its beginning leaves the source, relative to the snapshot.
-    - ``centre_s``: time after its beginning at which the Doppler factor is evaluated.
-    - ``response`` (path, mic, frequency)
-    """
+    """Return the copies of a call or a frame that leaves at ``start_s``, with the Doppler factor ``centre_s`` later."""
     gain, late_s = gains(source.shot, source.active)
     delay_s, stretch = source.arrival(start_s + centre_s)
     delay_s = delay_s - centre_s * (1.0 if stretch is None else stretch) + late_s
@@ -121,10 +113,9 @@ def _sent_s(source: SourceInScene[Noise] | SourceInScene[Sonar] | SourceInScene[
 
 
 def _calls_of(source: SourceInScene[Sonar] | SourceInScene[AnySource], sonar: Sonar) -> Floats:
-    """Return the start times of another sonar's calls that may arrive during the record: (call,) float64.
+    """Return the start times (call,) of another sonar's calls that may arrive during the record, often negative.
 
-    Times are relative to the snapshot, and often negative. Echoes of these calls from targets are far weaker than the
-    direct sound, and are not modelled.
+    Echoes of these calls from targets are far weaker than the direct sound, and are not modelled.
     """
     if not len(source.paths):
         return np.zeros(0)
@@ -138,10 +129,7 @@ def _calls_of(source: SourceInScene[Sonar] | SourceInScene[AnySource], sonar: So
 
 @dataclass(frozen=True)
 class _ToneAtMicrophones:
-    """Tone ``Im Σ a exp(2πi f tₑ)`` at the microphones, summed over paths and partials.
-
-    The sound left its source at the time tₑ of the scene: ``t - r / c`` at rest.
-    """
+    """Tone ``Im Σ a exp(2πi f tₑ)`` at the microphones, summed over paths and partials; tₑ is ``t - r / c`` at rest."""
 
     tone: SourceInScene[Tone]
 

@@ -18,11 +18,7 @@ __all__ = ["estimate", "gain"]
 def gain(
     shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: NDArray[np.float64]
 ) -> NDArray[np.float64] | float:
-    """Return the microphones' directivity towards the paths: (path, mic, frequency) float64.
-
-    By reciprocity the model is a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``, and 0 from
-    behind.
-    """
+    """Return the microphones' directivity, by reciprocity that of a piston in a baffle: (path, mic, frequency)."""
     diameter_m = shot.sensor.electronics.microphone_diameter_m
     if not diameter_m:
         return 1.0

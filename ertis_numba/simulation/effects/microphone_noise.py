@@ -11,10 +11,7 @@ __all__ = ["estimate", "loudness", "noise_rms"]
 
 
 def noise_rms(sensor: Sensor) -> float:
-    """Return the RMS of the noise over the whole band, full scale 1.
-
-    The modulators generate the noise themselves, from a hash of microphone and sample.
-    """
+    """Return the RMS of the noise over the whole band, full scale 1; modulators hash it from microphone and sample."""
     dbfs = sensor.electronics.noise_dbfs
     return 0.0 if dbfs is None else float(10 ** (dbfs / 20))
 

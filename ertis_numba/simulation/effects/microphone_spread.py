@@ -23,11 +23,7 @@ def microphones(shot: Snapshot, gain: Floats, delay_s: Floats) -> tuple[Floats, 
 
 
 def _spread(shot: Snapshot) -> tuple[Floats, Floats]:
-    """Return the gain and the delay of each microphone: both (mic,) float64.
-
-    They are normally distributed in decibels and in seconds. The scene's seed and the name of the sensor determine them
-    for all measurements.
-    """
+    """Return the gain and the delay (mic,), normal in dB and in s; the scene's seed and the sensor's name fix them."""
     electronics = shot.sensor.electronics
     name = int.from_bytes(shot.sensor.name.encode(), "little")
     random = np.random.default_rng(np.random.SeedSequence((shot.scene.seed, name)))

@@ -14,10 +14,6 @@ Floats = NDArray[np.float64]
 def times(
     shot: Snapshot, paths: Paths, sent_s: float, times: tuple[Floats, Floats | None]
 ) -> tuple[Floats, Floats | None]:
-    """Return delays plus the travel time of each path, ``(r₁ + r₂) / c``: (path, mic) float64, in seconds.
-
-    Delays are not rounded to samples. The factor ``exp(-2πi f τ)`` in the spectrum delays the call by any fraction of a
-    sample and preserves the energy at each frequency.
-    """
+    """Return delays plus the travel time of each path, ``(r₁ + r₂) / c``: (path, mic), not rounded to samples."""
     delay_s, stretch = times
     return delay_s + paths.length_m / shot.speed_m_s, stretch

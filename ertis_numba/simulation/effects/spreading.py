@@ -21,7 +21,7 @@ def gain(shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: NDArray[n
 
 
 def spreading(paths: Paths) -> NDArray[np.float64]:
-    """Return the amplitude gain due to geometric spreading: (path, mic) float64.
+    """Return the amplitude gain due to geometric spreading: (path, mic).
 
     A point re-radiates the sound that it receives, ``1 / (r₁ r₂)``. A plane mirror does not, ``1 / (r₁ + r₂)``. A
     sphere of radius a lies between the two, ``1 / √(A B)`` with ``A = r₁ + r₂ + 2 r₁ r₂ / (a cos θ)`` and

@@ -23,10 +23,7 @@ def clock_times(shot: Snapshot, number: int, delay_s: Floats, stretch: Floats | 
 
 
 def _start_s(shot: Snapshot, emitter: int) -> float:
-    """Return the start of an emitter relative to the record of the receiving sensor, in seconds.
-
-    Sensors are chained in the order of the scene. Each sensor starts its emitter and its record together.
-    """
+    """Return the start of an emitter after the receiving sensor's record; sensors are chained in the scene's order."""
     return (emitter - shot.number) * SYNC_STEP_S
 
 

@@ -11,10 +11,7 @@ __all__ = ["estimate", "views"]
 
 
 def views(shot: Snapshot, number: int, views: Views) -> Views:
-    """Return three views: the emitter and the microphones from the targets, and the emitter from the microphones.
-
-    Each contains the direct ways, and those over up to ``max_reflections`` walls.
-    """
+    """Return views over up to ``max_reflections`` walls: from the targets to both ends, and between the ends."""
     transmitter, largest = views[0].ends, shot.scene.max_reflections
     return shot.once(
         ("walls", number, *transmitter.position_m[0]),
