@@ -98,7 +98,7 @@ def peaks(
     peak, and level_dbfs to a full-scale echo in every microphone. Maxima that noise alone may cause in
     one of 1000 images are omitted unless --all is given, as are maxima that a hiss, a tone or a click from their
     direction may cause. Images that are cleaned keep all maxima. angle_sd_deg,
-    range_sd_m and level_sd_db are standard deviations of single echoes, if the noise is known. grid_error_deg is the
+    range_sd_m and level_sd_db are standard deviations, if the noise is known. grid_error_deg is the
     part of angle_sd_deg from directions that cannot be interpolated; other directions have 0. It is -, and null in
     JSON, where the source may lie beyond the edge of the grid. No level is more than 1 dB above its image
     or map. Angles that the array cannot observe are shown as –, and as null in JSON: both for one microphone, the

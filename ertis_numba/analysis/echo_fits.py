@@ -20,6 +20,7 @@ _STARTS = (0.25, 0.5)  # Shares of the way to each neighbour.
 _UNIFORM = 0.34  # A uniform distribution has 68 % of its values within this share of its width around the middle.
 _UNKNOWN = 1.0  # Variance of what a fit does not determine, in square metres, radians or nepers.
 _OTHER = 0.05  # Error of the model beyond the noise, above which samples are not those of a single echo at rest.
+_CHANCE = 0.6  # Error of the model relative to the noise, up to which noise alone may have caused the misfit.
 _SAME = 1e-9  # Distance in radians below which two directions are one.
 
 Floats = NDArray[np.float64]
@@ -40,6 +41,8 @@ class Fitted(NamedTuple):
         Standard deviations: of the range, of the direction along its least certain axis, and of the level in nepers.
     is_sparse : (place,) bool
         True where the main lobe of an echo is narrower than the cell, so that side lobes may decide its direction.
+    misfit : (place,) float64
+        Deviation of the samples from those of a single echo, relative to its amplitude, beyond noise and model.
     """
 
     range_m: Floats
@@ -49,6 +52,7 @@ class Fitted(NamedTuple):
     across_sd_rad: Floats
     level_sd: Floats
     is_sparse: NDArray[np.bool_]
+    misfit: Floats
 
 
 class EchoFits:
@@ -126,7 +130,8 @@ class EchoFits:
         across = covariance[:, 1:3, 1:3]
         widest = across[:, 0, 0] if self._is_planar else np.linalg.norm(across, 2, axis=(1, 2))
         # Samples that are not those of a single echo keep the maximum of the parabolas; the difference is uncertain.
-        is_other = out[:, 21] > _OTHER + noise / np.maximum(amplitude[:, 1], np.finfo(np.float32).tiny)
+        chance = noise / np.maximum(amplitude[:, 1], np.finfo(np.float32).tiny)
+        is_other = out[:, 21] > _OTHER + chance
         kept = np.where(is_other[:, None], starts[:, 0], out[:, :4])
         variance = np.stack([covariance[:, 0, 0], widest, covariance[:, 3, 3]])
         away = kept - out[:, :4]
@@ -141,6 +146,7 @@ class EchoFits:
             sd[1],
             np.hypot(sd[2], np.where(is_sparse, _SPARSE_NP, 0.0)),
             is_sparse,
+            np.sqrt(np.maximum(out[:, 21] ** 2 - model**2 - (_CHANCE * chance) ** 2, 0.0)),
         )
 
     def _axes(self, middle: NDArray[np.int64]) -> Floats:

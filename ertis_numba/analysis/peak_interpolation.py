@@ -37,6 +37,8 @@ class Tops(NamedTuple):
     range_sd_m, across_sd_rad, level_sd : (place,) float64
         Standard deviations of fitted echoes: of the range, of the direction along its least certain axis, and of the
         level in nepers. NaN for other maxima.
+    misfit : (place,) float64
+        Deviation of the samples from those of a single echo, relative to its amplitude: see `Fitted`.
     """
 
     direction: NDArray[np.float64]
@@ -46,6 +48,7 @@ class Tops(NamedTuple):
     range_sd_m: NDArray[np.float64]
     across_sd_rad: NDArray[np.float64]
     level_sd: NDArray[np.float64]
+    misfit: NDArray[np.float64]
 
 
 def listed(amplitude: NDArray[np.float64], image: Energyscape) -> NDArray[np.float64]:
@@ -116,10 +119,10 @@ class PeakInterpolator:
         found = np.empty((len(measured), 5))
         kernels.load_points().interpolate_tops(self._fits.quadrics, self._row[directions], measured, found)
         shift_m, offset, level, sd = found[:, 0] * step_m, found[:, 1:4], found[:, 4], np.full((3, len(found)), np.nan)
-        row, is_sparse = self._row[directions], np.zeros(len(found), np.bool_)
+        row, is_sparse, misfit = self._row[directions], np.zeros(len(found), np.bool_), np.zeros(len(found))
         is_fitted = self._echoes is not None
         if self._echoes is not None:
-            shift_m, offset, level, *sds, is_sparse = self._echoes(
+            shift_m, offset, level, *sds, is_sparse, misfit = self._echoes(
                 image, rows, columns, found, noise=noise, model=self._model
             )
             sd = np.array(sds)
@@ -145,6 +148,7 @@ class PeakInterpolator:
             range_sd_m=sd[0],
             across_sd_rad=sd[1],
             level_sd=np.hypot(sd[2], level - np.log(amplitude)),
+            misfit=misfit,
         )
 
     def _highest(
