@@ -17,10 +17,9 @@ _UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 
 class Attitudes:
-    """Rotations from the frame of a sensor to the world frame.
+    """Rotations from the frame of a sensor to the world frame, by default with its recorded mounting.
 
-    ``rotation_xyzw`` of the sensor on its platform is that of the recording by default. ``note`` describes poses that
-    are hardly those of a platform, such as those that tilt it.
+    ``note`` describes poses that are hardly those of a platform, such as those that tilt it.
     """
 
     def __init__(

@@ -16,11 +16,7 @@ __all__ = ["EchoMeasurements", "count_images", "no_images", "passive_note", "req
 
 
 class EchoMeasurements(Sequence[Measurement]):
-    """Measurements of one sensor that become images of echoes, each read when it is indexed.
-
-    ``settings.processing.mode`` decides if a measurement is passive; the attribute ``settings`` is that of the
-    recording.
-    """
+    """Measurements of one sensor that become images of echoes by their own mode; ``settings`` are the recording's."""
 
     def __init__(self, recording: RecordingReader, settings: Settings) -> None:
         self.recording = recording
@@ -46,10 +42,7 @@ class EchoMeasurements(Sequence[Measurement]):
         return (self.recording[place] for place in self._places)
 
     def attitudes(self, mountings: Mapping[str, Mounting] | None = None) -> Attitudes:
-        """Return the attitudes of the sensor at its measurements.
-
-        ``mountings``, (translation_m, rotation_xyzw) by sensor, replace those of the recording.
-        """
+        """Return the attitudes of the sensor at its measurements; ``mountings`` by sensor replace recorded ones."""
         stamps = self.recording.stamps()
         _, rotation_xyzw = (mountings or {}).get(self.sensor, (None, None))
         return Attitudes(self.recording, [stamps[place] for place in self._places], rotation_xyzw)

@@ -28,11 +28,9 @@ def examine(
     verify: bool,
     heard: Planner | None = None,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the examination of a sensor's plan for JSON: ``plan``, then ``verified``.
+    """Yield the examination of a sensor's plan for JSON: ``plan`` with predictions, ``verified`` with the true error.
 
-    ``first`` is the measurement to use; all ``threads`` are used by default. ``explain`` yields the plan with its
-    predicted error and time; ``verify`` yields the true error of the image of ``first``. Raises DataError if the true
-    error exceeds the budget, after it is yielded.
+    Raises DataError if the true error of the image of ``first`` exceeds the budget, after it is yielded.
     """
     settings = pipeline.settings
     if settings.processing.method == "paper":

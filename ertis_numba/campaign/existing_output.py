@@ -51,10 +51,10 @@ def _digest(*parts: bytes) -> str:
 
 
 def inspect_output(target: Path, recording: RecordingReader, kind: ResultKind, dtype: str) -> dict[str, Any] | None:
-    """Return the description of an existing output of a recording: settings and axes of its sensors.
+    """Return settings and axes by sensor of an existing output of a recording; None without a file.
 
-    Return None if the file does not exist. ``differs`` is the reason why the file is not this output, or that it is
-    damaged. It is empty if only the settings can differ. If ``recording`` is True, the file must not be replaced.
+    ``differs`` is the reason why the file is not this output, or that it is damaged. It is empty if only the settings
+    can differ. If ``recording`` is True, the file must not be replaced.
     """
     if not target.exists():
         return None
@@ -108,10 +108,7 @@ def _differs(made: _Reader, recording: RecordingReader, dtype: str) -> str:
 def difference(
     made: dict[str, Any], wanted: dict[str, Settings], mounting: Mapping[str, Mounting] | None = None
 ) -> str:
-    """Return the difference between a file and the output of these settings; empty if there is none.
-
-    A mounting is compared only if it is given in ``mounting``: the file already has that of the recording.
-    """
+    """Return the difference between a file and the output of these settings and given mountings; empty if none."""
     if made["differs"]:
         return str(made["differs"])
     if list(made["sensors"]) != list(wanted):

@@ -16,10 +16,7 @@ _PART = re.compile(r"(.+)\.[0-9a-f]{8}\.part")  # Names of `ertis_numba.base.ato
 
 @contextmanager
 def exclusive_folder(folder: Path) -> Iterator[None]:
-    """Create a folder unless it exists, and lock it for this campaign until the block ends.
-
-    The system releases the lock when the process ends, even after a crash.
-    """
+    """Create a folder unless it exists, and lock it until the block or, even by a crash, the process ends."""
     folder.mkdir(exist_ok=True)
     if os.name != "posix":  # Windows cannot open folders, so they cannot be locked.
         yield

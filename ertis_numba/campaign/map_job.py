@@ -77,10 +77,7 @@ class _MapsOfSensor:
         self._last: AcousticMap | None = None
 
     def write(self, writer: AcousticMapWriter) -> Generator[None]:
-        """Process the recording and write its maps; yield after each measurement.
-
-        All measurements need the air of the recording, unless settings replace it.
-        """
+        """Process the recording and write its maps, all with its air unless settings replace it; yield after each."""
         recording, camera = self._recording, self._camera
         settings, n_left, elapsed_s = camera.settings, len(recording), 0.0
         as_recorded = settings.air == recording.settings.air
@@ -153,10 +150,9 @@ def prepare_maps(
 ) -> Generator[MapJob]:
     """Open a recording and check every sensor, so that errors are reported before any processing.
 
-    Options of images have no effect. By default, ``options.settings`` derives ``settings`` from the recorded ones.
-    ``warn`` is called with a line for each sensor that has faulty microphones, bands of noise only or coarse
-    directions, and after the processing of a sensor that emitted its call. Raises DataError if microphones are faulty
-    and ``options.strict`` is set.
+    Options of images have no effect. ``warn`` is called with a line for each sensor that has faulty microphones, bands
+    of noise only or coarse directions, and after the processing of a sensor that emitted its call. Raises DataError if
+    microphones are faulty and ``options.strict`` is set.
     """
     with ExitStack() as stack:
         if settings is None:
@@ -189,10 +185,7 @@ def prepare_maps(
 def check_maps(
     path: Path, options: CampaignOptions, *, settings: Mapping[str, Settings], warn: _Warn = lambda _: None
 ) -> None:
-    """Check every sensor of a recording as `prepare_maps` does; write nothing.
-
-    ``settings`` are those with which its maps were made, by sensor; ``warn`` is as for `prepare_maps`.
-    """
+    """Check every sensor of a recording as `prepare_maps` does, with the settings of its maps; write nothing."""
     for name, each in settings.items():
         with open_recording(path, sensor=name) as recording:
             _check_sensor(recording, each, options, warn, several=len(settings) > 1)

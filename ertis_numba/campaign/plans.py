@@ -10,7 +10,7 @@ __all__ = ["Plans"]
 
 
 class Plans:
-    """Plans by settings, and the plans in progress.
+    """Plans by the kind of result and the settings, and the plans in progress.
 
     Without them, workers with different measured costs could choose different plans, and the files would depend on the
     worker. Acoustic maps have nothing to plan, but their kernels are also compiled by one worker.

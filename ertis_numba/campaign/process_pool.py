@@ -26,11 +26,7 @@ class _WorkerProcess:
 
 
 class ProcessPool:
-    """`WorkerPool` of processes on this machine.
-
-    A process that dies costs its recording, and is replaced. `wait` raises DeviceError if processes end before they are
-    ready.
-    """
+    """`WorkerPool` of local processes; one that dies costs its recording, or before it is ready raises DeviceError."""
 
     def __init__(self, size: int) -> None:
         self._size = size

@@ -88,7 +88,6 @@ def prepare_recording(
 ) -> Iterator[RecordingJob]:
     """Open a recording and check every sensor, so that errors are reported before any processing.
 
-    ``target`` is the energyscape file. By default, ``options.settings`` derives ``settings`` from the recorded ones.
     ``max_bytes`` limits the images that wait to be written; see `SensorProcessing`. ``warn`` is called with a line for
     each sensor that has faulty microphones, whose echoes do not match the call or the layout, or whose images may
     exceed the error budget, and for each sensor with passive measurements, which are left out, or with level directions
@@ -147,10 +146,7 @@ def check_recording(
     pipelines: Pipelines,
     warn: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Check every sensor of a recording as `prepare_recording` does, and return the results about plans; write nothing.
-
-    ``settings`` are those with which its energyscapes were made, by sensor.
-    """
+    """Check a recording as `prepare_recording` does, with the settings of its images; return results about plans."""
     with ExitStack() as stack:
         recordings = [
             EchoMeasurements(stack.enter_context(open_recording(path, sensor=name)), each)

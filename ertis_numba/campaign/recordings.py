@@ -94,7 +94,7 @@ def known_sensors(recordings: Iterable[RecordingFile]) -> set[str]:
 
 
 def output_paths(recordings: Sequence[RecordingFile], folder: Path, kind: ResultKind = "energyscape") -> list[Path]:
-    """Return the file of results in ``folder`` for each recording."""
+    """Return the energyscape file in ``folder`` for each recording; see `map_path` for those without images."""
     if folder.exists() and not folder.is_dir():
         raise ArgumentError(f"output {folder} is a file, but several recordings need a folder; choose another name")
     if not folder.parent.is_dir():

@@ -27,12 +27,7 @@ _SLOW_MS: Final = 500.0  # Compilation takes some seconds.
 
 
 def describe_faults(name: str, report: Health, sensor: str = "") -> str:
-    """Return the faults of the microphones with the remedy, in one line; empty if there are none.
-
-    ``sensor`` is the name for the remedy if the recording has several sensors.
-
-    `describe_shift` describes a shift of the record from several measurements, and `LayoutMatch` a wrong layout.
-    """
+    """Return the faulty microphones with the remedy, for one of several sensors, in a line; empty if there are none."""
     elsewhere = {"shifted record", *ARRAY_FAULTS}
     report = replace(report, findings=tuple(item for item in report.findings if item.fault not in elsewhere))
     if not report.faults:
@@ -54,10 +49,8 @@ class SensorProcessing:
     """Pipeline of one sensor, its predictions, and the time of each measurement.
 
     ``batch`` is the number of measurements per batch; fewer if the images that wait to be written exceed ``max_bytes``,
-    `MAX_WAITING_BYTES` by default. ``attitudes`` of the sensor are required if ``processing.level_directions`` is true.
-    ``times_ms`` are those of measurements, and ``reported`` has results about the plan. ``prediction`` is the predicted
-    error of the first image; None before it is computed, and for the paper's method. The warnings are that the sound
-    does not match the call, the start of the record or the layout, or that the call could not be checked.
+    `MAX_WAITING_BYTES` by default. ``attitudes`` are required if ``processing.level_directions`` is true. ``reported``
+    has results about the plan. ``prediction`` is None before the first image, and for the paper's method.
     """
 
     def __init__(
@@ -82,10 +75,7 @@ class SensorProcessing:
         return replace(measurement, settings=self.pipeline.settings)
 
     def write(self, recording: EchoMeasurements, writer: EnergyscapeWriter) -> Iterator[None]:
-        """Process a recording and write its images; yield after each.
-
-        All measurements need the air of the recording, unless settings replace it.
-        """
+        """Process a recording and write its images, all with its air unless settings replace it; yield after each."""
         settings = self.pipeline.settings
         as_recorded = settings.air == recording.settings.air
         measurements = iter(recording)

@@ -41,10 +41,7 @@ _idle_pipelines: dict[_Key, Pipeline] = {}  # Pipelines that are not in use.
 
 
 def run_task(action: str, arguments: Mapping[str, Any], notify: ReportProgress = lambda _: None) -> dict[str, Any]:
-    """Run a task, and return its result; expected errors are returned as ``error``.
-
-    ``notify`` is called with the number of processed measurements. An exception that it raises ends the work.
-    """
+    """Run a task, and return its result; expected errors are returned as ``error``, and those of ``notify`` end it."""
     try:
         return _ACTIONS[action](arguments, notify)
     except ErtisError as error:
@@ -61,10 +58,7 @@ def _one_line(error: OSError | MemoryError) -> str:
 
 
 def _inspect(arguments: Mapping[str, Any], _: ReportProgress) -> dict[str, Any]:
-    """Return sensors, settings and measurements of a recording, and a description of its existing output.
-
-    ``behaviours`` has the number of measurements of each sensor by their behaviour.
-    """
+    """Return sensors, settings and measurements by behaviour of a recording, and existing outputs by kind of result."""
     path = Path(arguments["path"])
     if not arguments["named"] and file_kind(path) != "recording":
         return {"skipped": True}
@@ -159,11 +153,7 @@ def _threads(arguments: Mapping[str, Any], settings: Settings) -> int | None:
 def _pipelines(
     settings: Sequence[Settings], device: str, threads: int | None, plan: PlanCosts = "nominal"
 ) -> Iterator[list[Pipeline]]:
-    """Yield a pipeline for each of the settings, reusing the previous recording's if the settings are the same.
-
-    A pipeline has one user at a time. Only the pipelines of the last recording are kept, so that the memory does not
-    grow with the number of recordings.
-    """
+    """Yield pipelines for settings, reusing those of the last recording only, so that the memory does not grow."""
     keys: list[_Key] = [(each.to_toml(), device, threads) for each in settings]
     with _idle_lock:
         found = {key: _idle_pipelines.pop(key) for key in keys if key in _idle_pipelines}

@@ -116,10 +116,7 @@ TaskAction = Literal["look", "plan", "make", "check"]
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """Task of a worker.
-
-    ``arguments`` are those of the action; see `ertis_numba.campaign.task_actions`.
-    """
+    """Task of a worker: an action of `ertis_numba.campaign.task_actions`, and its arguments."""
 
     number: int
     action: TaskAction
@@ -128,10 +125,9 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class TaskUpdate:
-    """Message of a worker about a task.
+    """Message of a worker about a task: measurements done, and at its end the result or the ``error``.
 
-    ``done`` measurements are processed. ``result`` comes at the end of a task: ``error`` is the reason of a failure,
-    and ``by_chance`` marks a failure that may be temporary.
+    ``by_chance`` marks a failure that may be temporary.
     """
 
     number: int
