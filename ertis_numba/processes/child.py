@@ -27,12 +27,12 @@ _WATCH_INTERVAL_S: Final = 0.1
 
 
 class Child(Generic[Kind]):
-    """Python process that runs a module of this package.
+    """Python process that runs a module of this package, which calls `connect` and sends messages of ``kinds``.
 
     It is a new interpreter rather than a fork, which OpenMP, HDF5 and ZeroMQ would not survive. Unlike a process of
     `multiprocessing`, it does not import the main program. It has a session of its own, so that Ctrl-C in a terminal
-    does not reach it. The module calls `connect`, and sends messages of ``kinds``. ``environment`` has additional
-    variables. ``keep_stderr`` keeps the last line of its stderr for `wait`, instead of sharing that of this process.
+    does not reach it. ``keep_stderr`` keeps the last line of its stderr for `wait`, instead of sharing that of this
+    process.
     """
 
     def __init__(
@@ -129,9 +129,9 @@ def connect(
 ) -> "Pipe[Any]":
     """Return the pipe to the parent process, in a process that `Child` has started.
 
-    The parent sends messages of ``kinds``. With ``outlives_parent``, this process continues when the parent has ended
-    or has closed the pipe, and accepts its interrupts. By default, it ends with the parent even if that is killed, and
-    ignores signals that ask it to end; ``on_parent_end`` is called in a thread before that.
+    With ``outlives_parent``, this process continues when the parent has ended or has closed the pipe, and accepts its
+    interrupts. By default, it ends with the parent even if that is killed, and ignores signals that ask it to end;
+    ``on_parent_end`` is called in a thread before that.
     """
     # Registered first, so it runs after all other exit handlers. Without it, Python's last garbage collection scans all
     # modules, which takes 0.1 to 0.3 s.

@@ -56,15 +56,7 @@ class WorkerActor:
 
 
 def connect(address: str, *, timeout_s: float) -> Client:
-    """Return a client of a scheduler.
-
-    Raises
-    ------
-    DeviceError
-        dask.distributed is not installed.
-    NetworkError
-        No scheduler answers.
-    """
+    """Return a client of a scheduler; raise DeviceError without dask.distributed, NetworkError without an answer."""
     with extra("cluster", "a scheduler needs dask.distributed", DeviceError):
         import distributed  # noqa: PLC0415  another package, and not always there
 
@@ -107,13 +99,7 @@ def silence_loggers() -> Iterator[None]:
 
 
 def require_workers(client: Client, address: str, *, timeout_s: float) -> None:
-    """Wait until a scheduler has a worker.
-
-    Raises
-    ------
-    NetworkError
-        The scheduler has no worker within the timeout.
-    """
+    """Wait until a scheduler has a worker; raise NetworkError after the timeout."""
     try:
         client.wait_for_workers(1, timeout=timeout_s)
     except TimeoutError as error:
@@ -123,13 +109,7 @@ def require_workers(client: Client, address: str, *, timeout_s: float) -> None:
 
 
 class WorkerActors:
-    """Actors in the workers of a scheduler; each ends with the client, or when it is no longer referenced.
-
-    Parameters
-    ----------
-    client : Client
-        From now on, it calls workers directly rather than through the scheduler.
-    """
+    """Actors in the workers of a scheduler, which ``client`` now calls directly; each ends with it or its reference."""
 
     def __init__(self, client: Client) -> None:
         client.direct_to_workers = True
@@ -139,8 +119,8 @@ class WorkerActors:
     def connected(self, addresses: Collection[str], *, timeout_s: float) -> dict[str, tuple[Any, int]]:
         """Return a new `WorkerActor` in each worker that answers within the timeout, and the number of its process.
 
-        Workers that do not answer yet are waited for in the next call, if it names them again. A worker that is dead
-        unknown to the scheduler therefore delays the others by no more than the timeout.
+        Workers that do not answer yet are waited for in the next call, if it names them again. A dead worker, unknown
+        to the scheduler, therefore delays the others by no more than the timeout.
         """
         import distributed  # noqa: PLC0415  it is installed, since a client exists
 
@@ -174,13 +154,7 @@ def current_worker() -> Any:
 
 @contextmanager
 def local_cluster(n_workers: int, *, n_threads: int = 1) -> Iterator[str]:
-    """Yield the address of a scheduler with workers on this machine; all end with the block.
-
-    Raises
-    ------
-    DeviceError
-        dask.distributed is not installed.
-    """
+    """Yield the address of a scheduler with workers on this machine; all end with the block."""
     with extra("cluster", "a cluster on this machine needs dask.distributed", DeviceError):
         import dask  # noqa: PLC0415  as above
         from distributed import LocalCluster  # noqa: PLC0415

@@ -26,14 +26,11 @@ _Selector: Final = getattr(selectors, "PollSelector", selectors.SelectSelector)
 
 
 class Pipe(Generic[Kind]):
-    """One end of a connection between two processes.
+    """One end of a connection between two processes, for messages that are tagged `msgspec.Struct` of ``kinds``.
 
     Messages are MessagePack, never pickle: a corrupted child cannot make its parent run code. Paths travel as bytes,
-    because names of files need not be valid text.
-
-    ``end`` is one socket of a pair; ``kinds`` is a union of tagged `msgspec.Struct`, the received messages. ``files``
-    are received descriptors, in the order of their messages. ``closed`` is true if the other process has ended, or has
-    sent an invalid message.
+    because names of files need not be valid text. ``files`` are received descriptors, in the order of their messages.
+    ``closed`` is true if the other process has ended, or has sent an invalid message.
     """
 
     def __init__(self, end: socket.socket, kinds: Any) -> None:
@@ -156,10 +153,9 @@ def wait_for(pipes: Iterable[Pipe[Any]], timeout_s: float | None) -> list[Pipe[A
 
 
 def anonymous_memory(n_bytes: int) -> int:
-    """Return the descriptor of new memory that processes can share.
+    """Return the descriptor of new memory that processes can share, and that the system frees with the last of them.
 
-    The system frees it with the last of them. Memory of `multiprocessing.shared_memory` has a name, by which it is left
-    behind if every process is killed at once.
+    Memory of `multiprocessing.shared_memory` has a name, by which it is left behind if every process is killed at once.
     """
     if hasattr(os, "memfd_create"):
         descriptor = os.memfd_create("ertis")

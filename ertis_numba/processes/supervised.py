@@ -16,7 +16,6 @@ class SupervisedProcess(Generic[Kind]):
 
     No method blocks, except `close`: the owner polls `fds`, and calls `check` several times a second. ``delays_s`` are
     the delays before it is replaced, by the number of earlier ends since the last `succeeded`; the last one repeats.
-    ``restarts`` counts the processes that have ended.
     """
 
     def __init__(
