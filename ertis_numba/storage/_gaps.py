@@ -43,10 +43,7 @@ class SensorSequences:
 
 
 class SequenceNumbers:
-    """Sequence numbers of one session of a sensor, in order of arrival, and the missing ones.
-
-    ``jumps`` are the missing numbers between successive ones, as (first, last).
-    """
+    """Sequence numbers of one session in order of arrival, and missing ones between them as ``jumps`` (first, last)."""
 
     def __init__(self) -> None:
         self.jumps: list[Range] = []
@@ -80,7 +77,7 @@ class SequenceNumbers:
 
         If the numbers rise, the missing part of a noted gap is outside of their interval or in a jump. Otherwise, as in
         recordings without session identifiers, equal numbers cannot be distinguished, and all noted gaps are missing.
-        If two gaps in ``noted``, (first, last, reason), overlap, the one that begins first has priority.
+        If two noted gaps overlap, the one that begins first has priority.
         """
         known = list(_disjoint(noted))
         if self._first is not None and not self._late:

@@ -16,11 +16,10 @@ _MAX_PAUSE_S: Final = 0.5
 
 
 class GradualSync:
-    """Gradual sync of a growing file, with a pause after each step.
+    """Gradual sync of a growing file, which need not exist yet, with a pause of ``rests`` times each step's duration.
 
     A single sync would write all buffered data at once, and the sync of another small file would have to wait. A
-    journal's commit then took 370 ms instead of 47 ms. The file need not exist yet. ``rests`` is the duration of a
-    pause, relative to that of the step.
+    journal's commit then took 370 ms instead of 47 ms.
     """
 
     def __init__(self, path: Path, rests: float) -> None:

@@ -28,10 +28,7 @@ def damaged_poses(count: int) -> str:
 
 
 class JournalRows:
-    """Measurements of one sensor of a journal, without damaged ones.
-
-    The attributes are valid once all measurements have been read; ``keys`` include ``damaged`` ones.
-    """
+    """Undamaged measurements of one sensor of a journal; once all are read, ``keys`` also have damaged ones."""
 
     def __init__(self, journal: Journal, sensor: str) -> None:
         self._journal, self._sensor = journal, sensor

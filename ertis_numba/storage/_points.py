@@ -53,10 +53,7 @@ def write_points(group: h5py.Group, clouds: Sequence[PointCloud]) -> None:
 
 
 class PointReader:
-    """Points of the images of a sensor.
-
-    ``group`` is that of the sensor, which has points.
-    """
+    """Points of the images of a sensor, in the group of a sensor that has points."""
 
     def __init__(self, group: h5py.Group, path: Path, settings: Settings) -> None:
         missing = [variable.name for variable in POINTS if variable.name not in group]

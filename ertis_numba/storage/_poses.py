@@ -81,11 +81,7 @@ def require_times(trajectory: Trajectory, time_ns: NDArray[np.int64], sensor: st
 
 
 def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
-    """Store the pose at each measurement of a sensor; the group has its rows, but no poses.
-
-    A sensor without measurements has no poses. If the trajectory has a `max_gap_s`, measurements that it does not cover
-    have NaN.
-    """
+    """Store the pose at each measurement of a sensor, if any; NaN where `max_gap_s` of the trajectory leaves none."""
     time_ns = np.asarray(group["time"][:], np.int64)
     require_times(trajectory, time_ns, group.name.rpartition("/")[2])
     times, rows = np.unique(time_ns, return_inverse=True)  # Measurements may be out of order, or share a time.
@@ -110,10 +106,7 @@ def write_poses(group: h5py.Group, trajectory: Trajectory) -> None:
 
 
 def read_poses(group: h5py.Group, path: Path) -> Trajectory | None:
-    """Return the poses at the measurements of a sensor, by increasing time; None if there are none.
-
-    Measurements without a pose are left out. The `max_gap_s` of the trajectory is then `MAX_GAP_S`.
-    """
+    """Return the poses at measurements by time, with gaps up to `MAX_GAP_S` if some have none; None without any."""
     found = [name for name in ("pose_position", "pose_rotation", "pose_source") if name in group]
     if not found:
         return None

@@ -38,11 +38,7 @@ _LIMITS = {
 
 
 class RowWriter:
-    """Writer of measurements to the variables of a sensor.
-
-    ``data`` is the variable with one array per measurement. ``numbered`` requires sequence numbers to be unique within
-    a session.
-    """
+    """Writer of measurements to the variables of a sensor; ``numbered`` requires unique numbers within a session."""
 
     def __init__(self, group: h5py.Group, data: str, *, numbered: bool) -> None:
         self._group = group
@@ -100,10 +96,7 @@ class RowWriter:
 
 
 class RowReader:
-    """Reader of measurements, which checks each against its CRC-32.
-
-    ``data`` is the variable with one array per row; ``name`` is that of a row in errors.
-    """
+    """Reader of measurements, which checks each against its CRC-32; ``name`` is that of a row in errors."""
 
     def __init__(self, group: h5py.Group, data: str, name: str = "measurement") -> None:
         self._name = name

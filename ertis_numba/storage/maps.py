@@ -41,10 +41,7 @@ _COUNTS: Final = ("n_groups", "time_ns")
 def write_map_file(
     path: str | Path, occupancy: OccupancyMap, *, truth: GroundTruth | None = None, overwrite: bool = False
 ) -> Path:
-    """Write an occupancy map as HDF5, and return the path.
-
-    ``truth`` is the ground truth of each pulse in the frame of the map, from `PlacedTruth`.
-    """
+    """Write an occupancy map as HDF5, with the ground truth of each pulse in its frame; return the path."""
     checks.instance("occupancy", occupancy, OccupancyMap, "Mapper.map returns")
     axes, table = _AXES[: occupancy.n_dimensions], _table(occupancy.n_dimensions)
     sizes = dict(zip(axes, occupancy.log_odds.shape[::-1], strict=True))

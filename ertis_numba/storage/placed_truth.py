@@ -28,10 +28,7 @@ _DIFFERS_DEG: Final = 0.1
 
 
 def surfaces_at(truth: GroundTruth, row: int, time_ns: int) -> Surfaces:
-    """Return the surfaces of the scene at a time, in the frame of a row of the ground truth of fused images or maps.
-
-    Raises SettingsError if another version wrote the scene, with other keys.
-    """
+    """Return the scene's surfaces in the frame of a row of ground truth; SettingsError: the scene has other keys."""
     position_m, rotation_xyzw = truth.frames[row]
     surfaces = surfaces_of(_scene_of(truth.scene), time_ns / _NS_PER_S)
     return surfaces.seen_from(np.array(position_m), Rotation.from_quat(rotation_xyzw).as_matrix())
@@ -47,12 +44,10 @@ class PlacedTruth:
     """Ground truth of the sensors of one platform, which grows with each pulse.
 
     Its reflectors are those that the image of a sensor can show at the place of the reflector: echoes of its own call
-    over a single surface. Those of several sensors are merged.
-
-    ``mountings``, (translation_m, rotation_xyzw) by sensor, define the frame of the platform. ``trajectory`` has the
-    poses of the platform in the frame of a map; none for fused images. If they are not those of the scene, such as
-    poses of an odometry that begins at the origin, the scene is moved to fit them best. ``missing`` is the reason why
-    there is no ground truth; ``is_partial`` is then true if some recordings are simulated.
+    over a single surface. Those of several sensors are merged. ``trajectory`` has the poses of the platform in the
+    frame of a map; none for fused images. If they are not those of the scene, such as poses of an odometry that begins
+    at the origin, the scene is moved to fit them best. ``missing`` is the reason why there is no ground truth;
+    ``is_partial`` is then true if some recordings are simulated.
     """
 
     def __init__(
@@ -93,10 +88,7 @@ class PlacedTruth:
         self._given.append(given)
 
     def truth(self, height_m: tuple[float, float] | None = None) -> GroundTruth | None:
-        """Return the ground truth of all pulses, in the frame of the platform or of the map; None if there is none.
-
-        ``height_m`` has the lowest and highest height of reflectors in this frame; all by default.
-        """
+        """Return the ground truth of all pulses between heights in the platform's or the map's frame, if any."""
         if self._scene is None or not self._rows:
             return None
         first = next(iter(self._truths.values()))

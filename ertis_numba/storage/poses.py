@@ -123,10 +123,7 @@ def add_poses(
 
 
 def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: bool = False) -> int:
-    """Refuse a recording to which poses cannot be added, and return the number of its measurements.
-
-    ``replace`` accepts a recording that has poses already. The measurements of all sensors count.
-    """
+    """Refuse a recording that cannot get poses or, with ``replace``, other ones; return its number of measurements."""
     n_measurements = 0
     for sensor in sensor_names(path, "a recording"):
         with open_recording(path, sensor=sensor) as recording:
@@ -148,10 +145,7 @@ def require_fitting_poses(path: str | Path, trajectory: Trajectory, *, replace: 
 
 
 def count_in_gaps(trajectory: Trajectory, time_ns: ArrayLike) -> int:
-    """Return the number of times whose poses are interpolated between poses more than a second apart.
-
-    ``time_ns`` has shape (n,) int64 and counts from 1970-01-01 UTC.
-    """
+    """Return the number of times since 1970 in ns whose poses are interpolated over more than a second."""
     is_near = trajectory.replace(max_gap_s=MAX_GAP_S).covers(time_ns)
     return int(np.count_nonzero(trajectory.covers(time_ns) & ~is_near))
 

@@ -226,11 +226,7 @@ class RecordingWriter(FileWriter[Measurement]):
 def create_sensor_variables(
     group: h5py.Group, settings: Settings, *, firmware: str, mounting: Mapping[str, Any]
 ) -> None:
-    """Create all variables of a sensor, without rows.
-
-    The name of ``group`` is that of the sensor. ``settings`` come from `ertis_numba.geometry.storable`, and
-    ``mounting`` from `ertis_numba.geometry.mounting`; it is empty if unknown.
-    """
+    """Create all variables of a sensor, named by its group, without rows; ``mounting`` is empty if unknown."""
     layout, words, samples = microphones(settings.array), sample_format(settings), call_samples(settings.call)
     data, table = _data_and_table(pdm=settings.recording.is_pdm)
     create_variables(

@@ -64,11 +64,10 @@ _UNLIMITED: Final = ("time", "gap")
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """Array of a file.
+    """Array of a file, which is a coordinate if it has the name of its only axis.
 
-    A variable with the name of its only axis, in ``dims``, is its coordinate. ``dtype`` is a NumPy type, ``str`` for
-    text, or empty if the settings determine it. ``description`` is stored as the attribute ``long_name``. ``units`` are
-    in the notation of UDUNITS; empty for numbers without a unit. ``optional`` is true if older files lack it.
+    ``dtype`` is a NumPy type, ``str`` for text, or empty if the settings determine it. ``description`` is stored as the
+    attribute ``long_name``. ``units`` are in the notation of UDUNITS. ``optional`` is true if older files lack it.
     """
 
     name: str
@@ -315,11 +314,10 @@ def create_variables(
     dtypes: Mapping[str, str | np.dtype[Any]] | None = None,
     texts: Mapping[str, str] | None = None,
 ) -> None:
-    """Create the variables of ``table`` in ``group``, with a named scale for each axis.
+    """Create the variables of ``table`` in ``group``, with a named scale for each axis that does not exist yet.
 
-    ``sizes`` has the length of each axis. An axis without a length is omitted, unless it grows with the file. If the
-    rows along time are samples or images, each row is a chunk. Existing axes are used. ``dtypes`` and ``texts``, by
-    variable, replace types of the table and fill text variables.
+    An axis without a length in ``sizes`` is omitted, unless it grows with the file. If the rows along time are samples
+    or images, each row is a chunk. ``dtypes`` replace types of the table, and ``texts`` fill text variables.
     """
     scales: dict[str, h5py.Dataset] = {}
     variables = [(variable, _dims(variable, sizes)) for variable in table]
@@ -381,10 +379,9 @@ def _scale_without_values(group: h5py.Group, dim: str, size: int) -> h5py.Datase
 
 
 def set_attributes(owner: h5py.File | h5py.Group | h5py.Dataset, attributes: Mapping[str, Any]) -> None:
-    """Set attributes.
+    """Set attributes, with texts of a fixed length, as everywhere in these files.
 
-    Texts have a fixed length, as everywhere in these files. HDF5 stores texts of variable length in a heap without
-    checksums, where a damaged length can block a reader forever.
+    HDF5 stores texts of variable length in a heap without checksums, where a damaged length can block a reader forever.
     """
     for name, value in attributes.items():
         if isinstance(value, str):
@@ -439,8 +436,7 @@ def _digest(digest: "hashlib._Hash", group: h5py.Group, table: Iterable[Variable
 def content_uuid(contents: Mapping[str, str]) -> str:
     """Return the identity of a file, a UUID of version 8 that its content determines (RFC 9562, section 5.8).
 
-    ``contents`` has the `content_sha256` of each sensor, by name. Neither the name of a single sensor nor the order of
-    several has an effect.
+    Neither the name of a single sensor nor the order of several hashes in ``contents`` has an effect.
     """
     (content,) = contents.values() if len(contents) == 1 else (_joined(contents),)
     made = bytearray(bytes.fromhex(content)[:16])

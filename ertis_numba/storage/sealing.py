@@ -58,11 +58,8 @@ def seal(path: str | Path, *, overwrite: bool = False, progress: Progress = lamb
 
     Measurements damaged in the journal become gaps of the recording, and the journal is kept under another name, also
     if poses in it are damaged, or if a recording cannot contain one of its sensors; the others are sealed. Measurements
-    that were sealed before are not written again.
-
-    ``overwrite`` replaces an existing file, even if it has other content. ``progress`` is called with the number of
-    written measurements and of all. Raises JournalInUseError if another process has the journal open; or DataError if
-    the journal cannot be read, or the recording cannot be written or has other content (the journal stays).
+    that were sealed before are not written again. Without ``overwrite``, an existing file with other content raises
+    DataError, and the journal stays.
     """
     path = Path(path)
     before = path.with_name(path.name.removesuffix(SUFFIX))

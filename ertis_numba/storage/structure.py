@@ -30,10 +30,7 @@ MAX_ROW_BYTES: Final = 2**32 - 1
 
 
 def local_member(group: h5py.Group, name: str, kind: type[Any]) -> Any:
-    """Return a member of a group; refuse links, and members with several names.
-
-    ``kind`` is the required type, ``h5py.Group`` or ``h5py.Dataset``. Raises KeyError if there is none.
-    """
+    """Return a member of a group; refuse links, other types and members with several names; raise KeyError for none."""
     link = group.get(name, getlink=True)
     if isinstance(link, h5py.ExternalLink):
         raise ForeignDataError(
@@ -78,10 +75,7 @@ def require_attributes(owner: h5py.File | h5py.Group) -> None:
 
 
 def require_variables(group: h5py.Group, table: Iterable[Variable]) -> None:
-    """Refuse variables that are not stored in the file as this package stores them.
-
-    ``group`` is that of a sensor. ``table`` lists the variables that may be read; missing ones are skipped.
-    """
+    """Refuse variables of a sensor that are not stored as this package stores them; missing ones are skipped."""
     if len(group) > MAX_MEMBERS:
         raise DamagedError(f"{group.name} has {len(group)} members; the limit is {MAX_MEMBERS}")
     require_attributes(group)

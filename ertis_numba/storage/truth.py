@@ -95,11 +95,9 @@ class GroundTruth:
 
 
 class GroundTruthLog:
-    """Ground truth that grows with each measurement, in a temporary file; use it in a ``with`` statement.
+    """Ground truth that grows with each measurement, in a nameless temporary file; use it in a ``with`` statement.
 
     ``scene`` is TOML. ``left_out`` are effects that were not simulated although they change the image slightly.
-    ``folder`` is that of the temporary file, by default that of the system; the file has no name, and is removed with
-    the process. ``sources`` are those during the first measurement.
     """
 
     def __init__(self, scene: str, seed: int, *, left_out: tuple[str, ...] = (), folder: Path | None = None) -> None:
@@ -145,10 +143,7 @@ class GroundTruthLog:
         return [text.encode() for text in self._texts[field]]
 
     def append(self, reflectors: Sequence[Reflector], sources: Sequence[TrueSource] = ()) -> None:
-        """Add the reflectors of the next measurement, the strongest first, and the sources of sound.
-
-        All measurements have the same sources, at any positions.
-        """
+        """Add the next reflectors, the strongest first, and sources of sound, always the same at any positions."""
         if not self._rows:
             self.sources = tuple(sources)
         names, wanted = [each.name for each in sources], [each.name for each in self.sources]

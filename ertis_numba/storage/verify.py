@@ -19,11 +19,10 @@ _SQLITE = b"SQLite format 3\0"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorReport:
-    """Result for one sensor.
+    """Result for one sensor; ``fault`` is the reason why nothing of it can be read.
 
-    ``measurements`` counts damaged ones too, and ``out_of_order`` has the indices of measurements whose sequence number
-    is not above the previous one of the session. ``fault`` is the reason why nothing of this sensor can be read. For
-    all sensors, ``remark`` describes damage to the file or to poses, and losses from its journal that no gap covers.
+    ``measurements`` counts damaged ones too; ``out_of_order`` are indices with a number not above the previous one of
+    the session. ``remark`` describes damage to the file or to poses, and losses from its journal that no gap covers.
     """
 
     sensor: str
