@@ -70,23 +70,11 @@ class _Run:
 
 
 def check_clock(stamps: Sequence[Stamp], duration_s: float, nominal_rate_hz: float | None = None) -> ClockCheck:
-    """Compare the pulse counters of measurements with their time stamps, and with the duration of a measurement.
+    """Compare the pulse counters of one sensor with its time stamps, and with the duration of a measurement.
 
     The counter belongs to the sensor, or to its SYNC chain, and the time stamps to the host. A line through counters
-    and times is fitted by least squares, with one offset for each session. Late time stamps are left out.
-
-    Parameters
-    ----------
-    stamps : sequence of Stamp
-        Stamps of one sensor, in the order of the recording.
-    duration_s : float
-        Duration of one measurement according to the settings, in seconds.
-    nominal_rate_hz : float, optional
-        Nominal rate of pulses or measurements, in hertz; the drift is not known without it.
-
-    Returns
-    -------
-    ClockCheck
+    and times is fitted by least squares, with one offset for each session. Late time stamps are left out. The drift is
+    unknown without the nominal rate.
     """
     if not stamps or not all(stamp.is_timed for stamp in stamps):
         return _unknown("the time stamps are not from a clock, as in simulations and imports")

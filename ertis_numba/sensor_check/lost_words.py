@@ -38,15 +38,7 @@ class LostWords:
 
 
 def find_lost_words(measurements: Iterable[tuple[int, Measurement]], settings: Settings) -> LostWords:
-    """Find measurements in which words are missing, misplaced or random; see `BitCheck`.
-
-    Parameters
-    ----------
-    measurements : iterable of (int, Measurement)
-        Measurements with their indices. They are read only if lost words can be detected.
-    settings : Settings
-        Settings of all measurements.
-    """
+    """Find measurements with missing, misplaced or random words; read none if these cannot be found: `BitCheck`."""
     recording, enabled = settings.recording, microphones(settings.array).enabled
     if not recording.is_pdm or len(enabled) != CHANNELS or settings.array.word_bits != CHANNELS:
         return LostWords(reasons={}, unknown=f"it needs PDM of {CHANNELS} microphones")

@@ -45,20 +45,7 @@ class CalibrationResiduals:
 
 
 def calibration_residuals(measurements: Sequence[Measurement], faulty: Collection[int]) -> CalibrationResiduals:
-    """Return the deviations from the layout, by the echo of a reflector; positions are those of the layout.
-
-    Parameters
-    ----------
-    faulty : collection of int
-        Channels without usable sound, which are left out.
-
-    Raises
-    ------
-    ArgumentError
-        There are no measurements.
-    DataError
-        No echo is strong and simple enough, or too few microphones receive it.
-    """
+    """Return the deviations from the layout by a reflector's echo, without ``faulty`` channels."""
     found = calibrate([_without(each, faulty) for each in measurements], target="reflector", position_tolerance_m=0.0)
     return CalibrationResiduals(
         channels=tuple(int(channel) for channel in found.channels),
