@@ -77,13 +77,7 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
             self._check_phase_shifts()
 
     def require_exact_delays(self) -> None:
-        """Refuse a plan with other delays than those that a delay matrix needs.
-
-        Raises
-        ------
-        ArgumentError
-            A key names another plan.
-        """
+        """Refuse a plan with other delays than those that a delay matrix needs."""
         for name, accepted in (("delay_taps", (None, 0)), *_EXACT_DELAYS):
             value = getattr(self, name)
             if value not in accepted:

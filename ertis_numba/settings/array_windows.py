@@ -34,13 +34,7 @@ class ArrayWindow(NamedTuple):
 
 
 def parse_window(name: str) -> ArrayWindow:
-    """Parse the name of a window, such as ``hann`` or ``taylor:35``.
-
-    Raises
-    ------
-    ArgumentError
-        The window is unknown, or its parameter cannot be used.
-    """
+    """Parse the name of a window, such as ``hann`` or ``taylor:35``."""
     window, colon, given = name.partition(":")
     checks.choice("processing.array_weights", window, WINDOWS)
     parameter = WINDOWS[window]

@@ -54,33 +54,19 @@ def _amplitudes(weights: "NDArray[np.complex64]", *_: float) -> "NDArray[np.comp
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Beamformer:
-    """Declaration of a beamformer.
+    """Declaration of a beamformer; functions receive the values of its options after their first argument.
 
-    The functions receive the values of the options after their first argument, in the order of ``options``.
-
-    Attributes
-    ----------
-    title : str
-        Name in publications, for captions.
-    kernel : str
-        Kernel that computes ``out`` from ``(analytic, offsets, weights, *options, out)``. Empty for delay-and-sum,
-        whose kernels depend on the plan.
-    weights : callable
-        Returns the weights for the kernel, (direction, mic) complex64, from weights whose magnitudes add up to about 1
-        in each direction. By default, multiplies them by the number of microphones.
-    sensitivity : callable
-        Returns the coefficients of `Sensitivity` from the number of microphones; 1 and 0 by default.
-    streams : callable
-        Returns the streams from whose sums the kernels `combine_streams_int16` compute the amplitude. These are the
-        power sums ``|y|^(k/n) exp(ikφ)``, k = 1 … n, of an elementary symmetric polynomial of order n. Without streams,
-        the default, only ``kernel`` can compute the beamformer.
-    cost : callable
-        Returns the time of ``kernel`` relative to delay-and-sum in single precision.
-    single_precision : callable
-        Returns the error power of an image in single precision from the number of microphones; 0 by default. If it is
-        not far below the budget, the weights for the kernel have double precision.
-    check : callable
-        Raises `ArgumentError` if the beamformer does not support the number of microphones.
+    - ``title``: name in publications, for captions.
+    - ``kernel``: computes ``out`` from ``(analytic, offsets, weights, *options, out)``; empty for delay-and-sum.
+    - ``weights``: makes those of the kernel, (direction, mic), from weights whose magnitudes add up to about 1; by
+      default, it multiplies them by the number of microphones.
+    - ``sensitivity``: coefficients of `Sensitivity` from the number of microphones; 1 and 0 by default.
+    - ``streams``: from their sums, `combine_streams_int16` computes the amplitude: the power sums ``|y|^(k/n)
+      exp(ikφ)``, k = 1 … n, of an elementary symmetric polynomial of order n. Without, only ``kernel`` can compute it.
+    - ``cost``: time of ``kernel`` relative to delay-and-sum in single precision.
+    - ``single_precision``: error power of an image in single precision from the number of microphones; 0 by default. If
+      it is not far below the budget, the weights for the kernel have double precision.
+    - ``check``: raises `ArgumentError` if the beamformer does not support the number of microphones.
     """
 
     title: str
@@ -102,19 +88,9 @@ class Beamformer:
 class Weighting:
     """Declaration of a weighting: a factor from 0 to 1 that multiplies each amplitude of any beamformer.
 
-    Attributes
-    ----------
-    title : str
-        Name in publications, for captions.
-    kernel : str
-        Kernel that multiplies ``out`` by the factor, from ``(analytic, offsets, weights, out)``. Empty for none.
-    sensitivity : float
-        Increase of the relative error of the image by the weighting, in units of that of delay-and-sum beams.
-    streams : tuple of SignalStream
-        Streams of a coherence factor: those of the beam and of the total power. Without streams, the default, only
-        ``kernel`` can compute the factor, and plans have no streams.
-    cost : float
-        Time of ``kernel`` relative to delay-and-sum in single precision.
+    ``kernel`` multiplies ``out`` from ``(analytic, offsets, weights, out)``. ``sensitivity`` is the increase of the
+    image's relative error in units of that of delay-and-sum beams. ``streams`` are those of the beam and of the total
+    power; without, only ``kernel`` can compute the factor. ``cost`` is relative to delay-and-sum in single precision.
     """
 
     title: str

@@ -11,13 +11,7 @@ MAX_LISTED_DELAYS: Final = 20_000
 
 
 def check_delays(given: tuple[tuple[float, ...], ...]) -> None:
-    """Refuse lists that are no matrix, and those that settings cannot hold.
-
-    Raises
-    ------
-    ArgumentError
-        Rows have different lengths, or there are too many numbers.
-    """
+    """Refuse lists that are no matrix, and those with too many numbers for settings."""
     lengths = {len(row) for row in given}
     if len(lengths) > 1:
         raise ArgumentError(

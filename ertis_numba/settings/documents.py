@@ -263,10 +263,7 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
 
     @classmethod
     def _present(cls, value: Any) -> Any:
-        """Replace former keys and values in a value and in the tables in it.
-
-        A former key beside its present name is left, and so refused, because their meaning is ambiguous.
-        """
+        """Replace former keys and values; one beside its present name is left, and so refused as ambiguous."""
         if isinstance(value, list):
             return [cls._present(item) for item in value]
         if not isinstance(value, dict):
@@ -392,10 +389,7 @@ def _choices(kind: Any, keys: list[str]) -> Iterator[str]:
 
 
 def _line_of_error(kind: type[TomlDocument], text: str, error: msgspec.ValidationError) -> int:
-    """Return the number of the line with the error, counted from 1.
-
-    It is the line of the key that the error names, or the first line of the table with the error; 0 if there is none.
-    """
+    """Return the line, from 1, of the key with the error or of its table; 0 if there is none."""
     lines = text.splitlines()
     starts = [1, *(n for n, line in enumerate(lines, 1) if n > 1 and _HEADER.match(line))]
     stops = [*starts[1:], len(lines) + 1]

@@ -21,28 +21,14 @@ _LARGEST_TAP = 1e6
 
 
 class FirFilters(NamedTuple):
-    """FIR filters that follow one another, without the delay of half of their length.
-
-    Attributes
-    ----------
-    rate_hz : float
-        Rate of the taps in hertz.
-    taps : tuple of tuple of float
-        Taps of each filter.
-    """
+    """FIR filters that follow one another, without the delay of half of their length."""
 
     rate_hz: float
     taps: tuple[tuple[float, ...], ...]
 
     @classmethod
     def of(cls, given: Mapping[str, str | tuple[float, ...]], *, rate_hz: float) -> Self | None:
-        """Return the filters of some keys; None if all are empty.
-
-        Raises
-        ------
-        ArgumentError
-            The file of a filter has not been read.
-        """
+        """Return the filters of some keys; None if all are empty; raise if the file of one has not been read."""
         taps: list[tuple[float, ...]] = []
         for name, value in given.items():
             if isinstance(value, str):
@@ -59,7 +45,7 @@ class FirFilters(NamedTuple):
         return sum(len(each) - 1 for each in self.taps) / (2 * self.rate_hz)
 
     def response(self, frequency_hz: NDArray[np.floating]) -> NDArray[np.complex128]:
-        """Return the combined gain: (frequency,) complex128.
+        """Return the combined gain: (frequency,).
 
         ``F(f) = Π Σ_k h_k exp(-2πi f (k − (n − 1) / 2) / rate)`` over the filters of n taps h.
         """
@@ -71,13 +57,7 @@ class FirFilters(NamedTuple):
 
 
 def check_taps(name: str, taps: tuple[float, ...]) -> None:
-    """Refuse filters that are too long, without sound, or not finite.
-
-    Raises
-    ------
-    ArgumentError
-        The taps cannot be used.
-    """
+    """Refuse filters that are too long, without sound, or not finite."""
     if len(taps) > MAX_FILTER_TAPS:
         raise ArgumentError(f"{name} has {len(taps)} taps; the limit is {MAX_FILTER_TAPS}")
     for place, tap in enumerate(taps):

@@ -63,20 +63,7 @@ def presets(kind: PresetKind | None = None) -> tuple[str, ...]:
 
 
 def preset_tables(name: str, kind: PresetKind | None = None) -> dict[str, dict[str, Any]]:
-    """Return the tables of a preset, by the names of the sections of settings.
-
-    Parameters
-    ----------
-    name : str
-        One of `presets`, or the name of the same preset in RTIS Dev, such as ``2D_5m_181``.
-    kind : {"recording", "processing"}, optional
-        Kind that is wanted; any by default.
-
-    Raises
-    ------
-    ArgumentError
-        The preset is unknown or of the other kind.
-    """
+    """Return the tables of a preset, by its name or that of RTIS Dev, such as ``2D_5m_181``; of one kind, or of any."""
     of_rtisdev = {tables["rtisdev"]: own for own, tables in _shipped().items() if "rtisdev" in tables}
     own = of_rtisdev.get(name, name)
     if own not in _shipped():
@@ -90,18 +77,7 @@ def preset_tables(name: str, kind: PresetKind | None = None) -> dict[str, dict[s
 
 
 def preset_text(name: str) -> str:
-    """Return a preset as the text of a settings file.
-
-    Parameters
-    ----------
-    name : str
-        One of `presets`, or the name of the same preset in RTIS Dev.
-
-    Raises
-    ------
-    ArgumentError
-        The preset is unknown.
-    """
+    """Return a preset, by its name or that of RTIS Dev, as the text of a settings file."""
     return tomli_w.dumps(preset_tables(name))
 
 

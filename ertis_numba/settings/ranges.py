@@ -27,21 +27,6 @@ def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Proc
     A default range window is shortened so that whole echoes fit into the record in any air. A ``range_decimation`` that
     gives fewer than 1.8 ranges per second and hertz of bandwidth is reduced. With the default spacing of 3.8 mm, a
     pulse of 60 kHz bandwidth could lie between two ranges and lose 2 dB.
-
-    Returns
-    -------
-    Processing
-
-    Raises
-    ------
-    ArgumentError
-        The record is not longer than the call.
-
-    Examples
-    --------
-    >>> from ertis_numba.settings import Call, Processing, Recording, fit_ranges
-    >>> fit_ranges(Processing(), Recording(n_samples=65_536), Call()).range_m
-    (0.5, 1.8)
     """
     if recording.duration_s <= call.end_s:
         raise ArgumentError(
@@ -62,16 +47,7 @@ def fit_ranges(processing: Processing, recording: Recording, call: Call) -> Proc
 
 
 def record_range_m(recording: Recording, call: Call, sound_speed_m_s: float) -> tuple[float, float]:
-    """Return the ranges in metres whose echoes begin after the call and end within the record.
-
-    Both are rounded inwards to a centimetre. The first is 0 if no echo meets both conditions.
-
-    Examples
-    --------
-    >>> from ertis_numba.settings import Call, Recording, record_range_m
-    >>> record_range_m(Recording(n_samples=65_536), Call(), 343.0)
-    (0.43, 2.06)
-    """
+    """Return the ranges, rounded inwards to a cm, of echoes after the call and within the record; first 0 for none."""
     first_m, last_m = (sound_speed_m_s * time_s / 2 for time_s in (call.duration_s, recording.duration_s - call.end_s))
     steps = 100 if last_m > 0.1 else 1000
     first_m, last_m = math.ceil(first_m * steps) / steps, math.floor(last_m * steps) / steps

@@ -26,20 +26,7 @@ _BAND_STEP_HZ = 100.0  # step of the edges, so that they do not depend on roundi
 
 
 def read_waveform(path: Path, *, key: str = "call.waveform") -> tuple[tuple[float, ...], float | None]:
-    """Return the samples in a file, and their rate if the file contains it.
-
-    Parameters
-    ----------
-    path : Path
-        WAV of one channel, CSV with one number per line or cell, or NPY with a one-dimensional array.
-    key : str
-        Name of the setting in errors.
-
-    Raises
-    ------
-    SettingsError
-        The file cannot be read, or its content is none of these.
-    """
+    """Return the samples in a WAV, CSV or NPY file of one channel, and their rate if stated; ``key`` is for errors."""
     suffix = path.suffix.lower()
     if suffix not in WAVEFORM_FILES:
         raise SettingsError(f"{key} is {str(path)!r}; choose a .wav, .csv or .npy file, or a list of samples")
@@ -79,13 +66,7 @@ def _read_numbers(path: Path, suffix: str) -> NDArray[Any]:
 
 
 def normalise(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
-    """Return samples scaled to a peak of 1, with seven decimals. Many samples lose the zeros at their end.
-
-    Raises
-    ------
-    ArgumentError
-        The samples are too few or too many, one is not finite, or all are 0.
-    """
+    """Return samples scaled to a peak of 1, with seven decimals. Many samples lose the zeros at their end."""
     smallest = 17  # the duration of a call is at least 16 samples
     if len(samples) > MAX_WAVEFORM_SAMPLES:
         samples = samples[: max((number + 1 for number, sample in enumerate(samples) if sample), default=len(samples))]
@@ -104,15 +85,7 @@ def normalise(samples: tuple[float, ...], rate_hz: float) -> tuple[float, ...]:
 
 @functools.lru_cache(maxsize=16)
 def band_hz(samples: tuple[float, ...], rate_hz: float) -> tuple[float, float]:
-    """Return the edges of a waveform's band, in the order of its sweep.
-
-    The band is where the spectrum is less than 20 dB below its maximum.
-
-    Raises
-    ------
-    ArgumentError
-        The band reaches 0 Hz or half of the sample rate.
-    """
+    """Return the edges, in the order of the sweep, between which a spectrum is less than 20 dB below its maximum."""
     n_fft = 2 ** math.ceil(math.log2(16 * len(samples)))
     spectrum = np.abs(np.fft.rfft(samples, n_fft))
     strong = np.flatnonzero(spectrum >= _BAND_THRESHOLD * spectrum.max()) * (rate_hz / n_fft)

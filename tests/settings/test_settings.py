@@ -24,6 +24,7 @@ from ertis_numba.settings import (
     Recording,
     Settings,
     fit_ranges,
+    record_range_m,
 )
 
 TWO = ((0.0, 0.0, 0.0), (0.0, 0.01, 0.0))
@@ -437,3 +438,8 @@ def test_range_window_ends_where_the_whole_echo_fits():
         match=r"recording.n_samples gives a record of 2\.5 ms, but the call ends after 2\.5 ms; use more samples",
     ):
         window_m(2_500)
+
+
+def test_record_range_m_is_rounded_inwards_to_a_centimetre():
+    assert record_range_m(Recording(n_samples=65_536), Call(), 343.0) == (0.43, 2.06)
+    assert fit_ranges(Processing(), Recording(n_samples=65_536), Call()).range_m == (0.5, 1.8)
