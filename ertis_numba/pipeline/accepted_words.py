@@ -17,13 +17,7 @@ _REMEDY: Final = "process it with its own settings (measurement.settings)"
 
 
 class AcceptedWords:
-    """Reader of measurements of the sensor that settings describe.
-
-    Raises
-    ------
-    ArgumentError
-        The array has a size that does not suit the sound; see `require_plausible_size`.
-    """
+    """Reader of measurements of the sensor that settings describe, in an array of plausible size."""
 
     def __init__(self, settings: Settings) -> None:
         require_plausible_size(settings)
@@ -31,24 +25,12 @@ class AcceptedWords:
         self.format = sample_format(settings)
 
     def read(self, measurement: Measurement) -> tuple[NDArray[Any], int]:
-        """Return the words, scaled into the range of single precision, and the exponent n of the divisor 2^n.
-
-        Raises
-        ------
-        DataError
-            The measurement's array, call, record or air, or its data, are not those of the settings.
-        """
+        """Return the words, scaled into the range of single precision, and the exponent n of the divisor 2^n."""
         self.require_sensor(measurement.settings)
         return self.format.normalised(self.format.validated(measurement.data))
 
     def require_sensor(self, settings: Settings) -> None:
-        """Refuse settings of another sensor; only ``processing`` and ``accuracy`` may differ.
-
-        Raises
-        ------
-        DataError
-            The array, call, record or air differ.
-        """
+        """Refuse settings of another sensor; only ``processing`` and ``accuracy`` may differ."""
         if settings is self._accepted_settings:
             return
         for name in ("call", "recording", "air"):
@@ -81,13 +63,7 @@ def _same_layout(array: Array, other: Array) -> bool:
 
 
 def rescaled(amplitude: NDArray[np.float32], exponent: int) -> NDArray[np.float32]:
-    """Return an image multiplied by a power of two, in place.
-
-    Raises
-    ------
-    DataError
-        The image exceeds single precision.
-    """
+    """Return an image multiplied in place by a power of two; raise DataError if it exceeds single precision."""
     if exponent:
         with np.errstate(over="ignore"):
             np.ldexp(amplitude, exponent, out=amplitude)

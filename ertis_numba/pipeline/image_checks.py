@@ -33,17 +33,7 @@ _CALLER: Final = 5  # Frames from a warning to the caller of `Pipeline.process`.
 
 
 class ImageChecks:
-    """Checks of the images of one pipeline, each of which issues at most one warning.
-
-    Simulated kernels would take minutes for a prediction, so that their images are not checked.
-
-    Parameters
-    ----------
-    settings : Settings
-        Settings with the complete plan.
-    threads : int
-        Number of threads for predictions.
-    """
+    """Checks of images, each with at most one warning; none of simulated kernels, whose predictions take minutes."""
 
     def __init__(self, settings: Settings, kernel_set: KernelSet, *, threads: int) -> None:
         self._settings = settings

@@ -548,13 +548,7 @@ class Pipeline:
 
 
 class _Heard(NamedTuple):
-    """Directions of a level image in the sensor frame, for comparison with exact images.
-
-    Attributes
-    ----------
-    is_ahead : (direction,) bool
-        False for directions behind the sensor, whose amplitude is 0.
-    """
+    """Directions of a level image in the sensor frame; those that are not ``is_ahead`` have the amplitude 0."""
 
     grid: Grid
     is_ahead: NDArray[np.bool_]

@@ -57,25 +57,13 @@ class PredictionDict(TypedDict):
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Predicted and permitted error of the images of a sensor.
+    """Predicted error of a measurement's image relative to the exact image, and the budget.
 
-    Attributes
-    ----------
-    predicted_error_db : float
-        Error of one measurement's image relative to the exact image. The error model predicts it for delay-and-sum; for
-        adaptive beamformers, it is measured in a sample of the directions.
-    max_error_db : float
-        The budget.
-    uncertainty_db : float
-        Largest amount by which the prediction may be too low.
-    budget_applies_to : {"image", "echoes", "beams"}
-        Images for which the plan was chosen. ``echoes`` if images of noise, or of many overlapping echoes, may exceed
-        the budget of an adaptive beamformer with streams. ``beams`` if no plan keeps the budget for images of an
-        adaptive beamformer; the plan then keeps it for the delay-and-sum beams of the same signals.
-    beamformer : str
-        Beamformer, and its weighting if it has one.
-    has_echoes : bool
-        False if the budget is exceeded and no echo exceeds the noise of the image; True by default.
+    The error model predicts it for delay-and-sum; for adaptive beamformers, it is measured in a sample of the
+    directions. ``uncertainty_db`` is the largest amount by which it may be too low. The budget applies to ``echoes`` if
+    images of noise, or of many overlapping echoes, may exceed that of an adaptive beamformer with streams; to ``beams``
+    if no plan keeps it for images of one, and the plan keeps it for the delay-and-sum beams of the same signals.
+    ``has_echoes`` is False if the budget is exceeded and no echo exceeds the noise of the image.
     """
 
     predicted_error_db: float
@@ -123,11 +111,6 @@ def planner_of(image: Energyscape, measurement: Measurement, kernels: KernelSet,
 
     The sensitivity is the ratio of two error powers. One is that of the image, measured in a sample of the directions.
     The other is predicted for the delay-and-sum beams of the same signals.
-
-    Parameters
-    ----------
-    image : Energyscape
-        Image of ``measurement`` with a complete plan.
     """
     settings = image.settings
     adaptive = settings.processing.is_adaptive
@@ -184,14 +167,9 @@ def memory_bytes(image: Energyscape) -> int:
 
 
 class BudgetMonitor:
-    """Prediction for the first image, and for each that is 10 dB fainter than all images predicted before.
+    """Prediction for the first image, and for each that is 10 dB fainter than all predicted before; thread-safe.
 
-    Relative errors grow as images become fainter. Several threads may use one monitor.
-
-    Attributes
-    ----------
-    prediction : Prediction or None
-        The latest; None before the first image that is not silent.
+    Relative errors grow as images become fainter. ``prediction`` is None before the first image that is not silent.
     """
 
     def __init__(self, kernels: KernelSet, threads: int) -> None:

@@ -214,10 +214,7 @@ def _resampled(
     n_phases: int,
     n_outputs: int,
 ) -> NDArray[np.complex64]:
-    """Return analytic signals at the output rate in several phases: (mic, phase, sample) complex64.
-
-    A chirp z-transform evaluates the inverse transform at any spacing of times.
-    """
+    """Return analytic signals in phases, (mic, phase, sample), by a chirp z-transform for any spacing of times."""
     n_bins = spectra.shape[1]
     frequency_hz = np.arange(n_bins) * spacing_hz
     transform = scipy.signal.CZT(n_bins, n_outputs, w=np.exp(2j * math.pi * spacing_hz / rate_hz))

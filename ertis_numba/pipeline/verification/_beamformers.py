@@ -16,14 +16,7 @@ Delayed = NDArray[np.complex128]
 
 
 def combine(y: Delayed, processing: Processing) -> NDArray[np.float64]:
-    """Return the amplitude of one direction: (range,) float64.
-
-    Parameters
-    ----------
-    y : (mic, range) complex128
-        Analytic signals delayed for the direction, multiplied by the array weights and divided by the gains of their
-        microphones.
-    """
+    """Return the amplitude (range,) of a direction from delayed signals (mic, range) with weights, without gains."""
     amplitude, factor = _BEAMFORMERS[processing.beamformer](y, processing), _WEIGHTINGS[processing.weighting](y)
     found: NDArray[np.float64] = amplitude * factor
     return found

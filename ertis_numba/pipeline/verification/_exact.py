@@ -30,26 +30,10 @@ _RINGING = 100.0  # The ringing of a raised cosine of width w is below -160 dB a
 
 
 class ExactImage:
-    """The exact counterpart of an image, computed direction by direction.
+    """The exact counterpart of an image of a measurement, computed direction by direction from its axes and settings.
 
-    Parameters
-    ----------
-    image : Energyscape
-        Image with the axes and settings to use; its amplitudes are ignored.
-    measurement : Measurement
-        Measurement that the image was made from.
-
-    Attributes
-    ----------
-    operations_per_direction : int
-        Estimated number of complex multiplications per direction.
-
-    Raises
-    ------
-    DataError
-        The samples do not match the settings.
-    ArgumentError
-        The image is cleaned, so that the exact image is not its counterpart.
+    ``operations_per_direction`` estimates the complex multiplications. A cleaned image raises ArgumentError, because it
+    has no exact counterpart.
     """
 
     def __init__(self, image: Energyscape, measurement: Measurement) -> None:
@@ -92,26 +76,14 @@ class ExactImage:
         return int(count)
 
     def amplitudes(self, direction: int, ranges: NDArray[np.intp]) -> NDArray[np.float64]:
-        """Return the exact amplitudes of given ranges of one direction: (range,) float64.
-
-        Parameters
-        ----------
-        direction : int
-            Index of the direction.
-        ranges : (range,) intp
-            Indices of the ranges.
-        """
+        """Return the exact amplitudes of some ranges, given by their indices, of one direction: (range,)."""
         processing = self._settings.processing
         if processing.wavefront == "spherical":
             return combine(self._spherical(direction, self._range_m[ranges]), processing)
         return combine(self._plane(direction), processing)[ranges]  # Capon needs the neighbours of a range, too.
 
     def _plane(self, direction: int) -> NDArray[np.complex128]:
-        """Return the signals delayed for plane waves: (mic, range) complex128.
-
-        The spacing of the ranges is an integer number of samples, so one inverse transform of the folded bins computes
-        all ranges.
-        """
+        """Return signals delayed for plane waves, (mic, range), by one inverse transform of the folded bins."""
         if self._given_s is not None:
             delay_s = self._given_s[direction]
         else:

@@ -22,17 +22,7 @@ _MIN_DIRECTIONS = 16
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Measured error of an image relative to the exact image.
-
-    Attributes
-    ----------
-    error_db : float
-        Norm of the difference relative to the norm of the exact image, in decibels.
-    n_directions : int
-        Number of compared directions.
-    peaks : PeakErrors or None
-        None if not all directions were compared.
-    """
+    """Norm of an image's difference relative to that of the exact image in dB; ``peaks`` need all directions."""
 
     error_db: float
     n_directions: int
@@ -45,20 +35,6 @@ def measure(image: Energyscape, measurement: Measurement) -> Measured:
     The exact image is computed in float64, according to the definition of the image's beamformer. If the whole image
     would take more than about ten seconds, a sample is compared: directions for plane wavefronts, single points
     for spherical ones. Bright ones are drawn more often, and each is weighted by the inverse of its probability.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        Measurement that the image was computed from.
-
-    Returns
-    -------
-    Measured
-
-    Raises
-    ------
-    DataError
-        The exact image is silent, or the samples do not match the settings.
     """
     exact = ExactImage(image, measurement)
     share = _MAX_OPERATIONS / exact.operations_per_direction / len(image.amplitude)
@@ -73,22 +49,7 @@ def measure(image: Energyscape, measurement: Measurement) -> Measured:
 
 
 def sampled_error_db(image: Energyscape, measurement: Measurement, *, max_directions: int) -> float:
-    """Return the error of the image of a measurement in decibels, measured in a sample of the directions.
-
-    Bright directions are preferred. The sample is smaller if ``max_directions`` would take more than about a second.
-
-    Parameters
-    ----------
-    measurement : Measurement
-        Measurement that the image was computed from.
-    max_directions : int
-        Maximum number of directions to compare.
-
-    Raises
-    ------
-    DataError
-        The exact image is silent in these directions, or the samples do not match the settings.
-    """
+    """Return the error of an image, measured in a sample of directions that takes at most about a second."""
     exact = ExactImage(image, measurement)
     count = min(max_directions, max(_MIN_DIRECTIONS, int(_QUICK_OPERATIONS / exact.operations_per_direction)))
     if count >= len(image.amplitude):
@@ -115,26 +76,7 @@ def _measured_in_part(image: Energyscape, exact: ExactImage, *, share: float) ->
 
 
 def exact_image(image: Energyscape, measurement: Measurement) -> Energyscape:
-    """Return the exact image of a measurement, with the axes and the settings of another image.
-
-    All directions are computed, without a time limit. Amplitudes are rounded to float32 at the end.
-
-    Parameters
-    ----------
-    image : Energyscape
-        Image with the axes and settings to use.
-    measurement : Measurement
-        Measurement that the image was computed from.
-
-    Returns
-    -------
-    Energyscape
-
-    Raises
-    ------
-    DataError
-        The samples do not match the settings.
-    """
+    """Return the exact image of a measurement in all directions, with another's axes and settings; no time limit."""
     return image.replace(amplitude=_whole(image, ExactImage(image, measurement)).astype(np.float32))
 
 
@@ -145,18 +87,7 @@ def _whole(image: Energyscape, exact: ExactImage) -> NDArray[np.float64]:
 
 
 def error_db(amplitude: NDArray[np.floating], exact: NDArray[np.floating]) -> float:
-    """Return the norm of the difference relative to the norm of the exact image, in decibels.
-
-    Parameters
-    ----------
-    amplitude, exact : (direction, range) floating
-        Amplitudes of the image and of the exact image.
-
-    Raises
-    ------
-    DataError
-        The exact image is silent.
-    """
+    """Return the norm of the difference relative to the exact image's; raise DataError if that is silent."""
     wanted = float(np.linalg.norm(exact.astype(np.float64)))
     if not wanted:
         raise DataError(
@@ -171,18 +102,6 @@ def sampled(power: NDArray[np.float64], count: int) -> tuple[NDArray[np.intp], N
 
     Half of the probability is uniform, and half is proportional to power. Neighbours are alike, so systematic sampling
     at equal steps of the cumulative probability has a smaller error than random sampling.
-
-    Parameters
-    ----------
-    power : (item,) float64
-        Power of each item.
-    count : int
-        Number of draws.
-
-    Returns
-    -------
-    chosen : (item,) intp
-    weights : (item,) float64
     """
     total = float(power.sum())
     even = np.full(len(power), 1 / len(power))

@@ -20,16 +20,7 @@ _NEAR_DEG, _NEAR_M = 5.0, 0.02  # Half a main lobe and half a pulse; peaks farth
 
 @dataclass(frozen=True, slots=True)
 class PeakErrors:
-    """Errors of another image at the strongest reflectors of the exact image.
-
-    Attributes
-    ----------
-    wanted, lost : int
-        Number of reflectors of the exact image, and number of those missed in the other image.
-    level_db, range_mm, angle_deg : float or None
-        Largest errors of the reflectors found: level relative to the strongest in dB, range in millimetres, and angle
-        in degrees. None if no reflector was found.
-    """
+    """Largest errors at the reflectors of the exact image that were found, None for none; levels are relative."""
 
     wanted: int
     lost: int
@@ -39,15 +30,7 @@ class PeakErrors:
 
 
 def peak_errors(image: Energyscape, wanted: Sequence[Peak]) -> PeakErrors:
-    """Return the errors of an image at the reflectors of the exact image.
-
-    Parameters
-    ----------
-    image : Energyscape
-        Image to assess.
-    wanted : sequence of Peak
-        Strongest reflectors of the exact image.
-    """
+    """Return the errors of an image at the strongest reflectors of the exact image."""
     # Reflectors of nearly the same level may change order. Twice the number ensures that the last are included.
     found = peaks_of_grid(image, top=2 * PEAKS, min_level_db=-1000.0)
     errors = [error for peak in wanted if (error := _nearest(peak, found)) is not None]
