@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.call_start import WIDER, start_match
+from ertis_numba.analysis.call_start import WIDER, start_error_s, start_match
 from ertis_numba.analysis.emission_time import emission_time_s
 from ertis_numba.analysis.health.limits import MAX_SHIFT_S
 from ertis_numba.analysis.sound_spectra import SoundSpectra, some_signals, sound_spectra
@@ -62,6 +62,8 @@ class CallMatch:
         Call with which it was compared.
     note : str
         Reason why the match is unknown; empty by default.
+    start_error_s : float, optional
+        Largest error of the time of emission, for a call that matches; None if the sound does not show it.
     """
 
     verdict: Literal["matches", "differs", "unknown"]
@@ -69,6 +71,7 @@ class CallMatch:
     sweep: Sweep | None = None
     call: Call | None = None
     note: str = ""
+    start_error_s: float | None = None
 
     @property
     def warning(self) -> str:
@@ -135,7 +138,9 @@ def call_match(measurement: Measurement) -> CallMatch:
     emission_s = None if is_clear else emission_time_s(measurement)
     if emission_s is None or abs(emission_s) > MAX_SHIFT_S:
         return found
-    return CallMatch("matches", found.loss_db)  # Direct sound at the right time shows that ranges are right.
+    return CallMatch(
+        "matches", found.loss_db, start_error_s=MAX_SHIFT_S
+    )  # Direct sound at the right time shows that ranges are right.
 
 
 def _match(sound: SoundSpectra, call: Call) -> CallMatch:
@@ -214,7 +219,7 @@ def _judged(
     """Return the match of a call whose curve is nearly that of the sound, by the start of the emission."""
     start = start_match(sound, call, curves, arrival)
     if start == "same":
-        return CallMatch("matches", loss_db)
+        return CallMatch("matches", loss_db, start_error_s=start_error_s(call, curves[0]))
     sweep = sweep_along(sound, curves[1], call.low_frequency_hz / WIDER, call.high_frequency_hz * WIDER)
     if start == "before":
         return CallMatch("differs", loss_db, sweep, call)

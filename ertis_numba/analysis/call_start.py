@@ -17,7 +17,7 @@ from ertis_numba.analysis.sweeps import Curve
 from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Call
 
-__all__ = ["WIDER", "StartMatch", "start_match"]
+__all__ = ["WIDER", "StartMatch", "start_error_s", "start_match"]
 
 StartMatch = Literal["same", "before", "after", "unknown"]
 WIDER: Final = 1.5
@@ -87,7 +87,7 @@ def start_match(sound: SoundSpectra, call: Call, curves: tuple[Curve, Curve], ar
         begin_s += min(_BEGIN_OF_RISE * faster_s, _MAX_FASTER * ramp_s)
     steeper = float(better.slopes_s_hz(np.array(call.start_frequency_hz))) / slope_s_hz
     shift_s = (begin_s - expected_s) * abs(steeper)
-    tolerance_s = _MAX_ERROR_S + _RESOLUTION_HZ * slope_s_hz + (_EARLY * ramp_s if shift_s < 0 else 0.0)
+    tolerance_s = start_error_s(call, curve) - (0.0 if shift_s < 0 else _EARLY * ramp_s)
     if abs(_curve_error_s(arrival, call, curve, better) - shift_s) <= tolerance_s:
         return "same"
     if shift_s > 0:
@@ -95,6 +95,12 @@ def start_match(sound: SoundSpectra, call: Call, curves: tuple[Curve, Curve], ar
     is_earlier = (since_s >= begin_s) & (since_s < expected_s)
     is_full = float(power[is_earlier].sum()) > _MIN_EARLIER * full * np.count_nonzero(is_earlier)
     return "before" if shift_s < -tolerance_s - ramp_s / 2 and is_full else "unknown"
+
+
+def start_error_s(call: Call, curve: Curve) -> float:
+    """Return the largest error of the time of emission if the start is the ``same``."""
+    slope_s_hz = abs(float(curve.slopes_s_hz(np.array(call.start_frequency_hz))))
+    return _MAX_ERROR_S + _RESOLUTION_HZ * slope_s_hz + _EARLY * call.ramp_fraction * call.duration_s
 
 
 def _times_s(call: Call) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from ertis_numba.analysis.health import Health
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_GAIN_DB, MAX_WHITE_DB
 from ertis_numba.base.units import counted
 from ertis_numba.calibration import OtherLayoutError
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.sensor_check.clock import ClockCheck
 from ertis_numba.sensor_check.lost_words import LostWords
 from ertis_numba.sensor_check.microphone_faults import (
@@ -20,7 +21,7 @@ from ertis_numba.sensor_check.microphone_faults import (
 )
 from ertis_numba.sensor_check.residuals import CalibrationResiduals
 from ertis_numba.sensor_check.result import CheckFault
-from ertis_numba.settings import Settings
+from ertis_numba.settings import Air, Settings
 from ertis_numba.storage.verify import SensorReport
 
 __all__ = [
@@ -202,7 +203,10 @@ def of_call(match: CallMatch | None) -> CheckResult:
     if match.verdict == "unknown":
         return CheckResult("not known", match.note)
     if match.verdict == "matches":
-        return _result_of((), "echoes match the call of the settings")
+        shown = "but do not show its start, which determines ranges"
+        if match.start_error_s is not None:
+            shown = f"which determines ranges to within {50 * match.start_error_s * sound_speed_m_s(Air()):.1f} cm"
+        return CheckResult("ok", f"echoes match the call of the settings, {shown}")
     text, _, rest = match.warning.partition(". ")
     return _result_of([CheckFault(check=CALL, text=text, remedy=rest.partition("; ")[2])], "")
 

@@ -161,7 +161,9 @@ class RecordingCheck:
         if self.is_fit:
             unknown = f"not known: {', '.join(self.not_known)}" if self.not_known else ""
             hidden = not_observable_text(self.not_observable)
-            found = "fit for use as far as this recording shows" if hidden else "fit for use"
+            shown = dict.fromkeys(item.check for each in self.sensors for item in each.items)
+            passed = ", ".join(check for check in shown if check not in self.not_known)
+            found = f"no fault in {passed}" if hidden else "fit for use"
             return f"{self.path}: {'; '.join(filter(None, (found, unknown, hidden)))}"
         faults = self.faults
         count = counted(len(faults), "fault")

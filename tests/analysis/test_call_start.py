@@ -123,3 +123,15 @@ def test_right_calls_are_never_named(emitted, scene):
         data = recorded(emitted, scene, snr_db=(15, 30, 40)[seed], seed=seed, band_hz=band_hz)
         found = compared(data, emitted)
         assert found.verdict == "matches" or (band_hz is not None and found.verdict == "unknown"), found
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_calls_of_another_kind_that_pass_keep_the_stated_range_error(seed):
+    random = np.random.default_rng(seed)
+    start_hz, width, duration_s = random.uniform(30e3, 60e3), random.uniform(1.2, 1.5), random.uniform(1e-3, 4e-3)
+    emitted, stated = ((kind, start_hz, start_hz * width, duration_s) for kind in ("linear", "hyperbolic"))
+    found = compared(recorded(emitted, "one echo", seed=seed), stated)
+    assert found.verdict != "matches" or abs(range_error_m(emitted, stated)) < SPEED_M_S / 2 * found.start_error_s
+    own = compared(recorded(emitted, "one echo", seed=seed), emitted)
+    assert own.verdict == "matches"
+    assert own.start_error_s < 0.4e-3

@@ -48,7 +48,7 @@ def verdict_of(path):
     """Last line of the command, without the folder; the exit code must agree."""
     done = CliRunner().invoke(cli, ["sensors", "check", str(path)])
     verdict = done.stdout.splitlines()[-1].replace(f"{path.parent}/", "")
-    assert done.exit_code == (0 if ": fit for use" in verdict else 1), (done.stderr, done.exception)
+    assert done.exit_code == (1 if re.search(r": \d+ faults?: ", verdict) else 0), (done.stderr, done.exception)
     return verdict
 
 
@@ -74,7 +74,8 @@ def test_healthy_recordings_are_fit_for_use(tmp_path):
         assert checked.is_fit
         assert "fault" not in results(checked).values()
     checked = check_recording(stored(tmp_path / "a.h5", real(), real(), real()))
-    start = f"{tmp_path / 'a.h5'}: fit for use as far as this recording shows; not known: clock drift, calibration; "
+    shown = "microphones, noise floor, samples, measurements, timing, call"
+    start = f"{tmp_path / 'a.h5'}: no fault in {shown}; not known: clock drift, calibration; "
     assert checked.verdict.startswith(f"{start}not observable: ")
     assert results(checked) == {
         "microphones": "ok",
@@ -109,7 +110,8 @@ def test_recording_without_a_call_is_examined_without_its_echoes(tmp_path):
     path = passive(tmp_path / "a.h5", silence(), silence(), silence())
     checked = check_recording(path)
     assert checked.verdict == (
-        f"{path}: fit for use as far as this recording shows; not known: clock drift, call, calibration; "
+        f"{path}: no fault in microphones, noise floor, samples, measurements, timing; not known: clock drift, call, "
+        "calibration; "
         "not observable: polarity of channels, order of channels, delay of channels, scale of the positions, "
         "mirrored or turned positions, shift of the record (record with calls)"
     )
@@ -157,7 +159,7 @@ def test_measurements_with_a_call_are_preferred(tmp_path):
 def test_faulty_channel_is_named_with_its_remedy(tmp_path, name, fault):
     path = stored(tmp_path / "a.h5", BY_HAND[name]())
     assert verdict_of(path) == f"a.h5: 1 fault: {fault}. Remedy: exclude channel 3 (--without 3)"
-    assert run(path, "--without", "3").stdout.splitlines()[-1].startswith(f"{path}: fit for use")
+    assert run(path, "--without", "3").stdout.splitlines()[-1].startswith(f"{path}: no fault in ")
 
 
 def test_channels_with_equal_faults_are_one_fault(tmp_path):
@@ -419,9 +421,9 @@ def test_page_has_an_entry_for_each_file_that_cannot_be_read(tmp_path):
 def test_page_of_an_earlier_check_does_not_survive(tmp_path):
     target, absent = tmp_path / "r.html", tmp_path / "absent.h5"
     run(stored(tmp_path / "a.h5", sound()), "--report", target)
-    assert "fit for use" in target.read_text("utf-8")
+    assert "no fault in" in target.read_text("utf-8")
     run(absent, "--report", target, "--force", code=1)
-    assert "fit for use" not in target.read_text("utf-8")
+    assert "no fault in" not in target.read_text("utf-8")
     assert "No such file" in target.read_text("utf-8")
     target.write_text("fit for use")
     run(tmp_path / "a.h5", "--report", target, "--force", "--settings", tmp_path / "absent.toml", code=1)
@@ -488,7 +490,7 @@ def test_check_page_shows_the_printed_output(tmp_path, monkeypatch):
             assert done.exit_code == int("fault:" in shown or "faults:" in shown), command
     (code,) = python_in(page)
     run_code_here(tmp_path, code)
-    assert Page((tmp_path / "REPORT.html").read_text("utf-8")).text.count("fit for use") == 1
+    assert Page((tmp_path / "REPORT.html").read_text("utf-8")).text.count("no fault in") == 1
 
 
 def test_page_of_limits_has_the_limits():
