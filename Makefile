@@ -10,7 +10,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx --ignore=tests/kernels
 CORE := base settings geometry frames chain analysis pipeline
 
-.PHONY: demo test test-core test-kernels test-host test-simulator test-ptx test-arm check docs reference data pictures bench peers soak gpu clean
+.PHONY: demo test test-core test-kernels test-host test-simulator test-ptx test-arm check docs reference data pictures bench peers soak gpu release clean
 
 $(VENV)/ready: setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -117,6 +117,11 @@ soak: $(VENV)/ready-to-test  ## test faults, kills, full disks and random scenes
 gpu: $(VENV)/ready  ## test and time this machine's NVIDIA GPU in less than ten minutes; GPU=cu13 for CUDA 13
 	$(BIN)/python -m pip install --quiet --editable '.[test,$(GPU)]'
 	$(BIN)/ertis bench gpu --results bench/results --update docs/explanation/gpu.md --update README.md
+
+release: $(VENV)/ready  ## build the distributions of the last commit in dist, and try them in empty environments
+	$(BIN)/python -m pip install --quiet --editable '.[release]'
+	$(BIN)/cffconvert --validate
+	$(BIN)/python -m tests.release dist
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info demo site

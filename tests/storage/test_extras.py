@@ -11,7 +11,7 @@ from tests.files import noise
 from tests.pages import forking
 
 ROOT = Path(__file__).parents[2]
-FOR_AUTHORS = {"test", "docs", "check", "peers"}
+FOR_AUTHORS = {"test", "docs", "check", "peers", "release"}
 NEEDED_BY = {
     "browser": ["{root}/docs/pictures/view.py"],
     "cluster": [
