@@ -8,6 +8,7 @@ import click
 
 from ertis_cli import _image_options, _mountings, _process_many, options
 from ertis_cli._help_sections import SectionedCommand
+from ertis_numba.settings.map_methods import MAP_METHODS
 
 if TYPE_CHECKING:
     from ertis_numba.campaign import CampaignOptions
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 __all__ = ["acoustic"]
 
 _PREFIX = "passive_"
-_METHODS = ("delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc")
 
 
 class _Bands(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
@@ -53,7 +53,7 @@ class _Bands(click.ParamType):  # type: ignore[type-arg]  # generic since click 
 @click.option(
     "--bands", "passive_bands_hz", type=_Bands(), help="Frequency bands: third_octaves, octaves, or A:B,... in Hz."
 )
-@click.option("--method", "passive_method", type=click.Choice(_METHODS), help="Method of the maps.")
+@click.option("--method", "passive_method", type=click.Choice([*MAP_METHODS]), help="Method of the maps.")
 @click.option(
     "--average",
     "passive_averages",

@@ -27,7 +27,6 @@ _LINE_RATIO, _BAND_RATIO = 0.42, 0.42
 _SPARE_DB = 3.0
 _OPAQUE = 0.6  # of the colours over a photo
 _FADED = 0.3  # share of the dynamic range over which they fade in
-_NARROW = ("capon", "music")  # Interpolation may change the order of their peaks; the figure shows those of the grid.
 _ALL_DB = -1000.0
 _TICKS_DEG = (-60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60)
 
@@ -145,8 +144,9 @@ def _levels(
     power = _referred(found, reference).sum(axis=1)
     limits_hz = np.array([[found.band_hz.min(), found.band_hz.max()]])
     combined = gathered(found.replace(power=power[:, None].astype(np.float32), band_hz=limits_hz))
-    is_narrow = found.settings.passive.method in _NARROW
-    sources = sources_of_grid(combined, top=None if is_narrow else 1, min_level_db=_ALL_DB if is_narrow else None)
+    # Interpolation may change the order of their narrow peaks; the figure shows those of the grid.
+    is_inverse = found.settings.passive.traits.is_inverse
+    sources = sources_of_grid(combined, top=None if is_inverse else 1, min_level_db=_ALL_DB if is_inverse else None)
     scaled = _scaled(canvas, found, reference, combined.power[:, 0].astype(np.float64))
     if not sources:
         return *scaled, None

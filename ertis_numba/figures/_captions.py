@@ -12,7 +12,6 @@ from ertis_numba.frames import AcousticMap, Energyscape, Stamp
 from ertis_numba.geometry import microphones, observable_angles
 from ertis_numba.settings import Settings
 from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS
-from ertis_numba.settings.passive import MAP_METHOD_TITLES
 
 __all__ = [
     "Heading",
@@ -115,7 +114,7 @@ def of_acoustic_map(title: str, found: AcousticMap, *parts: str) -> Heading:
         (
             settings.array.layout,
             *parts,
-            f"method {MAP_METHOD_TITLES[passive.method]}",
+            f"method {passive.traits.title}",
             *((f"mean of {count} measurements",) if count > 1 else ()),
             *(() if passive.focus_m is None else (f"focus at {passive.focus_m:g} m",)),
             *left_out(found.masked_s),

@@ -169,8 +169,8 @@ class AcousticMap(DegreesFromRadians):
 
     @property
     def has_level(self) -> bool:
-        """True unless the method is ``music``, whose numbers find directions only."""
-        return self.settings.passive.method != "music"
+        """True unless the numbers of the method find directions only, as those of ``music``."""
+        return self.settings.passive.traits.has_level
 
     @property
     def is_silent(self) -> NDArray[np.bool_]:

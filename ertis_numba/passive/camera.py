@@ -120,7 +120,7 @@ class AcousticCamera:
             self.band_hz,
             self.frequency_hz,
             HIGHEST_SHARE * settings.recording.sample_rate_hz / 2,
-            settings.passive.method,
+            is_linear=settings.passive.traits.is_linear,
         )
         self._masked_s = 0.0
         self._shape = len(self.frequency_hz), delay_s.shape[1], delay_s.shape[1]
@@ -221,7 +221,7 @@ class AcousticCamera:
         with one_thread():
             powers = self.powers()
             power = (self._shares @ powers).T
-        if self.settings.passive.method != "music":  # It has no levels.
+        if self.settings.passive.traits.has_level:
             heard = np.einsum("bmm->b", self._sums.real) / (self._shape[1] * self._n_blocks)
             self._edge_tones.add(powers, power, heard, self.n_measurements)
         if self._check and (note := self.band_note) is not None:
@@ -307,15 +307,11 @@ class AcousticCamera:
         self.close()
 
     def _require_microphones(self) -> None:
-        """Refuse a single microphone, and as many sources as microphones."""
+        """Refuse a single microphone, and settings of the method that need more microphones."""
         passive, n_mics = self.settings.passive, int(microphones(self.settings.array).enabled.sum())
         if n_mics < 2:
             raise ArgumentError(
                 "array has 1 enabled microphone, which hears no directions; choose a layout with two or more, or "
                 "disable fewer"
             )
-        if passive.method == "music" and passive.n_sources >= n_mics:
-            raise ArgumentError(
-                f"passive.n_sources is {passive.n_sources}, but the array has {n_mics} microphones; use fewer than "
-                f"{n_mics}"
-            )
+        passive.traits.check(passive, n_mics)

@@ -1,7 +1,5 @@
 """Components of CLEAN-SC, gathered at the directions of their sources."""
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,10 +7,7 @@ from ertis_numba.analysis.detect import neighbours_of
 from ertis_numba.frames import AcousticMap
 from ertis_numba.geometry import unit_vectors
 
-__all__ = ["COMPONENT_METHODS", "gathered", "strongest_first"]
-
-COMPONENT_METHODS: Final = frozenset({"clean_sc", "hr_clean_sc"})
-"""Methods whose maps hold the powers of sources, and 0 elsewhere."""
+__all__ = ["gathered", "strongest_first"]
 
 
 def gathered(found: AcousticMap) -> AcousticMap:
@@ -22,7 +17,7 @@ def gathered(found: AcousticMap) -> AcousticMap:
     direction of a band on, the components of a direction and its neighbours are summed there. The power of a source in
     the map is therefore its level, and the sum over all directions remains.
     """
-    if found.settings.passive.method not in COMPONENT_METHODS:
+    if not found.settings.passive.traits.is_sparse:
         return found
     neighbours = neighbours_of(unit_vectors(found.azimuth_rad, found.elevation_rad))
     power = np.zeros_like(found.power)

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.passive.bands import bin_shares, typed_hz
-from ertis_numba.settings import MapMethod
 
 __all__ = ["EdgeTones"]
 
@@ -16,7 +15,6 @@ _LINE: Final = 2  # Bins on each side into which the window spreads a tone.
 _TAIL: Final = 0.12  # Largest power at the ends of a tone relative to its middle.
 _MOST: Final = 0.5  # Least share of the tone in the power of a band in its direction.
 _LOSS: Final = 0.11  # Share of the tone beyond an edge, -0.5 dB, that is worth a note.
-_LINEAR: Final = ("delay_and_sum", "functional")
 _ROUNDING: Final = 1e-9
 _WIDTH: Final = 0.15  # Half of the width of advised bands, relative to the tone.
 _TINY: Final = 1e-30
@@ -41,13 +39,13 @@ class EdgeTones:
     """Spectra at the edges of bands, at the microphones and in the loudest directions of the bands, over all maps.
 
     Directions show a tone that is weaker than noise at the microphones. Beams of grids coarser than the main lobe
-    distort its spectrum, so that of the microphones has priority if it shows the tone. Powers of methods other than
-    ``delay_and_sum`` and ``functional`` do not follow the window: their tones are found at the microphones only.
+    distort its spectrum, so that of the microphones has priority if it shows the tone. Powers of methods that are not
+    linear do not follow the window: their tones are found at the microphones only.
     """
 
-    def __init__(self, band_hz: Floats, frequency_hz: Floats, highest_hz: float, method: MapMethod) -> None:
+    def __init__(self, band_hz: Floats, frequency_hz: Floats, highest_hz: float, *, is_linear: bool) -> None:
         self._band_hz, self._frequency_hz, self._highest_hz = band_hz, frequency_hz, highest_hz
-        self._is_linear = method in _LINEAR
+        self._is_linear = is_linear
         self._spacing_hz = float(frequency_hz[1] - frequency_hz[0])
         self._shares = bin_shares(band_hz, frequency_hz)
         self._edges = [self._edge(edge_hz) for edge_hz in sorted(set(band_hz.ravel().tolist()))]

@@ -16,7 +16,7 @@ from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.high_resolution import HighResolutionClean
 from ertis_numba.passive.parallel_bins import in_parts
 from ertis_numba.passive.waves import Waves
-from ertis_numba.settings import MapMethod, Passive
+from ertis_numba.settings import MapMethodName, Passive
 
 __all__ = ["METHODS", "capon", "clean_sc", "delay_and_sum", "functional", "hr_clean_sc", "music"]
 
@@ -139,7 +139,7 @@ def _matrices(values: NDArray[Any], vectors: NDArray[np.complex128]) -> Matrices
     return product.astype(np.complex64)
 
 
-METHODS: Final[dict[MapMethod, Method]] = {
+METHODS: Final[dict[MapMethodName, Method]] = {
     "delay_and_sum": delay_and_sum,
     "functional": functional,
     "capon": capon,

@@ -22,7 +22,6 @@ __all__ = ["coarse_map_warning", "search_changes", "search_warning"]
 
 _SEARCH_LOSS_DB: Final = 6.0  # Bearings are refined beyond the grid, and so are their levels.
 _LINE: Final = 1e-6  # Width of an array relative to its length, below which it is a line.
-_NARROWER: Final = ("functional", "capon")  # Methods whose peaks are narrower than those of delay-and-sum.
 _STEP: Final = 1.02
 _HALF_SPACE: Final[dict[str, object]] = {
     "processing.azimuth_limits_deg": (-90.0, 90.0),
@@ -88,18 +87,19 @@ def _coarse(
     """Return the warning of a grid that is too coarse from some band upwards."""
     lobe, method = lobe_at(highest_hz), settings.passive.method
     wide = lobe._replace(peak=np.asarray)
-    is_narrow = method in _NARROWER and check.suffices(wide)
+    is_narrower = settings.passive.traits.peak is not None
+    is_narrow = is_narrower and check.suffices(wide)
     text = (
         f"directions are {check.apart(lobe)} apart; above {above_hz / 1e3:.3g} kHz, a source "
         f"between them appears up to {check.loss_db(lobe)} dB too weak"
-        + (f" in maps of {method}, whose peaks are narrow" if method in _NARROWER else "")
+        + (f" in maps of {method}, whose peaks are narrow" if is_narrower else "")
         + ("" if check.exceeds_side_lobes(lobe) else ", or in the direction of a side lobe")
     )
     if named := check.remedy(lobe):
         return f"{text}; {named}"
     if is_narrow:
         return f"{text}; use method delay_and_sum or clean_sc for levels"
-    if named := check.remedy(wide) if method in _NARROWER else None:
+    if named := check.remedy(wide) if is_narrower else None:
         return f"{text}; {named}, and method delay_and_sum or clean_sc for levels"
     resolved_hz = _highest_hz(lambda high_hz: check.suffices(lobe_at(high_hz)), highest_hz)
     return (
@@ -251,8 +251,7 @@ def _lobes(settings: Settings, peak: Peak, max_loss_db: float = MAX_LOSS_DB) -> 
 def _map_peak(settings: Settings) -> Peak:
     """Return the function from amplitudes of delay-and-sum to those of the method of maps, for one source.
 
-    ``ρ²`` becomes ``(M ρ² − 1) / (M − 1)`` without the diagonal, ``ρ^(2ν)`` for ``functional`` of the order ν, and
-    ``ε / (ε + M (1 − ρ²))`` for ``capon`` with the loading ε and M microphones. Maps of ``music`` have no level.
+    ``ρ²`` becomes ``(M ρ² − 1) / (M − 1)`` without the diagonal, or the `MapMethod.peak` of the method.
     """
     passive, n_mics = settings.passive, len(microphones(settings.array).enabled_positions_m)
 
@@ -260,10 +259,8 @@ def _map_peak(settings: Settings) -> Peak:
         power = np.clip(rho, 0.0, 1.0) ** 2
         if passive.diagonal_removal:
             power = np.maximum(n_mics * power - 1, 0.0) / max(n_mics - 1, 1)
-        elif passive.method == "functional":
-            power = power**passive.functional_order
-        elif passive.method == "capon":
-            power = passive.diagonal_loading / (passive.diagonal_loading + n_mics * (1 - power))
+        elif (narrower := passive.traits.peak) is not None:
+            power = narrower(power, n_mics, passive)
         return np.asarray(np.sqrt(power))
 
     return peak

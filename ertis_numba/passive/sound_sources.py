@@ -14,7 +14,7 @@ from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.base import checks
 from ertis_numba.frames import AcousticMap, SoundDirection
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
-from ertis_numba.passive.components import COMPONENT_METHODS, strongest_first
+from ertis_numba.passive.components import strongest_first
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.settings import Passive, Settings
 
@@ -23,7 +23,6 @@ __all__ = ["find_sound_sources", "sources_of_grid"]
 Floats = NDArray[np.float64]
 _LossOf = Callable[[Floats, Floats], Floats]
 
-_INVERSE: Final = frozenset({"capon", "music"})  # The inverses of their powers are quadratic forms, and thus smooth.
 _MIN_LEVEL_DB: Final = -10.0  # Side lobes of most arrays are lower.
 _MIN_COMPONENT_DB: Final = -20.0  # CLEAN-SC removes side lobes, but 1 % of a source may remain.
 _FLOOR: Final = 2.0  # Lowest power of a maximum relative to the median over directions; that of noise varies less.
@@ -135,12 +134,11 @@ def sources_of_grid(
     checks.instance("found", found, AcousticMap, "AcousticCamera.map returns")
     top = len(found.azimuth_rad) if top is None else checks.integer("top", top, 1)
     passive = found.settings.passive
-    method = passive.method
+    is_of_components = passive.traits.is_sparse
     if min_level_db is None:
-        min_level_db = _MIN_COMPONENT_DB if method in COMPONENT_METHODS else _MIN_LEVEL_DB
+        min_level_db = _MIN_COMPONENT_DB if is_of_components else _MIN_LEVEL_DB
     least = 10 ** (checks.between("min_level_db", min_level_db, -1000.0, 0.0) / 10)
     grid = _Grid.of(unit_vectors(found.azimuth_rad, found.elevation_rad))
-    is_of_components = method in COMPONENT_METHODS
     search = _components if is_of_components else _maxima
     delays, out = WaveDelays(found.settings), []
     for band, power in enumerate(found.power.T.astype(np.float64)):
@@ -153,7 +151,7 @@ def sources_of_grid(
         outside = None if is_of_components else _outside(power, grid.directions, found.settings, found.band_hz[band])
         if is_of_components or outside is not None:
             tops = _of_doubtful_direction(tops, is_beyond=outside is not None)
-        if method == "delay_and_sum":
+        if passive.traits.is_linear and passive.traits.peak is None:  # Other side lobes differ from those of beams.
             tops = _without_side_lobes(tops, delays, found.band_hz[band], top=top, outside=outside)
         for each in tops[:top]:
             x, y, z = each.direction.tolist()
@@ -185,9 +183,8 @@ def _outside(power: Floats, directions: Floats, settings: Settings, band_hz: Flo
         return None
     values = np.maximum(power[patterns.samples] / highest, _DEEPEST)
     passive = settings.passive  # These numbers are linear in the beam pattern of a single source in noise.
-    if passive.method == "functional":
-        values = values ** (1 / passive.functional_order)
-    found = patterns.source_of(-1 / values if passive.method in _INVERSE else values)
+    values = values ** (1 / passive.traits.order(passive))
+    found = patterns.source_of(-1 / values if passive.traits.is_inverse else values)
     return None if found is None else found._replace(power=highest * found.power)
 
 
@@ -255,8 +252,8 @@ def _maxima(power: Floats, grid: _Grid, passive: Passive, loss_of: _LossOf) -> I
     order = _order_of(passive)
     floor = _EDGE_OF_LOBE**order
     relative = np.clip(around[places] / np.maximum(power[places, None], _TINY), floor, 1.0)
-    values = 1 - 1 / relative if passive.method in _INVERSE else np.log(relative)
-    if passive.method in _INVERSE:
+    values = 1 - 1 / relative if passive.traits.is_inverse else np.log(relative)
+    if passive.traits.is_inverse:
         fits = QuadricFits.of(grid.directions, grid.neighbours, places)
         offsets, rises = fits.tops(np.arange(len(places)), values)
         rises = -np.log(np.where(rises < 1, 1 - rises, 1.0))  # A peak may be too narrow for a quadric.
@@ -267,7 +264,7 @@ def _maxima(power: Floats, grid: _Grid, passive: Passive, loss_of: _LossOf) -> I
     widths = np.where(fits.are_open(np.arange(len(places)), grid.neighbours[places], values), np.inf, widths)
     tops = grid.directions[places] + offsets
     tops /= np.linalg.norm(tops, axis=1)[:, None]
-    if passive.method != "music":  # Its numbers have no level, and no main lobe of delay-and-sum.
+    if passive.traits.has_level:  # Other numbers have no main lobe of delay-and-sum.
         rises = np.minimum(rises, order * np.log(_NOISE / loss_of(tops, grid.directions[places])))
     powers = power[places] * np.exp(rises)
     yield from (_Top(top, float(each), float(width)) for top, each, width in zip(tops, powers, widths, strict=True))
@@ -275,6 +272,4 @@ def _maxima(power: Floats, grid: _Grid, passive: Passive, loss_of: _LossOf) -> I
 
 def _order_of(passive: Passive) -> float:
     """Return the main lobe of a method in decibels, relative to that of delay-and-sum."""
-    if passive.method == "functional":
-        return float(passive.functional_order)
-    return _NARROWER if passive.method in _INVERSE else 1.0
+    return _NARROWER if passive.traits.is_inverse else passive.traits.order(passive)

@@ -25,11 +25,14 @@ from .call import (
 from .excluded_channels import (
     ExcludedChannels as ExcludedChannels,
 )
+from .map_methods import (
+    MAP_METHODS as MAP_METHODS,
+    MapMethod as MapMethod,
+    MapMethodName as MapMethodName,
+)
 from .passive import (
     HIGHEST_SHARE as HIGHEST_SHARE,
-    MAP_METHODS as MAP_METHODS,
     MAX_BANDS as MAX_BANDS,
-    MapMethod as MapMethod,
     Passive as Passive,
 )
 from .preset_files import (

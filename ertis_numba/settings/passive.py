@@ -1,32 +1,15 @@
 """Passive listening: maps of sound that the sensor did not emit."""
 
 import itertools
-from collections.abc import Mapping
-from types import MappingProxyType
-from typing import Final, Literal
+from typing import Final
 
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings.documents import TomlTable
+from ertis_numba.settings.map_methods import MAP_METHODS, MapMethod, MapMethodName
 from ertis_numba.settings.recording import Recording
 
-__all__ = ["HIGHEST_SHARE", "MAP_METHODS", "MAP_METHOD_TITLES", "MAX_BANDS", "MapMethod", "Passive"]
-
-MapMethod = Literal["delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc"]
-
-MAP_METHOD_TITLES: Final[Mapping[MapMethod, str]] = MappingProxyType(
-    {
-        "delay_and_sum": "delay-and-sum",
-        "functional": "functional beamforming",
-        "capon": "Capon",
-        "music": "MUSIC",
-        "clean_sc": "CLEAN-SC",
-        "hr_clean_sc": "HR-CLEAN-SC",
-    }
-)
-"""Methods of acoustic maps, with their names in publications."""
-MAP_METHODS: Final = tuple(MAP_METHOD_TITLES)
-"""Methods of acoustic maps; ``docs/explanation/acoustic-maps.md`` has their equations."""
+__all__ = ["HIGHEST_SHARE", "MAX_BANDS", "Passive"]
 
 MAX_BANDS: Final = 100
 
@@ -37,8 +20,6 @@ _PDM_LIMITS_HZ: Final = (8_900.0, 89_500.0)
 _BLOCK: Final = 1024  # Samples of a block, whose spacing is a third of the lowest band …
 _BLOCKS: Final = 4.0  # … and least number of blocks in a record.
 _SPACINGS: Final = 13.0  # A third octave at 13 spacings of bins is three of them wide.
-
-_WITHOUT_DIAGONAL: Final = ("delay_and_sum", "clean_sc", "hr_clean_sc")
 
 
 class Passive(TomlTable, frozen=True, kw_only=True):
@@ -52,12 +33,10 @@ class Passive(TomlTable, frozen=True, kw_only=True):
         Limits of third octaves and octaves, in hertz. By default, they follow the record: for PCM, up to 0.8 of half of
         the sample rate, from the frequency that blocks of 1024 samples resolve, or shorter ones of short records. The
         bands at both ends reach to the limits. For PDM, whose noise dominates beyond, 8.9 to 89.5 kHz.
-    method : {"delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc"}, default "delay_and_sum"
-        Estimate of the power from each direction. ``music`` finds directions, and has no level. ``hr_clean_sc`` is
-        CLEAN-SC for sources within one main lobe.
+    method : str, default "delay_and_sum"
+        Estimate of the power from each direction, one of `MAP_METHODS`. ``docs/how-to/passive.md`` compares them.
     diagonal_removal : bool, default false
-        Leave out the power of each microphone itself, which contains its noise; for ``delay_and_sum``, ``clean_sc``
-        and ``hr_clean_sc``.
+        Leave out the power of each microphone itself, which contains its noise. Not all methods support this.
     functional_order : float, default 8
         Order of ``functional``, 1 to 100; 1 is delay-and-sum, and higher ones have narrower lobes.
     n_sources : int, default 1
@@ -76,7 +55,7 @@ class Passive(TomlTable, frozen=True, kw_only=True):
 
     bands_hz: str | tuple[tuple[float, float], ...] = "third_octaves"
     limits_hz: tuple[float, float] | None = None
-    method: MapMethod = "delay_and_sum"
+    method: MapMethodName = "delay_and_sum"
     diagonal_removal: bool = False
     functional_order: float = 8.0
     n_sources: int = 1
@@ -99,11 +78,17 @@ class Passive(TomlTable, frozen=True, kw_only=True):
         checks.integer("passive.averages", self.averages, 1, 100_000)
         if self.focus_m is not None:
             checks.between("passive.focus_m", self.focus_m, 0.01, 10_000.0)
-        if self.diagonal_removal and self.method not in _WITHOUT_DIAGONAL:
+        if self.diagonal_removal and not self.traits.removes_diagonal:
+            supported = ", ".join(name for name, each in MAP_METHODS.items() if each.removes_diagonal)
             raise ArgumentError(
                 f"passive.diagonal_removal is true, which passive.method {self.method!r} does not support; leave it "
-                f"out, or choose one of {', '.join(_WITHOUT_DIAGONAL)}"
+                f"out, or choose one of {supported}"
             )
+
+    @property
+    def traits(self) -> MapMethod:
+        """Declaration of the method of the maps."""
+        return MAP_METHODS[self.method]
 
     @property
     def follows_record(self) -> bool:

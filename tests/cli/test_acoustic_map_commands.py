@@ -316,7 +316,7 @@ def test_campaigns_of_maps_refuse_options_of_images(changes):
 def test_methods_are_those_of_the_settings():
     option = next(each for each in acoustic.acoustic.params if each.name == "passive_method")
     assert isinstance(option.type, click.Choice)
-    assert tuple(option.type.choices) == MAP_METHODS
+    assert tuple(option.type.choices) == tuple(MAP_METHODS)
 
 
 def test_info_describes_acoustic_maps():

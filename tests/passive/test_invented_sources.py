@@ -18,7 +18,6 @@ from ertis_numba.analysis.quadric_fits import QuadricFits
 from ertis_numba.frames import AcousticMap
 from ertis_numba.geometry import Grid, direction_grid, unit_vectors
 from ertis_numba.passive import find_sound_sources
-from ertis_numba.passive.components import COMPONENT_METHODS
 from ertis_numba.passive.sound_sources import sources_of_grid
 from ertis_numba.settings import MAP_METHODS, Processing
 from tests.analysis.test_detect import image_of
@@ -61,7 +60,7 @@ def test_no_source_is_louder_than_its_map():
         if not sources:
             continue
         listed = unit_vectors(*np.transpose([(each.azimuth_rad, each.elevation_rad) for each in sources]))
-        is_interpolated = found.settings.passive.method not in COMPONENT_METHODS
+        is_interpolated = not found.settings.passive.traits.is_sparse
         assert not is_interpolated or all(are_in_cells(found, found.power, listed)), seed
 
 

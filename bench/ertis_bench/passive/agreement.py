@@ -86,7 +86,7 @@ def _compared(case: Case, seed: int) -> dict[str, Any]:
         camera.add(heard)
         ours, spectrum = camera.powers()[::step].astype(np.float64), camera.cross_spectrum()
         bins = bins_of(camera)
-    if settings.passive.method != "music":
+    if settings.passive.traits.has_level:
         return _of_maps(ours, theirs.powers(heard.data, slice(bins.start, bins.stop, step)))
     other = theirs.equalised(spectrum.matrix, spectrum.frequency_hz)
     return _of_maps(*(each / each.max(axis=1, keepdims=True) for each in (ours, other)))
