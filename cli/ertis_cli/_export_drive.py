@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _poses, _pulses, _results, options
+from ertis_cli import _naming, _poses, _pulses, _results, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 __all__ = ["drive_of", "drive_options", "open_ears", "require_fitting"]
 
-_OPTIONS = {"poses": "poses", "odometry": "odometry", "scene": "scene", "beam_azimuth_deg": "beam-azimuth"}
 _IDENTITY: "Mounting" = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -57,14 +56,17 @@ def drive_options(command: Any) -> Any:
 
 
 def require_fitting(name: str, paths: "Sequence[Path]") -> None:
-    """Raise UsageError for options of format batslam, or several files, with another format."""
+    """Raise UsageError for options that a format does not have, and for several files."""
+    from ertis_numba.base.errors import ArgumentError
+    from ertis_numba.interop import EXPORT_FORMATS, require_options
+
     context = click.get_current_context()
-    if name == "batslam":
-        return
-    for option, spelling in _OPTIONS.items():
-        if typed(option):
-            raise click.UsageError(f"--{spelling} is for format batslam, not for {name}; leave it out", context)
-    if len(paths) > 1:
+    of_formats = dict.fromkeys(option for each in EXPORT_FORMATS.values() for option in each.options)
+    try:
+        require_options(name, {option: True for option in of_formats if typed(option)})
+    except ArgumentError as error:
+        raise click.UsageError(_naming.named(str(error), context), context) from error
+    if len(paths) > 1 and EXPORT_FORMATS[name].takes != "drive":
         raise click.UsageError(
             f"format {name} exports one recording, but {len(paths)} are given; choose one of them", context
         )

@@ -2,27 +2,9 @@
 
 from pathlib import Path
 
-import click
-
 from ertis_cli import options
-from ertis_cli._config import typed
 
-__all__ = ["export_poses", "is_chosen"]
-
-_OF_IMAGES = {
-    "places": "--measurement",
-    "topics": "--topic",
-    "top": "--top",
-    "min_level_db": "--min-level",
-    "mounting": "--mounting",
-    "text": "--ascii",
-}
-"""Options of the export that apply to images only."""
-
-
-def is_chosen(target: Path, file_format: str | None) -> bool:
-    """Return True if the output holds poses, by its format or else by its suffix."""
-    return file_format == "tum" or (file_format is None and target.suffix.lower() == ".tum")
+__all__ = ["export_poses"]
 
 
 def export_poses(path: Path, target: Path, sensor: str | None, *, force: bool, quiet: bool, as_json: bool) -> None:
@@ -32,9 +14,6 @@ def export_poses(path: Path, target: Path, sensor: str | None, *, force: bool, q
     from ertis_numba.base.errors import DataError
     from ertis_numba.storage import recorded_trajectory, sensor_names
 
-    for parameter, option in _OF_IMAGES.items():
-        if typed(parameter):
-            raise click.UsageError(f"{option} is not for poses; remove it", click.get_current_context())
     check_target(target, overwrite=force, sources=[path])
     poses = recorded_trajectory(path, sensor=sensor)
     if poses is None:

@@ -6,28 +6,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from ertis_cli import options
-from ertis_cli._config import typed
 
 if TYPE_CHECKING:
     from ertis_numba.passive import BeamSound
     from ertis_numba.storage import RecordingReader
 
-__all__ = ["SoundOptions", "export_sound", "is_chosen", "require_possible", "sound_options"]
+__all__ = ["SoundOptions", "export_sound", "require_possible", "sound_options"]
 
-_OF_IMAGES = {
-    "topics": "--topic",
-    "top": "--top",
-    "min_level_db": "--min-level",
-    "mounting": "--mounting",
-    "text": "--ascii",
-}
-"""Options of the export that apply to images only."""
-_OF_SOUND = {
-    "direction": "--listen",
-    "heterodyne_hz": "--heterodyne",
-    "expansion": "--expand",
-    "with_silence": "--silence",
-}
 _MAX_SILENCE_S = 600.0
 _PEAK = 10 ** (-1 / 20)  # of the file
 
@@ -77,23 +62,9 @@ def sound_options(command: Any) -> Any:
     return command
 
 
-def is_chosen(target: Path, file_format: str | None) -> bool:
-    """Return True if the output is sound; raise UsageError for options of sound with another output."""
-    chosen = file_format == "wav" or (file_format is None and target.suffix.lower() == ".wav")
-    for parameter, option in _OF_SOUND.items():
-        if not chosen and typed(parameter):
-            raise click.UsageError(
-                f"{option} is for sound; name a .wav file, or leave it out", click.get_current_context()
-            )
-    return chosen
-
-
 def require_possible(sound: SoundOptions) -> None:
     """Refuse impossible combinations of options."""
     context = click.get_current_context()
-    for parameter, option in _OF_IMAGES.items():
-        if typed(parameter):
-            raise click.UsageError(f"{option} is not for sound; remove it", context)
     if sound.direction is None:
         raise click.UsageError(
             "a .wav file contains the sound of one direction; choose it with --listen AZ,EL", context

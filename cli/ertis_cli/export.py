@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import _export_drive, _export_poses, _export_sound, _mountings, options
-from ertis_cli._config import typed
+from ertis_numba.interop.export_formats import EXPORT_FORMATS, TOPICS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["export"]
 
-FORMATS = ("mcap", "ply", "pcd", "csv", "npz", "acoular", "batslam")
-FORMATS_OF_POSES = ("tum",)
-FORMATS_OF_SOUND = ("wav",)
-TOPICS = ("points", "scan", "image", "sonar_image")
+_ENDINGS = ", ".join(f"{each.suffix} {each.about}".rstrip() for each in EXPORT_FORMATS.values())
 
 
 class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
@@ -47,12 +44,12 @@ class _Places(click.ParamType):  # type: ignore[type-arg]  # generic since click
     type=options.FILE,
     metavar="OUT",
     required=True,
-    help="File to write: .mcap, .ply, .pcd, .csv, .npz, .tum, .wav, .mat for BatSLAM, or .h5 and .xml for Acoular.",
+    help=f"File to write: {_ENDINGS}.",
 )
 @click.option(
     "--format",
     "file_format",
-    type=click.Choice((*FORMATS, *FORMATS_OF_POSES, *FORMATS_OF_SOUND)),
+    type=click.Choice([*EXPORT_FORMATS]),
     help="Output format; chosen by the suffix of OUT by default.",
 )
 @options.sensor("Export this sensor only; all sensors by default.")
@@ -115,14 +112,17 @@ def export(
     platform. WAV files contain the sound
     from one direction. Except for Acoular, TUM, BatSLAM and WAV, a recording is first processed with its own settings.
     """
-    if _export_poses.is_chosen(target, file_format):
-        _export_drive.require_fitting("tum", paths)
+    from ertis_numba import interop
+
+    name = interop.choose_format(target, file_format)
+    takes = interop.EXPORT_FORMATS[name].takes
+    _export_drive.require_fitting(name, paths)
+    if takes == "poses":
         _export_poses.export_poses(paths[0], target, sensor, force=force, quiet=quiet, as_json=as_json)
         return
     from ertis_numba.storage import check_target, file_kind, open_recording, sensor_names
 
-    if _export_sound.is_chosen(target, file_format):
-        _export_drive.require_fitting("wav", paths)
+    if takes == "sound":
         sound = _export_sound.SoundOptions(direction, heterodyne_hz, expansion, with_silence)
         _export_sound.require_possible(sound)
         with open_recording(paths[0], sensor=sensor) as reader:
@@ -130,26 +130,17 @@ def export(
                 reader, _between(places, len(reader)), target, sound, force=force, quiet=quiet, as_json=as_json
             )
         return
-    from ertis_numba import interop
-
-    name = _format_of(target, file_format)
     for file in interop.output_files(target, name):
         check_target(file, overwrite=force, sources=paths)
-    _export_drive.require_fitting(name, paths)
     given = {"topics": topics or None, "top": top, "min_level_db": min_level_db, "text": text}
     fitting = interop.FORMATS[name].options
-    chosen: dict[str, Any] = {key: value for key, value in given.items() if key in fitting or typed(key)}
-    if "mounting" not in fitting and mounting is not None:
-        raise click.UsageError(
-            f"--mounting is for formats with points, not for {name}; remove it", click.get_current_context()
-        )
+    chosen: dict[str, Any] = {key: value for key, value in given.items() if key in fitting}
     with ExitStack() as stack:
-        every, readers = _readers(name, paths, sensor, stack)
+        every, readers = _readers(takes, paths, sensor, stack)
         known = _known(every, mounting) if "mounting" in fitting else None
-        is_image = name not in {"acoular", "batslam"}
-        process = is_image and file_kind(paths[0]) == "recording"
-        items = _Items(readers, places, process=process, echoes=name == "batslam", quiet=quiet)
-        if name == "batslam":
+        process = takes not in {"signals", "drive"} and file_kind(paths[0]) == "recording"
+        items = _Items(readers, places, process=process, echoes=takes == "drive", quiet=quiet)
+        if takes == "drive":
             (ears,), (indices,) = readers, items.indices
             chosen["drive"] = _export_drive.drive_of(every, ears, indices, known or {}, **drive, quiet=quiet)
         written = interop.export(
@@ -166,7 +157,7 @@ def export(
         unknown = [reader.sensor for reader in readers if reader.sensor not in known]
         remedy = "the export uses the frame of the sensor; add --mounting FILE for the frame of the platform"
         _mountings.note_unknown(unknown, remedy, quiet=quiet)
-    if name == "mcap" and sum(len(sensor_names(path)) for path in paths) > 1 and "scan" in (topics or TOPICS):
+    if takes == "topics" and sum(len(sensor_names(path)) for path in paths) > 1 and "scan" in (topics or TOPICS):
         options.note(
             "scans of single sensors contain echoes of the other sensors' calls; for /fused/scan, export the file that "
             "'ertis fuse' writes",
@@ -187,34 +178,22 @@ def export(
 
 
 def _readers(
-    name: str, paths: tuple[Path, ...], sensor: str | None, stack: ExitStack
+    takes: str, paths: tuple[Path, ...], sensor: str | None, stack: ExitStack
 ) -> "tuple[Sequence[Any], Sequence[Any]]":
     """Open files; return the readers of all sensors of the platform, and of those to export."""
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording
 
-    if name == "batslam":
+    if takes == "drive":
         every, ears = _export_drive.open_ears(paths, sensor, stack)
         return every, [ears]
     path = paths[0]
     open_file: Callable[..., Any] = (
-        open_recording if name == "acoular" or file_kind(path) == "recording" else open_energyscapes
+        open_recording if takes == "signals" or file_kind(path) == "recording" else open_energyscapes
     )
     readers = [stack.enter_context(open_file(path, sensor=each)) for each in options.sensors_of(path, sensor)]
     for reader in readers:
-        options.note_missing_points(reader, quiet=name == "npz")
+        options.note_missing_points(reader, quiet=takes == "results")
     return readers, readers
-
-
-def _format_of(target: Path, file_format: str | None) -> str:
-    """Return the name of the format of images or signals, given or by the suffix; refuse unknown suffixes."""
-    from ertis_numba import interop
-    from ertis_numba.base import checks
-
-    if file_format is None:
-        others = (f".{name}" for name in (*FORMATS_OF_POSES, *FORMATS_OF_SOUND))
-        endings = (*(each.suffix for each in interop.FORMATS.values()), *others)
-        checks.file_ending("export", target, endings)
-    return interop.choose_format(target, file_format)
 
 
 def _known(

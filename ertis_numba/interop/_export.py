@@ -3,9 +3,8 @@
 import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
 from ertis_numba.base import checks
 from ertis_numba.base.atomic_files import atomic_write, check_target, remedy
@@ -14,68 +13,22 @@ from ertis_numba.frames import Beams, Energyscape, Measurement, MicrophoneSignal
 from ertis_numba.geometry import observable_angles
 from ertis_numba.interop._drive import Drive
 from ertis_numba.interop._mountings import Mountings, validated
+from ertis_numba.interop.export_formats import EXPORT_FORMATS, FORMATS, TOPICS, ExportFormat
 
-__all__ = ["FORMATS", "TOPICS", "ExportFormat", "choose_format", "export", "output_files"]
+__all__ = ["choose_format", "export", "output_files", "require_options"]
 
-TOPICS: Final = ("points", "scan", "image", "sonar_image")
-"""Products of a sensor in MCAP."""
 Exported: TypeAlias = Energyscape | Measurement | Beams | MicrophoneSignals
 """Items that some format supports."""
-_POINTS = (
-    *("x", "y", "z", "intensity", "uncertainty_range", "uncertainty_across"),
-    *("sensor", "sequence", "sec", "nanosec"),
-)
-_POINT_OPTIONS = ("mounting", "top", "min_level_db")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExportFormat:
-    """Export format."""
-
-    suffix: str
-    fields: tuple[str, ...]
-    options: tuple[str, ...] = ()  # of `export` that apply to this format, but not to all
-
-
-FORMATS: Final = {
-    "mcap": ExportFormat(suffix=".mcap", fields=(*TOPICS, "tf_static"), options=(*_POINT_OPTIONS, "topics")),
-    "ply": ExportFormat(suffix=".ply", fields=_POINTS, options=(*_POINT_OPTIONS, "text")),
-    "pcd": ExportFormat(suffix=".pcd", fields=_POINTS, options=(*_POINT_OPTIONS, "text")),
-    "csv": ExportFormat(
-        suffix=".csv",
-        fields=(
-            *("sensor", "session_id", "sequence", "sync_count", "timestamp_ns"),
-            *("x_m", "y_m", "z_m", "amplitude", "uncertainty_range_m", "uncertainty_across_m"),
-        ),
-        options=_POINT_OPTIONS,
-    ),
-    "npz": ExportFormat(
-        suffix=".npz",
-        fields=(
-            *("amplitude", "azimuth_rad", "elevation_rad", "range_m"),
-            *("session_id", "sequence", "sync_count", "timestamp_ns", "timestamp_uncertainty_ns"),
-            *("behaviour", "sensor", "settings"),
-        ),
-    ),
-    "acoular": ExportFormat(suffix=".h5", fields=("time_data", "metadata")),
-    "batslam": ExportFormat(
-        suffix=".mat",
-        fields=(
-            *("gt_pose", "gt_delta", "odom_delta", "t", "lap"),
-            *("echo_left", "echo_right", "echo_scale", "meta", "reflectors"),
-        ),
-        options=("mounting", "drive"),
-    ),
-}
-"""Formats by name; the how-to guide on exports states the content of each."""
-
-
-def choose_format(path: str | Path, name: str | None = None) -> str:
+def choose_format(
+    path: str | Path, name: str | None = None, formats: Mapping[str, ExportFormat] = EXPORT_FORMATS
+) -> str:
     """Return the name of the format to write: the given name, or that of the file's suffix."""
     if name is None:
-        endings = {each.suffix: known for known, each in FORMATS.items()}
+        endings = {each.suffix: known for known, each in formats.items()}
         return endings[checks.file_ending("export", path, endings)]
-    checks.choice("format", name, FORMATS)
+    checks.choice("format", name, formats)
     return name
 
 
@@ -116,8 +69,8 @@ def export(
         matched-filtered ones otherwise; it holds one sensor. Other formats can contain several sensors. ``mcap`` is
         written one image at a time, and so is ``npz`` if ``items`` has a length. Other formats collect all points or
         signals first.
-    file_format : {"mcap", "ply", "pcd", "csv", "npz", "acoular", "batslam"}, optional
-        Name of the format; by default that of the suffix of ``path``.
+    file_format : str, optional
+        Name of the format, one of ``interop.FORMATS``; by default that of the suffix of ``path``.
     mounting : mapping of str to (translation_m, rotation_xyzw), optional
         Mounting of each sensor on its platform, by name, as for `RecordingWriter`. Points of ``ply``, ``pcd`` and
         ``csv`` are then in the platform frame, otherwise in the sensor frame. ``batslam`` contains the
@@ -159,9 +112,9 @@ def export(
     """
     if not isinstance(items, Iterable):
         raise ArgumentError(f"items is of type {type(items).__name__}; pass a list of Energyscape")
-    name = choose_format(path, file_format)
+    name = choose_format(path, file_format, FORMATS)
     finding = {"top": top, "min_level_db": min_level_db}
-    _require_options(name, {"mounting": mounting, "topics": topics, "text": text or None, **finding, "drive": drive})
+    require_options(name, {"mounting": mounting, "topics": topics, "text": text or None, **finding, "drive": drive})
     chosen = TOPICS if topics is None else topics
     for topic in chosen:
         checks.choice("topic", topic, TOPICS)
@@ -171,14 +124,17 @@ def export(
     try:
         with ExitStack() as stack:
             parts = [stack.enter_context(atomic_write(each, overwrite=overwrite)) for each in paths]
-            if name == "acoular":
-                _write_signals(parts[0], parts[1], items)
-            elif name == "npz":
-                _write_npz(parts[0], items)
-            elif name == "batslam":
-                _write_drive(parts[0], items, validated(mounting), drive)
-            else:
-                _write_points(name, parts[0], _located(items, name), validated(mounting), chosen, finding, text=text)
+            match FORMATS[name].takes:
+                case "signals":
+                    _write_signals(name, parts, items)
+                case "results":
+                    FORMATS[name].load()(*parts, _results(items), len(items) if isinstance(items, Sized) else None)
+                case "drive":
+                    _write_drive(name, parts[0], items, validated(mounting), drive)
+                case _:
+                    _write_points(
+                        name, parts[0], _located(items, name), validated(mounting), chosen, finding, text=text
+                    )
     except OSError as error:
         if isinstance(error, ErtisError):  # Errors of the images' source pass unchanged.
             raise
@@ -186,46 +142,32 @@ def export(
     return paths
 
 
-def _require_options(name: str, given: Mapping[str, object]) -> None:
+def require_options(name: str, given: Mapping[str, object]) -> None:
     """Refuse options that a format does not use; None stands for an option that is not given."""
     for option, value in given.items():
-        if value is not None and option not in FORMATS[name].options:
-            *others, last = [other for other, each in FORMATS.items() if option in each.options]
+        if value is not None and option not in EXPORT_FORMATS[name].options:
+            *others, last = [other for other, each in EXPORT_FORMATS.items() if option in each.options]
             fitting = f"{', '.join(others)} or {last}" if others else last
             raise ArgumentError(
                 f"option {option!r} is given, but format {name!r} does not have it; leave it out, or write {fitting}"
             )
 
 
-# Writers are imported when they are needed: they import scipy.spatial, and one of them needs an extra.
-
-
-def _write_signals(path: Path, geometry: Path, items: Iterable[Exported]) -> None:
-    from ertis_numba.interop._acoular import write_acoular  # noqa: PLC0415
-
+def _write_signals(name: str, paths: Sequence[Path], items: Iterable[Exported]) -> None:
     several = list(itertools.islice(items, 2))
     if len(several) != 1 or not isinstance(several[0], Measurement):
         came = f"{'no' if not several else 'more than one'} measurement" if len(several) != 1 else "an energyscape"
         raise ArgumentError(
-            f"format 'acoular' contains signals of one measurement, but {came} was passed; choose one measurement "
+            f"format {name!r} contains signals of one measurement, but {came} was passed; choose one measurement "
             "(measurement)"
         )
-    write_acoular(path, geometry, several[0])
+    FORMATS[name].load()(*paths, several[0])
 
 
-def _write_drive(path: Path, items: Iterable[Any], mountings: Mountings, drive: Drive | None) -> None:
-    from ertis_numba.interop._batslam import write_batslam  # noqa: PLC0415
-
+def _write_drive(name: str, path: Path, items: Iterable[Any], mountings: Mountings, drive: Drive | None) -> None:
     if drive is None:
-        raise ArgumentError("format 'batslam' needs poses and odometry; pass drive=Drive(poses=…, odometry=…)")
-    write_batslam(path, items, drive, mountings)
-
-
-def _write_npz(path: Path, items: Iterable[Exported]) -> None:
-    from ertis_numba.interop._npz import write_npz  # noqa: PLC0415
-
-    count = len(items) if isinstance(items, Sized) else None
-    write_npz(path, _results(items), count)
+        raise ArgumentError(f"format {name!r} needs poses and odometry; pass drive=Drive(poses=…, odometry=…)")
+    FORMATS[name].load()(path, items, drive, mountings)
 
 
 def _write_points(
@@ -238,21 +180,15 @@ def _write_points(
     *,
     text: bool,
 ) -> None:
-    from ertis_numba.analysis.point_finder import PointFinder  # noqa: PLC0415
-    from ertis_numba.interop import _mcap, _point_files  # noqa: PLC0415
+    from ertis_numba.analysis.point_finder import PointFinder  # noqa: PLC0415  it imports scipy.spatial
     from ertis_numba.interop._points import PointTable  # noqa: PLC0415
 
-    find = PointFinder(**finding)
-    if name == "mcap":
-        _mcap.write_mcap(path, images, find, mountings, topics=topics)
+    find, write = PointFinder(**finding), FORMATS[name].load()
+    if FORMATS[name].takes == "topics":
+        write(path, images, find, mountings, topics=topics)
         return
     table = PointTable.from_images(images, find, mountings)
-    if name == "csv":
-        _point_files.write_csv(path, table)
-    elif name == "ply":
-        _point_files.write_ply(path, table, text=text)
-    else:
-        _point_files.write_pcd(path, table, text=text)
+    write(path, table, **({"text": text} if "text" in FORMATS[name].options else {}))
 
 
 def _energyscapes(items: Iterable[Exported]) -> Iterator[Energyscape]:

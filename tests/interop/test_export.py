@@ -15,7 +15,7 @@ import ertis_numba as ertis
 from ertis_numba.analysis.point_finder import PointFinder
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement, Stamp
-from ertis_numba.interop import FORMATS, TOPICS, Drive, choose_format, export, output_files
+from ertis_numba.interop import EXPORT_FORMATS, FORMATS, TOPICS, Drive, choose_format, export, output_files
 from ertis_numba.settings import Air
 from ertis_numba.storage import write_energyscapes, write_recording
 from tests.files import SMALL, echoes, image, noise
@@ -158,16 +158,16 @@ CASES = {
     "no signals": ("img.h5 -o a.h5 -m 0", 1, "img.h5 is an energyscape file, wanted a recording; use the recording"),
     "topics of a cloud": (
         "img.h5 -o a.ply --topic points",
-        1,
+        2,
         "option --topic is given, but format 'ply' does not have it; leave it out, or write mcap",
     ),
-    "text of a table": ("img.h5 -o a.csv --ascii", 1, "option --ascii is given, but format 'csv' does not have it"),
+    "text of a table": ("img.h5 -o a.csv --ascii", 2, "option --ascii is given, but format 'csv' does not have it"),
     "points of images": (
         "img.h5 -o a.npz --top -3",
-        1,
+        2,
         "option --top is given, but format 'npz' does not have it; leave it out, or write mcap, ply, pcd or csv",
     ),
-    "levels of signals": ("rec.h5 -o a.h5 -m 0 --min-level -9", 1, "option --min-level is given, but format"),
+    "levels of signals": ("rec.h5 -o a.h5 -m 0 --min-level -9", 2, "option --min-level is given, but format"),
     "no points": ("img.h5 -o a.csv --top 0", 2, "--top is 0; use a whole number of at least 1"),
     "over the input": ("rec.h5 -o rec.h5 --force -m 0", 1, "output rec.h5 is the input itself; choose another name"),
     "exists": ("img.h5 -o both.h5 --format csv", 1, "output both.h5 exists; choose another name, or replace the file"),
@@ -285,8 +285,9 @@ def test_export_rejects_measurements_and_unknown_formats(tmp_path):
 
 
 def test_export_command_lists_formats_and_topics_of_the_library():
-    assert tuple(FORMATS) == command.FORMATS
-    assert command.TOPICS == TOPICS
+    options = {option.name: option.type for option in command.export.params}
+    assert tuple(options["file_format"].choices) == tuple(EXPORT_FORMATS)
+    assert tuple(options["topics"].choices) == TOPICS
 
 
 def test_export_page_lists_fields_of_each_format():

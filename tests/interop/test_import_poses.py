@@ -184,7 +184,7 @@ def test_export_of_poses_refuses_what_it_cannot_write(recording, trajectory, tmp
     )
     run("import", "poses", recording, trajectory)
     done = run("export", recording, "-o", tmp_path / "OUT.tum", "--top", "3", code=2)
-    assert "--top is not for poses; remove it" in done.stderr
+    assert "option --top is given, but format 'tum' does not have it; leave it out" in done.stderr
     write_energyscapes(tmp_path / "IMG.h5", [image()])
     done = run("export", tmp_path / "IMG.h5", "-o", tmp_path / "OUT.tum", code=1)
     assert "IMG.h5 has no poses; add them to its recording" in done.stderr

@@ -153,9 +153,12 @@ def test_command_writes_sound(recording, tmp_path, options, rate_hz, duration_s)
     [
         (["-o", "x.wav"], "--listen AZ,EL"),
         (["-o", "x.wav", "--listen", "20"], "is not a direction"),
-        (["-o", "x.wav", "--listen", "0,0", "--top", "3"], "--top is not for sound"),
+        (["-o", "x.wav", "--listen", "0,0", "--top", "3"], "option --top is given, but format 'wav' does not have it"),
         (["-o", "x.wav", "--listen", "0,0", "--expand", "3", "--heterodyne", "3"], "choose one of them"),
-        (["-o", "x.npz", "--listen", "0,0"], "--listen is for sound"),
+        (
+            ["-o", "x.npz", "--listen", "0,0"],
+            "option --listen is given, but format 'npz' does not have it; leave it out, or write wav",
+        ),
     ],
 )
 def test_command_refuses_impossible_options(recording, arguments, words):
