@@ -19,29 +19,14 @@ _POINT_OPTIONS = ("mounting", "top", "min_level_db", "places")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportFormat:
-    """Export format.
-
-    Attributes
-    ----------
-    suffix : str
-    takes : {"points", "topics", "results", "signals", "drive", "poses", "sound"}
-        Content. The writer of ``points`` gets the path and a `PointTable`, and the option ``text`` if it has that.
-    writer : str
-        Module and function, imported when they are needed: some need an extra.
-    fields : tuple of str
-        Names in the file.
-    options : tuple of str
-        Options that do not apply to all formats.
-    about : str
-        Addition to the suffix in the help.
-    """
+    """Export format."""
 
     suffix: str
     takes: Literal["points", "topics", "results", "signals", "drive", "poses", "sound"]
-    writer: str
+    writer: str  # module and function, imported when they are needed: some need an extra
     fields: tuple[str, ...] = ()
-    options: tuple[str, ...] = ("places",)
-    about: str = ""
+    options: tuple[str, ...] = ("places",)  # that do not apply to all formats
+    about: str = ""  # after the suffix in the help
 
     def load(self) -> Callable[..., Any]:
         """Return the function that writes the format."""
