@@ -40,6 +40,8 @@ WITH_EXTRA = {
     "ros": "ertis export images.h5 -o images.mcap",
     "xarray": "python -c \"import ertis_numba as e; print(e.open_energyscapes('images.h5')[0].to_xarray().dims)\"",
 }
+FOR_AUTHORS = {"test", "docs", "check", "peers", "release"}
+"""Extras that only those who work on the package install."""
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
 LIMIT_S = 600.0
 

@@ -17,6 +17,7 @@ from ertis_numba import kernels
 from ertis_numba.base.errors import DeviceError
 from ertis_numba.devices.ports import Port
 from ertis_numba.network.keys import KeyPair
+from tests.release import FOR_AUTHORS
 
 permission = vars(_diagnosis)["_permission"]
 
@@ -122,8 +123,7 @@ def test_doctor_checks_all_extras(doctor):
     brought = {
         extra: {re.split(r"[\[<>=]", line)[0] for line in lines.split("\n") if line}
         for extra, lines in parser["options.extras_require"].items()
-        if extra
-        not in {"cu12", "cu13", "test", "docs", "check", "peers"}  # GPUs have their own check; others are not for users
+        if extra not in {"cu12", "cu13", *FOR_AUTHORS}  # GPUs have their own check
     }
     packages = packages_distributions()
     looked_at = {

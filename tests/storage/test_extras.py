@@ -9,9 +9,9 @@ import pytest
 
 from tests.files import noise
 from tests.pages import forking
+from tests.release import FOR_AUTHORS
 
 ROOT = Path(__file__).parents[2]
-FOR_AUTHORS = {"test", "docs", "check", "peers", "release"}
 NEEDED_BY = {
     "browser": ["{root}/docs/pictures/view.py"],
     "cluster": [
