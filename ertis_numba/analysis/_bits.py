@@ -29,16 +29,9 @@ _BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder=
 
 
 class Shares(NamedTuple):
-    """Bit statistics of eight channels.
+    """Bit statistics (bit,) of eight channels: shares of ones, of changes, and of samples where 17 equal bits start.
 
-    Attributes
-    ----------
-    ones, changes : (bit,) float64
-        Share of ones, and of samples at which the bit changes.
-    runs : (bit,) float64
-        Share of samples at which 17 equal bits start.
-    repeats : (bit,) bool
-        True if the whole record repeats a pattern of 2 to 32 samples.
+    ``repeats`` is True if the whole record repeats a pattern of 2 to 32 samples.
     """
 
     ones: NDArray[np.float64]
@@ -63,13 +56,7 @@ def signal_of(octets: NDArray[np.uint8], channel: int) -> NDArray[np.float32]:
 
 
 def bit_shares(column: NDArray[np.uint8]) -> Shares:
-    """Return the bit statistics of eight channels.
-
-    Parameters
-    ----------
-    column : (sample,) uint8
-        One octet per sample, at least 33 samples.
-    """
+    """Return the bit statistics of eight channels from one octet per sample, at least 33."""
     differs = column[1:] ^ column[:-1]
     runs = ~differs
     for doubling in range(_RUN_DOUBLINGS):
@@ -85,20 +72,12 @@ def _ones(column: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def spectrogram(signal: NDArray[np.float32], *, size: int, n_lines: int) -> NDArray[np.float32]:
-    """Return the power of a signal over time and frequency: (segment, line) float32.
+    """Return the power of a signal over time and frequency, from frequency 0 on: (segment, line).
 
     The result holds periodograms of half-overlapping segments under a Hann window (P. D. Welch, The use of fast Fourier
     transform for the estimation of power spectra, IEEE Trans. Audio Electroacoust. 15, 1967). The sum over all
     ``size / 2`` lines of white noise is its mean square, full scale 1. scipy.signal has an equivalent function, but its
     import takes longer than all computations here.
-
-    Parameters
-    ----------
-    signal : (sample,) float32
-    size : int
-        Length of a segment in samples.
-    n_lines : int
-        Number of lines to return, from frequency 0 on.
     """
     segments = sliding_window_view(signal, size)[:: size // 2]
     window = np.hanning(size + 1)[:-1].astype(np.float32)
@@ -113,25 +92,7 @@ def rises(level_db: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def common_lines(rise_db: NDArray[np.float64], min_db: float, share: float) -> tuple[NDArray[np.bool_], list[int]]:
-    """Return the lines that stand out in more than a share of the channels.
-
-    Adjacent lines count as the same line.
-
-    Parameters
-    ----------
-    rise_db : (mic, line) float64
-        Level of each line relative to the surrounding lines: see `rises`.
-    min_db : float
-        Level above which a line stands out.
-    share : float
-        Share of the channels.
-
-    Returns
-    -------
-    is_common : (line,) bool
-    highest : list of int
-        Highest line of each group of adjacent common lines.
-    """
+    """Return a mask of lines that stand out in more than a share of channels, and the highest of adjacent ones."""
     apart = np.pad(rise_db, ((0, 0), (1, 1)), constant_values=-np.inf)
     near_db = np.max(sliding_window_view(apart, 3, axis=1), axis=-1)
     is_common = np.mean(near_db > min_db, axis=0) > share

@@ -29,30 +29,14 @@ class Response(Protocol):
     """Axes of the array, with the weights of its microphones."""
 
     def __call__(self, sources: Floats, directions: Floats) -> Floats:
-        """Return amplitudes relative to that of a source in the direction: (n,) float64.
-
-        Parameters
-        ----------
-        sources, directions : (n, axis) float64
-            Unit vectors.
-        """
+        """Return amplitudes (n,) relative to that of a source in the direction, for unit vectors (n, axis)."""
 
     def side_lobe(self, places: Floats) -> float:
         """Return the highest side lobe in some places of sources in others, 0 to 1; 0 if it does not matter."""
 
 
 class ArrayAxes:
-    """Axes of an array, with its extent along each.
-
-    Parameters
-    ----------
-    weights : (mic,) float64
-
-    Attributes
-    ----------
-    longest : (axis,) float64
-        Unit vector along the longest axis.
-    """
+    """Axes of an array with weights (mic,), its extent along each, and the unit vector ``longest``."""
 
     def __init__(self, settings: Settings, weights: Floats) -> None:
         places_m, shares = microphones(settings.array).enabled_positions_m, weights / weights.sum()
@@ -72,13 +56,7 @@ class ArrayAxes:
 
 
 class ToneResponse:
-    """Response to a tone.
-
-    Parameters
-    ----------
-    delays : callable
-        Returns the delays in seconds, (n, mic), of unit vectors, (n, axis).
-    """
+    """Response to a tone; ``delays`` returns those of unit vectors (n, axis) in seconds, (n, mic)."""
 
     def __init__(self, settings: Settings, frequency_hz: float, delays: Callable[[Floats], Floats]) -> None:
         n_mics = len(microphones(settings.array).enabled_positions_m)

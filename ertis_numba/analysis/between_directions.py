@@ -27,21 +27,10 @@ _BEHIND: Final = 0.1  # Triangles nearer to the centre of the sphere close its o
 
 
 class Between:
-    """Places between directions, or for a spatial grid with a name, within its limits.
+    """Places (place, axis) between directions, or for a spatial grid with a name, within its limits.
 
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
-    processing : Processing
-        The limits of ``3d:N`` apply if it names a grid of as many directions.
-
-    Attributes
-    ----------
-    places : (place, axis) float64
-        Unit vectors; none for a single direction.
-    is_planar : bool
-        True if all directions lie on a circle. The places are then in the middle between neighbours.
+    A single direction has none. With ``is_planar``, all directions lie on a circle, and the places in the middle
+    between neighbours.
     """
 
     def __init__(self, directions: Floats, processing: Processing) -> None:
@@ -85,13 +74,7 @@ class Between:
 
 
 def farthest_places(between: Between, distance: Callable[[Floats], Floats]) -> Floats:
-    """Return the places with the largest distance from a grid: (place, axis) float64.
-
-    Parameters
-    ----------
-    distance : callable
-        Returns the distances of places, (place,), from (place, axis).
-    """
+    """Return the places (place, axis) with the largest distance from a grid; ``distance`` returns those of places."""
     places = between.places[np.argsort(-distance(between.places))[:_TOP]]
     if between.is_planar:
         return np.asarray(places)

@@ -76,15 +76,9 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Errors:
-    """Errors over several images.
+    """Numbers and errors of reflectors over several images; errors of the matched ones are None if there are none.
 
-    Attributes
-    ----------
-    measurements, matched, missed, spurious : int
-        Numbers of images, of reflectors found, of missed reflectors, and of spurious peaks.
-    angle_rms_deg, range_bias_m, range_rms_m, level_rms_db : float or None
-        Errors of the matched reflectors, None if there are none. The bias is positive if peaks are too far away. The
-        error of the angle is None if no array observes a direction.
+    The bias is positive if peaks are too far away. The error of the angle is None if no array observes a direction.
     """
 
     measurements: int
@@ -175,7 +169,7 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
 
 
 def visible(image: Energyscape, reflectors: Sequence[Reflector]) -> NDArray[np.bool_]:
-    """Return True for each reflector that an image can show, whatever its level: (reflector,) bool.
+    """Return True for each reflector (reflector,) that an image can show, whatever its level.
 
     It returns the sensor's own call, its range lies on the range axis, and its direction within half a main lobe of the
     nearest direction of the image.
@@ -184,13 +178,7 @@ def visible(image: Energyscape, reflectors: Sequence[Reflector]) -> NDArray[np.b
 
 
 def errors_of(comparisons: Iterable[Comparison]) -> Errors:
-    """Return the errors over all reflectors of several images.
-
-    Parameters
-    ----------
-    comparisons : iterable of Comparison
-        One comparison per image.
-    """
+    """Return the errors over all reflectors of several images, one comparison per image."""
     given = list(comparisons)
     matches = [match for comparison in given for match in comparison.matched]
     ranges_m = [match.range_m for match in matches]
@@ -212,16 +200,12 @@ def _rms(values: Iterable[float]) -> float | None:
 
 
 class _Lobe:
-    """Main lobe of an array.
+    """Main lobe of an array; infinitely wide for a single microphone.
 
     Near a reflector, the amplitude falls like ``exp(−k² Δuᵀ C Δu / 2)``. Δu is the difference of the unit vectors, and
     C is the weighted covariance of the microphone positions. k is the wave number at the centre of the call. For the
-    shipped layouts, the width at half amplitude is accurate to one tenth.
-
-    Attributes
-    ----------
-    half_deg : float
-        Half of the width at half amplitude in degrees, along the narrowest axis; infinite for a single microphone.
+    shipped layouts, the width at half amplitude is accurate to one tenth. ``half_deg`` is half of it, along the
+    narrowest axis.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -236,15 +220,7 @@ class _Lobe:
         self.half_deg = math.degrees(1 / largest) if largest else math.inf
 
     def __call__(self, direction_offset: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the distance of directions in half main lobes of the array: (...,) float64.
-
-        The distance is 0 between a direction and its mirror image behind a plane array.
-
-        Parameters
-        ----------
-        direction_offset : (..., axis) float64
-            Difference of the unit vectors.
-        """
+        """Return distances (...,) in half main lobes; 0 between a direction and its mirror image at a plane array."""
         return np.asarray(np.linalg.norm(direction_offset @ self._reach.T, axis=-1))
 
 
@@ -315,7 +291,7 @@ def _explained(
     counts: NDArray[np.bool_],
     step_db: float,
 ) -> NDArray[np.bool_]:
-    """Return True for each peak caused by a reflector that need not be found there: (peak,) bool.
+    """Return True for each peak (peak,) caused by a reflector that need not be found there.
 
     Such peaks belong to reflectors that do not count, or to mirror images behind the array. They may also be side lobes
     of reflectors outside the solid angle, which `find_peaks` cannot predict.

@@ -25,23 +25,10 @@ _MIN_DB: Final = -1000.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceErrors:
-    """Errors of points or occupied cells relative to a scene.
+    """Errors of points or occupied cells relative to a scene, over SYNC pulses.
 
-    Attributes
-    ----------
-    pulses : int
-        Number of SYNC pulses.
-    matched, missed : int
-        Reflectors with a point or an occupied cell, and without one.
-    found : int
-        Points or occupied cells.
-    spurious : int
-        Points or occupied cells away from all reflectors and surfaces.
-    spurious_confirmed : int
-        Spurious points that the fusion has confirmed; 0 for maps.
-    error_cm : float or None
-        Root mean square of distances in cm: between reflectors and their points, or between the cells that are not
-        spurious and the nearest surface. None without any.
+    ``spurious`` are away from all reflectors and surfaces; the fusion has confirmed ``spurious_confirmed`` points.
+    ``error_cm`` is the RMS distance between reflectors and their points, or between cells and the nearest surface.
     """
 
     pulses: int
@@ -55,19 +42,7 @@ class PlaceErrors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Comparison of the places of one pulse, or of a map.
-
-    Attributes
-    ----------
-    matched : (reflector,) bool
-        True for reflectors that count and were found.
-    missed : (reflector,) bool
-        True for reflectors that count and were not found.
-    spurious : (place,) bool
-    confirmed : (place,) bool
-    distance_m : (distance,) float64
-        Distances of the places that are not spurious.
-    """
+    """Comparison of the places of one pulse, or of a map; ``distance_m`` are those of places that are not spurious."""
 
     matched: Flags
     missed: Flags
@@ -84,27 +59,11 @@ def compare_points(
     is_planar: bool,
     min_level_db: float = -30.0,
 ) -> Places:
-    """Compare the points of a fused pulse with the ground truth.
+    """Compare the points of a fused pulse with the ground truth in the same frame.
 
     Points and reflectors are assigned one to one within 10 cm, as many as possible, and then with the least sum of
     squared distances. A point is spurious if it is more than 10 cm away from all reflectors and surfaces. Planar images
-    show the distance of a reflector, but not its height.
-
-    Parameters
-    ----------
-    reflectors : sequence of Reflector
-        Reflectors that the images of the pulse can show, in the frame of the points.
-    surfaces : Surfaces
-        Surfaces in the frame of the points.
-    is_planar : bool
-        True for the points of planar images.
-    min_level_db : float
-        Level relative to the strongest reflector, below which reflectors do not count.
-
-    Raises
-    ------
-    ArgumentError
-        ``min_level_db`` is above 0.
+    show the distance of a reflector, but not its height. Reflectors below ``min_level_db`` do not count.
     """
     counts = _counted(reflectors, min_level_db)
     place_m, true_m = points.position_m.astype(np.float64), positions_m(reflectors)
@@ -124,25 +83,11 @@ def compare_points(
 def compare_map(
     occupancy: OccupancyMap, reflectors: Sequence[Reflector], surfaces: Surfaces, *, min_level_db: float = -30.0
 ) -> Places:
-    """Compare an occupancy map with the ground truth.
+    """Compare an occupancy map with the ground truth in the same frame; `joined` merges reflectors of several pulses.
 
     A reflector is found if the centre of an occupied cell is at most 5 cm and half a cell away from it. A cell is
     spurious if its centre is farther than this from all reflectors and surfaces. Heights do not count in a map of two
     dimensions, and neither do floors and ceilings.
-
-    Parameters
-    ----------
-    reflectors : sequence of Reflector
-        Reflectors that the images can show, in the frame of the map; `joined` merges those of several pulses.
-    surfaces : Surfaces
-        Surfaces in the frame of the map.
-    min_level_db : float
-        Level below which reflectors do not count, relative to the strongest.
-
-    Raises
-    ------
-    ArgumentError
-        ``min_level_db`` is above 0.
     """
     gate_m = _OUTSIDE_M + occupancy.cell_m / 2
     counts = _counted(reflectors, min_level_db)

@@ -196,17 +196,7 @@ def _peaks(image: Energyscape, each_top: list[Tops], errors_rad: list[float], no
 def left_out_at_edges(
     image: Energyscape, peaks: Sequence[Peak], *, min_level_db: float = -30.0, false_alarm: float | None = None
 ) -> int:
-    """Return the number of maxima that `find_peaks` left out because an echo beyond an edge may have caused them.
-
-    Side lobes of the listed reflectors do not count.
-
-    Parameters
-    ----------
-    peaks : sequence of Peak
-        Reflectors of the image, from `find_peaks` with the same arguments.
-    min_level_db, false_alarm
-        Lowest level relative to the strongest in dB, and the probability of a false alarm, as for `find_peaks`.
-    """
+    """Return the number of maxima that `find_peaks` left out because an echo beyond an edge may have caused them."""
     if image.points is not None:
         return 0
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
@@ -224,13 +214,7 @@ def left_out_at_edges(
 
 
 def left_out_in_noise(image: Energyscape, *, min_level_db: float = -30.0, false_alarm: float) -> bool:
-    """Return True if `find_peaks` left out the strongest maximum because noise from its direction may have caused it.
-
-    Parameters
-    ----------
-    min_level_db, false_alarm
-        Lowest level relative to the strongest in dB, and the probability of a false alarm, as for `find_peaks`.
-    """
+    """Return True if `find_peaks` left out the strongest maximum as possible noise from its direction."""
     if image.points is not None:
         return False
     neighbours = neighbours_of(unit_vectors(image.azimuth_rad, image.elevation_rad))
@@ -271,21 +255,10 @@ def _fused_peaks(cloud: PointCloud, *, is_planar: bool) -> list[Peak]:
 
 
 def neighbours_of(directions: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return each direction with its nearest neighbours.
+    """Return each direction with its two nearest neighbours at one elevation, otherwise eight: (direction, neighbour).
 
-    Directions of a single elevation have two neighbours, others have eight. Equal directions, such as azimuths of -180°
-    and 180°, count as one neighbour, and are added to each other's rows.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
-
-    Returns
-    -------
-    (direction, neighbour) int64
-        Indices of the direction, or the first one equal to it, and of its neighbours; fewer if there are too few
-        directions. Further columns, which exist if directions are equal, hold those that are.
+    Equal directions, such as azimuths of -180° and 180°, count as one neighbour, and are added to each other's rows in
+    further columns. Column 0 is the direction, or the first one equal to it.
     """
     count = 2 if np.ptp(directions[:, 2]) == 0 else _NEIGHBOURS
     # Adding 0 turns -0 into 0.
@@ -308,7 +281,7 @@ def _local_maxima(
     floor: NDArray[np.float64],
     where: NDArray[np.bool_] | None,
 ) -> NDArray[np.int64]:
-    """Return the local maxima that reach ``floor``, (range,): (peak, [direction, range]) int64.
+    """Return the local maxima that reach ``floor`` (range,): (peak, [direction, range]).
 
     The first and the last range contain no maxima, because an amplitude that rises towards them peaks outside of the
     image.

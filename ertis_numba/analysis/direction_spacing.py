@@ -44,14 +44,8 @@ _LEAST: Final = 1e-9
 class Lobe(NamedTuple):
     """Main lobe of an array at one frequency, or of a call, for one method.
 
-    Attributes
-    ----------
-    response : Response
-        Response of delay-and-sum.
-    peak : callable
-        Returns the amplitudes of the method from those of delay-and-sum.
-    max_loss_db : float
-        Largest loss of a source between directions.
+    ``response`` is that of delay-and-sum, from which ``peak`` returns the amplitudes of the method; a source between
+    directions may lose ``max_loss_db``.
     """
 
     response: Response
@@ -83,15 +77,7 @@ class Lobe(NamedTuple):
 
 
 class GridCheck:
-    """Sources between the directions of a grid, for lobes of one array.
-
-    Parameters
-    ----------
-    processing : Processing
-        Source of the grid's name and limits.
-    side_lobes : dict of Response to float, optional
-        Results of `side_lobe` in the same limits.
-    """
+    """Sources between the directions of a grid, named by ``processing``, for lobes of one array."""
 
     def __init__(
         self, grid: DegreesFromRadians, processing: Processing, *, side_lobes: dict[Response, float] | None = None
@@ -144,10 +130,7 @@ class GridCheck:
         return self._side_lobes[lobe.response]
 
     def suffices(self, lobe: Lobe) -> bool:
-        """Return True if no source between the directions is too weak, or weaker than side lobes.
-
-        Side lobes that are as strong as a source do not count.
-        """
+        """Return True if sources between directions are strong enough, and above side lobes weaker than a source."""
         if self.is_single:
             return True
         amplitude = self.weakest(lobe)
@@ -263,28 +246,9 @@ def image_peak(settings: Settings) -> Peak:
 
 
 def spacing_warning(settings: Settings, grid: DegreesFromRadians) -> str | None:
-    """Return a warning if a reflector between the directions of images may lose half of its power.
+    """Return a warning, with a grid that suffices, if a reflector between directions may lose half of its power.
 
-    Parameters
-    ----------
-    settings : Settings
-        Settings of the images.
-    grid : Grid, Energyscape or EnergyscapeReader
-        Directions, or a result with them.
-
-    Returns
-    -------
-    str or None
-        None for fine grids, for grids of a single direction, and for arrays that observe no direction. The warning
-        names a grid that suffices.
-
-    Examples
-    --------
-    >>> import ertis_numba as ertis
-    >>> from ertis_numba.analysis.direction_spacing import spacing_warning
-    >>> with ertis.open_recording("reflectors.h5") as recording:
-    ...     spacing_warning(recording.settings, ertis.Pipeline(recording.settings).grid) is None
-    True
+    Grids of a single direction and arrays that observe no direction have none.
     """
     if not any(observable_angles(settings.array)[:2]):
         return None

@@ -22,23 +22,13 @@ _LEAST: Final = 16  # Ranges from which the noise of a direction is estimated at
 def stands_out(
     image: Energyscape, row: NDArray[np.int64], column: NDArray[np.int64], false_alarm: float, n_pulse: int
 ) -> NDArray[np.bool_]:
-    """Return True for maxima that noise from their direction does not explain: (maximum,) bool.
+    """Return True for maxima (maximum,) that noise from their direction does not explain.
 
     They are as short in range as the pulse of the call. They also exceed the noise of the same direction, over the
     whole record and within the length of the call, to which the matched filter spreads clicks. In cleaned images, the
-    noise is unknown, and all maxima stand out.
-
-    Weak echoes do not stand out among many stronger ones of the same direction. A click yields a maximum that stands
-    out in about one of 40 images.
-
-    Parameters
-    ----------
-    row, column : (maximum,) int64
-        Direction and range of local maxima.
-    false_alarm : float
-        Probability that noise alone yields a maximum anywhere in the image, approximately.
-    n_pulse : int
-        Length of the pulse, from `pulse_steps`.
+    noise is unknown, and all maxima stand out. Weak echoes do not stand out among many stronger ones of the same
+    direction. A click yields a maximum that stands out in about one of 40 images. ``false_alarm`` is the approximate
+    probability anywhere in the image.
     """
     if not len(row) or len(image.range_m) < _LEAST or image.settings.processing.is_cleaned:
         return np.ones(len(row), np.bool_)
@@ -52,17 +42,7 @@ def stands_out(
 def is_short(
     image: Energyscape, row: NDArray[np.int64], column: NDArray[np.int64], top: NDArray[np.float32], n_pulse: int
 ) -> NDArray[np.bool_]:
-    """Return True for maxima as short as the pulse of the call; those of clicks last as long as the click.
-
-    Parameters
-    ----------
-    row, column : (maximum,) int64
-        Direction and range of the maxima.
-    top : (maximum,) float32
-        Amplitudes of the maxima.
-    n_pulse : int
-        Length of the pulse, from `pulse_steps`.
-    """
+    """Return True for maxima as short as the pulse of the call; those of clicks last as long as the click."""
     beside = np.arange(1, n_pulse + 1)
     columns = column[:, None] + np.concatenate([-beside, beside])
     around = image.amplitude[row[:, None], columns.clip(0, image.amplitude.shape[1] - 1)]

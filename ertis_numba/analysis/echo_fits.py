@@ -27,22 +27,13 @@ Floats = NDArray[np.float64]
 
 
 class Fitted(NamedTuple):
-    """Echoes that were fitted.
+    """Echoes that were fitted, with ranges relative to those of the maxima: (place,).
 
-    Attributes
-    ----------
-    range_m : (place,) float64
-        Ranges relative to those of the maxima.
-    offset : (place, axis) float64
-        Offsets of the directions, before they are scaled to unit vectors.
-    level : (place,) float64
-        Natural logarithm of the amplitude.
-    range_sd_m, across_sd_rad, level_sd : (place,) float64
-        Standard deviations: of the range, of the direction along its least certain axis, and of the level in nepers.
-    is_sparse : (place,) bool
-        True where the main lobe of an echo is narrower than the cell, so that side lobes may decide its direction.
-    misfit : (place,) float64
-        Deviation of the samples from those of a single echo, relative to its amplitude, beyond noise and model.
+    ``offset`` (place, axis) is that of the direction, before it is scaled to a unit vector, and ``level`` the natural
+    logarithm of the amplitude. Standard deviations are those of the range, of the direction along its least certain
+    axis, and of the level in nepers. ``is_sparse`` is True where the main lobe of an echo is narrower than the cell, so
+    that side lobes may decide its direction. ``misfit`` is the deviation of the samples from those of a single echo,
+    relative to its amplitude, beyond noise and model.
     """
 
     range_m: Floats
@@ -56,13 +47,7 @@ class Fitted(NamedTuple):
 
 
 class EchoFits:
-    """Fits of single echoes to maxima of images of delay-and-sum.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
-    """
+    """Fits of single echoes to maxima of images of delay-and-sum, with unit vectors (direction, axis)."""
 
     def __init__(self, settings: Settings, directions: Floats, spread: PointSpread) -> None:
         self._directions, self._spread = np.ascontiguousarray(directions), spread
@@ -79,19 +64,11 @@ class EchoFits:
         noise: float,
         model: float,
     ) -> Fitted:
-        """Return the echoes that fit samples best.
+        """Return the echoes that fit samples (place, sample) best.
 
-        Parameters
-        ----------
-        rows, columns : (place, sample) int64
-            Directions and ranges of the samples. The second one is the maximum, the first and third ones are those
-            beside it in range, and its neighbours follow.
-        tops : (place, 5) float64
-            Interpolated maxima: shift in range steps, offset of the direction, and logarithm of the amplitude.
-        noise : float
-            Root mean square of the noise of the image; 0 if it is unknown.
-        model : float
-            Errors of the plan relative to the amplitude.
+        The second sample is the maximum, the first and third ones are those beside it in range, and its neighbours
+        follow. ``tops`` (place, 5): shift in range steps, offset of the direction, and logarithm of the amplitude.
+        ``noise`` is the RMS of the image, 0 if unknown, and ``model`` the plan's error relative to the amplitude.
         """
         middle = rows[:, 0]
         offsets = self._directions[rows[:, 3:]] - self._directions[middle][:, None]

@@ -21,15 +21,7 @@ _EQUALLY_LOUD: Final = 0.5  # Peak of another emission relative to the strongest
 
 
 class EmissionTimes(NamedTuple):
-    """First emission in a record, and the time until the next one.
-
-    Attributes
-    ----------
-    first_s : float
-        Time since the start of the record, which is negative if the emission began before.
-    interval_s : float, optional
-        Time from the first to the second emission; None if the record contains one.
-    """
+    """First emission since the start of a record, negative if before, and the time until the next one, or None."""
 
     first_s: float
     interval_s: float | None
@@ -46,11 +38,6 @@ def emissions_of(measurement: Measurement) -> EmissionTimes | None:
 
     The emitter is at the array's centre. The result is None if the strongest arrival may be an echo, and for arrays
     such as rings, at which direct sound equals an echo from ahead. Saturated direct sound has a result, too.
-
-    Raises
-    ------
-    DataError
-        The samples do not match the settings.
     """
     settings = measurement.settings
     layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
@@ -91,14 +78,7 @@ def describe_start(
 ) -> tuple[str, str] | None:
     """Return a text about records that do not begin with their only emission, and a remedy; None if all do.
 
-    The direct sound is not compared unless that of most records is clear.
-
-    Parameters
-    ----------
-    emissions : iterable of EmissionTimes or None
-        Result of `emissions_of` for each record.
-    delay_s : float
-        Setting ``call.delay_s``, for which the remedy names another value.
+    The direct sound is not compared unless that of most records is clear. The remedy names ``call.delay_s``.
     """
     every = list(emissions)
     known = [each for each in every if each is not None]

@@ -29,13 +29,7 @@ _MAX_MICS: Final = 48
 
 @dataclass(frozen=True, slots=True)
 class LayoutMatch:
-    """Comparison of the strongest sound of a measurement with the layout of the settings.
-
-    Attributes
-    ----------
-    finding : Finding, optional
-        Another order, size or timing of the channels, which fits far better; None if the layout may be right.
-    """
+    """Comparison of the strongest sound with the layout, and another order, size or timing that fits far better."""
 
     finding: Finding | None
 
@@ -65,18 +59,7 @@ def first_layout_match(measurements: Iterable[Measurement]) -> LayoutMatch | Non
 
 
 def layout_match(measurement: Measurement) -> LayoutMatch | None:
-    """Compare the strongest arrival with the layout, and with other orders, sizes and timings of its channels.
-
-    Returns
-    -------
-    LayoutMatch or None
-        None if no arrival exceeds the background.
-
-    Raises
-    ------
-    DataError
-        The samples do not match the settings.
-    """
+    """Compare the strongest arrival with the layout, and with other orders, sizes and timings; None for no arrival."""
     settings = measurement.settings
     channels = np.flatnonzero(microphones(settings.array).enabled)
     if len(channels) < _MIN_MICS:

@@ -7,20 +7,7 @@ __all__ = ["below_strongest_db"]
 
 
 def below_strongest_db(amplitude: NDArray[np.float32], dynamic_range_db: float) -> NDArray[np.float32]:
-    """Return levels in dB relative to the strongest amplitude, clipped at the dynamic range.
-
-    All levels of a silent image are at the lower end of the dynamic range.
-
-    Parameters
-    ----------
-    dynamic_range_db : float
-        Dynamic range, above 0.
-
-    Returns
-    -------
-    float32 of the same shape
-        Levels from ``-dynamic_range_db`` to 0.
-    """
+    """Return levels from ``-dynamic_range_db`` to 0 relative to the strongest amplitude; the lowest if silent."""
     strongest = np.float32(amplitude.max(initial=0.0)) or np.float32(1)
     floor = np.float32(10 ** (-dynamic_range_db / 20))
     return np.asarray(20 * np.log10(np.maximum(amplitude / strongest, floor)), dtype=np.float32)

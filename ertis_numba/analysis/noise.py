@@ -28,18 +28,11 @@ _QUIET = 1 / 3  # Quantile of these estimates: side lobes raise those near echoe
 class EchoFloor(NamedTuple):
     """Amplitude that noise reaches anywhere in an image with a given probability.
 
-    Attributes
-    ----------
-    by_direction : (direction,) float32
-        Threshold for noise that lasts for the whole record.
-    by_range : (range,) float32
-        Threshold for noise that changes within the record. Side lobes of strong echoes raise it, too.
-    n_around : int
-        Number of ranges that the matched filter spreads a click over.
-    ratio : float
-        Threshold relative to the median of the noise.
-    exponent : float
-        Exponent of the image's noise: it is distributed as a Rayleigh variable to this power.
+    - ``by_direction`` (direction,): threshold for noise that lasts for the whole record.
+    - ``by_range`` (range,): that for noise that changes within the record. Side lobes of strong echoes raise it, too.
+    - ``n_around``: number of ranges that the matched filter spreads a click over.
+    - ``ratio``: threshold relative to the median of the noise.
+    - ``exponent``: the noise is distributed as a Rayleigh variable to this power.
     """
 
     by_direction: NDArray[np.float32]
@@ -63,14 +56,8 @@ class EchoFloor(NamedTuple):
     ) -> NDArray[np.float32]:
         """Return the thresholds of some bins of the image, also for clicks from their direction.
 
-        Parameters
-        ----------
-        amplitude : (direction, range) float32
-        direction, place : (bin,) int
-            Indices of directions and ranges.
-        quantile : float
-            Quantile of the amplitudes around a bin from which its noise is estimated. Higher ones than the median
-            follow noise that swells and fades, but also dense echoes. They exclude the slopes of the bin's own echo.
+        Their noise is estimated from a ``quantile`` of the amplitudes around a bin. Higher ones than the median follow
+        noise that swells and fades, but also dense echoes. They exclude the slopes of the bin's own echo.
         """
         last, n_around = amplitude.shape[1] - 1, self.n_around
         first = np.array([1 - n_around, -n_around // 2, 0])  # A click may begin or end at the bin.
@@ -120,11 +107,6 @@ def medians_of(rows: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the median of each row; NaN for rows with NaN.
 
     `numpy.median` takes nine times as long, because it partitions at several places, without vector instructions.
-
-    Parameters
-    ----------
-    rows : (row, sample) float32
-        At least one sample.
     """
     half = rows.shape[1] // 2
     sorted_half = np.partition(rows, half, axis=1)
@@ -149,21 +131,11 @@ def _medians_of_blocks(amplitude: NDArray[np.float32], n_blocks: int) -> NDArray
 
 
 def threshold_of(image: Energyscape, false_alarm: float) -> float:
-    """Return the amplitude that noise reaches anywhere in an image with a given probability; 0 if noise is unknown.
+    """Return the amplitude that noise reaches anywhere in an image with a probability; 0 if noise is unknown.
 
     A bin of noise with root mean square s exceeds t with the probability ``exp(-t²/s²)``. The function treats all bins
     as independent, so the threshold is slightly too high. For one-bit microphones, it is at least -140 dB of full
-    scale, because bits that never change leave only rounding errors.
-
-    Parameters
-    ----------
-    false_alarm : float
-        Probability that at least one bin of the image exceeds the threshold, 1e-12 to 1.
-
-    Raises
-    ------
-    ArgumentError
-        ``false_alarm`` is not between 1e-12 and 1.
+    scale, because bits that never change leave only rounding errors. ``false_alarm`` is 1e-12 to 1.
     """
     checks.between("false_alarm", false_alarm, 1e-12, 1.0)
     smallest = _ROUNDING if image.settings.recording.is_pdm else 0.0
@@ -171,17 +143,12 @@ def threshold_of(image: Energyscape, false_alarm: float) -> float:
 
 
 def echo_floor(image: Energyscape, false_alarm: float) -> EchoFloor:
-    """Return the amplitude that noise reaches anywhere in an image with a given probability.
+    """Return the amplitude that noise reaches anywhere in an image with the approximate probability ``false_alarm``.
 
     Unlike `threshold_of`, it follows noise that differs between directions, such as that of a machine, or between
     ranges, such as a click, which the matched filter spreads over the length of the call. It holds for all beamformers
     and for cleaned images. The amplitude of others is about a power of that of delay-and-sum. Cleaned images keep the
     strongest direction of each range, which has the distribution of a single one at the worst.
-
-    Parameters
-    ----------
-    false_alarm : float
-        Probability that at least one bin of the image exceeds the floor, approximately.
     """
     settings, amplitude = image.settings, image.amplitude
     n_directions, n_ranges = amplitude.shape

@@ -20,13 +20,7 @@ _LEAST: Final = 0.01  # Power relative to the strongest part, from which a part 
 
 
 def has_outside(settings: Settings, directions: NDArray[np.float64]) -> bool:
-    """Return True if an array distinguishes directions that a grid does not contain, unlike those behind a plane array.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors of the grid.
-    """
+    """Return True if an array distinguishes directions outside of a grid, unlike those behind a plane array."""
     return _patterns(settings, directions.tobytes()) is not None
 
 
@@ -35,11 +29,6 @@ def outside_of(image: Energyscape, directions: NDArray[np.float64], range_m: flo
 
     The microphones receive an echo at ranges that differ by up to the radius of the array. The powers at all of them
     add up to the sum of the powers at the frequencies of the call.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
     """
     patterns = _patterns(image.settings, directions.tobytes())
     if patterns is None:

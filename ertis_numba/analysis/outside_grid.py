@@ -37,17 +37,10 @@ class OutsideSource(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutsidePatterns:
-    """Beam patterns of sources inside and outside of a grid, with a mean of 0 and a norm of 1.
+    """Beam patterns (source, sample) of sources inside and outside of a grid, with a mean of 0 and a norm of 1.
 
-    Attributes
-    ----------
-    samples : (sample,) int64
-        Directions of the grid at which patterns are compared.
-    places : (source, axis) float64
-        Unit vectors of the sources outside.
-    outside, inside : (source, sample) float32
-    norms : (source,) float64
-        Norms of the patterns outside.
+    ``samples`` are the compared directions of the grid, ``places`` (source, axis) the sources outside, and ``norms``
+    (source,) those of their patterns.
     """
 
     samples: NDArray[np.int64]
@@ -64,21 +57,10 @@ class OutsidePatterns:
         frequency_hz: Floats,
         weights: Floats | None = None,
     ) -> "OutsidePatterns | None":
-        """Return the patterns of an array, or None if there are none to compare.
+        """Return the patterns of an array, whose powers add up over frequencies, or None if there are none to compare.
 
         This is so if the grid contains all directions that the array distinguishes, if it has fewer than eight
         directions, or if the beams of the array are too narrow (`_MAX_PLACES`).
-
-        Parameters
-        ----------
-        directions : (direction, axis) float64
-            Unit vectors of the grid.
-        delays : callable
-            Function that returns the delays of sound from directions at the microphones: (direction, mic) float64.
-        frequency_hz : (frequency,) float64
-            Frequencies whose powers add up.
-        weights : (frequency,) float64, optional
-            Their shares; equal ones by default.
         """
         if len(directions) < _MIN_DIRECTIONS:
             return None
@@ -113,13 +95,7 @@ class OutsidePatterns:
         return cls(samples, places, outside.astype(np.float32), inside.astype(np.float32), norms)
 
     def source_of(self, values: Floats) -> OutsideSource | None:
-        """Return the source outside of the grid that explains values; None if a source inside may explain them.
-
-        Parameters
-        ----------
-        values : (sample,) float64
-            Powers at the samples, or numbers that are linear in them.
-        """
+        """Return the source outside that explains powers (sample,), or linear values; None if one inside may."""
         centred = values - values.mean()
         size = float(np.linalg.norm(centred))
         if size <= 0:

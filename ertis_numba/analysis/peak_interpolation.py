@@ -23,22 +23,11 @@ _NARROWER = 3.0  # The main lobe of adaptive beamformers in decibels, relative t
 
 
 class Tops(NamedTuple):
-    """Interpolated maxima near given bins.
+    """Interpolated maxima (place,) near given bins, with unit vectors ``direction`` (place, axis).
 
-    Attributes
-    ----------
-    direction : (place, axis) float64
-        Unit vectors.
-    range_m, amplitude : (place,) float64
-        Range in metres, and amplitude.
-    width_rad : (place,) float64
-        Spacing of the grid where the direction, or one of its angles, is that of the bin; 0 if it is interpolated. It
-        is infinite at an edge of the grid beyond which the maximum may lie: see `QuadricFits.are_open`.
-    range_sd_m, across_sd_rad, level_sd : (place,) float64
-        Standard deviations of fitted echoes: of the range, of the direction along its least certain axis, and of the
-        level in nepers. NaN for other maxima.
-    misfit : (place,) float64
-        Deviation of the samples from those of a single echo, relative to its amplitude: see `Fitted`.
+    ``width_rad`` is the spacing of the grid where the direction, or one of its angles, is that of the bin; 0 if it is
+    interpolated, infinite at an edge of the grid beyond which the maximum may lie: see `QuadricFits.are_open`. Standard
+    deviations of fitted echoes are those of `Fitted`, as is ``misfit``; NaN for other maxima.
     """
 
     direction: NDArray[np.float64]
@@ -52,35 +41,19 @@ class Tops(NamedTuple):
 
 
 def listed(amplitude: NDArray[np.float64], image: Energyscape) -> NDArray[np.float64]:
-    """Return amplitudes that exceed the strongest bin of an image by less than 1 dB.
-
-    Parameters
-    ----------
-    amplitude : (place,) float64
-        Interpolated amplitudes, which are higher if the grid is coarser than half of the main lobe.
-    """
+    """Return amplitudes that exceed the strongest bin by less than 1 dB, unlike interpolated ones of a coarse grid."""
     return np.minimum(amplitude, float(image.amplitude.max(initial=0.0)) * 10 ** (MAX_RISE_DB / 20))
 
 
 class PeakInterpolator:
-    """Interpolator of maxima between the bins of an image.
+    """Interpolator of maxima between the bins of an image, prepared for all directions or for ``only`` some.
 
     Parabolas through the logarithm of the amplitude locate a maximum. A main lobe is not a parabola, and a coarse grid
     has no bins within it. For delay-and-sum of the fast method, the image of a single reflector is therefore fitted to
     the bins: see `ertis_numba.analysis.echo_fits.EchoFits`. The fit includes the curvature of spherical waves that
     beams for plane waves do not expect.
-
     A maximum never leaves the cell of its direction, which ends half-way to each neighbour. It exceeds its bin by at
     most the loss of the main lobe over this distance. Lists of maxima also limit it by `listed`.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
-    neighbours : (direction, neighbour) int64
-        Result of `ertis_numba.analysis.detect.neighbours_of`.
-    only : (place,) int64, optional
-        Directions whose maxima are needed; all by default, which takes longer to prepare.
     """
 
     def __init__(
@@ -104,15 +77,7 @@ class PeakInterpolator:
     def __call__(
         self, image: Energyscape, directions: NDArray[np.int64], ranges: NDArray[np.int64], *, noise: float
     ) -> Tops:
-        """Return the interpolated maxima near given bins of an image.
-
-        Parameters
-        ----------
-        directions, ranges : (place,) int64
-            Indices of the bins. Maxima at the first and the last range are not interpolated along the range.
-        noise : float
-            Root mean square of the noise of the image; 0 if it is unknown.
-        """
+        """Return maxima near given bins, at the first and the last range not along it; ``noise`` is 0 if unknown."""
         step_m = float(image.range_m[1] - image.range_m[0]) if len(image.range_m) > 1 else 0.0
         rows, columns = _bins(directions, self._neighbours[directions], ranges, last=len(image.range_m) - 1)
         measured = np.log(np.maximum(image.amplitude[rows, columns].astype(np.float64), np.finfo(np.float32).tiny))
@@ -173,10 +138,7 @@ def _filled(logs: NDArray[np.float64]) -> NDArray[np.float64]:
 def _bins(
     directions: NDArray[np.int64], around: NDArray[np.int64], ranges: NDArray[np.int64], *, last: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the direction and range indices of the samples of each maximum, both (place, sample) int64.
-
-    The first three samples lie along the range, the others at the neighbouring directions.
-    """
+    """Return directions and ranges of samples, (place, sample): three along the range, then the neighbours."""
     columns = np.repeat(ranges[:, None], 3 + around.shape[1], axis=1)
     inner = (ranges > 0) & (ranges < last)
     columns[:, 0] -= inner

@@ -12,13 +12,7 @@ __all__ = ["PointFinder", "same_directions"]
 
 
 class PointFinder:
-    """Point detector for images of any sensors; it reuses the extractor of a sensor while the settings are the same.
-
-    Parameters
-    ----------
-    top, min_level_db : optional
-        Largest number of points, and their lowest level relative to the strongest in dB.
-    """
+    """Point detector for images of any sensors; it reuses the extractor of a sensor while the settings are the same."""
 
     def __init__(self, *, top: int | None = None, min_level_db: float | None = None) -> None:
         given = {"top": top, "min_level_db": min_level_db}

@@ -26,19 +26,10 @@ _STEPS_PER_WAVE = 512  # Table steps per wavelength at the band's edge: linear i
 class PointSpread:
     """Point-spread function of delay-and-sum with plane waves.
 
-    The amplitude at a range offset Δr and a direction offset Δu is
-
-    ``|Σ_f P(f) Σ_mic w exp(j k(f) (2 Δr − p·Δu))| / n_mics``,
-
-    where P is the power spectrum of the call, and w are the array weights, whose mean is 1.
-
-    Attributes
-    ----------
-    reach_m : float
-        Range offset in metres beyond which the image of the reflector ends. A side lobe is as long as the pulse. Its
-        shift is half of the difference of two paths, which is at most the aperture's radius.
-    pulse : Pulse
-        Table of the kernels.
+    The amplitude at a range offset Δr and a direction offset Δu is ``|Σ_f P(f) Σ_mic w exp(j k(f) (2 Δr − p·Δu))| /
+    n_mics``, where P is the power spectrum of the call, and w are the array weights, whose mean is 1. Beyond
+    ``reach_m``, the image ends: a side lobe is as long as the pulse, and its shift is half of the difference of two
+    paths, at most the aperture's radius.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -80,17 +71,7 @@ class PointSpread:
     def __call__(
         self, direction_offset: NDArray[np.float64], range_offset_m: NDArray[np.float64], air: Air | None = None
     ) -> NDArray[np.float64]:
-        """Return the amplitude, which is 1 at zero offset: (place,) float64.
-
-        Parameters
-        ----------
-        direction_offset : (place, axis) float64
-            Difference of the unit vectors.
-        range_offset_m : (place,) float64
-            Difference of the ranges in metres.
-        air : Air, optional
-            Air of the image; by default, that of the settings.
-        """
+        """Return the amplitude (place,), 1 at zero offset, by differences of unit vectors and ranges, in any air."""
         found = np.empty(len(range_offset_m))
         offsets = np.ascontiguousarray(direction_offset), np.ascontiguousarray(range_offset_m)
         kernels.load_points().spread_amplitudes(self.pulse, *offsets, self.scale(air), found)
@@ -101,12 +82,7 @@ class PointSpread:
         return 1.0 if air is None else self._speed_m_s / sound_speed_m_s(air)
 
     def beams(self, directions: NDArray[np.float64], deviation: Deviation | None) -> kernels.BeamErrors:
-        """Return directions with the errors of their beams.
-
-        Parameters
-        ----------
-        directions : (direction, axis) float64
-        """
+        """Return directions with the errors of their beams."""
         if deviation is None:
             none = np.empty((0, len(self._weights)), np.complex64)
             return kernels.BeamErrors(directions, none, none)

@@ -36,18 +36,8 @@ class QuadricFits:
     """Fit of a quadric to each direction and its neighbours, over the plane or the line that contains them.
 
     A plane needs neighbours all around. Otherwise, as at the edge of a grid, a parabola through two opposite neighbours
-    remains, and no fit at all if there are none, as in a corner.
-
-    Attributes
-    ----------
-    width_rad : (direction,) float64
-        Distance of the nearest other direction, which is the width of a cell; infinite if there is none.
-    wanted : (direction,) int64
-        Numbers of the directions in the grid.
-    grid : KDTree
-        All directions. The cell of a direction ends half-way to each of the others.
-    n_axes_of_grid : int
-        1 if all directions lie at one elevation, otherwise 2.
+    remains, and no fit at all if there are none, as in a corner. ``width_rad`` (direction,) is the distance of the
+    nearest other direction, infinite for none; the cell of a direction ends half-way to each of the others in ``grid``.
     """
 
     quadrics: kernels.Quadrics
@@ -60,16 +50,7 @@ class QuadricFits:
     def of(
         cls, directions: Floats, neighbours: NDArray[np.int64], wanted: NDArray[np.int64], weights: Floats | None = None
     ) -> "QuadricFits":
-        """Return the fits of some directions of a grid.
-
-        Parameters
-        ----------
-        directions : (direction, axis) float64
-        neighbours : (direction, neighbour) int64
-        wanted : (place,) int64
-        weights : (place, neighbour) float64, optional
-            Weights of the neighbours' squared errors; equal by default.
-        """
+        """Return the fits of some directions of a grid, with squared errors weighted by (place, neighbour)."""
         offsets = directions[neighbours[wanted]] - directions[wanted][:, None]
         _, sizes, axes = np.linalg.svd(np.pad(offsets, ((0, 0), (0, max(0, 3 - offsets.shape[1])), (0, 0))))
         axes = np.ascontiguousarray(axes[:, :2])
@@ -96,16 +77,10 @@ class QuadricFits:
         )
 
     def tops(self, directions: NDArray[np.int64], rises: Floats) -> tuple[Floats, Floats]:
-        """Return offsets from directions to the maxima of their quadrics, (place, axis) float64, and the rise there.
+        """Return offsets (place, axis) from directions to the maxima of their quadrics, and the rise there.
 
         An offset is 0 if there is no maximum within the distance of the farthest neighbour. It may lie outside of the
-        cell: see `within_cells`.
-
-        Parameters
-        ----------
-        directions : (place,) int64
-        rises : (place, neighbour) float64
-            Values at the neighbours minus the value at the direction.
+        cell: see `within_cells`. ``rises`` are the values at the neighbours minus that at the direction.
         """
         found = np.empty((len(rises), 4))
         kernels.load_points().find_tops(self.quadrics, directions, np.ascontiguousarray(rises, np.float64), found)
@@ -114,18 +89,10 @@ class QuadricFits:
     def within_cells(
         self, directions: NDArray[np.int64], offset: Floats, *, is_fitted: bool = False
     ) -> tuple[Floats, Floats]:
-        """Return offsets that end within their cells, (place, axis) float64, and the width of cells: (place,) float64.
+        """Return offsets shortened to end within their cells, (place, axis), and the width of cells: (place,).
 
         A width is 0 if the direction is interpolated along as many axes as the grid has, and less than that
-        of the cell if the offset was shortened a little.
-
-        Parameters
-        ----------
-        directions : (place,) int64
-        offset : (place, axis) float64
-            Result of `tops`; longer ones are shortened.
-        is_fitted : bool
-            True for offsets from fits, which also interpolate beside an edge of the grid.
+        of the cell if the offset was shortened a little. With ``is_fitted``, also beside an edge of the grid.
         """
         here = self.grid.data[self.wanted[directions]]
         share = np.ones(len(offset))
@@ -148,14 +115,7 @@ class QuadricFits:
     def within_limits(
         self, directions: NDArray[np.int64], neighbours: NDArray[np.int64], offset: Floats
     ) -> tuple[Floats, Floats]:
-        """Return offsets that do not leave the grid at its edges, (place, axis), and how far they did: (place,).
-
-        Parameters
-        ----------
-        directions : (place,) int64
-        neighbours : (place, neighbour) int64
-        offset : (place, axis) float64
-        """
+        """Return offsets that do not leave the grid at its edges, (place, axis), and how far they did: (place,)."""
         offset, beyond_rad = offset.copy(), np.zeros(len(offset))
         for place in np.flatnonzero(self.quadrics.n_axes[directions] < self.n_axes_of_grid):
             inwards = _inwards(self.grid.data[neighbours[place]] - self.grid.data[self.wanted[directions[place]]])
@@ -168,16 +128,10 @@ class QuadricFits:
     def are_open(
         self, directions: NDArray[np.int64], neighbours: NDArray[np.int64], rises: Floats | None = None
     ) -> NDArray[np.bool_]:
-        """Return True at edges of the grid where the maximum may lie beyond the cell of the direction: (place,) bool.
+        """Return True at edges of the grid where the maximum may lie beyond the cell of the direction: (place,).
 
-        Values on one side of a direction show a maximum in its cell only if a quadric through them has it there.
-
-        Parameters
-        ----------
-        directions : (place,) int64
-        neighbours : (place, neighbour) int64
-        rises : (place, neighbour) float64, optional
-            Values at the neighbours minus the value at the direction; if they are unknown, all edges are open.
+        Values on one side of a direction show a maximum in its cell only if a quadric through them has it there. If
+        ``rises``, the values at the neighbours minus that of the direction, are unknown, all edges are open.
         """
         is_open = np.zeros(len(directions), dtype=np.bool_)
         for place in np.flatnonzero(self.quadrics.n_axes[directions] < self.n_axes_of_grid):

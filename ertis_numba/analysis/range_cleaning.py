@@ -60,30 +60,14 @@ def clean(image: Energyscape, *, within_db: float | None = 6.0, above_mean_db: f
 
 
 def clean_in_place(amplitude: NDArray[np.float32], *, within_db: float | None, above_mean_db: float | None) -> None:
-    """Set the amplitudes to 0 that `clean` removes.
-
-    Parameters
-    ----------
-    amplitude : (direction, range) float32
-        Amplitudes of an image, which are changed.
-    within_db, above_mean_db : float, optional
-        Levels, as for `clean`; None for no limit.
-    """
+    """Set the amplitudes to 0 that `clean` removes."""
     of_max = None if within_db is None else 10 ** (-within_db / 20)
     of_mean = None if above_mean_db is None else 10 ** (above_mean_db / 20)
     keep_strongest(amplitude, of_max=of_max, of_mean=of_mean)
 
 
 def keep_strongest(amplitude: NDArray[np.float32], *, of_max: float | None, of_mean: float | None) -> None:
-    """Set amplitudes to 0 that are below a limit of their range.
-
-    Parameters
-    ----------
-    amplitude : (direction, range) float32
-        Amplitudes of an image, which are changed.
-    of_max, of_mean : float, optional
-        Limits relative to the strongest amplitude of the range, and to the mean; None for no limit.
-    """
+    """Set amplitudes to 0 below limits relative to the strongest of their range, and to its mean."""
     smallest = np.zeros(amplitude.shape[1], dtype=np.float32)
     if of_max is not None:
         np.maximum(smallest, amplitude.max(axis=0, initial=0.0) * np.float32(of_max), out=smallest)

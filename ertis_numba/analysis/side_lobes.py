@@ -44,27 +44,16 @@ _QUARTILE_OF_COMPONENT: Final = 0.8134
 
 
 class SideLobes:
-    """Classifier of the maxima of an image: reflectors, or possible side lobes of stronger reflectors.
+    """Classifier of the maxima of an image, strongest first: reflectors, or possible side lobes of stronger ones.
 
     `PointSpread` predicts side lobes for an array as designed and for point reflectors. Real microphones, transducers
     and surfaces change the pattern of the side lobes, but hardly their mean power. The limit is therefore the sum of
     the prediction and of a possible deviation. The deviation is a sum of many phasors, so its amplitude is
-    Rayleigh-distributed [1]_: in all of N directions, it stays below ``σ √ln(N / p)`` with a probability of 1 - p.
-
-    σ is measured in the image. It is the deviation from the prediction at the same range, and at most the mean of all
-    side lobes that extend to this range. Echoes that interfere deviate as well. The prediction is therefore first
-    compared with the reflector that fits best: if the pattern around it matches, the array is as designed, and σ is 0.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors of the image's directions.
-    candidates : (candidate, [direction, range]) int64
-        Bins of local maxima, strongest first.
-
-    References
-    ----------
-    .. [1] J. W. Goodman, *Speckle Phenomena in Optics*, 2nd edition, chapter 3.
+    Rayleigh-distributed (J. W. Goodman, Speckle Phenomena in Optics, 2nd edition, chapter 3): in all of N directions,
+    it stays below ``σ √ln(N / p)`` with a probability of 1 - p. σ is measured in the image. It is the deviation from
+    the prediction at the same range, and at most the mean of all side lobes that extend to this range. Echoes that
+    interfere deviate as well. The prediction is therefore first compared with the reflector that fits best: if the
+    pattern around it matches, the array is as designed, and σ is 0.
     """
 
     def __init__(self, image: Energyscape, directions: NDArray[np.float64], candidates: NDArray[np.int64]) -> None:
@@ -85,32 +74,14 @@ class SideLobes:
         return self._spread.reach_m
 
     def add(self, direction: NDArray[np.float64], range_m: float, amplitude: float) -> None:
-        """Add a reflector. Reflectors must be added in descending order of amplitude.
-
-        Parameters
-        ----------
-        direction : (axis,) float64
-            Unit vector.
-        range_m : float
-            Range in metres.
-        """
+        """Add a reflector. Reflectors must be added in descending order of amplitude."""
         if not self._sources:
             self._mean = self._mean_around(direction)
         self._sources.append((direction, range_m, amplitude))
         self._deviations.clear()
 
     def explain(self, direction: NDArray[np.float64], range_bin: int, level: float) -> bool:
-        """Return True if a maximum may be a side lobe of the reflectors added so far.
-
-        Parameters
-        ----------
-        direction : (axis,) float64
-            Unit vector.
-        range_bin : int
-            Index of the range.
-        level : float
-            Amplitude of the maximum.
-        """
+        """Return True if a maximum may be a side lobe of the reflectors added so far."""
         range_m = float(self._image.range_m[range_bin])
         near = [source for source in self._sources if abs(range_m - source[1]) < self._spread.reach_m]
         if not near:
@@ -186,11 +157,6 @@ class EdgeFloor:
     range of side lobes alone, it consists of many maxima of about the same level. A reflector near an edge must
     therefore exceed the level that its own side lobes would have by comparison with the image, and its pulse must fall
     towards the edge.
-
-    Parameters
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors of the image's directions.
     """
 
     def __init__(self, directions: NDArray[np.float64], spread: PointSpread) -> None:
@@ -240,17 +206,10 @@ def _upper_quartile(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the amplitude below which side lobes are expected, for each range: (range,) float32.
+    """Return the amplitude (range,) below which side lobes are expected, coarser than `SideLobes`, but fast.
 
-    The limit lies `SIDE_LOBE_DB` below the strongest amplitude of all ranges within a pulse length. It is coarser than
-    `SideLobes`, but fast.
-
-    Parameters
-    ----------
-    highest : (range,) float32
-        Maximum of the image over all directions.
-    range_m : (range,) float64
-        Range axis in metres: at least two ranges, evenly spaced.
+    The limit lies `SIDE_LOBE_DB` below the strongest amplitude of all ranges within a pulse length. ``highest``
+    (range,) are the maxima over all directions at evenly spaced ranges.
     """
     reach = max(1, round(PULSE_M / float(range_m[1] - range_m[0])))
     around = scipy.ndimage.maximum_filter1d(highest, 2 * reach + 1, mode="nearest")

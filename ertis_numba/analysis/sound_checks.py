@@ -25,14 +25,9 @@ class SoundChecks:
     """Checks of the measurements of one sensor, each of which reports at most one mismatch.
 
     Call and layout are compared until they are known, in at most 8 measurements. A note is reported once while the call
-    is unknown. The start of the record may change later, so that it is compared in measurements 1, 2, 4, 8 and so
-    on. Another call ends all checks, because its filter does not find the times of arrival.
-
-    Parameters
-    ----------
-    thinned : bool
-        True to compare the start only in measurements 1, 2, 4, 8 and so on; False if the caller already skips
-        measurements.
+    is unknown. The start of the record may change later, so that it is compared in measurements 1, 2, 4, 8 and so on,
+    or in all if not ``thinned`` because the caller skips some. Another call ends all checks, because its filter does
+    not find the times of arrival.
     """
 
     def __init__(self, *, thinned: bool = True) -> None:
@@ -42,13 +37,7 @@ class SoundChecks:
         self._tries: dict[Literal["call", "layout"], int] = {"call": _MAX_TRIES, "layout": _MAX_TRIES}
 
     def check(self, measurement: Measurement) -> list[SoundMismatch]:
-        """Return the settings that the sound of the next measurement contradicts.
-
-        Raises
-        ------
-        DataError
-            The samples do not match the settings.
-        """
+        """Return the settings that the sound of the next measurement contradicts."""
         self._count += 1
         if self._is_other_call:
             return []

@@ -26,20 +26,7 @@ _FLOOR: Final = 1e-2  # Lowest noise that counts, relative to the loudest freque
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoundSpectra:
-    """Spectra of some microphones.
-
-    Attributes
-    ----------
-    bins : (mic, bin) complex64
-        Spectra, divided by the magnitude of the stationary noise.
-    noise : (bin,) float64
-        That magnitude.
-    frequency_hz : (bin,) float64
-    n_samples, n_fft : int
-        Length of the record, and of the transform, with zeros after the record.
-    rate_hz : float
-        Sample rate.
-    """
+    """Spectra (mic, bin) of some microphones, divided by the magnitude ``noise`` (bin,) of the stationary noise."""
 
     bins: NDArray[np.complex64]
     noise: NDArray[np.float64]
@@ -60,13 +47,7 @@ class SoundSpectra:
 
 
 def some_signals(measurement: Measurement, max_mics: int) -> tuple[NDArray[np.float32], float]:
-    """Return signals of some microphones, tapered at both ends: (mic, sample) float32, and their sample rate.
-
-    Raises
-    ------
-    DataError
-        The samples do not match the settings.
-    """
+    """Return signals of some microphones, tapered at both ends: (mic, sample), and their sample rate."""
     settings = measurement.settings
     form = sample_format(settings)
     words, _ = form.normalised(form.validated(measurement.data)[:_MAX_SAMPLES])
@@ -87,18 +68,7 @@ def some_signals(measurement: Measurement, max_mics: int) -> tuple[NDArray[np.fl
 
 
 def sound_spectra(signals: NDArray[np.float32], rate_hz: float, *, low_hz: float, padding_s: float) -> SoundSpectra:
-    """Return spectra over the whole band of a record, in which stationary noise and tones are flat.
-
-    Parameters
-    ----------
-    signals : (mic, sample) float32
-    rate_hz : float
-        Sample rate.
-    low_hz : float
-        Lowest frequency.
-    padding_s : float
-        Length of the zeros after the record, in seconds.
-    """
+    """Return spectra from ``low_hz`` on, in which stationary noise and tones are flat, with zeros of ``padding_s``."""
     n_samples = signals.shape[1]
     n_fft = scipy.fft.next_fast_len(n_samples + round(padding_s * rate_hz), real=True)
     high_hz = min(_EDGE * rate_hz, _MAX_HZ)

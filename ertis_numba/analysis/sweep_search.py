@@ -49,18 +49,10 @@ _EDGE: Final = 0.1  # Power at the edges of a band relative to its middle.
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GatedArrival:
-    """Sound around the strongest arrival of each microphone after the filter of a curve.
+    """Sound around the strongest arrival of each microphone after a curve's filter, with its power ``peak`` (mic,).
 
-    Attributes
-    ----------
-    spectra : (mic, bin) complex128
-    frequency_hz : (bin,) float64
-    peak : (mic,) float64
-        Power at the peaks.
-    elsewhere : (bin,) float64
-        Median of the power spectrum of equally long parts of the record, averaged over the microphones.
-    noise : (bin,) float64
-        Magnitude by which the spectra were divided.
+    ``elsewhere`` (bin,) is the median power spectrum of equally long parts of the record, averaged over microphones,
+    and ``noise`` (bin,) the magnitude by which the spectra were divided.
     """
 
     spectra: NDArray[np.complex128]

@@ -19,16 +19,9 @@ _MAX_TONE_HZ: Final = 4e3  # Bandwidth of a pulse of a tone.
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """Group delay of a sweep over frequency.
+    """Group delay of a sweep, whose frequency, its logarithm or its inverse is linear in time.
 
-    Attributes
-    ----------
-    modulation : {"linear", "exponential", "hyperbolic"}
-        The frequency, its logarithm or its inverse is linear in time.
-    slope_s_hz : float
-        Derivative of the group delay with respect to frequency at the pivot, in seconds per hertz.
-    pivot_hz : float
-        Frequency at which the group delay and its phase are 0.
+    ``slope_s_hz`` is its derivative at the pivot, where the group delay and its phase are 0.
     """
 
     modulation: Modulation
@@ -62,16 +55,7 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """Sweep in a record, without its ramps.
-
-    Attributes
-    ----------
-    modulation : {"linear", "exponential", "hyperbolic"}
-    start_hz, stop_hz : float
-        First and last frequency, in hertz.
-    duration_s : float
-        Time between them, in seconds.
-    """
+    """Sweep in a record, without its ramps."""
 
     modulation: Modulation
     start_hz: float

@@ -27,15 +27,7 @@ _UNIFORM = 0.34  # A uniform distribution has 68 % of its values within this sha
 
 
 class Uncertainty(NamedTuple):
-    """Standard deviations of points.
-
-    Attributes
-    ----------
-    range_m, across_rad : (point,) float64
-        Along the range, and of the direction along its least certain axis.
-    level : (point,) float64
-        Of the level in nepers.
-    """
+    """Standard deviations of points (point,): along the range, across it on the least certain axis, level in nepers."""
 
     range_m: NDArray[np.float64]
     across_rad: NDArray[np.float64]
@@ -49,9 +41,7 @@ class PositionUncertainty:
     of the bins that were fitted. It contains the noise, the remaining errors of the plan, other places that explain the
     bins nearly as well, and the deviation of the bins from the image of a single echo. With ``noise_only``, errors are
     the Cramér-Rao bounds of a single echo in white noise
-
     ``σ_range = c / (4π β √(2ρ))``, ``σ_across = r / (k √(λ 2ρ))`` and ``σ_level = 1 / √(2ρ)`` nepers,
-
     with these quantities:
 
     - ρ is the power of the point relative to the mean power of the noise.
@@ -70,20 +60,10 @@ class PositionUncertainty:
 
     A direction that was not interpolated, or that ends at the border of its cell, contributes the spacing of the grid.
     Where the reflector may lie beyond an edge, the direction is unknown, and its standard deviation is 1 rad.
-
     A value is infinite if the array cannot resolve that direction. It is NaN for images of the method ``paper``, whose
     errors by whole samples and plane waves exceed the noise, and if the noise is unknown: for beamformers
     other than delay-and-sum, whose noise is not Rayleigh-distributed, and if most of the image is 0, as after `clean`.
     Errors of layout and temperature are not included.
-
-    Parameters
-    ----------
-    settings : Settings
-        Settings of the images; the air may differ between images.
-    is_planar : bool
-        True if all directions have the same elevation.
-    noise_only : bool
-        State the Cramér-Rao bounds for fitted echoes, too.
     """
 
     def __init__(self, settings: Settings, *, is_planar: bool, noise_only: bool = False) -> None:
@@ -97,15 +77,7 @@ class PositionUncertainty:
         self._covariance_m2 = _effective_covariance_m2(positions_m, array_weights(settings))
 
     def __call__(self, image: Energyscape, tops: Tops, *, noise: float) -> Uncertainty:
-        """Return the standard deviations of points; NaN if the noise is unknown.
-
-        Parameters
-        ----------
-        tops : Tops
-            Points. Widths of π or infinity mark unknown directions.
-        noise : float
-            Root mean square of the noise of the image; 0 if it is unknown.
-        """
+        """Return the standard deviations of points; NaN if ``noise`` is 0. Widths of π or ∞ are unknown directions."""
         is_paper = self._settings.processing.method == "paper" and not self._noise_only
         if not noise or is_paper:
             unknown = np.full(len(tops.range_m), np.nan)

@@ -52,18 +52,10 @@ _LEAST_CURVATURE: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class _Match:
-    """Fit of a wavefront to times of arrival.
+    """Fit of a wavefront to times of arrival, with the RMS of the residuals without the largest ones.
 
-    Attributes
-    ----------
-    spread_s : float
-        Root mean square of the residuals, without the largest ones.
-    slowness : float
-        Slowness across the array relative to that of sound.
-    delay_s : float
-        Delay of some channels relative to the others, if it is fitted.
-    n_spare : int
-        Number of microphones beyond the unknowns.
+    ``slowness`` is relative to that of sound, ``delay_s`` that of some channels relative to the others, and ``n_spare``
+    the number of microphones beyond the unknowns.
     """
 
     spread_s: float
@@ -82,14 +74,7 @@ def unobservable(
 ) -> tuple[NotObservable, ...]:
     """Return the faults of an array that an arrival cannot reveal, with the reasons.
 
-    Parameters
-    ----------
-    times_s : (mic,) float64
-    positions_m : (mic, 3) float64
-    path_m : float
-        Way of the sound since the emission.
-    is_direct : bool
-        True for direct sound, whose curvature shows the size of the array; False by default.
+    ``path_m`` is the way of the sound since the emission; the curvature of direct sound shows the size of the array.
     """
     n_mics, n_unknowns = len(positions_m), 1 + places_of(positions_m).shape[1]
     n_spare = _kept(n_mics, n_unknowns) - n_unknowns
@@ -142,18 +127,8 @@ def find_other_array(
 ) -> Finding | None:
     """Return the finding of an array that fits the strongest arrival much better than the layout; None without one.
 
-    Parameters
-    ----------
-    found : Compressed
-        Signals after the matched filter.
-    times_s : (mic,) float64
-        Times of arrival as the layout expects them.
-    channels : sequence of int
-        Channels of the microphones.
-    path_m : float
-        Way of the sound since the emission.
-    is_near : bool
-        True for sound so soon after the emission that its curvature is unknown; False by default.
+    ``times_s`` (mic,) are those that the layout expects; ``is_near`` marks sound too early for its curvature to be
+    known.
     """
     picked = list(channels)
     own = _best(times_s, layout.positions_m[picked], path_m, speed_m_s)

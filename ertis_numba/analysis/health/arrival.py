@@ -24,21 +24,10 @@ _DEGENERATE_M = 1e-3  # Minimum extent of an axis of the array that the fit uses
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compressed:
-    """Signals after the matched filter.
+    """Signals after the matched filter: spectrum (mic, bin) in the call's band, and envelope (mic, step).
 
-    Attributes
-    ----------
-    bins : (mic, bin) complex128
-        Spectrum in the call's band.
-    frequency_hz : (bin,) float64
-        Frequencies of the bins, in hertz.
-    envelope : (mic, step) float64
-    step_s : float
-        Time between steps of the envelope, in seconds.
-    start_s : float
-        Time of the first step relative to the start of the record, in seconds; it may be negative.
-    origin_s : float
-        Time that the phases of the spectrum refer to, in seconds.
+    ``start_s`` is the time of the first step since the start of the record, negative if before; ``origin_s`` is the
+    time that the phases of the spectrum refer to.
     """
 
     bins: NDArray[np.complex128]
@@ -51,18 +40,9 @@ class Compressed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Wavefront fitted to times of arrival.
+    """Wavefront fitted to times of arrival, with its time (mic,) at each microphone, and the median absolute residual.
 
-    Attributes
-    ----------
-    delay_s : (mic,) float64
-        Time of the wavefront at each microphone, in seconds.
-    inliers : (mic,) bool
-        True for microphones that agree with the wavefront.
-    spread_s : float
-        Median absolute residual, in seconds.
-    emission_s : float
-        Time at which the wavefront passes the array's centre or leaves the emitter, in seconds.
+    ``inliers`` agree with it. At ``emission_s``, it passes the array's centre or leaves the emitter.
     """
 
     delay_s: NDArray[np.float64]
@@ -85,17 +65,7 @@ def compress(
     first: int,
     last: int,
 ) -> Compressed:
-    """Return samples ``first`` to ``last`` after the matched filter, starting one call length before the first.
-
-    Parameters
-    ----------
-    signals : callable
-        Function that returns the samples of a channel.
-    rate_hz : float
-        Sample rate.
-    first, last : int
-        Slice of the samples.
-    """
+    """Return samples ``first`` to ``last`` after the matched filter, starting one call length before the first."""
     replica = call_samples(call, rate_hz=rate_hz)
     n_fft = scipy.fft.next_fast_len(last - first + len(replica), real=True)
     low, high = (round(hz * n_fft / rate_hz) for hz in (call.low_frequency_hz, call.high_frequency_hz))
@@ -116,18 +86,7 @@ def _spectrum(signal: NDArray[np.float32], n_fft: int) -> NDArray[np.complex64]:
 
 
 def strongest(found: Compressed, width_s: float) -> tuple[NDArray[np.float64], float] | None:
-    """Return the times of the strongest arrival at each microphone, and their middle; None if no arrival stands out.
-
-    Parameters
-    ----------
-    width_s : float
-        Largest difference between the times of two microphones, in seconds.
-
-    Returns
-    -------
-    times_s : (mic,) float64
-    middle_s : float
-    """
+    """Return the times (mic,) of the strongest arrival, at most ``width_s`` apart, and their middle; None for none."""
     width = max(1, int(np.ceil(width_s / found.step_s))) + 2
     widened = _highest_around(found.envelope, width)
     common = np.median(widened, axis=0)
@@ -162,19 +121,7 @@ def _highest_around(envelope: NDArray[np.float64], width: int) -> NDArray[np.flo
 def fit_delays(
     times_s: NDArray[np.float64], positions_m: NDArray[np.float64], curvatures: Sequence[float], speed_m_s: float
 ) -> Fit | None:
-    """Return the wavefront that most microphones agree with; None if the array has too few microphones.
-
-    Parameters
-    ----------
-    times_s : (mic,) float64
-        Times of arrival in seconds.
-    positions_m : (mic, 3) float64
-        Positions in metres, relative to the centroid.
-    curvatures : sequence of float
-        Inverse distances of the source to try, in 1/m.
-    speed_m_s : float
-        Speed of sound in m/s.
-    """
+    """Return the wavefront, of given curvatures in 1/m, that most microphones agree with; None for too few of them."""
     _, extent, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=False)
     used = extent / np.sqrt(len(positions_m)) > _DEGENERATE_M
     places_m = positions_m @ axes[used].T

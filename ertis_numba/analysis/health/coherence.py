@@ -18,16 +18,10 @@ _GATE_PERIODS = 2.0  # Length of the gate on either side, in units of 1 / bandwi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Coherence:
-    """Correlation of real signals with a reference.
+    """Correlation of real signals (mic,) with a reference: its highest value and lag, and the same by their powers.
 
-    Attributes
-    ----------
-    lag_s, peak, coherence : (mic,) float64
-        Lag of the highest correlation in seconds, its value, and its value normalised by the powers.
-    at_zero : (mic,) float64
-        Highest correlation at lags within 10 µs.
-    negative, opposite : (mic,) float64
-        Magnitude of the lowest correlation at lags within 10 µs, and the same normalised by the powers.
+    ``at_zero``, ``negative`` and ``opposite`` are the highest, the magnitude of the lowest, and the latter normalised
+    by the powers, at lags within 10 µs.
     """
 
     lag_s: NDArray[np.float64]

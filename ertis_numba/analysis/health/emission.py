@@ -25,13 +25,6 @@ def fit_emission(times_s: NDArray[np.float64], positions_m: NDArray[np.float64],
     The times are fitted by a plane wave and a multiple of the distances from the centre. The multiple is 1 for direct
     sound, and near 0 for echoes. Arrays without distances that a plane wave cannot imitate, such as rings, have no
     result.
-
-    Parameters
-    ----------
-    times_s : (mic,) float64
-        Times of arrival since the start of the record, in seconds.
-    positions_m : (mic, 3) float64
-        Positions relative to the emitter, in metres.
     """
     _, extent, axes = np.linalg.svd(positions_m - positions_m.mean(axis=0), full_matrices=False)
     plane_s = positions_m @ axes[extent > 1e-3 * max(float(extent[0]), 1e-9)].T / speed_m_s
@@ -55,15 +48,7 @@ def fit_emission(times_s: NDArray[np.float64], positions_m: NDArray[np.float64],
 
 
 def describe_shift(late_s: Sequence[float], speed_m_s: float, *, delay_s: float = 0.0) -> tuple[str, str] | None:
-    """Return a text about records that do not begin with the emission, and a remedy; None if all do.
-
-    Parameters
-    ----------
-    late_s : sequence of float
-        Times of the emissions since the starts of their records, in seconds.
-    delay_s : float
-        Setting ``call.delay_s``, for which the remedy names another value.
-    """
+    """Return a text about records that begin at other times than the emission, and a remedy; None if none do."""
     if not late_s:
         return None
     first_s, last_s, middle_s = min(late_s), max(late_s), float(np.median(late_s))

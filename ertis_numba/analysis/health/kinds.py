@@ -12,16 +12,9 @@ _LAYOUT = "set array.layout to the layout of this array, with its channels in th
 
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """Description of a fault.
+    """Description of a fault; ``unit`` is empty for a share or a count, ``of_record`` marks faults of all channels.
 
-    Attributes
-    ----------
-    unit : str
-        Unit of the measured value and of its limit; empty (the default) for a share or a count.
-    remedy : str
-        Imperative sentence without a full stop; `DISABLE` by default.
-    of_record : bool
-        True for faults of the whole record rather than of single channels; False by default.
+    ``remedy`` is an imperative sentence without a full stop; `DISABLE` by default.
     """
 
     unit: str = ""

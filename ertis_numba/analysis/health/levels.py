@@ -37,13 +37,7 @@ def _limit(values_db: NDArray[np.float64], min_db: float) -> tuple[NDArray[np.fl
 
 
 def gain_findings(channels: Sequence[int], level_db: NDArray[np.float64]) -> list[Finding]:
-    """Return the channels in which the strongest arrival is too loud or too quiet.
-
-    Parameters
-    ----------
-    level_db : (channel,) float64
-        Level of the arrival in dB; NaN if its waveform differs from that of the other channels.
-    """
+    """Return the channels in which the strongest arrival is too loud or too quiet; NaN for another waveform."""
     known = np.isfinite(level_db)
     if known.sum() < _MIN_CHANNELS:
         return []
@@ -60,12 +54,8 @@ def noise_findings(
 ) -> list[Finding]:
     """Return the channels with more noise than the others, each in its own quietest eighth of the record.
 
-    Parameters
-    ----------
-    quiet_db : (channel,) float64
-        Noise in the call's band, in dB relative to a full scale of 1.
-    white_db : float or None
-        Level of white bits in that band; None for PCM.
+    ``quiet_db`` is in the call's band, relative to a full scale of 1, and ``white_db`` that of white bits; None for
+    PCM.
     """
     if len(channels) < 2 or (white_db is not None and in_limit_cycles(quiet_db)):
         return []
@@ -87,14 +77,9 @@ def noise_findings(
 
 
 def flip_findings(channels: Sequence[ChannelHealth], floor_db: NDArray[np.float64]) -> list[Finding]:
-    """Return the PDM channels whose noise floor indicates flipped bits.
+    """Return the PDM channels whose noise floor, in dB relative to white bits, indicates flipped bits.
 
     A share ``p`` of flipped bits adds ``4 p (1 - p)`` of the power of white bits, equally at all frequencies.
-
-    Parameters
-    ----------
-    floor_db : (channel,) float64
-        Power density of the quietest lines, in dB relative to white bits.
     """
     return [
         Finding(fault="flipped bits", channels=(item.channel,), measured=value, limit=MAX_FLIPPED_DB)

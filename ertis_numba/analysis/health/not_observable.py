@@ -32,18 +32,9 @@ KNOWN_PLACE: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NotObservable:
-    """Faults that a recording cannot show, for one reason.
+    """Names of faults, such as ``order of channels``, that a recording cannot show, a reason, and a remedy as clauses.
 
-    Attributes
-    ----------
-    faults : tuple of str
-        Names of the faults, such as ``order of channels``.
-    reason : str
-        Clause with the reason.
-    remedy : str
-        Imperative clause; it names a way to observe the faults.
-    cases : tuple of str
-        Names of the alternatives that are possible; empty (the default) if they are not counted.
+    ``cases`` are the alternatives that are possible; empty if they are not counted.
     """
 
     faults: tuple[str, ...]

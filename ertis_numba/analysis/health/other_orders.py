@@ -33,15 +33,7 @@ def other_orders(count: int) -> tuple[tuple[str, tuple[int, ...]], ...]:
 def spreads_s(
     times_s: NDArray[np.float64], positions_m: NDArray[np.float64], path_m: float, speed_m_s: float
 ) -> NDArray[np.float64]:
-    """Return the root mean square of the residuals of several arrivals, of which each is an echo or direct sound.
-
-    Parameters
-    ----------
-    times_s : (arrival, mic) float64
-    positions_m : (mic, 3) float64
-    path_m : float
-        Way of the sound since the emission.
-    """
+    """Return the RMS residuals (arrival,) of arrivals (arrival, mic), of which each is an echo or direct sound."""
     places_m = places_of(positions_m)
     matrix = np.column_stack([np.ones(len(places_m)), places_m])
     spare = max(1, len(places_m) - matrix.shape[1])

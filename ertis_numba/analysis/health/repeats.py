@@ -19,15 +19,7 @@ _MIN_CHANGING = 0.25  # Minimum share of samples in a repeated block that differ
 
 
 def duplicates(columns: Sequence[tuple[int, NDArray[Any]]], *, is_pdm: bool) -> list[Finding]:
-    """Return the groups of channels that are identical in every sample.
-
-    Parameters
-    ----------
-    columns : sequence of (channel, samples)
-        Channels that are not stuck, with their samples.
-    is_pdm : bool
-        True if the samples are bits.
-    """
+    """Return the groups of channels, of those that are not stuck, that are identical in every sample."""
     groups: dict[bytes, list[int]] = {}
     for channel, column in columns:
         content = np.packbits(column) if is_pdm else np.ascontiguousarray(column)
@@ -68,12 +60,6 @@ def repeated_blocks(words: NDArray[Any], channels: tuple[int, ...]) -> list[Find
 
     Anchors are samples whose hash, together with the samples after them, ends in six zeros. A block that is repeated at
     any distance therefore has the same anchors. The most frequent distances between equal anchors are compared in full.
-
-    Parameters
-    ----------
-    words : (sample, word) or (sample, channel)
-    channels : tuple of int
-        Channels to name in the finding.
     """
     n_samples = len(words)
     # With few microphones, modulators repeat their bits occasionally by chance.
@@ -135,17 +121,7 @@ def _is_cycle(block: NDArray[Any]) -> bool:
 
 
 def hum(columns: Sequence[tuple[int, NDArray[Any]]], *, block: int, full_scale: float) -> list[Finding]:
-    """Return the channels with low-frequency hum that most other channels do not have.
-
-    Parameters
-    ----------
-    columns : sequence of (channel, samples)
-        Channels with their bits or PCM samples.
-    block : int
-        Number of samples to average: several periods of the call.
-    full_scale : float
-        Half of the difference between the highest and the lowest sample value.
-    """
+    """Return the channels with low-frequency hum that most others lack; ``block`` averages several call periods."""
     if not columns or len(columns[0][1]) < 4 * block:
         return []
     used = len(columns[0][1]) // block * block

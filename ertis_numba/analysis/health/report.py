@@ -13,21 +13,7 @@ __all__ = ["ChannelHealth", "Finding", "Health", "merge"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """Fault with the measured value that indicates it.
-
-    Attributes
-    ----------
-    fault : str
-        Name of the fault in `ertis_numba.analysis.health.kinds.KINDS`.
-    channels : tuple of int
-        Faulty channels; for a fault of the record, all examined channels.
-    measured : float
-        Measured value, which is beyond the limit, in the unit of ``unit``.
-    limit : float
-        Limit of the measured value.
-    detail : str
-        Further information, such as the layout that fits; empty by default.
-    """
+    """Fault, by its name in `KINDS`, with the measured value beyond its limit; a record's has all examined channels."""
 
     fault: str
     channels: tuple[int, ...]
@@ -156,24 +142,7 @@ class Health:
 
 
 def merge(reports: Sequence[Health]) -> Health:
-    """Merge the health reports of several measurements of one array.
-
-    The result contains every fault of any report. Statistics are medians over the reports that have them.
-
-    Parameters
-    ----------
-    reports : sequence of Health
-        At least one report; all must have the same channels.
-
-    Returns
-    -------
-    Health
-
-    Raises
-    ------
-    ArgumentError
-        There are no reports, or their channels differ.
-    """
+    """Merge the health reports, of the same channels, with all faults and the medians of statistics."""
     if not reports:
         raise ArgumentError("reports is empty; pass at least one report")
     first, *others = ([item.channel for item in report.channels] for report in reports)

@@ -34,17 +34,7 @@ def by_spectra(
     settings: Settings,
     band_hz: tuple[float, float],
 ) -> tuple[list[ChannelHealth], tuple[float, ...], tuple[str, ...], list[Finding]]:
-    """Return the channels with spectral statistics, common tones, impossible checks, and findings of level and noise.
-
-    Parameters
-    ----------
-    signal_of : callable
-        Function that returns the samples of a channel.
-    found : sequence of ChannelHealth
-        Channels that are not stuck.
-    band_hz : (float, float)
-        Band of the sound.
-    """
+    """Return channels with spectral statistics, common tones, impossible checks, and findings of level and noise."""
     size = min(_LONGEST_SEGMENT, 2 ** int(math.log2(n_samples / _SEGMENTS)))
     line_hz = settings.recording.sample_rate_hz / size
     low = round(band_hz[0] / line_hz)
@@ -108,20 +98,10 @@ def by_spectra(
 def _deaf(
     power: NDArray[np.float64], noise: NDArray[np.float64], sensitivity_db: NDArray[np.float64], few: int
 ) -> NDArray[np.bool_]:
-    """Return True for each channel without sound in every eighth nearly as loud as the loudest: (mic,) bool.
+    """Return True for each channel without sound in every eighth nearly as loud as the loudest: (mic,).
 
-    A single eighth is not sufficient, because two echoes can cancel at one microphone.
-
-    Parameters
-    ----------
-    power : (mic, segment) float64
-        Power in the call's band, with segments in ascending order of loudness.
-    noise : (mic,) float64
-        Power of the noise.
-    sensitivity_db : (mic,) float64
-        Calibrated gain in dB.
-    few : int
-        Number of segments in an eighth.
+    A single eighth is not sufficient, because two echoes can cancel at one microphone. ``power`` (mic, segment) is in
+    the call's band, with segments in ascending order of loudness.
     """
     is_deaf, loudest_db = np.ones(len(power), bool), math.inf
     for last in range(power.shape[1], few, -few):

@@ -21,7 +21,7 @@ def places_of(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def curved_m(positions_m: NDArray[np.float64], slope_m: NDArray[np.float64], curvature: float) -> NDArray[np.float64]:
-    """Return the way of a spherical wave relative to a plane one of the same direction: (..., mic) float64.
+    """Return the way of a spherical wave relative to a plane one of the same direction: (..., mic).
 
     For the distance R of the source in direction u, and p·u = -slope, it is sqrt(R² + 2 R slope + p²) - R - slope.
     """
@@ -37,17 +37,9 @@ def fit_curved(
     speed_m_s: float,
     slopes_of: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Return times of arrival without the delays by the curvature of the wave: (..., mic) float64.
+    """Return times of arrival (..., mic) without the delays by the curvature of the wave, in 1/m.
 
-    Parameters
-    ----------
-    times_s : (..., mic) float64
-    positions_m : (mic, 3) float64
-    curvature : float
-        Reciprocal of the distance of the source, in 1/m.
-    slopes_of : callable
-        Function that fits a plane wave to times, (..., mic), and returns its delay per metre along each axis of
-        `places_of`, (..., used axis).
+    ``slopes_of`` fits a plane wave to times, and returns its delay per metre along each axis of `places_of`.
     """
     places_m, flat_s = places_of(positions_m), times_s
     for _ in range(_ITERATIONS):

@@ -49,22 +49,10 @@ _SHIFT = NotObservable(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _StrongestSound:
-    """Strongest arrival of a record.
+    """Strongest arrival of a record: times (mic,) without calibrated delays, and the way since the emission.
 
-    Attributes
-    ----------
-    found : Compressed
-        Signals after the matched filter.
-    times_s : (mic,) float64
-        Times of arrival without the calibrated delays, in seconds.
-    path_m : float
-        Way of the sound since the emission.
-    is_near : bool
-        True if the way is too short for an echo.
-    shifts : list of Finding
-        Finding if the record does not begin with the emission.
-    other : Finding, optional
-        Finding of an array that fits far better.
+    ``is_near`` if the way is too short for an echo; ``shifts`` if the record does not begin with the emission;
+    ``other`` is an array that fits far better.
     """
 
     found: Compressed
@@ -120,17 +108,7 @@ def by_wavefront(
     *,
     n_samples: int,
 ) -> tuple[list[Finding], tuple[NotObservable, ...]]:
-    """Return the findings from the strongest arrival, and the faults that it cannot reveal.
-
-    Parameters
-    ----------
-    signals : callable
-        Function that returns the samples of a channel.
-    channels : sequence of int
-        Channels that carry sound.
-    n_samples : int
-        Number of samples of the record.
-    """
+    """Return the findings from the strongest arrival in channels with sound, and the faults that it cannot reveal."""
     layout, speed_m_s = microphones(settings.array), sound_speed_m_s(settings.air)
     positions_m = layout.positions_m[list(channels)]
     arrival = _arrival(signals, channels, settings, n_samples)
@@ -185,10 +163,7 @@ def _shifts(emission_s: float, channels: Sequence[int], speed_m_s: float) -> lis
 def _loudest(
     signals: Callable[[int], NDArray[np.float32]], channels: Sequence[int], settings: Settings, n_samples: int
 ) -> tuple[int, int]:
-    """Return the slice of the record around the strongest arrival at a few microphones.
-
-    It extends from one call length before the arrival to two call lengths after it.
-    """
+    """Return the slice from one call length before the strongest arrival at some microphones to two after it."""
     rate_hz, call = settings.recording.sample_rate_hz, settings.call
     length = round(call.duration_s * rate_hz)
     few = list(channels)[:: max(1, len(channels) // _PILOTS)]
