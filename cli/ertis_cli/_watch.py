@@ -41,7 +41,7 @@ class Watch:
     def run(
         self, session: "CaptureSession", sink: "MeasurementSink", checks: "dict[str, BitCheck]", *, where: str
     ) -> Exception | None:
-        """Run a session; return the error that ended it early, or None; where names the measurements' place."""
+        """Run a session; return the error that ended it early, or None; an interruption prints where data are."""
         self._session, self._checks = session, checks
         begun_s, cpu_s = time.monotonic(), time.process_time()
         try:

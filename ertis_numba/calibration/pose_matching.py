@@ -91,7 +91,7 @@ def match_waves(
 def without_outliers(
     matched: Matched, reflectors_m: NDArray[np.float64], residual_m: NDArray[np.float64], limit_m: float
 ) -> Matched:
-    """Return waves with fitted paths to limit_m, without reflectors that lose too many of theirs."""
+    """Return the waves whose paths fit within limit_m, without reflectors that lose too many of theirs."""
     fits = np.abs(residual_m) < limit_m
     reflector = matched.waves.reflector
     counts = np.bincount(reflector[fits & (reflector >= 0)], minlength=len(reflectors_m))

@@ -83,7 +83,7 @@ class PcmSamples:
         self._without = without
 
     def block(self, samples: slice, enabled: NDArray[np.bool_] | None = None) -> NDArray[Any]:
-        """Return (sample, channel); 0 for non-finite disabled ones; raise DataError for other unusable samples."""
+        """Return samples (sample, channel), 0 for non-finite ones of disabled channels; others raise DataError."""
         numbers = self._numbers(samples)
         if self._without is not None:
             numbers = np.delete(numbers, self._without, axis=1)
@@ -130,7 +130,11 @@ def inspect(path: Path, expansion: float | None = None) -> PcmFile:
 
 
 def joined(files: Sequence[PcmFile]) -> PcmFile:
-    """Return one file with all channels, cut to the shortest; raise DataError if they differ or 10 precedes 2."""
+    """Return one file with the channels of all, cut to the shortest.
+
+    Raises DataError if the files differ in rate, type of numbers or time, or are in the order of the alphabet but not
+    of numbers.
+    """
     require_alike(files, joined=True)
     _require_one_measurement(files)
     first = files[0]

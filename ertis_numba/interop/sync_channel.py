@@ -38,14 +38,15 @@ Reader = Callable[[slice], NDArray[np.float64]]
 class Emissions:
     """Emissions in a file."""
 
-    times: NDArray[np.float64]  # (emission,) in samples since the first; range 0 of the call
+    times: NDArray[np.float64]  # (emission,) in samples from the first one of the file; range 0
     notes: tuple[str, ...]
 
 
 def find_emissions(read: Reader, n_samples: int, call: Call, *, rate_hz: float, path: Path, channel: int) -> Emissions:
     """Return the emissions in a loopback channel, by the matched filter of the call.
 
-    If no part of the channel resembles the call, its pulses are found by their onsets, as those of a trigger.
+    If no part of the channel resembles the call, its pulses are found by their onsets, as those of a trigger. ``read``
+    returns consecutive samples of the channel.
     """
     times, match = _of_call(read, n_samples, call_samples(call, rate_hz=rate_hz), call.start_s * rate_hz)
     notes = []

@@ -115,7 +115,7 @@ class Subscription:
             self._close()
 
     def turn(self, woken: WakeupSocket, now_s: float) -> None:
-        """Do pending work, or wait up to 0.1 s; raise RefusedError if the publisher never accepted us."""
+        """Do pending work, or wait up to 0.1 s; raise RefusedError if the publisher never accepted this application."""
         connection = self._connection
         if connection is None:
             if now_s < self._wait_until_s:
@@ -162,7 +162,10 @@ class Subscription:
         self._dropped_before, self._missed_before = self._counts.dropped, self._counts.missed
 
     def _restarted(self) -> None:
-        """Start again after ZeroMQ reconnected to another publisher, which counts from our consumed count."""
+        """Start again on a connection to another publisher, which ZeroMQ has made at the same address.
+
+        The consumed count continues: a publisher counts from the first value that it receives.
+        """
         numbers = self._numbers
         numbers.reader, numbers.received, numbers.next_number = ProductReader(), 0, 0
         self._counts.reconnects += 1

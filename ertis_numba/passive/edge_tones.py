@@ -71,7 +71,10 @@ class EdgeTones:
         self._count += count
 
     def note(self, *, within: bool = False) -> str | None:
-        """Return a note on the loudest tone that a band shows partly; within: if a band beyond the edge shows it."""
+        """Return a note on the loudest tone of whose power a band shows only a part; None without any.
+
+        ``within`` leaves out tones at edges of one band only, beyond which other sound is louder.
+        """
         tones = [
             (edge, tone)
             for number, edge in enumerate(self._edges)

@@ -24,7 +24,7 @@ class MeasurementSink(Protocol):
         translation_m: Sequence[float] | None = ...,
         rotation_xyzw: Sequence[float] | None = ...,
     ) -> None:
-        """Register a sensor first, or again with other settings, which a `Journal` refuses."""
+        """Register a sensor before its first measurement; a `Journal` refuses later changes of settings."""
 
     def append(self, entries: Sequence[JournalEntry]) -> Sequence[JournalEntry] | None:
         """Store measurements, and return those that were stored, or None for all."""
