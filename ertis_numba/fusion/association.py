@@ -36,28 +36,10 @@ class Reflectors:
     without confirmation is a reflector if the attribution of the images agrees. A foreign echo without confirmation has
     several explanations, and is discarded.
 
-    Parameters
-    ----------
-    echoes : sequence of SensorEchoes
-        Echoes of each receiver.
-    emitters : mapping of int to Emitters
-        Model of the emitters in the air of each receiver.
-    bound : (cell,) float32
-        Highest reflectivity of each cell of the grid that the images allow.
-
-    Attributes
-    ----------
-    position_m : (reflector, axis) float64
-    covariance_m2 : (reflector, axis, axis) float64
-    reflectivity : (reflector,) float64
-        Power of its echo at 1 m.
-    radiated : (reflector, emitter) float64
-        Power of each call towards it, relative to ahead.
-    confirmed : (reflector,) bool
-        Reflectors that echoes at enough pairs confirm, as in `ertis_numba.fusion.confirmation`.
-    is_unexplained : (echo,) bool
-    n_unexplained : int
-        Echoes that no reflector explains together with others.
+    ``bound`` (cell,) is the highest reflectivity that the images allow. ``reflectivity`` (reflector,) is the power of
+    an echo at 1 m, ``radiated`` (reflector, emitter) that of each call relative to ahead, ``confirmed`` as in
+    `ertis_numba.fusion.confirmation`. ``n_unexplained`` echoes, ``is_unexplained`` (echo,), have no reflector with
+    others.
     """
 
     def __init__(
@@ -98,18 +80,11 @@ class Reflectors:
         self.is_unexplained, self.n_unexplained = search.is_free, int(search.is_free.sum())
 
     def needs(self, number: int, silent: "Reflectors") -> bool:
-        """Return True if an emitter is needed to explain strong echoes of its own sensor.
+        """Return True if an emitter is needed to explain strong echoes of its own sensor; ``silent`` is without it.
 
         Echoes of sound that walls reflect several times are missed and unexplained in any case, so that their number
         does not show that an emitter is silent. The image of its sensor then holds only echoes of other calls, which
         others explain, or which are weak for an own call.
-
-        Parameters
-        ----------
-        number : int
-            Index of the emitter and of its sensor.
-        silent : Reflectors
-            Explanation of the same echoes without this emitter.
         """
         least = _STRONG * median_of(self.reflectivity) if len(self.reflectivity) else 0.0
         own = [

@@ -38,18 +38,10 @@ _NONE: Final = np.empty(0, dtype=np.float32)
 
 
 class Attributed(NamedTuple):
-    """Result of an attribution.
+    """Result of an attribution: ``reflectivity`` (cell,) as power at 1 m, and its ``bound``, infinite if unseen.
 
-    Attributes
-    ----------
-    reflectivity : (cell,) float32
-        Power of the echo of each cell's reflector at 1 m.
-    suspects : frozenset of int
-        Emitters whose calls no other sensor seems to hear, although it should. Ghosts may pretend this.
-    bound : (cell,) float32
-        Highest reflectivity that all pairs allow; infinite where none can see the cell.
-    unheard : frozenset of int
-        Emitters of which no echoes were expected at other sensors.
+    ``suspects`` are emitters whose calls no other sensor seems to hear, although it should; ghosts may pretend this.
+    ``unheard`` are those of which no echoes were expected at other sensors.
     """
 
     reflectivity: Singles
@@ -61,14 +53,7 @@ class Attributed(NamedTuple):
 
 
 class _Evidence(NamedTuple):
-    """Echoes of a pair in the images of one group.
-
-    Attributes
-    ----------
-    values : (3, entry) float32
-        Power that noise and side lobes may reach; highest power near each cell, with noise and side lobes; weight in
-        means over pairs.
-    """
+    """Echoes of a pair: power that noise and side lobes may reach, highest power near a cell, weight: (3, entry)."""
 
     pair: Pair
     values: Singles
@@ -77,14 +62,8 @@ class _Evidence(NamedTuple):
 class _Rivalry(NamedTuple):
     """Hypotheses of a receiver relative to one of them.
 
-    Where several of them lead to the same place, they are no rivals: its reflector causes all of their echoes.
-
-    Attributes
-    ----------
-    same_pixel, same_hypothesis : (entry,) uint32
-        Pixels in which other hypotheses lead to the same place, and these hypotheses.
-    part : (pixel,) float32
-        Power of the echo relative to that of all hypotheses with the same place.
+    Where several of them lead to the same place (``same_pixel``, ``same_hypothesis``), they are no rivals: its
+    reflector causes all of their echoes. ``part`` (pixel,) is the power of the echo relative to that of all of these.
     """
 
     same_pixel: Places
@@ -102,15 +81,8 @@ class Attribution:
     A reflector causes an echo in each pair of emitter and receiver that can see it. A pixel whose power is predicted by
     reflectors that other pixels show is attributed to them, unless an own reflector is confirmed by another pair. This
     is a successive interference cancellation on power images, because phases of far apart sensors are not known.
-
-    Parameters
-    ----------
-    hypotheses : mapping of int to sequence of Hypothesis
-        Hypotheses of each receiver.
-    unheard : frozenset of int
-        Emitters whose calls only they themselves receive. Their missing echoes show nothing.
-    rivalries : dict, optional
-        Rivalries that other attributions with the same receivers have computed, to which this one adds.
+    Only ``unheard`` emitters themselves receive their calls, so that missing echoes show nothing. ``rivalries``
+    of attributions with the same receivers are shared.
     """
 
     def __init__(
@@ -135,13 +107,7 @@ class Attribution:
         self._own = {pair.receiver: self._own_of(pair) for pair in self._pairs if pair.emitter == pair.receiver}
 
     def __call__(self, images: Mapping[int, CoarseImage]) -> Attributed:
-        """Return the reflectivity of each cell, and the share of each pair in the pixels.
-
-        Parameters
-        ----------
-        images : mapping of int to CoarseImage
-            Image of each receiver.
-        """
+        """Return the reflectivity of each cell, and the share of each pair in the pixels."""
         evidence = [self._evidence(pair, images[pair.receiver]) for pair in self._pairs]
         own = [each for each in evidence if each.pair.emitter == each.pair.receiver]
         alone = self._mean(own, images, None)
@@ -166,13 +132,7 @@ class Attribution:
         return Attributed(reflectivity, shares, suspects, bound, self._unheard, evidence)
 
     def informed(self, images: Mapping[int, CoarseImage], found: Attributed, shares: Shares) -> Singles:
-        """Return the reflectivity of each cell by other shares of the pixels than those found: (cell,) float32.
-
-        Parameters
-        ----------
-        found : Attributed
-            Result of the attribution.
-        """
+        """Return the reflectivity (cell,) by other shares of the pixels than those found."""
         return np.asarray(np.minimum(self._mean(found.evidence, images, shares), found.bound))
 
     def single(self, images: Mapping[int, CoarseImage]) -> Singles:
@@ -235,10 +195,7 @@ class Attribution:
         return bound
 
     def _confirmed(self, evidence: Sequence[_Evidence], alone: Singles) -> dict[int, Singles]:
-        """Return the power of own echoes that all pairs but a sensor's own confirm, by sensor: (pixel,) float32.
-
-        It is 0 where no other pair can see the cell.
-        """
+        """Return the power (pixel,) of own echoes, by sensor, that all other pairs confirm; 0 if none sees the cell."""
         numbers = [*self._own]
         least = np.full((len(numbers), self._grid.n_cells), np.inf, dtype=np.float32)
         for each in evidence:
@@ -307,10 +264,7 @@ class Attribution:
         return found
 
     def _own_of(self, pair: Pair) -> tuple[Places, Singles]:
-        """Return the cell of each pixel, and the gain of the receiver's own call there: (pixel,) uint32 and float32.
-
-        The gain is 0 outside of the grid.
-        """
+        """Return the cell of each pixel, and the gain of the receiver's own call there, 0 outside of the grid."""
         gain = np.zeros(self._grid.n_cells, dtype=np.float32)
         gain[pair.cell] = pair.gain
         own = next(
@@ -320,10 +274,7 @@ class Attribution:
         return inside.astype(np.uint32), np.where(own.cell >= 0, gain.take(inside), np.float32(0))
 
     def _mean(self, evidence: Sequence[_Evidence], images: Mapping[int, CoarseImage], shares: Shares | None) -> Singles:
-        """Return the mean over pairs of the reflectivity of each cell, as power at 1 m: (cell,) float32.
-
-        Shares are also weights for pairs of different sensors: what belongs to another pair says nothing about them.
-        """
+        """Return the mean reflectivity (cell,) over pairs; shares are also weights, as others' power shows nothing."""
         sums = np.zeros((2, self._grid.n_cells), dtype=np.float32)
         sums[1] = _TINY
         for each in evidence:

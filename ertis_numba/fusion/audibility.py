@@ -15,39 +15,13 @@ _RATIOS: Final = 1.0, 1e6  # Limits of thresholds.
 
 
 def audible_ratio(settings: Settings, *, searched_s: float, averaged_s: float, false_alarms: float) -> float:
-    """Return the threshold of an amplitude relative to the background.
+    """Return the threshold of an amplitude relative to the background, with ``false_alarms`` per window by noise alone.
 
     The envelope of Gaussian noise with the RMS bandwidth B rises above ρ times its RMS at the rate ``2 √π B ρ
     exp(-ρ²)`` (Rice, Mathematical Analysis of Random Noise, 1945, section 3.4). The measured power of the background is
     uncertain. Relative to its mean, it has a gamma distribution with the shape K, the number of independent values in
     the averaged time. The mean rate is then ``2 √π B ρ Γ(K + ½) / (Γ(K) √K) (1 + ρ² / K)^-(K + ½)``. Multiplied by the
     searched time, it is an upper limit of the probability that noise exceeds the threshold.
-
-    Parameters
-    ----------
-    settings : Settings
-        Settings with the call and the matched filter.
-    searched_s : float
-        Length of the window in which the strongest pulse is searched.
-    averaged_s : float
-        Time over which the power of the background is averaged.
-    false_alarms : float
-        Accepted probability that noise alone exceeds the threshold in a window.
-
-    Returns
-    -------
-    float
-        Amplitude divided by the RMS amplitude of the background.
-
-    Examples
-    --------
-    >>> from ertis_numba.fusion.audibility import audible_ratio
-    >>> from ertis_numba.settings import Settings
-    >>> rare, frequent = (
-    ...     audible_ratio(Settings(), searched_s=1e-3, averaged_s=8e-4, false_alarms=rate) for rate in (1e-6, 1e-3)
-    ... )
-    >>> rare > frequent > 3.5
-    True
     """
     rms_hz, independent = _noise(settings, averaged_s)
     low, high = np.log(_RATIOS)

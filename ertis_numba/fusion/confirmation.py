@@ -37,17 +37,7 @@ _N_SURE: Final = 4  # Echoes that two reflections hardly cause at the right path
 
 
 class Confirmation(NamedTuple):
-    """Confirmation of reflectors.
-
-    Attributes
-    ----------
-    is_confirmed : (reflector,) bool
-        True if enough echoes confirm a reflector, as a point or as a mirror-like wall.
-    is_wall : (reflector,) bool
-        True if enough echoes confirm a mirror-like wall.
-    n_pairs : (reflector,) int64
-        Pairs of emitter and receiver that should hear it.
-    """
+    """Reflectors (reflector,) that enough echoes confirm, as points or mirror-like walls, and pairs to hear each."""
 
     is_confirmed: Flags
     is_wall: Flags
@@ -57,25 +47,14 @@ class Confirmation(NamedTuple):
 def confirmation(
     heard: EchoPaths, place_m: Floats, gain: Floats, reflectivity: Floats, members: Sequence[Numbers]
 ) -> Confirmation:
-    """Return the confirmation of reflectors, each as a point or as a mirror-like wall.
+    """Return the confirmation of reflectors, each as a point or as a mirror-like wall, by their ``members``: echoes.
 
     At least 60 % of the pairs that should hear a reflector must do so, rounded down, and four if there are as many. On
     a platform with several sensors, at least two echoes must remain that no two nearer surfaces explain, and at least
     two must locate a point. A reflector that a nearer one and a wall explain is not confirmed.
-
     If the image of an emitting sensor is missing, two images must show a reflector, and 70 % of the pairs must each
     have a different echo. Sound over a nearer surface and a wall that only that sensor faces must not explain all of
     these echoes.
-
-    Parameters
-    ----------
-    place_m : (reflector, axis) float64
-    gain : (reflector, receiver, emitter) float64
-        Power of its echoes relative to that ahead.
-    reflectivity : (reflector,) float64
-        Power of an echo at 1 m.
-    members : sequence of (member,) int64
-        Echoes that locate each reflector.
     """
     n_sensors = len(heard.sensor_m)
     counts = gain > _COUNTS_FROM * gain.max(axis=(1, 2), initial=0.0)[:, None, None]
@@ -154,7 +133,7 @@ def _is_enough(heard: EchoPaths, confirming: Flags, needed: Floats, is_behind: F
 
 
 def _behind(heard: EchoPaths, away_m: Floats) -> Flags:
-    """Return True where a receiver hears a reflector from the direction of a nearer one: (reflector, receiver) bool.
+    """Return True where a receiver hears a reflector from the direction of a nearer one: (reflector, receiver).
 
     Sound that a wall and the nearer one reflect arrives from there as well.
     """
@@ -173,13 +152,6 @@ def _mirrored(place_m: Floats, sensor_m: Floats, facing: NDArray[np.int64]) -> F
     Sound that the wall reflects on both ways comes from the mirror image of the nearer reflector. Sound that it
     reflects on one way comes from the same direction, after the way from the receiver or from the sensor that faces the
     nearer reflector to the latter. Both imply a wall.
-
-    Parameters
-    ----------
-    place_m : (reflector, axis) float64
-    sensor_m : (sensor, axis) float64
-    facing : (reflector,) int64
-        The sensor that faces each reflector.
     """
     found = np.zeros(len(place_m), np.bool_)
     if not len(place_m):
@@ -208,16 +180,7 @@ def _mirrored(place_m: Floats, sensor_m: Floats, facing: NDArray[np.int64]) -> F
 
 
 def _confirming(heard: EchoPaths, origin_m: Floats, sent_m: Floats, counts: Flags) -> Flags:
-    """Return the echoes that confirm reflectors, and their emitters: (reflector, echo, emitter) bool.
-
-    Parameters
-    ----------
-    origin_m : (reflector, emitter, axis) float64
-        Place from which the sound of each emitter arrives: that of the reflector, or the mirror image of the emitter.
-    sent_m : (reflector, emitter) float64
-        Path of the sound to this place.
-    counts : (reflector, receiver, emitter) bool
-    """
+    """Return the echoes that confirm reflectors, (reflector, echo, emitter), by apparent origins and paths of sound."""
     found = np.zeros((len(origin_m), *heard.path_m.shape), np.bool_)
     reflector, emitter, echo = heard.arriving(origin_m, sent_m, _PATH_M, _ANGLE_RAD)
     found[reflector, echo, emitter] = counts[reflector, heard.receiver[echo], emitter]

@@ -42,14 +42,8 @@ _CLEAR: Final = 2.0  # Level relative to the threshold from which the way back w
 class DirectSound(NamedTuple):
     """Arrival of the direct sound of a neighbour, which is audible in most pulses.
 
-    Attributes
-    ----------
-    difference_s : float
-        Measured minus predicted arrival, as a median over the pulses in which it is audible.
-    noise_s : float
-        Standard deviation of the measured arrival.
-    uncertainty_s : float
-        Standard deviation of the difference, with that of the mountings and of the SYNC chain.
+    ``difference_s`` is the measured minus the predicted arrival, as a median over these pulses; its ``uncertainty_s``
+    contains ``noise_s`` of the measured arrival, and those of the mountings and of the SYNC chain.
     """
 
     emitter: str
@@ -67,38 +61,17 @@ class _Arrival:
 
 
 class DirectSoundCheck:
-    """Comparison of the direct sound between sensors with the prediction of their mountings.
+    """Comparison of the direct sound between sensors with the prediction of their mountings on the platform.
 
     Sound from sensor a to sensor b arrives early or late if their clocks differ, and late if they are farther apart
     than their mountings state. The way back tells both apart: a difference of clocks has the opposite sign there.
     Emitters are assumed to be at the origins of the sensors, as in images.
-
     The sound also shows silent emitters. Sound between two sensors is equally loud both ways. A sensor that most others
     do not hear, although it clearly hears one of them, does not emit. The same holds for a sensor that does not hear
     its own call, if all others clearly hear theirs.
-
     Noise alone passes for a direct sound in at most one of 1000 checks. Each of the n (n − 1) pairs of n sensors has an
     equal share of this rate in a single pulse. Of several pulses, more than half must contain the sound, which is less
     probable still, so the rate holds for any number of pulses.
-
-    Parameters
-    ----------
-    mountings : mapping of str to (translation_m, rotation_xyzw)
-        Position and orientation of each sensor on the platform, by name.
-
-    Raises
-    ------
-    ArgumentError
-        A mounting is missing or invalid.
-
-    Examples
-    --------
-    >>> import ertis_numba as ertis
-    >>> from ertis_numba.fusion import DirectSoundCheck
-    >>> ahead = (0.0, 0.0, 0.0, 1.0)
-    >>> check = DirectSoundCheck({"left": ((0.0, 0.1, 0.0), ahead), "right": ((0.0, -0.1, 0.0), ahead)})
-    >>> check.sounds, check.warnings()
-    ((), ())
     """
 
     def __init__(self, mountings: Mountings) -> None:
@@ -109,15 +82,7 @@ class DirectSoundCheck:
         self._speed_m_s = 0.0
 
     def add(self, measurements: Iterable[Measurement]) -> None:
-        """Add the measurements of one SYNC pulse, at most one of each sensor.
-
-        Raises
-        ------
-        ArgumentError
-            A sensor has no mounting.
-        DataError
-            The samples do not match the settings.
-        """
+        """Add the measurements of one SYNC pulse, at most one of each mounted sensor."""
         group = {}
         for each in checks.items("measurements", measurements, Measurement, "a recording contains"):
             if each.stamp.sensor not in self._mountings:
@@ -191,10 +156,7 @@ class DirectSoundCheck:
             )
 
     def warnings(self) -> tuple[str, ...]:
-        """Return one line for each silent emitter, and for each clock and distance that differs by more than allowed.
-
-        The limit of differences is three standard deviations and one sample of the signals.
-        """
+        """Return one line for each silent emitter, and each clock and distance beyond 3 σ and one signal sample."""
         sounds = {(each.emitter, each.receiver): each for each in self.sounds}
         clocks_s, distances_s = _both_ways(sounds, SYNC_STEP_S * (len(self._mountings) - 1))
         found = [f"{name} emits no sound, unlike the other sensors; check its emitter" for name in self.silent]
@@ -254,10 +216,7 @@ class DirectSoundCheck:
 def _both_ways(
     sounds: Mapping[tuple[str, str], DirectSound], chain_s: float
 ) -> tuple[dict[tuple[str, str], tuple[float, float]], dict[tuple[str, str], tuple[float, float]]]:
-    """Return differences of clocks and of distances of pairs whose sound is heard both ways, each with its deviation.
-
-    The first sensor of a pair is late by the first value. The second value is the excess of the distance as a time.
-    """
+    """Return the lateness of the first clock of a pair, and the distance's excess in s, each with its deviation."""
     clocks_s, distances_s = {}, {}
     names = dict.fromkeys(name for pair in sounds for name in pair)
     for one, other in combinations(names, 2):

@@ -18,20 +18,10 @@ _FEW: Final = 1024  # Matches that there is space for at first.
 
 
 class EchoPaths(NamedTuple):
-    """Echoes of all receivers, and the geometry of their sensors.
+    """Echoes of all receivers, with their ``rows`` by receiver with an image, and the positions and axes of sensors.
 
-    Attributes
-    ----------
-    sensor_m, ahead : (sensor, axis) float64
-        Positions and axes of the sensors.
-    rows : mapping of int to (echo,) int64
-        Echoes of each receiver that has an image.
-    flat : collection of int
-        Receivers that do not distinguish front and back.
-    direction : (echo, axis) float64
-    path_m : (echo, emitter) float64
-        Path of each echo if the emitter's call caused it; NaN for emitters that the receiver does not hear.
-    power : (echo,) float64
+    ``flat`` receivers do not distinguish front and back. ``path_m`` (echo, emitter) is that of an echo if the emitter's
+    call caused it; NaN for emitters that the receiver does not hear.
     """
 
     sensor_m: Floats
@@ -56,17 +46,7 @@ class EchoPaths(NamedTuple):
         return found
 
     def arriving(self, origin_m: Floats, sent_m: Floats, within_m: float, within_rad: float) -> Numbers:
-        """Return source, emitter and number of the echoes that fit sound from predicted places: (3, match) int64.
-
-        Parameters
-        ----------
-        origin_m : (source, emitter, axis) float64
-            Place from which the call of each emitter arrives.
-        sent_m : (source, emitter) float64
-            Path of the call to this place.
-        within_m, within_rad : float
-            Largest differences of paths, and of directions ahead of the receiver.
-        """
+        """Return source, emitter and number of the echoes that fit sound from predicted places: (3, match)."""
         echoes = self.is_flat, self.receiver, self.direction, self.path_m
         find_arrivals, count = kernels.load_fusion().find_arrivals, _FEW
         while True:

@@ -55,38 +55,21 @@ _TINY: Final = 1e-30
 
 
 class ExpectedEchoes(NamedTuple):
-    """Echoes that reflectors should cause, for each reflector, receiver and emitter.
-
-    Attributes
-    ----------
-    is_heard, is_missed : (reflector, receiver, emitter) bool
-        Both are false if noise or other echoes may hide the echo.
-    """
+    """Echoes to be heard, (reflector, receiver, emitter); neither heard nor missed if noise or others hide them."""
 
     is_heard: Flags
     is_missed: Flags
 
 
 class EmissionCounts(NamedTuple):
-    """Echoes of each call that should be heard in one pulse.
-
-    Attributes
-    ----------
-    heard, missed : (emitter,) int64
-    """
+    """Numbers (emitter,) of heard and missed echoes of each call in one pulse."""
 
     heard: NDArray[np.int64]
     missed: NDArray[np.int64]
 
     @classmethod
     def of(cls, expected: ExpectedEchoes, reflectors: Reflectors, judged: Collection[int]) -> "EmissionCounts":
-        """Return the counts at reflectors that echoes of other calls locate.
-
-        Parameters
-        ----------
-        judged : collection of int
-            Emitters to judge: those whose own sensors have an image.
-        """
+        """Return the counts of ``judged`` emitters, with images, at reflectors that echoes of other calls locate."""
         numbers = np.arange(expected.is_heard.shape[2])
         n_others = np.array([(each.emitter[:, None] != numbers).sum(axis=0) for each in reflectors.located])
         counts = (n_others.reshape(-1, len(numbers)) >= _N_OTHERS) & np.isin(numbers, [*judged])
@@ -114,18 +97,9 @@ def silent_one(
     """Return the emitter whose silence explains the echoes best, or None if that of several does about equally well.
 
     Echoes of one emitter fit another one that is silent, at slightly shifted places. The wrong explanation usually
-    leaves more echoes unexplained, and misses more of those that it predicts.
-
-    Parameters
-    ----------
-    suspected : int
-        Emitter that seems silent. Another one explains this if its own silence lets the suspected one be heard.
-    joint : EmissionCounts
-        Evidence if all emit. Emitters that it shows are rivals only if their silence explains clearly more.
-    costs : mapping of int to int
-        Unexplained and missed echoes if an emitter is silent.
-    counts : mapping of int to EmissionCounts
-        Evidence if an emitter is silent.
+    leaves more echoes unexplained, and misses more of those that it predicts. Emitters that ``joint``, the evidence if
+    all emit, shows are rivals of the suspected one only if their silence explains clearly more. ``costs`` are
+    unexplained and missed echoes if an emitter is silent.
     """
     shown = silence_ratios([joint])
     likely = []
@@ -140,17 +114,7 @@ def silent_one(
 
 
 def doubted(emitters: Collection[int], counts: EmissionCounts, cost: int) -> frozenset[int]:
-    """Return emitters that no echo shows to work, if the explanation of the echoes leaves room for a better one.
-
-    Parameters
-    ----------
-    emitters : collection of int
-        Emitters that are not known to be silent. One of two cannot be told from the other.
-    counts : EmissionCounts
-        Evidence if these emit.
-    cost : int
-        Unexplained and missed echoes if they emit.
-    """
+    """Return emitters that no echo shows to work, if the explanation, at its ``cost``, leaves room for a better one."""
     if len(emitters) < _N_SENSORS or cost <= _ALIKE:
         return frozenset()
     return frozenset(number for number in emitters if not is_heard(counts, number))
@@ -161,14 +125,7 @@ def cheapest(joint: int, costs: Mapping[int, int]) -> int | None:
 
     If all are assumed to emit, the echoes may explain so few reflectors that none of them shows the silent one. This
     applies to omnidirectional emitters. The calls of pistons reach few reflectors in common, so that a wrong one may
-    explain their echoes as well.
-
-    Parameters
-    ----------
-    joint : int
-        Unexplained and missed echoes if all emit.
-    costs : mapping of int to int
-        The same if an emitter is silent.
+    explain their echoes as well. Costs are numbers of unexplained and missed echoes.
     """
     ascending = sorted(costs, key=lambda number: costs[number])
     if not ascending:
@@ -201,20 +158,10 @@ def expected_echoes(
     deaf: Mapping[int, Flags],
     silent: Collection[int] = (),
 ) -> ExpectedEchoes:
-    """Return the echoes that reflectors should cause in images.
+    """Return the echoes that reflectors should cause in images, except steps with direct sound, ``deaf`` (step,).
 
-    Parameters
-    ----------
-    images : mapping of int to Energyscape
-        Images by receiver.
-    floors : mapping of int to EchoFloor
-        Detection thresholds.
-    late_m : mapping of int to mapping of int to float
-        Path of sound between the emissions of each receiver and of each emitter that it may hear.
-    deaf : mapping of int to (step,) bool
-        Steps at which direct sound hides echoes.
-    silent : collection of int
-        Emitters whose echoes hide no others.
+    ``late_m`` is the path of sound between the emissions of each receiver and of each emitter that it may hear; echoes
+    of ``silent`` emitters hide no others.
     """
     predicted = reflectors.predicted()
     is_heard, is_missed = np.zeros((2, *predicted.power.shape), np.bool_)

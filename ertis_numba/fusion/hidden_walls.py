@@ -26,14 +26,7 @@ def over_hidden_walls(
 ) -> Flags:
     """Return True for reflectors whose echoes sound over a nearer surface and a hidden wall explains: (reflector,).
 
-    Parameters
-    ----------
-    place_m : (reflector, axis) float64
-    confirming : (reflector, echo, emitter) bool
-    hidden : (sensor,) int64
-        Sensors that emit, but have no image.
-    is_ghost : (reflector,) bool
-        Reflectors that do not exist, and hence reflect no sound to others.
+    ``hidden`` sensors emit, but have no image; ``is_ghost`` reflectors do not exist, and reflect no sound to others.
     """
     range_m = np.linalg.norm(place_m[:, None] - heard.sensor_m, axis=2).min(axis=1)
     found = np.zeros(len(place_m), np.bool_)

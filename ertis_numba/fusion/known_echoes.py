@@ -31,17 +31,10 @@ _MOST: Final = 10 ** (22.0 / 10)  # Largest correction. Reflectors that the imag
 
 
 class KnownEchoes(NamedTuple):
-    """Echoes of located reflectors in the image of one receiver.
+    """Echoes (echo,) of located reflectors in the image of one receiver.
 
-    Attributes
-    ----------
-    reflector, emitter : (echo,) int64
-    path_m : (echo,) float64
-    direction : (echo, axis) float64
-        Unit vectors from the receiver, in the frame of the platform. A flat array shows sound from behind in front.
-    power : (echo,) float64
-    is_ahead : (echo,) bool
-        True for reflectors in front of the receiver.
+    ``direction`` (echo, axis) is in the frame of the platform. A flat array shows sound from behind in front, not
+    ``is_ahead``.
     """
 
     reflector: Numbers
@@ -52,13 +45,7 @@ class KnownEchoes(NamedTuple):
     is_ahead: Flags
 
     def amplitudes(self, receiver: Receiver, late_m: Mapping[int, float]) -> tuple[Singles, Singles]:
-        """Return factors of the amplitude of each echo in each pixel: (echo, direction) and (echo, step) float32.
-
-        Parameters
-        ----------
-        late_m : mapping of int to float
-            Path of sound between the emission of the receiver and that of each emitter.
-        """
+        """Return factors of the amplitude of each echo in each pixel: (echo, direction) and (echo, step)."""
         turned = self.direction[:, None] @ receiver.mounting.rotation - receiver.directions
         lobe = np.exp(_LOBE * (turned[..., 1] ** 2 + turned[..., 2] ** 2) / receiver.width**2)
         path_m = self.path_m + np.array([late_m[each] for each in self.emitter.tolist()])
@@ -81,17 +68,6 @@ def explained_shares(
     Sure reflectors explain a pixel if the sum of their echoes in phase may have its power. Their phases are
     unknown. All located reflectors share such a pixel by the powers of their echoes there. Echoes that arrive from
     behind, and reflectors of other calls, are thus no ghosts in front. Other pixels keep the shares of the attribution.
-
-    Parameters
-    ----------
-    shares : Shares
-        Result of the attribution.
-    number : int
-        Index of the receiver.
-    factors : tuple of (echo, direction) and (echo, step) float32
-        Amplitudes of the echoes, `KnownEchoes.amplitudes`.
-    is_sure : (reflector,) bool
-        Reflectors that explain pixels.
     """
     lobe, pulse = factors
     sure = is_sure[echoes.reflector]
@@ -117,15 +93,7 @@ def _sums(lobe: Singles, pulse: Singles, shape: tuple[int, ...]) -> Singles:
 
 
 def levelled(reflectivity: Singles, grid: PolarGrid, place_m: Floats, power: Floats) -> Singles:
-    """Return the reflectivity of cells, scaled around reflectors so that the highest one there is theirs.
-
-    Parameters
-    ----------
-    reflectivity : (cell,) float32
-    place_m : (reflector, axis) float64
-    power : (reflector,) float64
-        Power of the echo of each reflector at 1 m.
-    """
+    """Return the reflectivity (cell,), scaled around reflectors so that the highest one is theirs, power at 1 m."""
     cells = reflectivity.reshape(grid.n_directions, grid.n_ranges)
     weight, factor = np.zeros_like(cells), np.ones_like(cells)
     offset_m = (place_m - grid.centre_m) * (1, 1, not grid.is_planar)

@@ -28,26 +28,12 @@ _NEAREST_M: Final = 0.05
 
 
 class Pair(NamedTuple):
-    """Echoes of one emitter at one receiver, for the cells that both can see.
+    """Echoes (entry,) of one emitter at one receiver, for the cells that both can see.
 
-    Attributes
-    ----------
-    cell : (entry,) uint32
-        Cells that are seen.
-    step : (entry,) uint32
-        Step of the receiver's range axis.
-    first, second : (entry,) uint32
-        Pixels of two neighbouring directions, in a flat image.
-    share : (entry,) float32
-        Weight of the second pixel.
-    gain : (entry,) float32
-        Power of the echo of a point reflector relative to that at 1 m ahead.
-    lifted : (entry,) float32
-        The same with the limited correction of the emitter's directivity.
-    weight : (entry,) float32
-        Weight in fused images, which fades towards the limits of what the pair can see.
-    bounds, confirms : (entry,) bool
-        True where a missing echo shows that a cell is empty, and where an echo confirms a reflector.
+    ``first`` and ``second`` are pixels of two neighbouring directions in a flat image, ``share`` the weight of the
+    second. ``gain`` is relative to a point reflector at 1 m ahead, ``lifted`` the same with the limited correction of
+    the emitter's directivity. ``weight`` fades towards the limits of what the pair can see. ``bounds``: a missing echo
+    shows that a cell is empty; ``confirms``: an echo confirms a reflector.
     """
 
     emitter: int
@@ -67,24 +53,10 @@ class Pair(NamedTuple):
 class Hypothesis(NamedTuple):
     """Cells in which a reflector would cause an echo in each pixel of a receiver.
 
-    Attributes
-    ----------
-    is_mirrored : bool
-        True for reflectors behind a flat array, which the array cannot distinguish from those in front.
-    begin : (direction,) uint32
-        First half-step of each direction at which an echo is possible.
-    bounds : (direction + 1,) uint32
-        Bounds of the entries of each direction, one for each half-step.
-    half_cell : (entry,) uint32
-        Cell that a half-step leads to.
-    half_gain : (entry,) float32
-        Gain of an echo from there; 0 if none is possible.
-    cell : (pixel,) int64
-        Cell of the middle of each pixel, or -1.
-    place_m : (pixel, axis) float32
-        Position of the middle of each pixel.
-    gain : (pixel,) float32
-        Gain of a reflector there, 0 if none is possible.
+    With ``is_mirrored``, reflectors are behind a flat array, which cannot distinguish them. ``begin`` (direction,) is
+    the first half-step with a possible echo, ``bounds`` (direction + 1,) are those of entries, one for each half-step,
+    with ``half_cell`` and ``half_gain``, 0 if none is possible. ``cell`` (pixel,) of the middle is -1 for none, with
+    ``place_m`` and ``gain`` there.
     """
 
     emitter: int
@@ -109,18 +81,10 @@ def pair_of(
     late_m: float,
     deaf: NDArray[np.bool_],
 ) -> Pair:
-    """Return the echoes of one emitter at one receiver.
+    """Return the echoes of one emitter at one receiver, ``number``, with direct sound at the steps ``deaf``.
 
-    Parameters
-    ----------
-    positions_m : (cell, axis) float64
-        Centres of the cells.
-    emitter, number : int
-        Indices of the emitting and of the receiving sensor in ``sensors``.
-    late_m : float
-        Path of sound between the emission of the receiver and that of the emitter; negative if the latter is earlier.
-    deaf : (step,) bool
-        Steps at which direct sound hides echoes.
+    ``late_m`` is the path of sound between the emission of the receiver and that of the emitter, negative if it is
+    earlier.
     """
     sent, heard = sensors[emitter].local_m(positions_m), sensors[number].local_m(positions_m)
     from_m, to_m = np.linalg.norm(sent, axis=1), np.linalg.norm(heard, axis=1)
@@ -171,20 +135,12 @@ def hypothesis(
     late_m: float,
     is_mirrored: bool,
 ) -> Hypothesis:
-    """Return the cells whose reflectors cause echoes of an emitter in the pixels of a receiver.
+    """Return the cells whose reflectors, behind if ``is_mirrored``, cause echoes of an emitter in a receiver's pixels.
 
     A pixel covers paths of one step. Where emitter and receiver face each other, its begin, middle and end lead to
     cells far apart, so there are entries for all half-steps.
-
     Sound of path L that arrives from the direction u has met a reflector at ``s u``, where ``s + |s u − d| = L`` and d
     is the emitter, as seen from the receiver. Hence ``s = (L² − |d|²) / (2 (L − u·d))``.
-
-    Parameters
-    ----------
-    sensors, emitters, receiver, emitter, late_m
-        As in `pair_of`.
-    is_mirrored : bool
-        Look for reflectors behind the array.
     """
     mounting = receiver.mounting
     toward = receiver.directions * np.array([-1.0 if is_mirrored else 1.0, 1.0, 1.0])

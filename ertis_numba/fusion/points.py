@@ -41,15 +41,7 @@ _BESIDE: Final = np.arange(-1, 2)
 
 
 class HeardImage(NamedTuple):
-    """Detection threshold of an image, and its echoes, whatever calls caused them.
-
-    Attributes
-    ----------
-    floor : EchoFloor
-        Detection threshold (`_FALSE_ALARM`), infinite in an image of zeros.
-    echoes : _ImageEchoes
-        Echoes above it, strongest first.
-    """
+    """Detection threshold of an image, infinite for zeros, and its echoes above it, strongest first, of any call."""
 
     floor: EchoFloor
     echoes: "_ImageEchoes"
@@ -69,17 +61,7 @@ class _ImageEchoes(NamedTuple):
 
 
 class PointFuser:
-    """Extractor of the points of one sensor, attributed to the emitters of their echoes.
-
-    Parameters
-    ----------
-    number : int
-        Index of the sensor in ``sensors``.
-    image : Energyscape
-        Any image of the sensor.
-    deaf : (step,) bool
-        Steps at which direct sound hides echoes.
-    """
+    """Extractor of the points of one sensor, attributed to emitters; direct sound hides echoes at ``deaf`` steps."""
 
     def __init__(
         self,
@@ -108,13 +90,7 @@ class PointFuser:
         return heard
 
     def echoes(self, image: Energyscape, shares: Shares, late_m: Mapping[int, float]) -> SensorEchoes:
-        """Return the echoes of an image above its noise, strongest first.
-
-        Parameters
-        ----------
-        late_m : mapping of int to float
-            Path of sound between the emission of this sensor and that of each emitter.
-        """
+        """Return the echoes of an image above its noise, strongest first; ``late_m`` is as in `pair_of`."""
         heard = self.heard(image).echoes
         emitters = [emitter for emitter, number in shares if number == self._number]
         return SensorEchoes(
@@ -179,12 +155,7 @@ def _floor(image: Energyscape) -> EchoFloor:
 def joined(reflectors: Reflectors, image: Energyscape, grid: PolarGrid) -> PointCloud:
     """Return one point for each reflector, in the frame of the platform, strongest first.
 
-    Parameters
-    ----------
-    image : Energyscape
-        Fused image, which limits the amplitudes of reflectors that are not confirmed.
-    grid : PolarGrid
-        Cells of the image.
+    The fused image limits the amplitudes of reflectors that are not confirmed.
     """
     position_m = reflectors.position_m
     amplitude = np.sqrt(reflectors.reflectivity)

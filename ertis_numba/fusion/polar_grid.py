@@ -22,18 +22,9 @@ _NONE: Final = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PolarGrid:
-    """Directions all around a point of the platform, and equally spaced ranges.
+    """Directions all around a point of the platform at ``height_m``, and equally spaced ranges from half a step on.
 
-    Attributes
-    ----------
-    n_azimuths : int
-        Azimuths of each row; the first one is −180° and half a step.
-    elevation_rad : (row,) float64
-        Elevations of the rows, increasing and equally spaced; one row is a planar image.
-    step_m : float
-        Spacing of the ranges. The first one is half a step.
-    height_m : float
-        Height of the centre of the grid on the platform.
+    The first azimuth is −180° and half a step. ``elevation_rad`` (row,) are equally spaced; one row is a planar image.
     """
 
     n_azimuths: int
@@ -44,13 +35,7 @@ class PolarGrid:
 
     @classmethod
     def around(cls, spacing_deg: float, step_m: float, last_m: float, *, is_planar: bool, height_m: float) -> Self:
-        """Return a grid of a given spacing of directions and ranges, up to a range.
-
-        Raises
-        ------
-        ArgumentError
-            A spacing is out of range, or the grid has too many cells.
-        """
+        """Return a grid of a given spacing of directions and ranges, up to a range, with a limited number of cells."""
         checks.between("spacing_deg", spacing_deg, 0.1, 30.0)
         checks.between("range_step_m", step_m, 1e-3, 1.0)
         n_azimuths = round(360.0 / spacing_deg)
@@ -131,10 +116,7 @@ class PolarGrid:
 
 
 def close_directions(directions: Floats, within_rad: float) -> Places:
-    """Return the directions within an angle of each direction, itself included: (direction, neighbour) int64.
-
-    Rows with fewer neighbours repeat the direction itself.
-    """
+    """Return the directions within an angle of each, itself included and as filling: (direction, neighbour)."""
     # Importing SciPy's trees takes a tenth of a second, and no other function needs them.
     from scipy.spatial import KDTree  # noqa: PLC0415
 

@@ -79,7 +79,6 @@ class PulseGroups(Generic[Item]):
     Images of different sensors may overtake each other, so a group stays open while the next one begins. It ends
     without a sensor that has an item of a later pulse, or that was missing from the two groups before, and at the
     latest when three later groups have begun.
-
     Items of a session are ordered by their SYNC count, so that a clock may be wrong or be set. Times order only the
     items of different sessions, unless they contradict the arrivals by more than a second. If all items of a sensor are
     late for a second, its counter has begun anew, and so does its grouping.
@@ -115,10 +114,7 @@ class PulseGroups(Generic[Item]):
         return [group.items for group in found._open]
 
     def add(self, item: Item) -> list[dict[str, Item]]:
-        """Add an item, and return the groups that are complete now, by sensor.
-
-        Items that come after their group was returned are left out.
-        """
+        """Add an item, and return the groups that are complete now, by sensor; items after their group are left out."""
         sensor = item.stamp.sensor
         self._expected.add(sensor)
         place = self._place(item.stamp)

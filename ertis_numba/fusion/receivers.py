@@ -29,16 +29,9 @@ _THINNED: Final = 4  # One of so many ranges serves to estimate the noise.
 
 
 class CoarseImage(NamedTuple):
-    """Powers of an image at the steps of a coarse range axis.
+    """Highest power within each step of a coarse range axis above ``floor`` (step,), that of noise and side lobes.
 
-    Attributes
-    ----------
-    power : (direction, step) float32
-        Highest power within each step, without noise and side lobes.
-    highest : (direction, step) float32
-        Highest power of the neighbourhood, with noise and side lobes.
-    floor : (step,) float32
-        Power that noise and side lobes may reach.
+    ``highest`` (direction, step) is that of the neighbourhood, with noise and side lobes.
     """
 
     power: Singles
@@ -47,16 +40,9 @@ class CoarseImage(NamedTuple):
 
 
 class Beam(NamedTuple):
-    """Interpolation between two directions of an image, for points.
+    """Interpolation (point,) between two directions of an image, with the weight ``share`` of the second one.
 
-    Attributes
-    ----------
-    first, second : (point,) int64
-        Indices of directions.
-    share : (point,) float32
-        Weight of the second one.
-    inside : (point,) bool
-        True for points in front of the sensor and within the limits of its directions.
+    ``inside`` is True for points in front of the sensor and within the limits of its directions.
     """
 
     first: Places
@@ -66,15 +52,7 @@ class Beam(NamedTuple):
 
 
 class Receiver:
-    """Geometry of the images of one sensor.
-
-    Parameters
-    ----------
-    image : Energyscape
-        Any image of the sensor; others must have the same directions and ranges.
-    step_m : float
-        Spacing of the coarse range axis.
-    """
+    """Geometry of the images of one sensor, which all have the same directions and ranges."""
 
     def __init__(self, mounting: MountedSensor, image: Energyscape, step_m: float) -> None:
         self.mounting, self.step_m = mounting, step_m
@@ -109,13 +87,7 @@ class Receiver:
         )
 
     def coarse(self, image: Energyscape, deaf: NDArray[np.bool_]) -> CoarseImage:
-        """Return the powers of an image.
-
-        Parameters
-        ----------
-        deaf : (step,) bool
-            Steps at which direct sound hides echoes.
-        """
+        """Return the powers of an image, with direct sound, which hides echoes, at the steps ``deaf``."""
         amplitude = np.ascontiguousarray(image.amplitude, dtype=np.float32)
         noise = float(medians_of(amplitude[:, ::_THINNED].reshape(1, -1))[0]) ** 2 / math.log(2)
         least = np.float32(max(_NOISE_FACTOR * noise, _LEAST_POWER))
@@ -128,12 +100,7 @@ class Receiver:
         return CoarseImage(power, highest, floor)
 
     def beam(self, local_m: Floats) -> Beam:
-        """Return the directions of points in the sensor frame.
-
-        Parameters
-        ----------
-        local_m : (point, axis) float64
-        """
+        """Return the directions of points in the sensor frame, (point, axis)."""
         ahead = local_m[:, 0] > 0
         if self._order is None:
             # Importing SciPy's trees takes a tenth of a second, and planar images do not need them.

@@ -22,19 +22,7 @@ _BEFORE_M: Final = 0.05  # Least distance of a wall from a reflector in front of
 
 
 class Walls(NamedTuple):
-    """Planes of mirror-like walls.
-
-    Attributes
-    ----------
-    number : (wall,) int64
-        Reflector of each wall.
-    normal : (wall, axis) float64
-        Direction from the platform.
-    depth_m : (wall,) float64
-        Distance from the origin.
-    strength : (wall,) float64
-        Power of an echo after a path of 1 m.
-    """
+    """Planes of mirror-like walls (wall,), each of a reflector; ``strength`` is the power of an echo after 1 m."""
 
     number: Numbers
     normal: Floats
@@ -53,16 +41,9 @@ class Walls(NamedTuple):
 
 
 class _Sources(NamedTuple):
-    """Apparent origins of sound that two surfaces reflect, and the paths of the sound to them.
+    """Apparent origins (source, emitter, axis) of sound that two reflectors reflect, and its paths to them.
 
-    Attributes
-    ----------
-    first, second : (source,) int64
-        Reflectors.
-    origin_m : (source, emitter, axis) float64
-    sent_m : (source, emitter) float64
-        Path of the sound of each emitter to the place; 0 for mirror images of the emitter.
-    strength : (source,) float64
+    ``sent_m`` is 0 for mirror images of the emitter.
     """
 
     first: Numbers
@@ -79,15 +60,7 @@ class _Sources(NamedTuple):
 
 
 class Reflected(NamedTuple):
-    """Echoes that are explained by sound over two nearer surfaces.
-
-    Attributes
-    ----------
-    is_explained : (reflector, echo) bool
-        Echoes that two reflectors nearer than this one explain.
-    is_ghost : (reflector,) bool
-        Reflectors that have no other echoes.
-    """
+    """Echoes (reflector, echo) that two nearer reflectors explain, and ghosts (reflector,), which have no others."""
 
     is_explained: Flags
     is_ghost: Flags
@@ -99,14 +72,6 @@ def reflected_twice(
     """Return the echoes that are explained by sound over two nearer surfaces, one of them a wall.
 
     A reflector without other echoes is a ghost, which reflects no sound to others.
-
-    Parameters
-    ----------
-    place_m : (reflector, axis) float64
-    reflectivity : (reflector,) float64
-        Power of an echo at 1 m.
-    members : sequence of (member,) int64
-        Echoes that locate each reflector.
     """
     range_m = np.linalg.norm(place_m[:, None] - heard.sensor_m, axis=2).min(axis=1)
     is_explained = np.zeros((len(place_m), len(heard.path_m)), np.bool_)

@@ -21,25 +21,11 @@ _MOUNTED_RAD: Final = math.radians(0.22)  # the search for echoes of the same re
 
 
 class SensorEchoes(NamedTuple):
-    """Echoes in the image of one sensor.
+    """Echoes (echo,) in the image of one sensor, which the calls of ``emitters`` may have caused.
 
-    Attributes
-    ----------
-    emitters : (emitter,) int64
-        Sensors whose calls may have caused the echoes.
-    direction : (echo, axis) float64
-        Unit vectors from the receiver, in the frame of the platform.
-    path_m : (echo, emitter) float64
-        Length of the path of the sound if the emitter's call caused the echo.
-    path_sd_m, angle_sd_rad : (echo,) float64
-        Standard deviations of path and direction.
-    power : (echo,) float64
-    share : (echo, emitter) float64
-        Share of each emitter according to the attribution of the images.
-    is_clear : (echo,) bool
-        Echoes that noise hardly causes, even if its level changes within a record.
-    is_faint : (echo,) bool
-        Echoes that only confirm reflectors that others show.
+    Unit vectors from the receiver are in the frame of the platform; ``path_m`` (echo, emitter) is that of each
+    emitter's call, and ``share`` (echo, emitter) that of the attribution of the images. Noise hardly causes clear
+    echoes, even if its level changes within a record; faint ones only confirm reflectors that others show.
     """
 
     receiver: int
@@ -62,24 +48,11 @@ class SensorEchoes(NamedTuple):
 
 
 class PulseEchoes(NamedTuple):
-    """Echoes in the images of all sensors.
+    """Echoes (echo,) in the images of all sensors; path and share are NaN and 0 for emitters that are not heard.
 
-    Attributes
-    ----------
-    receiver : (echo,) int64
-    path_m, share : (echo, emitter) float64
-        As in `SensorEchoes`; NaN and 0 for emitters that the receiver does not hear.
-    direction : (echo, axis) float64
-    axes : (echo, 3, axis) float64
-        Direction, and two unit vectors across.
-    deviation : (echo, 2) float64
-        Standard deviations of path in metres and direction in radians.
-    gate_rad : (echo,) float64
-        That of the direction in the search for echoes of the same reflector.
-    power : (echo,) float64
-    is_clear, is_faint : (echo,) bool
-    has_image : (emitter,) bool
-        Only foreign echoes show the calls of sensors without an image.
+    ``axes`` (echo, 3, axis) are the direction and two unit vectors across, ``deviation`` (echo, 2) those of path in m
+    and direction in rad, and ``gate_rad`` that of the direction in the search for echoes of the same reflector. Only
+    foreign echoes show calls of sensors that are not ``has_image`` (emitter,).
     """
 
     receiver: Numbers

@@ -45,20 +45,9 @@ _DIRECT_SOUND_M: Final = 0.1  # Range before and after direct sound in which it 
 class PulseReflectors(NamedTuple):
     """Reflectors of a group of images, associated without the emitters that are not heard.
 
-    Attributes
-    ----------
-    floor : dict of int to EchoFloor
-        Detection thresholds of each sensor, `HeardImage.floor`.
-    without_echo : list of int
-        Numbers of the sensors whose images have no echo above the floor.
-    unheard : frozenset of int
-        Emitters whose calls are not heard.
-    apart : frozenset of int
-        Emitters whose calls only their own sensors hear, as on different SYNC chains.
-    pulses : tuple of EmissionCounts
-        Evidence of this pulse and of the ones before.
-    cost : int
-        Echoes that reflectors do not explain, and those that they should cause but that are missed.
+    ``without_echo`` are sensors whose images have no echo above the floor, and ``apart`` emitters whose calls only
+    their own sensors hear, as on different SYNC chains. ``pulses`` are the evidence of this pulse and of the ones
+    before. ``cost`` counts echoes that reflectors do not explain, and those that they should cause but that are missed.
     """
 
     attributed: Attributed
@@ -86,19 +75,7 @@ class _Explained(NamedTuple):
 
 
 class FusionTables:
-    """Tables of all receivers, computed when the first image of each one arrives.
-
-    Parameters
-    ----------
-    grid : PolarGrid
-        Cells of fused images.
-    emitting : list of int
-        Indices of the sensors that emit.
-    start_s : sequence of float
-        Start of each sensor's call after the start of the record.
-    diameters_m : sequence of float
-        Diameter of each sensor's emitter.
-    """
+    """Tables of all receivers, computed when the first image of each arrives; ``start_s`` are those of calls."""
 
     def __init__(
         self,
@@ -125,13 +102,7 @@ class FusionTables:
         self._converted: dict[str, tuple[Settings, Settings]] = {}  # The checks of settings take long.
 
     def fit(self, group: Mapping[int, Energyscape], diameters_m: Mapping[int, float]) -> bool:
-        """Return True if images have the same directions, ranges, calls and emitters as earlier ones of their sensors.
-
-        Parameters
-        ----------
-        diameters_m : mapping of int to float
-            Diameters of emitters.
-        """
+        """Return True if images have the directions, ranges, calls and emitters of earlier ones of their sensors."""
         return all(self._diameters_m[number] == each for number, each in diameters_m.items()) and all(
             image.settings.call.start_s == self._start_s[number]
             if number not in self._receivers
@@ -203,14 +174,7 @@ class FusionTables:
     ) -> PulseReflectors:
         """Return the reflectors of a group, and the emitters that are not heard.
 
-        Parameters
-        ----------
-        attributed : Attributed
-            Attribution without the emitters that the pulses before have not heard.
-        unheard : frozenset of int
-            These emitters.
-        pulses : tuple of EmissionCounts
-            Evidence of the pulses before.
+        ``attributed`` is the attribution without those that the pulses before have not heard, ``unheard``.
         """
         floor = {number: self._points[number].heard(each).floor for number, each in group.items()}
         explained = self._explained(group, attributed, floor, unheard)
@@ -276,11 +240,6 @@ class FusionTables:
 
         Infinite for emitters that echoes prove to work; negatively infinite for unheard ones, and for those without a
         located echo of their own call.
-
-        Parameters
-        ----------
-        found : PulseReflectors
-            Reflectors of the group.
         """
         return {number: self._evidence(group, found, number) for number in self.emitters(group)}
 
@@ -307,13 +266,7 @@ class FusionTables:
     def image(
         self, found: PulseReflectors, group: Mapping[int, Energyscape], coarse: Mapping[int, CoarseImage]
     ) -> Energyscape:
-        """Return the fused image of a group, in which no echoes of confirmed reflectors are ghosts.
-
-        Parameters
-        ----------
-        coarse : mapping of int to CoarseImage
-            Powers of the images.
-        """
+        """Return the fused image of a group, in which no echoes of confirmed reflectors are ghosts."""
         reflectors, shares = found.reflectors, found.attributed.shares
         informed: dict[tuple[int, int], NDArray[np.float32]] = {}
         for number, each in coarse.items():
