@@ -196,8 +196,9 @@ class Sight:
         taken = np.zeros(len(direction))
         for part in parts(len(direction), max(beams.shape)):
             waves = np.exp(1j * wave * (direction[part] @ self._positions_m.T))
-            taken[part] = np.max(np.abs(beams @ waves.T), axis=0, initial=0.0)
-        return taken / len(self._positions_m)
+            signals = beams @ waves.T
+            taken[part] = np.max(signals.real**2 + signals.imag**2, axis=0, initial=0.0)  # faster than np.abs
+        return np.sqrt(taken) / len(self._positions_m)
 
     @property
     def _wavenumber_rad_m(self) -> float:

@@ -64,7 +64,8 @@ def greatest(bounds: Floats, exact: Callable[[NDArray[np.intp]], Floats]) -> tup
 def envelope(spectra: NDArray[np.inexact[Any]], turns: NDArray[np.complex128]) -> Floats:
     """Return the envelopes of pulses, ``|spectra @ turns|``: (path, time) float64."""
     if np.iscomplexobj(spectra):
-        return np.abs(spectra @ turns)
+        pulses = spectra @ turns
+        return np.sqrt(pulses.real**2 + pulses.imag**2)
     return np.sqrt((spectra @ turns.real) ** 2 + (spectra @ turns.imag) ** 2)
 
 

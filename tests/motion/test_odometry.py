@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -242,19 +241,18 @@ def test_commands_of_the_motion_page_run(tmp_path):
     assert data["reflectors"]["position"][0, 0].shape == (8, 3)
 
 
-def test_path_of_odometry_serves_maps_and_recordings(tmp_path, monkeypatch):
+def test_path_of_odometry_serves_maps_and_recordings(folder, tmp_path, monkeypatch):
     """Sensors of a pulse measure in succession, so the path begins after some measurements and ends before others."""
     monkeypatch.chdir(tmp_path)
-    scene = Path(__file__).parents[2] / "data" / "synthetic" / "scenes" / "moving_platform.toml"
+    drive = str(folder / "both.h5")
     for command in (
-        ["simulate", str(scene), "-o", "drive.h5", "--count", "3"],
-        ["odometry", "drive.h5", "-o", "path.tum"],
-        ["import", "poses", "drive.h5", "path.tum", "-o", "posed.h5", "--force"],
-        ["map", "drive.h5", "--poses", "path.tum", "-o", "place.h5"],
+        ["odometry", drive, "-o", "path.tum"],
+        ["import", "poses", drive, "path.tum", "-o", "posed.h5", "--force"],
+        ["map", drive, "--poses", "path.tum", "-o", "place.h5"],
     ):
         done = CliRunner().invoke(cli, command)
         assert done.exit_code == 0, done.stderr
     assert ertis.read_map("place.h5").n_groups == 3
-    with ertis.open_recording("posed.h5", sensor="right") as recording:
+    with ertis.open_recording("posed.h5", sensor="back") as recording:
         assert recording.trajectory.source == "file"
         assert len(recording.trajectory) == 3

@@ -415,7 +415,8 @@ def test_setting_of_the_recording_levels_its_images(recording, tmp_path):
 
 
 def test_checks_of_the_plan_apply_to_levelled_images(recording, tmp_path):
-    done = process(recording, "--level", "--verify", "--explain", "-o", str(tmp_path / "level.h5"), "--json")
+    options = ["--directions", "3d:300", "--verify", "--explain", "-o", str(tmp_path / "level.h5"), "--json"]
+    done = process(recording, "--level", *options)
     report = json.loads(done.stdout)
     with open_energyscapes(tmp_path / "level.h5") as images:
         budget_db = images.settings.accuracy.max_error_db
