@@ -30,35 +30,10 @@ _HALF_SPACE: Final[dict[str, object]] = {
 
 
 def coarse_map_warning(settings: Settings, grid: DegreesFromRadians | None = None) -> str | None:
-    """Return a warning if sources between the directions of acoustic maps are too weak, or weaker than side lobes.
+    """Return a warning if sources between directions of maps are too weak, or weaker than side lobes.
 
-    Parameters
-    ----------
-    settings : Settings
-        Their directions, array, bands and method are compared.
-    grid : Grid, AcousticMap or AcousticMapReader, optional
-        Directions, or a result with them; those of the settings by default.
-
-    Returns
-    -------
-    str or None
-        None if a source anywhere between the directions loses at most 3 dB in all bands, and exceeds the side lobes of
-        the array. The warning names a grid that suffices, or frequencies that the grid resolves.
-
-    Raises
-    ------
-    ArgumentError
-        The settings have no band, or their directions cannot be used.
-
-    Examples
-    --------
-    >>> import ertis_numba as ertis
-    >>> from ertis_numba.passive.search_grid import coarse_map_warning
-    >>> settings = ertis.Settings().replace("passive.bands_hz", ((40e3, 60e3),))
-    >>> coarse_map_warning(settings.replace("processing.directions", "3d:1000")).split("; ")[-1]
-    'use at least 3d:1300 directions'
-    >>> coarse_map_warning(settings.replace("processing.directions", "3d:1300")) is None
-    True
+    None if a source anywhere between the directions of the settings or of a grid or result loses at most 3 dB in all
+    bands, and exceeds the side lobes. The warning names a grid that suffices, or frequencies that the grid resolves.
     """
     check = GridCheck(direction_grid(settings.processing) if grid is None else grid, settings.processing)
     found = (block_warning(settings, heard_bands(settings)), None if check.is_single else _map_warning(settings, check))
@@ -109,25 +84,9 @@ def _coarse(
 
 
 def search_changes(settings: Settings) -> dict[str, object]:
-    """Return the changes of settings with which directions suit the search for bearings.
+    """Return the changes of settings with which directions suit the search for bearings; empty if none.
 
-    Returns
-    -------
-    dict of str to value
-        Empty if `search_warning` has no objection. Otherwise, a grid over the half-space ahead; for an array on a
-        horizontal line, a grid in one plane.
-
-    Raises
-    ------
-    ArgumentError
-        The settings have no band, or their directions cannot be used.
-
-    Examples
-    --------
-    >>> import ertis_numba as ertis
-    >>> from ertis_numba.passive.search_grid import search_changes
-    >>> search_changes(ertis.Settings())["processing.directions"].startswith("3d:")
-    True
+    They are a grid over the half-space ahead; for an array on a horizontal line, a grid in one plane.
     """
     if _search_warning(settings) is None:
         return {}
@@ -141,31 +100,6 @@ def search_warning(settings: Settings) -> str | None:
 
     Bearings and their levels are refined beyond the grid, so a source in the middle between directions may lose 6 dB.
     An array that is not a horizontal line resolves elevations, so its directions need several.
-
-    Parameters
-    ----------
-    settings : Settings
-        Their directions, array, and bands are compared.
-
-    Returns
-    -------
-    str or None
-        None if the directions suffice in all bands.
-
-    Raises
-    ------
-    ArgumentError
-        The settings have no band, or their directions cannot be used.
-
-    Examples
-    --------
-    >>> import ertis_numba as ertis
-    >>> from ertis_numba.passive.search_grid import search_warning
-    >>> settings = ertis.Settings().replace("passive.bands_hz", ((20e3, 30e3),))
-    >>> search_warning(settings.replace("processing.directions", "3d:100")).split("; ")[-1]
-    'search at least 3d:230 directions'
-    >>> search_warning(settings.replace("processing.directions", "3d:230")) is None
-    True
     """
     found = (block_warning(settings, heard_bands(settings)), _search_warning(settings))
     return "; also, ".join(filter(None, found)) or None

@@ -32,61 +32,29 @@ _MAX_EXCESS: Final = 10**0.1  # Power of all sources relative to that of the ban
 
 
 class Scan(NamedTuple):
-    """Directions that are searched.
-
-    Attributes
-    ----------
-    directions : (direction, axis) float64
-        Unit vectors.
-    reach_rad : float
-        Largest distance from one of the directions to a maximum.
-    level : bool
-        True if all have one elevation, which maxima then keep.
-    """
+    """Directions that are searched, as unit vectors."""
 
     directions: Floats
     mesh: ScanMesh
-    reach_rad: float
-    level: bool
+    reach_rad: float  # largest distance from one of the directions to a maximum
+    level: bool  # all have one elevation, which maxima then keep
 
 
 class FoundSource(NamedTuple):
-    """Source in a band.
+    """Source in a band, with the covariance of its direction's errors sideways and upwards."""
 
-    Attributes
-    ----------
-    direction : (axis,) float64
-        Unit vector.
-    power : float
-        Mean square of its sound in the band, without noise.
-    ratio : float
-        This power relative to the noise of a microphone.
-    covariance_rad2 : (2, 2) float64
-        Covariance of the direction's errors sideways and upwards; infinite along directions that are not resolved.
-    may_be_crosstalk : bool
-        A signal that is equal at all microphones fits as well as the direction.
-    """
-
-    direction: Floats
-    power: float
-    ratio: float
-    covariance_rad2: Floats
-    may_be_crosstalk: bool
+    direction: Floats  # unit vector
+    power: float  # mean square in the band, without noise
+    ratio: float  # power relative to the noise of a microphone
+    covariance_rad2: Floats  # (2, 2), infinite where not resolved
+    may_be_crosstalk: bool  # a signal equal at all microphones fits as well
 
 
 class BandSearch:
-    """Search for the sources of one band.
+    """Search for the sources of one band, in bins of which shares lie within the band.
 
-    Parameters
-    ----------
-    frequency_hz, shares : (bin,) float64
-        Frequencies of the band's bins, and the share of each that lies within the band.
-    noise : NoiseModel
-        Noise at these frequencies.
-    delays : callable
-        Returns the delays of the sound from unit vectors, (direction, mic).
-    steer : callable
-        Returns the power of matrices, (bin, mic, mic) complex64, for the wave from each direction of the scan.
+    ``delays`` returns the delays of the sound from unit vectors, (direction, mic), and ``steer`` the power of matrices,
+    (bin, mic, mic), for the wave from each direction of the scan.
     """
 
     def __init__(
@@ -105,18 +73,9 @@ class BandSearch:
         self._laws: dict[int, tuple[ScanExtent, NDArray[np.float64]]] = {}
 
     def __call__(self, heard: CrossSpectrum, *, false_alarm: float, top: int, least: float) -> list[FoundSource]:
-        """Return the sources of a matrix that noise does not explain.
+        """Return up to ``top`` sources that noise does not explain, at least ``least`` times the strongest.
 
-        Parameters
-        ----------
-        heard : CrossSpectrum
-            Spectrum in the bins of the band.
-        false_alarm : float
-            Probability that noise alone yields a source.
-        top : int
-            Largest number of sources.
-        least : float
-            Least power relative to the strongest source.
+        Noise alone yields a source with the probability ``false_alarm``.
         """
         places, n_mics = np.zeros((0, 3)), heard.matrix.shape[1]
         band = HeardBand.of(heard, places, self._shares, self._delays) if _has_power(heard) else None
