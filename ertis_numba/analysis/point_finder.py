@@ -25,7 +25,7 @@ class PointFinder:
             chosen = {"top": TOP, "min_level_db": MIN_LEVEL_DB} | self._finding
             cloud = image.points.strongest(chosen["top"], chosen["min_level_db"])
             if cloud.uncertainty_m is not None and not all(observable_angles(cloud.settings.array)[:2]):
-                cloud = cloud.replace(uncertainty_m=cloud.uncertainty_m * np.float32([1, np.inf]))
+                cloud = cloud.replace(uncertainty_m=cloud.uncertainty_m * np.array([1, np.inf], np.float32))
             return cloud
         known = self._extractors.get(image.stamp.sensor)
         if known is None or not _suits(known[0], image):
