@@ -165,7 +165,7 @@ def _map(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "tuple[A
     with options.note_when_slow(options.PREPARING, quiet=quiet):
         from ertis_numba.passive import AcousticCamera
 
-        with AcousticCamera(heard.settings, check=False) as camera:
+        with AcousticCamera(heard.settings, check=False, false_alarm=options.FALSE_ALARM) as camera:
             return camera.process(heard), camera.band_note
 
 

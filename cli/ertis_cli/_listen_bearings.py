@@ -17,10 +17,6 @@ if TYPE_CHECKING:
 __all__ = ["listen_bearings"]
 
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'band':>15}  {'azimuth':>14}  {'elevation':>14}  {'level':>9}"
-_CROSSTALK = (
-    "a source marked 'may be crosstalk' has the same signal in all channels, as electrical crosstalk has; cover the "
-    "microphones: crosstalk remains, and sound does not"
-)
 
 
 def listen_bearings(
@@ -28,7 +24,6 @@ def listen_bearings(
     *,
     sensors: Sequence[str],
     average: int | None,
-    directions: str | None,
     keys: "ClientKeys | None",
     n: int | None,
     duration: float | None,
@@ -37,7 +32,6 @@ def listen_bearings(
 ) -> None:
     """Print the bearings of each acoustic map until a signal, a count or a duration ends it."""
     from ertis_numba.network.acoustic_map_subscriber import AcousticMapSubscriber
-    from ertis_numba.passive.search_grid import search_warning
 
     subscribers: list[AcousticMapSubscriber] = []
     checked: set[str] = set()
@@ -45,8 +39,7 @@ def listen_bearings(
     doubtful: set[str] = set()
 
     def connect(on_note: Callable[[str], None]) -> AcousticMapSubscriber:
-        wanted = {"passive.averages": average, "processing.directions": directions}
-        changes = {name: value for name, value in wanted.items() if value is not None}
+        changes = {} if average is None else {"passive.averages": average}
         subscribers.append(
             AcousticMapSubscriber(
                 address, sensors=sensors or None, changes=changes, false_alarm=1e-3, keys=keys, on_note=on_note
@@ -57,14 +50,12 @@ def listen_bearings(
     def show(found: "AcousticMap") -> None:
         if (sensor := found.stamp.sensor) not in checked:
             checked.add(sensor)
-            options.note_unknown_angles(sensor, found.settings, found, is_passive=True)
-            options.warn_of(sensor, search_warning(found.settings))
+            options.note_unknown_bearings(sensor, found.settings)
         if subscribers[0].band_note is not None and sensor not in outside:
             outside.add(sensor)
             options.warn_of(sensor, subscribers[0].band_note)
-        if sensor not in doubtful and any(each.may_be_crosstalk for each in subscribers[0].bearings):
+        if sensor not in doubtful and options.note_doubts(sensor, subscribers[0].bearings):
             doubtful.add(sensor)
-            options.note(f"sensor {sensor}: {_CROSSTALK}")
         _show(found, subscribers[0].bearings, _age_ms(subscribers[0]), as_json=as_json)
 
     def report_active(subscriber: AcousticMapSubscriber) -> None:
@@ -109,7 +100,7 @@ def _show(found: "AcousticMap", bearings: "Sequence[Bearing]", age_ms: float | N
                 "age_ms": age_ms,
                 "averages": found.n_measurements,
                 "masked_s": found.masked_s,
-                "bearings": [_numbers(each) for each in bearings],
+                "bearings": [each.as_dict() for each in bearings],
             }
         )
         return
@@ -125,25 +116,5 @@ def _show(found: "AcousticMap", bearings: "Sequence[Bearing]", age_ms: float | N
         click.echo(f"{start}  {band:>15}  {azimuth:>14}  {elevation:>14}  {level:.1f} {unit}{doubt}")
 
 
-def _numbers(bearing: "Bearing") -> dict[str, object]:
-    return {
-        "band_hz": list(bearing.band_hz),
-        "azimuth_deg": round(bearing.azimuth_deg, 4),
-        "elevation_deg": round(bearing.elevation_deg, 4),
-        **{name: _finite(getattr(bearing, name)) for name in ("sideways_deg", "upwards_deg")},
-        **{name: _rounded(getattr(bearing, name)) for name in ("level_dbfs", "level_db", "source_level_db")},
-        "snr_db": round(bearing.snr_db, 3),
-        "may_be_crosstalk": bearing.may_be_crosstalk,
-    }
-
-
 def _angle(angle_deg: float, size_deg: float) -> str:
     return f"{angle_deg:+.2f} ± {size_deg:.2f}°" if math.isfinite(size_deg) else "unknown"
-
-
-def _finite(size_deg: float) -> float | None:
-    return size_deg if math.isfinite(size_deg) else None
-
-
-def _rounded(level_db: float | None) -> float | None:
-    return None if level_db is None else round(level_db, 3)

@@ -65,12 +65,6 @@ _POLL_INTERVAL_S = 0.1
     help="With --bearings: number of measurements of each sensor to average; that of its settings by default.",
 )
 @click.option(
-    "--directions",
-    metavar="GRID",
-    help="With --bearings: directions to search (90, 1850, 3000, 2d:N or 3d:N). By default, those of the sensor's "
-    "settings, or if these are planar or too coarse, a sufficient grid over the half-space ahead.",
-)
-@click.option(
     "--output",
     "-o",
     "trajectory",
@@ -96,7 +90,6 @@ def listen(
     odometry: bool,
     bearings: bool,
     average: int | None,
-    directions: str | None,
     trajectory: Path | None,
     mounting: Path | None,
     key: str | None,
@@ -126,7 +119,6 @@ def listen(
             address,
             name="bearings" if bearings else "odometry" if odometry else "fused",
             average=average,
-            directions=directions,
             trajectory=trajectory,
             mounting=mounting,
             force=force,
@@ -192,7 +184,6 @@ def _listen_specially(
     *,
     name: str,
     average: int | None,
-    directions: str | None,
     trajectory: Path | None,
     mounting: Path | None,
     force: bool,
@@ -201,7 +192,7 @@ def _listen_specially(
     """Print bearings, odometry or fused images, which this command computes itself."""
     _network.require_duration(common["duration"])
     if name == "bearings":
-        _listen_bearings.listen_bearings(address, average=average, directions=directions, **common)
+        _listen_bearings.listen_bearings(address, average=average, **common)
         return
     common["mountings"] = _mountings.mountings(mounting, common["sensors"] or None)
     if name == "odometry":
@@ -226,9 +217,8 @@ def _require_options_of(outputs: dict[str, bool]) -> None:
             raise click.UsageError(f"{option} applies only without {chosen[0]}", context)
     if typed("mounting") and chosen not in (["--fuse"], ["--odometry"]):
         raise click.UsageError("--mounting applies only with --fuse or --odometry", context)
-    for name in ("average", "directions"):
-        if typed(name) and chosen != ["--bearings"]:
-            raise click.UsageError(f"--{name} applies only with --bearings", context)
+    if typed("average") and chosen != ["--bearings"]:
+        raise click.UsageError("--average applies only with --bearings", context)
     if typed("trajectory") and chosen != ["--odometry"]:
         raise click.UsageError("-o applies only with --odometry; --save FILE.h5 saves products", context)
 

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
     from ertis_numba.base.angles import DegreesFromRadians
     from ertis_numba.chain.costs import PlanCosts
+    from ertis_numba.frames import Bearing
     from ertis_numba.pipeline import Pipeline
     from ertis_numba.settings import Array, ExcludedChannels, Settings
     from ertis_numba.storage import EnergyscapeReader, RecordingReader
@@ -64,11 +65,13 @@ __all__ = [
     "measurement",
     "min_level",
     "note",
+    "note_doubts",
     "note_layout",
     "note_missing_points",
     "note_noise",
     "note_open_edges",
     "note_unknown_angles",
+    "note_unknown_bearings",
     "note_unknown_places",
     "note_unlisted_directions",
     "note_when_slow",
@@ -480,6 +483,27 @@ def note_noise(sensor: str, count: int, *, quiet: bool = False) -> None:
             "click from its direction may have caused it; 'ertis peaks --all' lists it",
             quiet=quiet,
         )
+
+
+def note_unknown_bearings(sensor: str, settings: "Settings") -> None:
+    """Print a note on angles that bearings cannot show, and a warning if the array needs too fine a search."""
+    from ertis_numba.geometry import direction_grid
+    from ertis_numba.passive.search_grid import search_changes, search_warning
+
+    searched = settings.replace(**search_changes(settings))
+    note_unknown_angles(sensor, searched, direction_grid(searched.processing), is_passive=True)
+    warn_of(sensor, search_warning(searched))
+
+
+def note_doubts(sensor: str, bearings: "Iterable[Bearing]") -> bool:
+    """Print a note on bearings that may not be those of sound, and return True if there are any."""
+    found = any(each.may_be_crosstalk for each in bearings)
+    if found:
+        note(
+            f"sensor {sensor}: a source marked as possible crosstalk has the same signal in all channels, as "
+            "electrical crosstalk has; cover the microphones: crosstalk remains, and sound does not"
+        )
+    return found
 
 
 def note_open_edges(

@@ -1,7 +1,7 @@
 """``ertis peaks``: reflectors in an energyscape file, or sources in acoustic maps."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from ertis_cli._config import typed
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison, Match
-    from ertis_numba.frames import Energyscape, Peak
+    from ertis_numba.frames import Bearing, Energyscape, Peak
 
 __all__ = ["peaks"]
 
@@ -31,10 +31,8 @@ _ERROR_COLUMNS: dict[str, _tables.Side] = {
     "level_error_db": "right",
     "reflector": "left",
 }
-_SOURCE_COLUMNS: dict[str, _tables.Side] = {
-    "sensor": "left",
-    **dict.fromkeys(("map", "band_khz", "azimuth_deg", "elevation_deg"), "right"),
-}
+_BEARING = {"azimuth_deg": "+.2f", "sideways_deg": ".2f", "elevation_deg": "+.2f", "upwards_deg": ".2f"}
+_LEVELS = ("level_dbfs", "level_db", "source_level_db")
 _OF_IMAGES = ("detector", "false_alarm", "everything", "truth")
 _DIGITS = dict.fromkeys((*_PLACE, "angle_deg", "level_dbfs", "grid_error_deg", "angle_sd_deg", "level_sd_db"), 4) | {
     "range_m": 6,
@@ -58,7 +56,7 @@ _SD = {"angle_sd_deg": ".2g", "range_sd_m": ".2g", "level_sd_db": ".2g"}
     type=float,
     metavar="DB",
     help=f"Lowest level relative to the strongest peak; {_MIN_LEVEL_DB:g} by default, no limit with cfar. In acoustic "
-    "maps, -10 by default, and -20 with CLEAN-SC.",
+    "maps, relative to the loudest source of the band; -20 by default, and at least.",
 )
 @options.measurement("One measurement, or map of a file of acoustic maps, counted from 0; all by default.")
 @click.option(
@@ -116,14 +114,14 @@ def peaks(
     'ertis compare --help'). In JSON, "truth" of each peak is its true reflector or null, "spurious" is true or
     false, and "missed" lists missed reflectors.
 
-    For a file of acoustic maps, there is one entry per source, the strongest of each map and band first. Maps of
-    CLEAN-SC and HR-CLEAN-SC yield their components, summed over neighbouring directions of the grid. Other maps yield
-    local maxima above the floor of the map, interpolated between directions of the grid; side lobes of delay-and-sum
-    are left out. grid_error_deg is the standard deviation of directions that are not interpolated, as at the edge of
-    the grid, and - where the source may lie beyond the edge. The loudest direction of each band is always listed,
-    except in silence. Levels are those of the band; level_dbfs is the mean square, where a full-scale tone has -3.
-    level_db, in dB re 20 µPa, needs the sensitivity of the microphones. source_level_db, in dB re 20 µPa at 1 m from
-    the source, also needs the distance of the source (process --focus). Maps of the method music have no levels. Maps
+    For a file of acoustic maps, there is one entry per source, the loudest of each map and band first: the bearings
+    that 'ertis acoustic' has found in the sound of the map, in all directions that the array can tell apart, whatever
+    the method and the directions of the map. Noise alone yields a source in one of 1000 maps. Side lobes yield none.
+    sideways_deg and upwards_deg are the standard deviations of the direction along the sphere, horizontally and
+    vertically, because of noise. Levels are those of the band, without noise; level_dbfs is the mean square, where a
+    full-scale tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones. source_level_db, in
+    dB re 20 µPa at 1 m from the source, also needs the distance of the source (process --focus). snr_db is relative to
+    the noise of a microphone. A source marked 'crosstalk?' may be electrical crosstalk (may_be_crosstalk in JSON). Maps
     are counted from 0, regardless of the number of measurements that they average. --measurement chooses a
     map. Of the other options, --sensor, --top, --min-level and --json apply to maps.
     """
@@ -209,8 +207,7 @@ def _list_sources(
     as_json: bool,
 ) -> None:
     """Print the sources in each band of acoustic maps."""
-    from ertis_numba.passive import find_sound_sources
-    from ertis_numba.passive.search_grid import coarse_map_warning
+    from ertis_numba.base.errors import DataError
     from ertis_numba.storage import open_acoustic_maps
 
     for name in _OF_IMAGES:
@@ -221,28 +218,38 @@ def _list_sources(
             )
     rows: list[dict[str, Any]] = []
     for name in sensors:
+        listed: list[Bearing] = []
         with open_acoustic_maps(path, sensor=name) as maps:
-            options.warn_of(name, coarse_map_warning(maps.settings, maps))
+            if not maps.has_bearings:
+                raise DataError(f"{path} contains no bearings; use 'ertis acoustic' again to list sources")
             options.warn_of(name, maps.band_note)
-            errors_rad: list[float] = []
             for index in options.places(measurement, len(maps)):
-                found = find_sound_sources(maps[index], top=top, min_level_db=min_level_db)
-                errors_rad += [each.grid_error_rad for each in found]
+                found = _chosen(maps[index].bearings, top, -math.inf if min_level_db is None else min_level_db)
+                listed += found
                 rows += [{"sensor": name, "map": index, **each.as_dict()} for each in found]
-            options.note_unknown_angles(name, maps.settings, maps, is_passive=True)
-            options.note_open_edges(name, maps, errors_rad)
+            options.note_unknown_bearings(name, maps.settings)
+        options.note_doubts(name, listed)
     if as_json:
         options.print_json({"sources": rows})
         return
     if not rows:
-        click.echo("nothing found: the maps are silent", err=True)
+        click.echo("nothing found", err=True)
         return
-    optional = (name for name in ("level_db", "source_level_db") if any(row[name] is not None for row in rows))
-    more = {"grid_error_deg": ".2f"} if _has_grid_errors(rows) else {}
-    more |= dict.fromkeys(("level_dbfs", *optional), ".1f")
-    _tables.TextTable(
-        _SOURCE_COLUMNS | dict.fromkeys(more, "right"), [_source_cells(row, more) for row in rows]
-    ).print()
+    more = {name: ".1f" for name in (*_LEVELS, "snr_db") if any(row[name] is not None for row in rows)}
+    columns: dict[str, _tables.Side] = {"sensor": "left"}
+    columns |= dict.fromkeys(("map", "band_khz", *_BEARING, *more), "right")
+    columns |= {"doubt": "left"} if any(row["may_be_crosstalk"] for row in rows) else {}
+    _tables.TextTable(columns, [_source_cells(row, more)[: len(columns)] for row in rows]).print()
+
+
+def _chosen(bearings: "Iterable[Bearing]", top: int, min_level_db: float) -> "list[Bearing]":
+    """Return the bearings of each band, up to a number, with at least a level relative to the loudest of the band."""
+    bands: dict[tuple[float, float], list[Bearing]] = {}
+    for each in bearings:
+        bands.setdefault(each.band_hz, []).append(each)
+    return [
+        each for band in bands.values() for each in band[:top] if each.level_dbfs >= band[0].level_dbfs + min_level_db
+    ]
 
 
 def _has_grid_errors(rows: list[dict[str, Any]]) -> bool:
@@ -252,8 +259,8 @@ def _has_grid_errors(rows: list[dict[str, Any]]) -> bool:
 
 def _source_cells(row: dict[str, Any], more: dict[str, str]) -> tuple[str, ...]:
     band = "–".join(f"{edge_hz / 1e3:.1f}" for edge_hz in row["band_hz"])
-    angles = _formatted(row, dict.fromkeys(("azimuth_deg", "elevation_deg"), "+.2f"))
-    return (row["sensor"], str(row["map"]), band, *angles, *_formatted(row, more))
+    doubt = "crosstalk?" if row["may_be_crosstalk"] else ""
+    return (row["sensor"], str(row["map"]), band, *_formatted(row, _BEARING), *_formatted(row, more), doubt)
 
 
 def _finder(

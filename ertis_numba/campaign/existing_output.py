@@ -102,6 +102,8 @@ def _differs(made: _Reader, recording: RecordingReader, dtype: str) -> str:
             return f"was made by {name} {came}, but this is {wanted}"
     if made.dtype != dtype:
         return f"contains {made.dtype}, not {dtype}"
+    if isinstance(made, AcousticMapReader) and not made.has_bearings:
+        return "contains no bearings of sources"
     return ""
 
 

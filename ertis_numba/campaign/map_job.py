@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from ertis_numba.base.errors import DataError
 from ertis_numba.campaign.sensor_processing import describe_faults, require_same_air
 from ertis_numba.campaign.tasks import CampaignOptions
 from ertis_numba.frames import AcousticMap
-from ertis_numba.passive import AcousticCamera, find_sound_sources
+from ertis_numba.passive import AcousticCamera
 from ertis_numba.passive.bands import shaped_noise_warning
 from ertis_numba.passive.components import gathered
 from ertis_numba.settings import Settings
@@ -25,6 +25,7 @@ from ertis_numba.storage import AcousticMapWriter, RecordingReader, open_recordi
 __all__ = ["MapJob", "check_maps", "prepare_maps"]
 
 _Warn = Callable[[str], None]
+_FALSE_ALARM: Final = 1e-3  # Probability that noise alone yields a bearing in a map.
 
 
 class MapJob:
@@ -123,7 +124,7 @@ class _MapsOfSensor:
         self._sum = self._sum + found.n_measurements * found.power.astype(np.float64)
 
     def report(self) -> dict[str, Any]:
-        """Return the report of ``--json``; ``loudest`` holds the strongest sources of the mean of all measurements."""
+        """Return the report of ``--json``; ``loudest`` holds the loudest direction of each band of the mean map."""
         assert self._last is not None  # noqa: S101  a recording has at least one measurement
         mean = gathered(self._last.replace(power=np.asarray(self._sum / len(self._recording), np.float32)))
         return {
@@ -134,7 +135,7 @@ class _MapsOfSensor:
             "bands": len(mean.band_hz),
             "median_ms": round(statistics.median(self.times_ms), 3),
             **({"band_note": note} if (note := self._camera.band_note) else {}),
-            "loudest": [each.as_dict() for each in find_sound_sources(mean, top=1)],
+            "loudest": [each.as_dict() for each in mean.loudest()],
         }
 
 
@@ -169,6 +170,7 @@ def prepare_maps(
                     options.device,
                     options.threads,
                     check=False,
+                    false_alarm=_FALSE_ALARM,
                 )
             )
             for recording in recordings
@@ -177,8 +179,9 @@ def prepare_maps(
             _check_sensor(recording, camera.settings, options, warn, several=len(recordings) > 1)
             if noisy := shaped_noise_warning(camera.settings, camera.band_hz):
                 warn(f"{path}: {noisy}")
-            if camera.warning:
-                warn(f"{path}: sensor {recording.sensor}: {camera.warning}")
+            searched = camera.finder.warning if camera.finder is not None else None
+            for text in filter(None, dict.fromkeys((camera.warning, searched))):
+                warn(f"{path}: sensor {recording.sensor}: {text}")
         yield MapJob(recordings, cameras, writer, warn)
 
 

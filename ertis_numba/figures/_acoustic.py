@@ -18,7 +18,7 @@ from ertis_numba.figures._images import level_map
 from ertis_numba.figures._page import Panel, compose
 from ertis_numba.figures._sampling import PIXELS, centres, look_raster
 from ertis_numba.figures.style import angle, minus
-from ertis_numba.frames import AcousticMap, LevelReference, SoundDirection
+from ertis_numba.frames import AcousticMap, Bearing, LevelReference
 from ertis_numba.geometry import observable_angles, unit_vectors
 
 __all__ = ["draw", "draw_bands", "draw_on_photo"]
@@ -27,17 +27,16 @@ _LINE_RATIO, _BAND_RATIO = 0.42, 0.42
 _SPARE_DB = 3.0
 _OPAQUE = 0.6  # of the colours over a photo
 _FADED = 0.3  # share of the dynamic range over which they fade in
-_ALL_DB = -1000.0
 _TICKS_DEG = (-60, -45, -30, -20, -10, 0, 10, 20, 30, 45, 60)
 
 
 def draw(canvas: Canvas, found: AcousticMap, *, band_hz: tuple[float, float] | None) -> Figure:
     """Draw the levels of a band over azimuth and elevation, or as a line over azimuth."""
-    canvas, level_db, loudest = _levels(canvas, found, band_hz)
-    heading = _heading(canvas, found, loudest)
+    canvas, level_db, shown = _levels(canvas, found, band_hz)
+    heading = _heading(canvas, shown)
     if np.ptp(found.elevation_rad) > 1e-9:
         panel = level_map(canvas, level_db, found.azimuth_rad, found.elevation_rad)
-        return compose(canvas, heading, [_with_loudest(canvas, loudest, panel)])
+        return compose(canvas, heading, [_with_sources(canvas, shown, panel)])
     _require_directions(found)
     order = np.argsort(found.azimuth_rad)
     azimuth_deg = np.degrees(found.azimuth_rad[order])
@@ -67,7 +66,7 @@ def draw_on_photo(
             "the directions of the acoustic map have one elevation, which a photo cannot show; process with directions "
             "in space, such as 3000 or 3d:2000"
         )
-    canvas, level_db, loudest = _levels(canvas, found, band_hz)
+    canvas, level_db, combined = _levels(canvas, found, band_hz)
     half_y, half_z = (math.tan(math.radians(each_deg) / 2) for each_deg in fov_deg)
     extent = (half_y, -half_y, -half_z, half_z)
     step = 2 * max(half_y, half_z) / PIXELS
@@ -91,7 +90,7 @@ def draw_on_photo(
 
     ratio = half_z / half_y
     view = f"field of view {fov_deg[0]:g}° × {fov_deg[1]:g}°"
-    heading = _heading(canvas, found, loudest, view)
+    heading = _heading(canvas, combined, view)
     return compose(canvas, heading, [Panel(paint, lambda width_pt: ratio * width_pt, box_aspect=ratio)])
 
 
@@ -131,29 +130,19 @@ def draw_bands(canvas: Canvas, found: AcousticMap, *, direction_deg: tuple[float
 
 def _levels(
     canvas: Canvas, found: AcousticMap, band_hz: tuple[float, float] | None
-) -> tuple[Canvas, NDArray[np.float32], SoundDirection | None]:
-    """Return the levels of a band over direction, a canvas with their scale, and the loudest source, if any."""
+) -> tuple[Canvas, NDArray[np.float32], AcousticMap]:
+    """Return the levels of a band over direction, a canvas with their scale, and the map of this band."""
     from ertis_numba.passive.components import gathered  # noqa: PLC0415  few plots need it, and it imports kernels
-    from ertis_numba.passive.sound_sources import sources_of_grid  # noqa: PLC0415
 
     if band_hz is not None:
         found.in_band(*band_hz)  # raises an error if there is none
         shown = (found.centre_hz >= band_hz[0]) & (found.centre_hz <= band_hz[1])
-        found = found.replace(power=found.power[:, shown], band_hz=found.band_hz[shown])
-    reference = found.reference
-    power = _referred(found, reference).sum(axis=1)
+        heard = tuple(each for each in found.bearings if band_hz[0] <= each.center_hz <= band_hz[1])
+        found = found.replace(power=found.power[:, shown], band_hz=found.band_hz[shown], bearings=heard)
+    power = _referred(found, found.reference).sum(axis=1)
     limits_hz = np.array([[found.band_hz.min(), found.band_hz.max()]])
     combined = gathered(found.replace(power=power[:, None].astype(np.float32), band_hz=limits_hz))
-    # Interpolation may change the order of their narrow peaks; the figure shows those of the grid.
-    is_inverse = found.settings.passive.traits.is_inverse
-    sources = sources_of_grid(combined, top=None if is_inverse else 1, min_level_db=_ALL_DB if is_inverse else None)
-    scaled = _scaled(canvas, found, reference, combined.power[:, 0].astype(np.float64))
-    if not sources:
-        return *scaled, None
-    directions = unit_vectors(*np.transpose([(each.azimuth_rad, each.elevation_rad) for each in sources]))
-    brightest = int(combined.power.argmax())
-    drawn = unit_vectors(found.azimuth_rad[[brightest]], found.elevation_rad[[brightest]])[0]
-    return *scaled, sources[int(np.argmax(directions @ drawn))]
+    return *_scaled(canvas, found, found.reference, combined.power[:, 0].astype(np.float64)), combined
 
 
 def _referred(found: AcousticMap, reference: LevelReference) -> NDArray[np.float64]:
@@ -173,42 +162,58 @@ def _scaled(
     return replace(canvas, top_db=top_db, unit=unit), np.asarray(top_db + below_db, np.float32)
 
 
-def _heading(canvas: Canvas, found: AcousticMap, loudest: SoundDirection | None, *parts: str) -> _captions.Heading:
-    low_khz, high_khz = (_captions.number(edge_hz / 1e3) for edge_hz in (found.band_hz.min(), found.band_hz.max()))
-    heard = "silence: all values are 0" if loudest is None else _loudest_text(canvas, loudest)
-    if loudest is not None:
-        low_khz, high_khz = (_captions.number(edge_hz / 1e3) for edge_hz in loudest.band_hz)
-    note = observable_angles(found.settings.array, found).note
+def _heading(canvas: Canvas, shown: AcousticMap, *parts: str) -> _captions.Heading:
+    low_khz, high_khz = (_captions.number(edge_hz / 1e3) for edge_hz in shown.band_hz[0])
+    note = observable_angles(shown.settings.array, shown).note
     parts = (*parts, f"array {note}") if note else parts
     return _captions.of_acoustic_map(
         "Acoustic map",
-        found,
-        f"{len(found.azimuth_rad)} directions",
+        shown,
+        f"{len(shown.azimuth_rad)} directions",
         f"{low_khz}–{high_khz} kHz",
-        heard,
+        _loudest_text(canvas, shown),
         *parts,
     )
 
 
-def _loudest_text(canvas: Canvas, loudest: SoundDirection) -> str:
-    """Return the direction and the level of the loudest source in words."""
-    level_db = loudest.level_dbfs  # relative to the reference of the canvas, as its powers are
-    level = "" if level_db is None or math.isinf(level_db) else f": {minus(f'{level_db:.1f}')} {canvas.unit}"
-    towards = f"azimuth {angle(math.degrees(loudest.azimuth_rad))}, elevation "
-    return f"loudest at {towards}{angle(math.degrees(loudest.elevation_rad))}{level}"
+def _loudest_text(canvas: Canvas, shown: AcousticMap) -> str:
+    """Return the direction and the level of the loudest source in words; of the grid, if no sources were searched."""
+    if shown.is_silent[0]:
+        return "silence: all values are 0"
+    if shown.bearings:
+        loudest = max(shown.bearings, key=lambda each: each.level_dbfs)
+        level_db, unit = loudest.level
+        doubt = ", may be crosstalk" if loudest.may_be_crosstalk else ""
+        text = f"loudest source at {_towards(loudest)}: {minus(f'{level_db:.1f}')} {unit}{doubt}"
+    elif shown.has_bearings:
+        return "no source that noise does not explain"
+    else:
+        place = int(shown.power.argmax())
+        level = f": {minus(f'{10 * math.log10(shown.power[place, 0]):.1f}')} {canvas.unit}" if shown.has_level else ""
+        azimuth_deg, elevation_deg = float(shown.azimuth_deg[place]), float(shown.elevation_deg[place])
+        text = f"loudest direction: azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}{level}"
+    return text
 
 
-def _with_loudest(canvas: Canvas, loudest: SoundDirection | None, panel: Panel) -> Panel:
-    """Return a map with a ring around its loudest source."""
-    if loudest is None:
-        return panel
+def _towards(bearing: Bearing) -> str:
+    """Return the angles of a bearing that are known, in words."""
+    every = (
+        ("azimuth", bearing.azimuth_deg, bearing.sideways_deg),
+        ("elevation", bearing.elevation_deg, bearing.upwards_deg),
+    )
+    return ", ".join(f"{name} {angle(at_deg)}" for name, at_deg, size_deg in every if math.isfinite(size_deg))
+
+
+def _with_sources(canvas: Canvas, shown: AcousticMap, panel: Panel) -> Panel:
+    """Return a map with a ring around each source."""
 
     def finish(axes: Axes) -> None:
         panel.finish(axes)
         east = min(axes.get_xlim())
-        at_deg = east + (math.degrees(loudest.azimuth_rad) - east) % 360.0
         ring: dict[str, Any] = {"fillstyle": "none", "markersize": 1.1 * canvas.style.em_pt, "scalex": False}
-        axes.plot(at_deg, math.degrees(loudest.elevation_rad), "o", color=canvas.style.mark, scaley=False, **ring)
+        for each in shown.bearings:
+            at_deg = east + (each.azimuth_deg - east) % 360.0
+            axes.plot(at_deg, each.elevation_deg, "o", color=canvas.style.mark, scaley=False, **ring)
 
     return replace(panel, finish=finish)
 

@@ -5,7 +5,13 @@ from ertis_numba.frames._beams import Beams
 from ertis_numba.frames._bearings import Bearing
 from ertis_numba.frames._energyscape import Energyscape
 from ertis_numba.frames._gap import SequenceGap
-from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelReference, LevelUnit, level_offset_db
+from ertis_numba.frames._level_reference import (
+    LEVEL_UNITS,
+    LevelReference,
+    LevelUnit,
+    known_levels,
+    level_offset_db,
+)
 from ertis_numba.frames._measurement import Measurement, MicrophoneSignals
 from ertis_numba.frames._occupancy_map import FREE_BELOW, MAX_CELLS, OCCUPIED_ABOVE, OccupancyMap
 from ertis_numba.frames._point_cloud import PointCloud
@@ -44,5 +50,6 @@ __all__ = [
     "Trajectory",
     "TrueSource",
     "is_passive",
+    "known_levels",
     "level_offset_db",
 ]

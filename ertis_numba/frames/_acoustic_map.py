@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from ertis_numba.base import checks
 from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.base.errors import ArgumentError
-from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelReference, LevelUnit, level_offset_db
+from ertis_numba.frames._bearings import Bearing
+from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelReference, LevelUnit, known_levels, level_offset_db
 from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames._stamp import Stamp
 from ertis_numba.settings import Settings
@@ -25,32 +26,11 @@ class SoundDirection(NamedTuple):
     """Direction of sound in a band, with its level at the array; None for levels that are unknown."""
 
     band_hz: tuple[float, float]
-    azimuth_rad: float  # NaN if the array cannot observe it
-    elevation_rad: float  # likewise
+    azimuth_rad: float
+    elevation_rad: float
     level_dbfs: float | None  # None for the method music
     level_db: float | None  # re 20 µPa; needs the sensitivity
     source_level_db: float | None  # re 20 µPa at 1 m; needs the distance, and at most 60 dB of absorption
-    grid_error_rad: float = math.nan
-
-    @classmethod
-    def of(
-        cls,
-        found: "AcousticMap",
-        band: int,
-        azimuth_rad: float,
-        elevation_rad: float,
-        *,
-        power: float,
-        grid_error_rad: float = math.nan,
-    ) -> Self:
-        """Return a direction in band number ``band`` of a map, with all known levels of a power."""
-        level_dbfs = 10 * math.log10(power) if power else -math.inf
-        levels: dict[str, float | None] = dict.fromkeys(LEVEL_UNITS)
-        for name, unit in LEVEL_UNITS.items() if found.has_level else ():
-            offset_db = level_offset_db(found.settings, found.centre_hz[band : band + 1], unit)
-            levels[name] = None if offset_db is None or np.isnan(offset_db[0]) else level_dbfs + float(offset_db[0])
-        low_hz, high_hz = found.band_hz[band].tolist()
-        return cls((low_hz, high_hz), azimuth_rad, elevation_rad, **levels, grid_error_rad=grid_error_rad)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the direction in degrees and the levels for JSON; unknown or infinite numbers are null."""
@@ -59,7 +39,6 @@ class SoundDirection(NamedTuple):
             "azimuth_deg": _rounded(math.degrees(self.azimuth_rad)),
             "elevation_deg": _rounded(math.degrees(self.elevation_rad)),
             **{name: _rounded(getattr(self, name)) for name in reversed(LEVEL_UNITS)},
-            "grid_error_deg": _rounded(math.degrees(self.grid_error_rad)),
         }
 
 
@@ -92,6 +71,10 @@ class AcousticMap(DegreesFromRadians):
         Blocks of samples whose powers were averaged.
     masked_s : float, default 0
         Time at the start of each measurement that was left out, because the sensor emitted its call.
+    bearings : tuple of Bearing, default ()
+        Bearings of the sources in each band, loudest first, as by `BearingFinder`.
+    false_alarm : float, default NaN
+        Probability that noise alone yields any bearing; NaN if no bearings were searched.
 
     Raises
     ------
@@ -116,6 +99,8 @@ class AcousticMap(DegreesFromRadians):
     n_measurements: int = 1
     n_blocks: int = 1
     masked_s: float = 0.0
+    bearings: tuple[Bearing, ...] = ()
+    false_alarm: float = math.nan
 
     def __post_init__(self) -> None:
         for name in ("power", "azimuth_rad", "elevation_rad", "band_hz"):
@@ -127,6 +112,13 @@ class AcousticMap(DegreesFromRadians):
         checks.integer("n_measurements", self.n_measurements, 1)
         checks.integer("n_blocks", self.n_blocks, 1)
         checks.between("masked_s", self.masked_s, 0.0, math.inf)
+        for _ in checks.items("bearings", self.bearings, Bearing, "BearingFinder.find returns"):
+            pass
+
+    @property
+    def has_bearings(self) -> bool:
+        """True if the bearings of sources were searched; there may be none."""
+        return not math.isnan(self.false_alarm)
 
     @property
     def level_dbfs(self) -> NDArray[np.float32]:
@@ -209,24 +201,29 @@ class AcousticMap(DegreesFromRadians):
     def loudest(self) -> list[SoundDirection]:
         """Return the loudest direction of the grid in each band; none in bands of silence.
 
-        The true direction may lie between those of the grid, and its level may be higher. `find_sound_sources`
-        interpolates both, and returns all sources.
+        It may be noise or a side lobe, and a source may lie between the directions of the grid, with a higher level:
+        ``bearings`` has the sources.
 
         Returns
         -------
         list of SoundDirection
         """
         return [
-            SoundDirection.of(
-                self,
-                band,
+            SoundDirection(
+                (float(self.band_hz[band, 0]), float(self.band_hz[band, 1])),
                 float(self.azimuth_rad[place]),
                 float(self.elevation_rad[place]),
-                power=float(self.power[place, band]),
+                **self._levels(band, float(self.power[place, band])),
             )
             for band, place in enumerate(np.argmax(self.power, axis=0))
             if not self.is_silent[band]
         ]
+
+    def _levels(self, band: int, power: float) -> dict[str, float | None]:
+        """Return the known levels of a power, which is above 0."""
+        if not self.has_level:
+            return dict.fromkeys(LEVEL_UNITS)
+        return known_levels(self.settings, float(self.centre_hz[band]), 10 * math.log10(power))
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed.

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 from ertis_numba.base.angles import RadiansFromDegrees
 from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelUnit
@@ -68,7 +69,27 @@ class Bearing(RadiansFromDegrees):
         levels = ((getattr(self, name), unit) for name, unit in LEVEL_UNITS.items())
         return next((level, unit) for level, unit in levels if level is not None)
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the bearing for JSON; unknown numbers, such as angles that the array cannot observe, are null."""
+        is_known = math.isfinite(self.sideways_deg), math.isfinite(self.upwards_deg)
+        angles = ("azimuth_deg", "sideways_deg"), ("elevation_deg", "upwards_deg")
+        return {
+            "band_hz": [round(edge_hz, 3) for edge_hz in self.band_hz],
+            **{
+                name: round(getattr(self, name), 4) if known else None
+                for names, known in zip(angles, is_known, strict=True)
+                for name in names
+            },
+            **{name: _rounded(getattr(self, name)) for name in reversed(LEVEL_UNITS)},
+            "snr_db": round(self.snr_db, 3),
+            "may_be_crosstalk": self.may_be_crosstalk,
+        }
+
     @property
     def center_hz(self) -> float:
         """Geometric centre of the band in hertz."""
         return math.sqrt(self.band_hz[0] * self.band_hz[1])
+
+
+def _rounded(level_db: float | None) -> float | None:
+    return None if level_db is None else round(level_db, 3)

@@ -9,7 +9,7 @@ from ertis_numba.base.units import sound_pressure_level_db
 from ertis_numba.geometry.air import absorption_db_m, transmission_loss_db
 from ertis_numba.settings import Settings
 
-__all__ = ["LEVEL_UNITS", "LevelReference", "LevelUnit", "level_offset_db"]
+__all__ = ["LEVEL_UNITS", "LevelReference", "LevelUnit", "known_levels", "level_offset_db"]
 
 LevelUnit: TypeAlias = Literal["dBFS", "dB re 20 µPa", "dB re 20 µPa at 1 m"]
 
@@ -44,6 +44,15 @@ def level_offset_db(
         return None
     is_heard = focus_m * absorption_db_m(settings.air, frequency_hz) <= _MAX_ABSORPTION_DB
     return np.where(is_heard, pressure_db + transmission_loss_db(settings.air, focus_m, frequency_hz), np.nan)
+
+
+def known_levels(settings: Settings, centre_hz: float, level_dbfs: float) -> dict[str, float | None]:
+    """Return the level of sound at a frequency in each unit of `LEVEL_UNITS`; None where it is unknown."""
+    offsets = {name: level_offset_db(settings, np.array([centre_hz]), unit) for name, unit in LEVEL_UNITS.items()}
+    return {
+        name: None if offset_db is None or np.isnan(offset_db[0]) else level_dbfs + float(offset_db[0])
+        for name, offset_db in offsets.items()
+    }
 
 
 class LevelReference(NamedTuple):

@@ -9,8 +9,7 @@ from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.result_subscriber import ResultSubscriber
 from ertis_numba.network.subscriber import Arrival, Subscriber
-from ertis_numba.passive import AcousticCamera, BearingFinder
-from ertis_numba.passive.search_grid import search_changes
+from ertis_numba.passive import AcousticCamera
 from ertis_numba.settings import Settings
 
 __all__ = ["AcousticMapSubscriber"]
@@ -33,8 +32,7 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
     changes : mapping of str to value, optional
         Changes of the settings of each sensor, such as ``{"passive.averages": 10, "processing.directions": "3000"}``.
     false_alarm : float, optional
-        Find bearings with each map, with this probability that noise alone yields any; none by default. If ``changes``
-        has no directions, those of a sensor are replaced by a grid over the half-space where they are planar or coarse.
+        Find bearings with each map, with this probability that noise alone yields any; none by default.
     device : {"auto", "cpu", "cuda", "numpy"}
     threads : int, optional
         Number of threads; all cores by default.
@@ -47,8 +45,8 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
     ----------
     counts : SubscriberCounts
         Counts of the measurements.
-    bearings : list of Bearing
-        Bearings of the last map, as by `BearingFinder`; empty without ``false_alarm``.
+    bearings : tuple of Bearing
+        Bearings of the last map; empty without ``false_alarm``.
     band_note : str or None
         Note of `AcousticCamera.band_note` on the sensor of the last map.
     n_active : int
@@ -82,7 +80,7 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
         self._false_alarm = false_alarm
         self._hearer_of(Settings()).close()  # refuses changes, and loads kernels
         self._hearers: dict[str, _Hearer] = {}
-        self.bearings: list[Bearing] = []
+        self.bearings: tuple[Bearing, ...] = ()
         self.band_note: str | None = None
         self.n_active = 0
         self._subscriber: Subscriber[Measurement] = Subscriber(
@@ -113,7 +111,7 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
             return None
         found = camera.map()
         self.band_note = camera.band_note
-        self.bearings = [] if hearer.finder is None else hearer.finder.find()
+        self.bearings = found.bearings
         camera.reset()
         return found
 
@@ -133,17 +131,14 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
         return made
 
     def _hearer_of(self, settings: Settings) -> "_Hearer":
-        changed, alarm = settings.replace(**self._changes), self._false_alarm
-        if alarm is not None and "processing.directions" not in self._changes:
-            changed = changed.replace(**search_changes(changed))
-        camera = AcousticCamera(changed, self._device, self._threads, check=False)
-        return _Hearer(settings, camera, None if alarm is None else BearingFinder(camera, false_alarm=alarm))
+        changed = settings.replace(**self._changes)
+        camera = AcousticCamera(changed, self._device, self._threads, check=False, false_alarm=self._false_alarm)
+        return _Hearer(settings, camera)
 
 
 class _Hearer(NamedTuple):
     settings: Settings
     camera: AcousticCamera
-    finder: BearingFinder | None
 
     def suits(self, settings: Settings) -> bool:
         """Return True unless settings differ, or before the first measurement of a map, the speed of sound."""

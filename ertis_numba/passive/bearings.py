@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.base import checks
-from ertis_numba.frames import LEVEL_UNITS, Bearing, level_offset_db
-from ertis_numba.geometry import direction_note, microphones, spacing_rad, unit_vectors
+from ertis_numba.chain.interpolation_fit import one_thread
+from ertis_numba.frames import Bearing, known_levels
+from ertis_numba.geometry import direction_grid, direction_note, microphones, spacing_rad, unit_vectors
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.passive.bands import bin_shares
 from ertis_numba.passive.camera import AcousticCamera
 from ertis_numba.passive.noise_model import NoiseModel
 from ertis_numba.passive.scan_extent import ScanMesh, is_level
-from ertis_numba.passive.search_grid import search_warning
+from ertis_numba.passive.search_grid import search_changes, search_warning
 from ertis_numba.passive.source_search import BandSearch, FoundSource, Scan
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.settings import Settings
@@ -40,9 +41,9 @@ class BearingFinder:
     Parameters
     ----------
     camera : AcousticCamera
-        Camera whose measurements are searched, in its directions and bands. Sources in other directions, such as above
-        or below a grid in one plane, yield wrong bearings and levels. So do grids coarser than the beam; see `warning`.
-        The method of its maps has no influence.
+        Camera whose measurements are searched, in its bands. If its directions are coarser than the beam, or do not
+        contain all directions that the array can tell apart, those of `search_changes` are searched instead. The method
+        of its maps has no influence.
     false_alarm : float
         Probability that noise alone yields any bearing, 1e-9 to 0.5; 0.001 by default. It does not hold for tones with
         phases at random, as of electronics, at twelve microphones or fewer: they resemble a wave by chance.
@@ -55,7 +56,7 @@ class BearingFinder:
     Attributes
     ----------
     warning : str or None
-        Warning that the camera's directions are planar or too far apart, with a grid that suffices; None if they do.
+        Warning that the searched directions are too far apart, because no grid suffices for the array; else None.
     direction_note : str or None
         Note on sound that bearings cannot locate, such as sound from behind a flat array, as a predicate of the sensor:
         `ertis_numba.geometry.direction_note`.
@@ -84,23 +85,28 @@ class BearingFinder:
         self._camera, self._top = camera, checks.integer("top", top, 1)
         self._least = 10 ** (checks.between("min_level_db", min_level_db, -200.0, 0.0) / 10)
         self._false_alarm = 1 - (1 - false_alarm) ** (1 / len(camera.band_hz))
-        self.warning = search_warning(camera.settings)
-        self.direction_note = direction_note(camera.settings.array, camera.grid, is_passive=True)
-        directions = unit_vectors(camera.grid.azimuth_rad, camera.grid.elevation_rad)
+        settings = camera.settings.replace(**search_changes(camera.settings))
+        self.warning, grid = search_warning(settings), direction_grid(settings.processing)
+        self.direction_note = direction_note(settings.array, grid, is_passive=True)
+        directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         reach_rad = _REACH * min(spacing_rad(directions), _MAX_SPACING_RAD)
-        delays = WaveDelays(camera.settings)
+        delays, waves = (
+            WaveDelays(settings),
+            camera.waves if settings is camera.settings else camera.waves_of(directions),
+        )
         scan = Scan(directions, ScanMesh(directions, delays(directions)), reach_rad, is_level(directions))
         self._bins: list[NDArray[np.intp]] = []
         self._searches: list[BandSearch] = []
         for shares in bin_shares(camera.band_hz, camera.frequency_hz).astype(np.float64):
             bins = np.flatnonzero(shares)
-            frequency_hz, steer = camera.frequency_hz[bins], functools.partial(camera.waves.steer, bins=bins)
-            noise = NoiseModel(
-                microphones(camera.settings.array).enabled_positions_m,
-                frequency_hz,
-                spacing_hz=float(camera.frequency_hz[1] - camera.frequency_hz[0]),
-                sound_speed_m_s=sound_speed_m_s(camera.settings.air),
-            )
+            frequency_hz, steer = camera.frequency_hz[bins], functools.partial(waves.steer, bins=bins)
+            with one_thread():
+                noise = NoiseModel(
+                    microphones(settings.array).enabled_positions_m,
+                    frequency_hz,
+                    spacing_hz=float(camera.frequency_hz[1] - camera.frequency_hz[0]),
+                    sound_speed_m_s=sound_speed_m_s(settings.air),
+                )
             self._bins.append(bins)
             self._searches.append(BandSearch(scan, frequency_hz, shares[bins], noise, delays, steer))
 
@@ -119,7 +125,10 @@ class BearingFinder:
         spectrum = self._camera.cross_spectrum()
         out = []
         for bins, search, band_hz in zip(self._bins, self._searches, self._camera.band_hz, strict=True):
-            sources = search(spectrum.of_bins(bins), false_alarm=self._false_alarm, top=self._top, least=self._least)
+            with one_thread():
+                sources = search(
+                    spectrum.of_bins(bins), false_alarm=self._false_alarm, top=self._top, least=self._least
+                )
             sources.sort(key=lambda source: -source.power)
             out += [_bearing(source, band_hz, self._camera.settings) for source in sources]
         return out
@@ -165,6 +174,7 @@ def _bearing(source: FoundSource, band_hz: NDArray[np.float64], settings: Settin
     is_known = 0 < sideways < math.inf and 0 < upwards < math.inf
     correlation = source.covariance_rad2[0, 1] / (sideways * upwards) if is_known else 0.0
     level_dbfs = 10 * math.log10(max(source.power, _LEAST))
+    levels = known_levels(settings, math.sqrt(band_hz.prod()), level_dbfs)
     return Bearing(
         azimuth_deg=math.degrees(math.atan2(y, x)),
         elevation_deg=math.degrees(math.asin(max(-1.0, min(1.0, z)))),
@@ -175,11 +185,5 @@ def _bearing(source: FoundSource, band_hz: NDArray[np.float64], settings: Settin
         level_dbfs=level_dbfs,
         snr_db=10 * math.log10(max(source.ratio, _LEAST)),
         may_be_crosstalk=source.may_be_crosstalk,
-        **{name: _level(level_dbfs, settings, band_hz, name) for name in ("level_db", "source_level_db")},
+        **{name: levels[name] for name in ("level_db", "source_level_db")},
     )
-
-
-def _level(level_dbfs: float, settings: Settings, band_hz: NDArray[np.float64], name: str) -> float | None:
-    """Return the level in the unit of a field of `Bearing`; None if it is unknown."""
-    offset_db = level_offset_db(settings, np.sqrt(band_hz.prod(keepdims=True)), LEVEL_UNITS[name])
-    return None if offset_db is None or np.isnan(offset_db[0]) else level_dbfs + float(offset_db[0])

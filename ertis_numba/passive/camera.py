@@ -4,7 +4,7 @@ import functools
 import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from ertis_numba.passive.search_grid import coarse_map_warning
 from ertis_numba.passive.wave_delays import WaveDelays
 from ertis_numba.passive.waves import Waves
 from ertis_numba.settings import HIGHEST_SHARE, Settings
+
+if TYPE_CHECKING:
+    from ertis_numba.passive.bearings import BearingFinder
 
 __all__ = ["AcousticCamera"]
 
@@ -53,6 +56,9 @@ class AcousticCamera:
     check : bool, default True
         Issue a `CoarseGridWarning` if ``warning`` is not None, and an `OutsideBandsWarning`, once, if ``band_note`` is
         not None when a map is made.
+    false_alarm : float, optional
+        Find the bearings of sources with each map, with this probability that noise alone yields any, as for
+        `BearingFinder`; none by default.
 
     Attributes
     ----------
@@ -69,6 +75,8 @@ class AcousticCamera:
         Waves from each direction of the grid.
     n_measurements : int
         Measurements since the last `reset`.
+    finder : BearingFinder or None
+        Finder of the bearings of each map; None without ``false_alarm``.
 
     Raises
     ------
@@ -94,6 +102,7 @@ class AcousticCamera:
         threads: int | None = None,
         *,
         check: bool = True,
+        false_alarm: float | None = None,
     ) -> None:
         if isinstance(settings, str | Path):
             settings = Settings.load(settings)
@@ -114,7 +123,8 @@ class AcousticCamera:
         self._shares = bin_shares(self.band_hz, self.frequency_hz)
         directions = unit_vectors(self.grid.azimuth_rad, self.grid.elevation_rad)
         delay_s = WaveDelays(settings)(directions)
-        self.waves = Waves(delay_s, self._blocks.bins, self._blocks.spacing_hz, kernel_set, threads=self._threads)
+        self.waves = self._waves(delay_s)
+        self._of_search: list[Waves] = []
         self._outside, self._check = OutsideBands(settings, self.band_hz), check
         self._edge_tones = EdgeTones(
             self.band_hz,
@@ -127,6 +137,20 @@ class AcousticCamera:
         self.reset()
         if check and self.warning is not None:
             warnings.warn(self.warning, CoarseGridWarning, stacklevel=2)
+        self.finder, self._false_alarm = self._finder(false_alarm), np.nan if false_alarm is None else false_alarm
+
+    def _finder(self, false_alarm: float | None) -> "BearingFinder | None":
+        from ertis_numba.passive.bearings import BearingFinder  # noqa: PLC0415  it imports this module
+
+        return None if false_alarm is None else BearingFinder(self, false_alarm=false_alarm)
+
+    def _waves(self, delay_s: NDArray[np.float64]) -> Waves:
+        return Waves(delay_s, self._blocks.bins, self._blocks.spacing_hz, self._kernels, threads=self._threads)
+
+    def waves_of(self, directions: NDArray[np.float64]) -> Waves:
+        """Return the waves from unit vectors, (direction, axis), at all frequencies, until the camera is closed."""
+        self._of_search.append(self._waves(WaveDelays(self.settings)(directions)))
+        return self._of_search[-1]
 
     @functools.cached_property
     def warning(self) -> str | None:
@@ -237,6 +261,8 @@ class AcousticCamera:
             self.n_measurements,
             self._n_blocks,
             self._masked_s,
+            () if self.finder is None else tuple(self.finder.find()),
+            self._false_alarm,
         )
         return gathered(found)
 
@@ -298,7 +324,8 @@ class AcousticCamera:
     def close(self) -> None:
         """Free the memory of the device."""
         self._blocks.close()
-        self.waves.close()
+        for waves in (self.waves, *self._of_search):
+            waves.close()
 
     def __enter__(self) -> Self:
         return self

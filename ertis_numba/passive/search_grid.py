@@ -23,10 +23,8 @@ __all__ = ["coarse_map_warning", "search_changes", "search_warning"]
 _SEARCH_LOSS_DB: Final = 6.0  # Bearings are refined beyond the grid, and so are their levels.
 _LINE: Final = 1e-6  # Width of an array relative to its length, below which it is a line.
 _STEP: Final = 1.02
-_HALF_SPACE: Final[dict[str, object]] = {
-    "processing.azimuth_limits_deg": (-90.0, 90.0),
-    "processing.elevation_limits_deg": (-90.0, 90.0),
-}
+_HALF_DEG: Final = (-90.0, 90.0)
+_MOST_SEARCHED: Final = 30_000  # Directions beyond which fine ones within limits are searched instead of all.
 
 
 def coarse_map_warning(settings: Settings, grid: DegreesFromRadians | None = None) -> str | None:
@@ -86,13 +84,31 @@ def _coarse(
 def search_changes(settings: Settings) -> dict[str, object]:
     """Return the changes of settings with which directions suit the search for bearings; empty if none.
 
-    They are a grid over the half-space ahead; for an array on a horizontal line, a grid in one plane.
+    They are a grid over all directions, or for an array without extent along x over the half-space ahead; for an array
+    on a horizontal line, a grid in one plane. Fine directions within narrower limits are kept if this grid has over
+    30,000.
     """
-    if _search_warning(settings) is None:
+    processing, limits = settings.processing, _all_directions(settings)
+    contains_all = all(
+        min(getattr(processing, name)) <= low and high <= max(getattr(processing, name))
+        for name, (low, high) in limits.items()
+    )
+    is_fine = _search_warning(settings) is None
+    if is_fine and contains_all and isinstance(processing.directions, str):
         return {}
-    wide = settings.replace(**_HALF_SPACE)
+    wide = settings.replace(**{f"processing.{name}": value for name, value in limits.items()})
     fine = _search_check(wide).finer(_search_lobe(wide))
-    return _HALF_SPACE | {"processing.directions": f"3d:{LARGEST_GRID}" if fine is None else fine.directions}
+    if is_fine and (fine is None or len(direction_grid(fine)) > _MOST_SEARCHED):
+        return {}
+    changes: dict[str, object] = {f"processing.{name}": value for name, value in limits.items()}
+    return changes | {"processing.directions": f"3d:{LARGEST_GRID}" if fine is None else fine.directions}
+
+
+def _all_directions(settings: Settings) -> dict[str, tuple[float, float]]:
+    """Return the limits of the directions that an array can tell apart."""
+    is_flat = float(np.ptp(microphones(settings.array).enabled_positions_m[:, 0])) == 0
+    limits_deg = {"azimuth_limits_deg": _HALF_DEG if is_flat else (-180.0, 180.0)}
+    return limits_deg if _is_line(settings) else limits_deg | {"elevation_limits_deg": _HALF_DEG}
 
 
 def search_warning(settings: Settings) -> str | None:
@@ -127,7 +143,9 @@ def _search_warning(settings: Settings) -> str | None:
 def _sufficient(settings: Settings) -> str:
     """Return the advice to search a grid within the limits of settings that suffices for bearings in all bands."""
     if _is_flat(settings):
-        settings = settings.replace(**_HALF_SPACE)
+        settings = settings.replace(
+            **{"processing.azimuth_limits_deg": _HALF_DEG, "processing.elevation_limits_deg": _HALF_DEG}
+        )
     advice = _search_check(settings).remedy(_search_lobe(settings), "search")
     return advice or f"search narrower limits or lower bands: no grid of up to {LARGEST_GRID} directions suffices"
 

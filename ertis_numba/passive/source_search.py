@@ -23,6 +23,8 @@ Matrices = NDArray[np.complex128]
 _NONE: Final = np.zeros((0, 3))
 _BLIND: Final = 0.3  # Size of a wave outside of other sources, relative to its whole, below which it is theirs.
 _SHARE_STEPS: Final = 10  # Per decade of white noise. Between steps, extents change by a few hundredths.
+_STARTS: Final = 3  # Directions from which the most likely one is searched.
+_MAY_BE_LOUDEST: Final = 0.5  # Share of the power of a start, relative to the largest.
 _SWEEPS: Final = 2  # Corrections of all sources after each new one.
 _OWN: Final = 0.75  # Largest distance of sound from the centre of its bin, in spacings of bins.
 _WITHIN_NOISE: Final = 4.5  # Log-likelihood below its maximum: three standard deviations of a direction.
@@ -123,7 +125,9 @@ class BandSearch:
 
     def _place(self, rest: BandLikelihood, whole: BandLikelihood) -> Floats:
         """Return the most likely direction of a further source."""
-        return rest.maximum(self._loudest(rest, whole), reach_rad=self._scan.reach_rad, level=self._scan.level)
+        scan = self._scan
+        tops = [rest.maximum(each, reach_rad=scan.reach_rad, level=scan.level) for each in self._loudest(rest, whole)]
+        return tops[int(rest.relative_power(np.array(tops)).argmax())]
 
     def _is_found(
         self,
@@ -205,7 +209,10 @@ class BandSearch:
         return places
 
     def _loudest(self, rest: BandLikelihood, whole: BandLikelihood) -> Floats:
-        """Return the direction of the scan with the largest mean power relative to the noise."""
+        """Return directions of the scan with the largest mean power relative to the noise, apart from each other.
+
+        The highest maximum in noise may lie between weaker directions of the scan than another one.
+        """
         every: Floats | NDArray[np.float32] = np.full((len(self._omega), 1), float(whole.dimensions))
         if whole.is_whitened:
             every = self._powers_of(whole, whole.projection)
@@ -215,7 +222,13 @@ class BandSearch:
         # Beams of bins with the sound of other bins point elsewhere.
         is_own = np.abs(rest.omega - self._omega) <= _OWN * 2 * np.pi * self._spacing_hz
         weights = np.where(is_own, rest.weights, 0) if (is_own & (rest.weights > 0)).any() else rest.weights
-        return np.asarray(self._scan.directions[int(((weights / rest.power) @ ratio).argmax())])
+        shares, directions = (weights / rest.power) @ ratio, self._scan.directions
+        found: list[int] = []
+        least = _MAY_BE_LOUDEST * shares.max()
+        while (len(found) < _STARTS and shares.max() >= least > 0) or not found:
+            found.append(int(shares.argmax()))
+            shares[directions @ directions[found[-1]] > math.cos(self._scan.reach_rad)] = 0
+        return directions[found]
 
     def _powers_of(self, whole: BandLikelihood, matrices: Matrices) -> NDArray[np.float32]:
         """Return the powers of matrices for the whitened wave from each direction: (bin, direction)."""

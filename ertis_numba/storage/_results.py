@@ -20,7 +20,15 @@ from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import FileWriter
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import FORMAT_VERSION, POINTS, POSES, Variable, create_variables, set_attributes
+from ertis_numba.storage.schema import (
+    BEARINGS,
+    FORMAT_VERSION,
+    POINTS,
+    POSES,
+    Variable,
+    create_variables,
+    set_attributes,
+)
 from ertis_numba.storage.truth import GroundTruth
 
 __all__ = ["ResultFile", "ResultReader", "ResultWriter"]
@@ -100,7 +108,7 @@ class ResultWriter(ResultFile, FileWriter[Result]):
         axes = {name: getattr(first, field) for name, field in self._axes.items()}
         create_variables(
             group,
-            [variable for variable in self._table if variable not in (*POINTS, *POSES)],
+            [variable for variable in self._table if variable not in (*BEARINGS, *POINTS, *POSES)],
             sizes=self._sizes_of(axes),
             dtypes={self._data: self._dtype},
             texts={"settings": self_contained(first.settings).to_toml()},
@@ -176,7 +184,7 @@ class ResultReader(ResultFile, FileReader[Result], DegreesFromRadians):
         fields = {
             self._data: self._rows.row(index).astype(np.float32, copy=False),
             **{field: getattr(self, field) for field in self._axes.values()},
-            **{field: self._rows.column(name, index) for name, field in self._columns.items()},
+            **{field: self._rows.column(name, index) for name, field in self._columns.items() if name in self._group},
         }
         try:
             made: Result = self._type(**fields, settings=self.settings, stamp=self._rows.stamp(index, self.sensor))

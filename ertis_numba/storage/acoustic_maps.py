@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.base import checks
-from ertis_numba.frames import AcousticMap
+from ertis_numba.frames import AcousticMap, Bearing
+from ertis_numba.storage._bearings import BEARING_SIZES, BearingReader, write_bearings
 from ertis_numba.storage._results import ResultFile, ResultReader, ResultWriter
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import ACOUSTIC_MAP, POSES, Variable, set_attributes, to_python
+from ertis_numba.storage.schema import ACOUSTIC_MAP, BEARINGS, POSES, Variable, set_attributes, to_python
 
 __all__ = ["AcousticMapReader", "AcousticMapWriter", "open_acoustic_maps", "write_acoustic_maps"]
 
@@ -21,7 +22,7 @@ __all__ = ["AcousticMapReader", "AcousticMapWriter", "open_acoustic_maps", "writ
 class _AcousticMapFile(ResultFile):
     _kind: ClassVar[str] = "acoustic_map"
     _data: ClassVar[str] = "power"
-    _table: ClassVar[tuple[Variable, ...]] = (*ACOUSTIC_MAP, *POSES)
+    _table: ClassVar[tuple[Variable, ...]] = (*ACOUSTIC_MAP, *BEARINGS, *POSES)
     _type: ClassVar[type[Any]] = AcousticMap
     _name: ClassVar[str] = "an acoustic map"
     _axes: ClassVar[Mapping[str, str]] = {
@@ -33,6 +34,7 @@ class _AcousticMapFile(ResultFile):
         "n_measurements": "n_measurements",
         "n_blocks": "n_blocks",
         "masked": "masked_s",
+        "false_alarm": "false_alarm",
     }
     _lengths: ClassVar[Mapping[str, int | str]] = {"direction": "azimuth", "band": "band_edge", "edge": 2}
 
@@ -66,6 +68,7 @@ class AcousticMapWriter(_AcousticMapFile, ResultWriter[AcousticMap]):
     ) -> None:
         super().__init__(path, recording=recording, mounting=mounting, dtype="float32", overwrite=overwrite)
         self._band_notes: dict[str, str] = {}
+        self._bearings: dict[str, list[tuple[Bearing, ...]]] = {}
 
     def note_bands(self, sensor: str, band_note: str) -> None:
         """Store a note on sound that the bands of a sensor's maps do not show: `AcousticCamera.band_note`.
@@ -74,9 +77,16 @@ class AcousticMapWriter(_AcousticMapFile, ResultWriter[AcousticMap]):
         """
         self._band_notes[sensor] = band_note
 
+    def _row(self, item: AcousticMap) -> tuple[NDArray[Any], dict[str, float]]:
+        row = super()._row(item)
+        self._bearings.setdefault(item.stamp.sensor, []).append(item.bearings)
+        return row
+
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
+        sensor = group.name.rpartition("/")[2]
+        write_bearings(group, self._bearings[sensor])
         super()._complete(group, rows)
-        note = self._band_notes.get(group.name.rpartition("/")[2])
+        note = self._band_notes.get(sensor)
         if note:
             set_attributes(group, {"band_note": note})
 
@@ -114,6 +124,20 @@ class AcousticMapReader(_AcousticMapFile, ResultReader[AcousticMap]):
         super()._load()
         self.n_measurements = np.asarray(self._group["n_measurements"][:])
         self.band_note = str(to_python(self._group.attrs.get("band_note", "")))
+        is_searched = "false_alarm" in self._group and np.isfinite(self._group["false_alarm"][:]).all()
+        self._bearings = BearingReader(self._group, self.path, self.settings) if is_searched else None
+
+    @property
+    def has_bearings(self) -> bool:
+        """True if the bearings of sources were searched in all maps."""
+        return self._bearings is not None
+
+    def _item(self, index: int) -> AcousticMap:
+        found = super()._item(index)
+        return found if self._bearings is None else found.replace(bearings=self._bearings(index))
+
+    def _sizes(self) -> dict[str, int]:
+        return super()._sizes() | BEARING_SIZES
 
 
 def open_acoustic_maps(path: str | Path, *, sensor: str | None = None) -> AcousticMapReader:

@@ -23,6 +23,7 @@ from ertis_numba.base.errors import ArgumentError
 
 __all__ = [
     "ACOUSTIC_MAP",
+    "BEARINGS",
     "CHUNK_ROWS",
     "CONVENTIONS",
     "ENERGYSCAPE",
@@ -184,9 +185,35 @@ ACOUSTIC_MAP: Final = (
     Variable("n_measurements", ("time",), "<i8", "measurements whose powers were averaged"),
     Variable("n_blocks", ("time",), "<i8", "blocks of samples whose powers were averaged"),
     Variable("masked", ("time",), "<f8", "time of the call, left out at the start of each measurement", "s"),
+    Variable(
+        "false_alarm",
+        ("time",),
+        "<f8",
+        "probability that noise alone yields any bearing; NaN if none was searched",
+        optional=True,
+    ),
     _SETTINGS,
 )
 """Variables of acoustic maps; the stamp of a map is that of its last measurement."""
+
+BEARINGS: Final = (
+    Variable("bearing_count", ("time",), "<u4", "number of sources that noise does not explain", optional=True),
+    Variable("bearing_direction", ("bearing", "angle"), "<f8", "azimuth and elevation", "degree", optional=True),
+    Variable(
+        "bearing_uncertainty",
+        ("bearing", "angle"),
+        "<f8",
+        "standard deviation of the direction along the sphere, horizontally and vertically; infinite if unknown",
+        "degree",
+        optional=True,
+    ),
+    Variable("bearing_correlation", ("bearing",), "<f8", "correlation of the two errors", optional=True),
+    Variable("bearing_band", ("bearing", "edge"), "<f8", "lower and upper edge of the band", "Hz", optional=True),
+    Variable("bearing_level", ("bearing",), "<f8", "level at the array without noise, in dBFS", "dB", optional=True),
+    Variable("bearing_snr", ("bearing",), "<f8", "power relative to the noise of a microphone", "dB", optional=True),
+    Variable("bearing_doubts", ("bearing",), "<u1", "bit 0: the signal may be electrical crosstalk", optional=True),
+)
+"""Bearings of the sources in acoustic maps; those of the first map come first."""
 
 OCCUPANCY_MAP: Final = (
     Variable("log_odds", ("y", "x"), "<f4", "logarithm of p / (1 - p) of the probability p that a cell is occupied"),

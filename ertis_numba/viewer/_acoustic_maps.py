@@ -31,8 +31,7 @@ __all__ = ["ViewedMaps", "masked_note"]
 
 _STEP_DB: Final = 5.0  # The automatic scale moves in steps, because each change redraws its axes.
 _RADIUS_M: Final = (0.05, 1.0)
-_MARKS: Final = np.array([[0.96], [1.04]])  # Marks of the loudest direction inside and outside a sphere of radius 1.
-_WHITE: Final = np.full((2, 3), 255, np.uint8)
+_MARKS: Final = np.array([[0.96], [1.04]])  # Marks of a source inside and outside a sphere of radius 1.
 _AROUND: Final = 1.3  # Visible range around a sphere of radius 1.
 
 Edges = tuple[float, float]
@@ -51,7 +50,7 @@ class _SensorMaps:
     plane: LevelPlane
     picture: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((1, 1, 3), np.uint8))
     shape: Sector | Dome | None = None
-    loudest: tuple[int, int] | None = None  # Direction, and its shade.
+    marks: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None  # Unit vectors, and their distances.
     drawn_for: tuple[object, ...] = ()
 
 
@@ -197,7 +196,7 @@ def _prepare(kept: _SensorMaps, choices: Choices, scale: LevelScale, radius_m: f
     drawn_for = (found, band, scale.low_db, scale.high_db, scale.unit, choices.colours, radius_m, overdue)
     if kept.drawn_for == drawn_for:
         return
-    kept.drawn_for, kept.shape, kept.loudest = drawn_for, None, None
+    kept.drawn_for, kept.shape, kept.marks = drawn_for, None, None
     power = _power(found, band, scale.unit)
     if power is None:
         low_hz, high_hz = found.band_hz.min(), found.band_hz.max()
@@ -206,8 +205,7 @@ def _prepare(kept: _SensorMaps, choices: Choices, scale: LevelScale, radius_m: f
         return
     table = colour_table(choices.colours, dim=overdue)
     shades = scale.shade(_decibels(power))
-    place = int(shades.argmax())
-    kept.loudest = (place, int(shades[place])) if shades[place] else None
+    kept.marks = _marks(found, band, shades, is_planar=plane.is_planar)
     kept.picture = plane.picture(shades, table, scale)
     if plane.is_planar:
         west, east, low, high = (radius_m * each for each in plane.extent)
@@ -219,14 +217,32 @@ def _prepare(kept: _SensorMaps, choices: Choices, scale: LevelScale, radius_m: f
         kept.shape = Dome(np.asarray(position_m, np.float32), table[shades[seen]], size_m)
 
 
+def _marks(
+    found: AcousticMap, band: Edges | None, shades: NDArray[np.uint8], *, is_planar: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return unit vectors of the sources, (source, axis), or of the loudest direction if none were searched.
+
+    Their distances are (1, source) for directions in one plane, else (2, source).
+    """
+    grid = unit_vectors(found.azimuth_rad, found.elevation_rad)
+    if found.has_bearings:
+        heard = [each for each in found.bearings if band is None or each.band_hz == band]
+        directions = unit_vectors(
+            np.array([each.azimuth_rad for each in heard]), np.array([each.elevation_rad for each in heard])
+        )
+        places = (directions @ grid.T).argmax(axis=1)
+    else:
+        places = np.flatnonzero(shades.argmax() == np.arange(len(shades)))[: int(shades.any())]
+        directions = grid[places]
+    return directions, shades[places][None] / 255 if is_planar else np.broadcast_to(_MARKS, (2, len(places)))
+
+
 def _drawn(kept: _SensorMaps, pose: Pose | None, radius_m: float, *, overdue: bool) -> Drawn:
-    """Return the drawn objects of a sensor, with its loudest direction as a point."""
+    """Return the drawn objects of a sensor, with points at the marks."""
     position_m = np.empty((0, 3), np.float32)
-    if kept.loudest is not None and pose is not None:
-        place, shade = kept.loudest
-        found, away_m = kept.latest.image, radius_m * (np.array([[shade / 255]]) if kept.plane.is_planar else _MARKS)
-        direction = unit_vectors(found.azimuth_rad[place : place + 1], found.elevation_rad[place : place + 1])
-        position_m = pose.placed(np.asarray(away_m * direction, np.float32))
+    if kept.marks is not None and pose is not None:
+        directions, distances = kept.marks
+        position_m = pose.placed(np.asarray(radius_m * (distances[..., None] * directions).reshape(-1, 3), np.float32))
     return Drawn(
         pose=pose,
         stamp=kept.latest.image.stamp,
@@ -235,7 +251,7 @@ def _drawn(kept: _SensorMaps, pose: Pose | None, radius_m: float, *, overdue: bo
         picture=kept.picture,
         shape=kept.shape,
         position_m=position_m,
-        colours=_WHITE[: len(position_m)],
+        colours=np.full((len(position_m), 3), 255, np.uint8),
         share_left=np.ones(len(position_m), np.float32),
         n_points=0,
     )

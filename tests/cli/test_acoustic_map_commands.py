@@ -106,14 +106,14 @@ def test_passive_recording_becomes_acoustic_maps():
         for one, other in zip(found, expected, strict=True):
             assert np.array_equal(one.power, other.power)
         mean = found[0].replace(power=sum(each.n_measurements * each.power for each in found) / np.float32(3))
-    expected = ertis.find_sound_sources(mean, top=1)
+    expected = mean.loudest()
     assert [row["level_dbfs"] for row in report["loudest"]] == pytest.approx(
         [each.level_dbfs for each in expected], abs=1e-3
     )
     assert azimuths_deg(report["loudest"]) == pytest.approx(
         [np.degrees(each.azimuth_rad) for each in expected], abs=1e-3
     )
-    assert azimuths_deg(report["loudest"]) == pytest.approx([21, 21], abs=1.0)  # directions are 3 degrees apart
+    assert azimuths_deg(report["loudest"]) == pytest.approx([20, 20], abs=2.0)  # directions are 3 degrees apart
     assert report["sensors"][0]["loudest"] == report["loudest"]
 
 
@@ -339,14 +339,17 @@ def test_peaks_are_the_sources_of_maps():
     run("acoustic passive.h5 -o maps.h5 --device numpy")
     rows = json.loads(run("peaks maps.h5 --top 1 --json").stdout)["sources"]
     with ertis.open_acoustic_maps("maps.h5") as maps:
-        expected = [each for found in maps for each in ertis.find_sound_sources(found, top=1)]
+        expected = [each for found in maps for each in found.bearings]
+        assert {found.false_alarm for found in maps} == {1e-3}
     assert [(row["map"], *row["band_hz"]) for row in rows] == [
         (number, *band) for number in (0, 1) for band in ((20e3, 25e3), (30e3, 40e3))
     ]
-    assert azimuths_deg(rows) == pytest.approx([np.degrees(each.azimuth_rad) for each in expected], abs=1e-3)
+    assert azimuths_deg(rows) == pytest.approx([each.azimuth_deg for each in expected], abs=1e-3)
+    assert azimuths_deg(rows) == pytest.approx([20] * 4, abs=1.0)
     assert [row["level_dbfs"] for row in rows] == pytest.approx([each.level_dbfs for each in expected], abs=1e-3)
     shown = run("peaks maps.h5 -m 1 --top 1").stdout.splitlines()
-    assert shown[0].split() == ["sensor", "map", "band_khz", "azimuth_deg", "elevation_deg", "level_dbfs"]
+    columns = "sensor map band_khz azimuth_deg sideways_deg elevation_deg upwards_deg level_dbfs snr_db"
+    assert shown[0].split() == columns.split()
     assert [line.split()[:3] for line in shown[1:]] == [["sensor", "1", "20.0–25.0"], ["sensor", "1", "30.0–40.0"]]
 
 
@@ -356,9 +359,9 @@ def test_levels_are_sound_pressures_if_the_sensitivity_is_known(folder):
     for row in report["loudest"]:
         assert row["level_db"] - row["level_dbfs"] == pytest.approx(94 + 26 + 3, abs=0.05)
     heading, first, *_ = run("peaks maps.h5").stdout.splitlines()
-    assert heading.split()[-2:] == ["level_dbfs", "level_db"]
+    assert heading.split()[-3:] == ["level_dbfs", "level_db", "snr_db"]
     with ertis.open_acoustic_maps("maps.h5") as maps:
-        assert float(first.split()[-1]) == pytest.approx(ertis.find_sound_sources(maps[0])[0].level_db, abs=0.06)
+        assert float(first.split()[-2]) == pytest.approx(maps[0].bearings[0].level_db, abs=0.06)
     run("acoustic passive.h5 -o unknown.h5 --device numpy")
     assert {row["level_db"] for row in json.loads(run("peaks unknown.h5 --json").stdout)["sources"]} == {None}
 
@@ -367,18 +370,37 @@ def test_source_levels_are_listed_if_the_distance_is_known(folder):
     (folder / "given.toml").write_text("[array]\nsensitivity_dbfs = -26\n")
     run("acoustic passive.h5 -o maps.h5 --settings given.toml --focus 4 --device numpy")
     heading, first, *_ = run("peaks maps.h5").stdout.splitlines()
-    assert heading.split()[-3:] == ["level_dbfs", "level_db", "source_level_db"]
+    assert heading.split()[-4:-1] == ["level_dbfs", "level_db", "source_level_db"]
     with ertis.open_acoustic_maps("maps.h5") as maps:
-        assert float(first.split()[-1]) == pytest.approx(ertis.find_sound_sources(maps[0])[0].source_level_db, abs=0.06)
+        assert float(first.split()[-2]) == pytest.approx(maps[0].bearings[0].source_level_db, abs=0.06)
     for row in json.loads(run("peaks maps.h5 --json").stdout)["sources"]:
         loss_db = transmission_loss_db(SETTINGS.air, 4.0, np.array([np.sqrt(np.prod(row["band_hz"]))]))
         assert row["source_level_db"] - row["level_db"] == pytest.approx(loss_db[0], abs=1e-3)
 
 
-def test_maps_of_music_have_no_level():
+def test_maps_of_music_have_no_level_but_their_bearings():
     report = json.loads(run("acoustic passive.h5 -o maps.h5 --method music --device numpy --json").stdout)
     assert [row["level_dbfs"] for row in report["loudest"]] == [None, None]
-    assert run("peaks maps.h5 -m 0").stdout.splitlines()[1].split()[-1] == "-"
+    run("acoustic passive.h5 -o other.h5 --device numpy")
+    assert run("peaks maps.h5").stdout == run("peaks other.h5").stdout
+
+
+def test_peaks_list_no_sources_of_maps_without_bearings():
+    with ertis.open_recording("passive.h5") as recording, ertis.AcousticCamera(recording.settings, "cpu") as camera:
+        ertis.write_acoustic_maps("old.h5", camera.process_many(recording))
+    message = "error: old.h5 contains no bearings; use 'ertis acoustic' again to list sources"
+    assert message in run("peaks old.h5", code=1).stderr
+
+
+def test_peaks_mark_sources_that_may_be_crosstalk():
+    made = heard(["passive"])[0]
+    same = np.random.default_rng(0).standard_normal((len(made.data), 1)) + 0 * made.data
+    ertis.write_recording("same.h5", [dataclasses.replace(made, data=(0.1 * same).astype(np.float32))])
+    run("acoustic same.h5 -o maps.h5 --device numpy")
+    done = run("peaks maps.h5")
+    assert done.stderr.count("possible crosstalk has the same signal in all channels") == 1
+    assert [line.split()[-1] for line in done.stdout.splitlines()] == ["doubt", "crosstalk?", "crosstalk?"]
+    assert all(row["may_be_crosstalk"] for row in json.loads(run("peaks maps.h5 --json").stdout)["sources"])
 
 
 @pytest.mark.parametrize("option", ["--detector peaks", "--all", "--truth"])
@@ -397,11 +419,10 @@ def test_commands_and_code_of_the_page_run(tmp_path):
             scene_file.write_text(scene_file.read_text("utf-8").replace("count = 10", "count = 2"), "utf-8")
     with ertis.open_acoustic_maps(tmp_path / "leak.acoustic.h5") as maps:
         assert (len(maps), maps[0].n_measurements) == (1, 2)
-        sources = ertis.find_sound_sources(maps[0])
+        sources = maps[0].bearings
     found: dict[int, float] = {}
     for each in sources:
-        found.setdefault(round(np.sqrt(np.prod(each.band_hz)) / 1e3), np.degrees(each.azimuth_rad))
-    assert len(found) == 10
+        found.setdefault(round(each.center_hz / 1e3), each.azimuth_deg)
     assert found[16] == pytest.approx(-40, abs=2)  # the machine
     assert found[63] == pytest.approx(28, abs=0.5)  # the leak
     (code,) = python_in(text)

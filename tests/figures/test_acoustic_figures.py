@@ -16,7 +16,7 @@ from ertis_numba import figures
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.figures import _acoustic_signals
 from ertis_numba.figures.style import angle
-from ertis_numba.frames import Stamp
+from ertis_numba.frames import Bearing, Stamp
 from ertis_numba.geometry import direction_grid, unit_vectors
 from ertis_numba.geometry.air import absorption_db_m, transmission_loss_db
 from ertis_numba.settings import Settings
@@ -68,29 +68,37 @@ def test_map_shows_the_level_of_a_band_in_each_direction(band_hz, place_deg, lev
     assert ("25–31.5 kHz" if band_hz else "20–31.5 kHz") in texts(figure)
 
 
-def test_caption_of_a_map_states_the_source_that_peaks_lists():
-    found = acoustic_map()
-    first = next(each for each in ertis.find_sound_sources(found) if each.band_hz == tuple(BANDS_HZ[0]))
-    azimuth_deg, elevation_deg = np.degrees([first.azimuth_rad, first.elevation_rad])
+def bearing(azimuth_deg, elevation_deg, band_hz, level_dbfs, **other):
+    known = {"sideways_deg": 0.2, "upwards_deg": 0.3, "correlation": 0.0, "snr_db": 5.0} | other
+    places = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg, "band_hz": tuple(band_hz)}
+    return Bearing(**places, level_dbfs=level_dbfs, **known)
+
+
+def test_rings_and_caption_of_a_map_are_those_of_its_bearings():
+    heard = (bearing(24.3, 12.2, BANDS_HZ[0], -41.2), bearing(-30.0, 2.0, BANDS_HZ[0], -50.0))
+    other = bearing(-40.0, 0.5, BANDS_HZ[1], -51.0, may_be_crosstalk=True)
+    found = acoustic_map().replace(bearings=(*heard, other), false_alarm=1e-3)
     figure = figures.acoustic_map(found, band_hz=(20e3, 25e3))
-    stated = f"loudest at azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}: −{-first.level_dbfs:.1f} dBFS"
-    assert stated in texts(figure)
-    assert (azimuth_deg, elevation_deg) == pytest.approx(LOUD_DEG, abs=0.1)
-    (ring,) = figure.axes[0].lines
-    assert (ring.get_xdata()[0], ring.get_ydata()[0]) == pytest.approx((azimuth_deg, elevation_deg), abs=1e-6)
+    assert "loudest source at azimuth +24.3°, elevation +12.2°: −41.2 dBFS" in texts(figure)
+    rings = [(ring.get_xdata()[0], ring.get_ydata()[0]) for ring in figure.axes[0].lines]
+    assert np.array(rings) == pytest.approx(np.array([(24.3, 12.2), (-30.0, 2.0)]), abs=1e-6)
+    assert len(figures.acoustic_map(found).axes[0].lines) == 3
+    assert "−51.0 dBFS, may be crosstalk" in texts(figures.acoustic_map(found, band_hz=(25e3, 30e3)))
 
 
-def test_caption_of_a_line_states_its_highest_peak():
-    """The inverse of a narrow peak is so small that its interpolation may exceed the highest peak of the grid."""
-    found = acoustic_map("2d:361", method="music")
-    azimuth_deg = np.degrees(found.azimuth_rad)
-    inverse = [1 + (azimuth_deg - 28.0) ** 2, 0.9 + 5 * (azimuth_deg + 40.2) ** 2]
-    power = (1 / np.minimum(*inverse))[:, None].astype(np.float32)
-    found = found.replace(power=power, band_hz=BANDS_HZ[:1])
-    (first,) = ertis.find_sound_sources(found, top=1)
-    assert (np.degrees(first.azimuth_rad), azimuth_deg[power.argmax()]) == pytest.approx((-40.2, 28.0), abs=0.1)
-    figure = figures.acoustic_map(found)
-    assert f"loudest at azimuth {angle(28.0)}" in texts(figure)
+def test_map_without_sources_has_no_ring():
+    figure = figures.acoustic_map(acoustic_map().replace(false_alarm=1e-3))
+    assert not figure.axes[0].lines
+    assert "no source that noise does not explain" in texts(figure)
+
+
+@pytest.mark.parametrize("directions", ["3d:800", "2d:361"])
+def test_caption_of_a_map_without_bearings_states_its_loudest_direction(directions):
+    found = acoustic_map(directions)
+    (loudest, _) = found.loudest()
+    figure = figures.acoustic_map(found, band_hz=(20e3, 25e3))
+    towards = f"azimuth {angle(np.degrees(loudest.azimuth_rad))}, elevation {angle(np.degrees(loudest.elevation_rad))}"
+    assert f"loudest direction: {towards}: −{-loudest.level_dbfs:.1f} dBFS" in texts(figure)
 
 
 def test_labels_of_maps_keep_clear_of_the_edges():

@@ -154,22 +154,8 @@ def test_listen_prints_bearings():
     assert leak["source_level_db"] - leak["level_db"] == pytest.approx(loss_db, abs=0.01)
 
 
-def test_listen_warns_once_of_given_directions_at_one_elevation():
-    heard = heard_leak("3d:1000", n=2)
-    shown = listen_to_bearings(heard, "--directions", "2d:61")
-    assert shown.stderr.count("warning: sensor inspector: directions lie at one elevation, 0°") == 1
-    lines = [line for line in shown.stdout.splitlines() if "kHz" in line]
-    assert len(lines) >= 2
-    assert all(line.split("kHz")[1].count("unknown") == 1 for line in lines)
-    shown = listen_to_bearings(heard[:1], "--directions", "2d:61", "--json")
-    _, found, _ = map(json.loads, shown.stdout.splitlines())
-    assert found["bearings"]
-    assert all(each["upwards_deg"] is None and each["sideways_deg"] > 0 for each in found["bearings"])
-
-
-@pytest.mark.parametrize("arguments", [(), ("--directions", "3d:1000")])
-def test_listen_searches_a_half_space_by_default_or_given_directions(arguments):
-    shown = listen_to_bearings(heard_leak("2d:61"), "--json", *arguments)
+def test_listen_searches_a_half_space_whatever_the_directions():
+    shown = listen_to_bearings(heard_leak("2d:61"), "--json")
     assert "warning" not in shown.stderr
     _, found, _ = map(json.loads, shown.stdout.splitlines())
     (leak,) = found["bearings"]
@@ -207,7 +193,6 @@ def test_unknown_direction_is_printed_as_such(capsys, as_json):
         (["--bearings", "--product", "raw"], "--product applies only without --bearings"),
         (["--bearings", "--fuse"], "--fuse and --bearings cannot be combined"),
         (["--average", "3"], "--average applies only with --bearings"),
-        (["--fuse", "--directions", "90"], "--directions applies only with --bearings"),
     ],
 )
 def test_listen_refuses_options_that_do_not_fit_bearings(arguments, message):

@@ -51,7 +51,7 @@ def test_tones_at_any_frequency_are_found_or_named(rate_hz):
     for frequency_hz in (0.5 * rate_hz * share for share in shares):
         found, note = mapped(heard(rate_hz, frequency_hz))
         if found.band_hz.min() < frequency_hz < found.band_hz.max():
-            loudest = max(ertis.find_sound_sources(found), key=lambda source: source.level_dbfs)
+            loudest = max(found.loudest(), key=lambda source: source.level_dbfs)
             # A tone at the edge of two bands has half of its power in each.
             both = 10 * math.log10(found.power.sum(axis=1).max())
             assert both == pytest.approx(TONE_DBFS, abs=1.0)
@@ -104,7 +104,7 @@ def test_advised_bands_locate_sound_below_the_default_bands():
     low_hz, high_hz = map(float, re.search(r"use the band ([\d.]+):([\d.e+]+) Hz", note).groups())
     own = measurement.settings.replace("passive.bands_hz", ((low_hz, high_hz),))
     found, _ = mapped(ertis.Measurement(measurement.data, own, measurement.stamp))
-    assert ertis.find_sound_sources(found)[0].level_dbfs == pytest.approx(TONE_DBFS, abs=1.0)
+    assert found.loudest()[0].level_dbfs == pytest.approx(TONE_DBFS, abs=1.0)
 
 
 def test_cameras_warn_once_of_sound_beyond_their_bands():
@@ -149,7 +149,7 @@ def test_tones_at_edges_of_bands_are_named_with_their_level(rate_hz, method):
             assert float(level) == pytest.approx(TONE_DBFS, abs=1.0)
             own = measurement.settings.replace("passive.bands_hz", ((float(low_hz), float(high_hz)),))
             found, note = mapped(ertis.Measurement(measurement.data, own, measurement.stamp))
-            assert ertis.find_sound_sources(found)[0].level_dbfs == pytest.approx(TONE_DBFS, abs=1.0)
+            assert found.loudest()[0].level_dbfs == pytest.approx(TONE_DBFS, abs=1.0)
             assert note is None
 
 
@@ -159,7 +159,7 @@ def test_bands_note_every_tone_that_they_show_half_a_decibel_low(rate_hz):
     for edge_hz in (edges[0, 0], edges[2, 0], edges[-1, 1]):
         for steps in np.arange(-3, 3.1, 0.6):
             found, note = mapped(heard(rate_hz, float(edge_hz) + steps * spacing_hz))
-            loudest = max(ertis.find_sound_sources(found), key=lambda source: source.level_dbfs)
+            loudest = max(found.loudest(), key=lambda source: source.level_dbfs)
             assert note is not None or loudest.level_dbfs == pytest.approx(TONE_DBFS, abs=0.6)
 
 
