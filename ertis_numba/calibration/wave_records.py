@@ -97,7 +97,7 @@ def _receivers(array: Array, faulty: tuple[int, ...] = ()) -> WorkingMicrophones
 
 
 def wave_record(measurement: Measurement) -> tuple[WaveRecord, WorkingMicrophones]:
-    """Return the signals, and the microphones that work; raise DataError if those are fewer than 6."""
+    """Return the signals, and the working microphones; raise DataError for fewer than 6, or mostly saturated ones."""
     settings = measurement.settings
     receivers = _receivers(settings.array)
     signals, _, stuck, loud, n_samples = _signals(measurement, receivers.channels)

@@ -68,10 +68,11 @@ _FINISH_S: Final = 5.0
 class CentralNode:
     """Receiver of sensor nodes' measurements; use it in a ``with`` statement, and call `run`.
 
-    Addresses that other machines can reach require ``keys``; with an ``archive``, acks confirm storage. ``on_event``
-    gets dicts whose ``event`` is listening, joined, left, fault, resumed, sealed, unsealed, conflict, configure,
-    refused, keys (state of the allow list), shared (two nodes send one sensor) or internal (an internal error).
-    ``on_stored`` gets sensor, session_id, sequence and CRC-32. Other threads may read ``latest``, a recent status.
+    Addresses that other machines can reach require ``keys``; with an ``archive``, acks confirm storage. ``max_bytes``
+    limits a measurement, and ``window`` the unacknowledged measurements of a session. ``on_event`` gets dicts whose
+    ``event`` is listening, joined, left, fault, resumed, sealed, unsealed, conflict, configure (an admin changes
+    settings), refused, keys (state of the allow list), shared (two nodes send one sensor) or internal (an internal
+    error). ``on_stored`` gets sensor, session_id, sequence and CRC-32. Other threads may read ``latest``.
     """
 
     def __init__(
