@@ -11,7 +11,7 @@ from typing import Any, Protocol, Self, TypeVar
 import click
 
 from ertis_cli import options
-from ertis_cli._product_printer import MicrophoneTable
+from ertis_cli._product_printer import ProductTable
 from ertis_cli._stop_signals import stopped_by_signals
 
 __all__ = ["Connect", "listen_pulses"]
@@ -60,7 +60,7 @@ def listen_pulses(
     called.
     """
     notes: deque[str] = deque()
-    heard = MicrophoneTable(as_json=as_json, quiet=quiet)
+    heard = ProductTable(as_json=as_json, quiet=quiet)
     with stopped_by_signals() as signals, connect(notes.append) as subscriber:
         signals.obey(subscriber.close)
         begun_s, received = time.monotonic(), 0  # Connecting loads kernels, which may take longer than the duration.

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ertis_numba.network.status import Status
     from ertis_numba.network.subscriber import SubscriberCounts
 
-__all__ = ["PRINTERS", "MicrophoneTable"]
+__all__ = ["PRINTERS", "ProductTable"]
 
 _HEAD = f"{'sensor':12}  {'sequence':>8}  {'age':>8}  {'made in':>8}  {'dropped':>7}  what"
 _MADE = frozenset({"energyscape", "points"})  # Products of measurements with a call.
@@ -32,7 +32,7 @@ _STAMP = (
 _ROW = "{sensor:12}  {sequence:8d}  {age:>8}  {made_in:>8}  {dropped:7d}  {text}"
 
 
-class MicrophoneTable:
+class ProductTable:
     """Printer of received products: one line per product, or one JSON object per event."""
 
     def __init__(self, *, as_json: bool, quiet: bool) -> None:
@@ -201,7 +201,7 @@ def _of_status(item: "Status") -> tuple[dict[str, Any], str]:
     return {"state": item.state, "received": received}, text
 
 
-PRINTERS: Final[dict[str, Callable[[MicrophoneTable, Any], tuple[dict[str, Any], str]]]] = {
+PRINTERS: Final[dict[str, Callable[[ProductTable, Any], tuple[dict[str, Any], str]]]] = {
     "energyscape": lambda table, item: _of_points(table.find(item)),
     "points": lambda _, item: _of_points(item),
     "raw": lambda _, item: _of_measurement(item),

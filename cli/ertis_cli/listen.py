@@ -13,7 +13,7 @@ import click
 
 from ertis_cli import _listen_bearings, _listen_fused, _listen_odometry, _mountings, _network, options
 from ertis_cli._config import typed
-from ertis_cli._product_printer import PRINTERS, MicrophoneTable
+from ertis_cli._product_printer import PRINTERS, ProductTable
 from ertis_cli._saving import PRODUCTS as FILED, saving
 from ertis_cli._stop_signals import stopped_by_signals
 
@@ -139,7 +139,7 @@ def listen(
         importlib.import_module("ertis_numba.analysis.points")
     keys = _network.client_keys(key, server_key)
     notes: deque[str] = deque()
-    heard = MicrophoneTable(as_json=as_json, quiet=quiet)
+    heard = ProductTable(as_json=as_json, quiet=quiet)
     begun_s, failure = time.monotonic(), None
     written: Path | None = None
     end_s = math.inf if duration is None else begun_s + duration

@@ -16,25 +16,20 @@ from ertis_numba.network.messages import (
     SILENCE_LIMIT_S,
     Bye,
     Description,
-    Group,
-    Image,
-    Points,
     Pong,
     Product,
-    Raw,
     Refused,
-    Report,
     Subscribe,
     decode,
     encode,
 )
-from ertis_numba.network.products import Arrival, Header, ProductReader, trace
+from ertis_numba.network.product_messages import PRODUCT_MESSAGES, MeasuredProduct, ProductMessage
+from ertis_numba.network.products import Arrival, ProductReader, trace
 from ertis_numba.network.wakeup_socket import WakeupSocket
 
 __all__ = ["SubscriberCounts", "Subscription"]
 
-_EXPECTED: Final = (Description, Image, Points, Raw, Group, Report, Pong, Refused)
-_DESCRIBED: Final = (Image, Points, Raw)
+_EXPECTED: Final = (Description, *PRODUCT_MESSAGES, Pong, Refused)
 _UNMADE_S: Final = 5.0  # ZeroMQ gives up after a refusal, whose event may precede the monitor.
 _AGAIN_S: Final = 0.5
 _MAX_AGAIN_S: Final = 5.0
@@ -232,7 +227,7 @@ class Subscription:
         elif not isinstance(message, Pong):
             self._take(message, frames[1:])
 
-    def _take(self, header: Header, payload: list[memoryview]) -> None:
+    def _take(self, header: ProductMessage, payload: list[memoryview]) -> None:
         """Deliver a product, and count the missing ones before it."""
         numbers = self._numbers
         if header.number < numbers.next_number:  # Numbers must rise.
@@ -245,7 +240,7 @@ class Subscription:
         self._counts.missed = self._missed_before + numbers.next_number - numbers.received
         self._counts.dropped = max(self._counts.dropped, self._dropped_before + header.dropped)
         place: tuple[Any, Any] = (None, None)
-        if isinstance(header, _DESCRIBED):
+        if isinstance(header, MeasuredProduct):
             about = numbers.reader.description(header.description)
             place = about.translation_m, about.rotation_xyzw
         self._deliver(Arrival(item, header, arrived_ns, arrived_utc_ns, numbers.connection, *place))

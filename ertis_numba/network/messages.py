@@ -33,6 +33,7 @@ from ertis_numba.network.message_fields import (
     Uint32,
 )
 from ertis_numba.network.product_messages import (
+    PRODUCT_MESSAGES,
     PRODUCTS,
     Description,
     Group,
@@ -260,7 +261,7 @@ class AskStatus(Message, frozen=True, kw_only=True):
 
 MESSAGES: Final[tuple[type[Message], ...]] = (
     Hello, Welcome, Data, Gap, Ack, PlatformPose, Ping, Pong, Bye, Refused, Configure, Configured, Subscribe,
-    Description, Image, Points, Raw, Group, AskStatus, Report,
+    AskStatus, Description, *PRODUCT_MESSAGES,
 )  # fmt: skip
 """All messages of the network."""
 

@@ -16,7 +16,20 @@ from ertis_numba.network.message_fields import (
     Uint32,
 )
 
-__all__ = ["PRODUCTS", "Description", "Group", "Image", "Points", "Product", "Raw", "Report", "Subscribe"]
+__all__ = [
+    "PRODUCTS",
+    "PRODUCT_MESSAGES",
+    "Description",
+    "Group",
+    "Image",
+    "MeasuredProduct",
+    "Points",
+    "Product",
+    "ProductMessage",
+    "Raw",
+    "Report",
+    "Subscribe",
+]
 
 Product: TypeAlias = Literal["energyscape", "points", "raw", "group", "status"]
 PRODUCTS: Final[tuple[Product, ...]] = get_args(Product)
@@ -50,7 +63,9 @@ class Description(Message, frozen=True, kw_only=True):
     rotation_xyzw: Quaternion | None = None
 
 
-class _Product(OfMeasurement, frozen=True, kw_only=True):
+class MeasuredProduct(OfMeasurement, frozen=True, kw_only=True):
+    """Product of one measurement, which refers to a description of its sensor."""
+
     number: Count
     """Number of the product among all that this subscriber has requested since it connected, from 0; dropped products
     leave a gap.
@@ -60,7 +75,7 @@ class _Product(OfMeasurement, frozen=True, kw_only=True):
     description: Count
 
 
-class Image(_Product, frozen=True, kw_only=True):
+class Image(MeasuredProduct, frozen=True, kw_only=True):
     """An energyscape. Payloads: its amplitudes, little-endian, cut into frames."""
 
     routes = (("publisher", "application"),)
@@ -73,7 +88,7 @@ class Image(_Product, frozen=True, kw_only=True):
     published_ns: Int64  # departure of the image, by the same clock
 
 
-class Points(_Product, frozen=True, kw_only=True):
+class Points(MeasuredProduct, frozen=True, kw_only=True):
     """A point cloud. Payload: ``(point, 4)`` little-endian float32, each x, y, z in m and the amplitude."""
 
     routes = (("publisher", "application"),)
@@ -85,7 +100,7 @@ class Points(_Product, frozen=True, kw_only=True):
     published_ns: Int64
 
 
-class Raw(_Product, frozen=True, kw_only=True):
+class Raw(MeasuredProduct, frozen=True, kw_only=True):
     """A measurement as received. Payload: its samples, little-endian."""
 
     routes = (("publisher", "application"),)
@@ -132,3 +147,8 @@ class Report(Message, frozen=True, kw_only=True):
 
     number: Count = 0
     dropped: Count = 0
+
+
+ProductMessage: TypeAlias = Image | Points | Raw | Group | Report
+"""Headers of products: number, drops, times."""
+PRODUCT_MESSAGES: Final[tuple[type[ProductMessage], ...]] = get_args(ProductMessage)

@@ -13,16 +13,15 @@ from ertis_numba.frames import Energyscape, Measurement, PointCloud, Stamp
 from ertis_numba.frames.sample_format import sample_format
 from ertis_numba.geometry import received_settings
 from ertis_numba.network.messages import Description, Group, Image, Message, Points, Raw, Report
+from ertis_numba.network.product_messages import ProductMessage
 from ertis_numba.network.status import Status
 from ertis_numba.network.trace import mark
 from ertis_numba.settings import Settings
 
-__all__ = ["Arrival", "Header", "Item", "Payload", "ProductReader", "trace"]
+__all__ = ["Arrival", "Item", "Payload", "ProductReader", "trace"]
 
 Item: TypeAlias = Energyscape | PointCloud | Measurement | Group | Status
 """Products that an application receives."""
-Header: TypeAlias = Image | Points | Raw | Group | Report
-"""Headers of products: number, drops, times."""
 Payload: TypeAlias = Sequence[bytes | memoryview]
 
 _AXES = 3
@@ -35,7 +34,7 @@ class Arrival:
     """A received product."""
 
     item: Item
-    header: Header
+    header: ProductMessage
     arrived_ns: int  # complete arrival by time.monotonic_ns, as header.monotonic_ns on this machine
     arrived_utc_ns: int  # by the system clock
     connection: int  # product numbers count from 0 in each
@@ -100,7 +99,7 @@ class ProductReader:
         """Return the description of a product."""
         return self.described(number).header
 
-    def read(self, header: Header, payload: Payload) -> Item:
+    def read(self, header: ProductMessage, payload: Payload) -> Item:
         """Return the frame of a message."""
         return _DECODERS[type(header)](self, header, payload)
 
@@ -111,7 +110,7 @@ class ProductReader:
         return self._described[number]
 
 
-def trace(stage: str, header: Header) -> None:
+def trace(stage: str, header: ProductMessage) -> None:
     """Record that an image has passed a stage; see `ertis_numba.network.trace`."""
     if isinstance(header, Image):
         mark(stage, header.sensor, header.sequence)

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from ertis_cli._product_printer import MicrophoneTable
+from ertis_cli._product_printer import ProductTable
 from ertis_cli.main import cli
 
 from ertis_numba.network.keys import KeyPair
@@ -156,7 +156,7 @@ def test_unstorable_image_ends_listen_and_keeps_earlier_ones(tmp_path):
 
 @pytest.mark.parametrize("product", ["energyscape", "raw"])
 def test_listen_without_images_writes_no_file(tmp_path, monkeypatch, product):
-    connected = results_of(monkeypatch, MicrophoneTable, "subscribed")
+    connected = results_of(monkeypatch, ProductTable, "subscribed")
     end_when(monkeypatch, "ertis_cli.listen", lambda: connected)
     with Publisher() as publisher, publisher.playing([]):
         done = listen(
@@ -173,7 +173,7 @@ def test_listen_without_images_writes_no_file(tmp_path, monkeypatch, product):
 
 
 def test_listen_reports_too_few_images_within_its_duration(monkeypatch):
-    printed = results_of(monkeypatch, MicrophoneTable, "product")
+    printed = results_of(monkeypatch, ProductTable, "product")
     end_when(monkeypatch, "ertis_cli.listen", lambda: printed)
     done = heard([image(1)], "-n", 2, "--duration", 0.5)
     assert done.exit_code == 1
@@ -182,7 +182,7 @@ def test_listen_reports_too_few_images_within_its_duration(monkeypatch):
 
 def test_unanswered_address_is_reported_once(monkeypatch):
     monkeypatch.setattr("ertis_cli._product_printer._SOON_S", 0.1)
-    reported = results_of(monkeypatch, MicrophoneTable, "unanswered")
+    reported = results_of(monkeypatch, ProductTable, "unanswered")
     clock = SimpleNamespace(monotonic=lambda: 0.2 * len(reported))
     monkeypatch.setattr("ertis_cli.listen.time", clock)
     text = "waiting for tcp://127.0.0.1:1: no answer; is 'ertis serve' running?"
@@ -213,7 +213,7 @@ def test_computed_output_without_an_answer_fails_as_products_do(output):
     ],
 )
 def test_silence_is_reported_at_the_end_without_a_delay(capsys, product, text):
-    heard = MicrophoneTable(as_json=False, quiet=False)
+    heard = ProductTable(as_json=False, quiet=False)
     heard.subscribed("tcp://here", (), (product,))
     heard.silent("tcp://here", (product,), 0)
     assert not capsys.readouterr().err
@@ -224,7 +224,7 @@ def test_silence_is_reported_at_the_end_without_a_delay(capsys, product, text):
 
 def test_points_use_the_directions_of_each_image(capsys):
     """The output keeps part of the previous image, but must not keep its directions."""
-    heard, flat = MicrophoneTable(as_json=True, quiet=True), image(1, reflectors=[(0, 1.5, 1)])
+    heard, flat = ProductTable(as_json=True, quiet=True), image(1, reflectors=[(0, 1.5, 1)])
     raised = replace(flat, elevation_rad=np.full_like(flat.elevation_rad, np.radians(20.0)))
     for item in (flat, raised):
         heard.product(
@@ -236,7 +236,7 @@ def test_points_use_the_directions_of_each_image(capsys):
 
 def test_late_sensor_is_reported(capsys, monkeypatch):
     monkeypatch.setattr("ertis_cli._product_printer._SOON_S", 3.0)
-    heard = MicrophoneTable(as_json=False, quiet=False)
+    heard = ProductTable(as_json=False, quiet=False)
     heard.unanswered("tcp://127.0.0.1:1", 2.0)
     heard.unanswered("tcp://127.0.0.1:1", 4.0)
     heard.note("connected")
@@ -244,7 +244,7 @@ def test_late_sensor_is_reported(capsys, monkeypatch):
 
 
 def test_prompt_sensor_is_not_reported(capsys):
-    heard = MicrophoneTable(as_json=False, quiet=False)
+    heard = ProductTable(as_json=False, quiet=False)
     heard.note("connected")
     heard.unanswered("tcp://127.0.0.1:1", 4.0)
     assert capsys.readouterr().err == ""
@@ -300,7 +300,7 @@ def test_listen_refuses_invalid_usage(arguments, match):
 @pytest.mark.parametrize(("n_received", "lines"), [(0, 1), (3, 0)])
 def test_silence_is_reported_once(monkeypatch, capsys, n_received, lines):
     monkeypatch.setattr("ertis_cli._product_printer._SILENT_S", 0.0)
-    heard = MicrophoneTable(as_json=False, quiet=False)
+    heard = ProductTable(as_json=False, quiet=False)
     heard.silent("tcp://here", ("energyscape",), 0)  # not connected yet; another message reports this
     heard.subscribed("tcp://here", (), ("energyscape",))
     for _ in range(2):

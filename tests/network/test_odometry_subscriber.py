@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner
 from ertis_bench.network.processes import until
 from ertis_cli._listen_pulses import listen_pulses
-from ertis_cli._product_printer import MicrophoneTable
+from ertis_cli._product_printer import ProductTable
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
@@ -353,7 +353,7 @@ def test_sensor_of_unknown_mounting_does_not_end_listen(tmp_path):
 
 def test_listen_without_pulses_writes_no_trajectory(tmp_path, monkeypatch):
     target = tmp_path / "path.tum"
-    connected = results_of(monkeypatch, MicrophoneTable, "subscribed")
+    connected = results_of(monkeypatch, ProductTable, "subscribed")
     end_when(monkeypatch, "ertis_cli._listen_pulses", lambda: connected)
     with Publisher() as publisher, publisher.playing([]):
         arguments = ["--odometry", "-o", str(target), "--duration", "0.3"]

@@ -5,23 +5,19 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, TypeAlias
+from typing import Any, Final
 
 import msgspec
 import zmq
 
 from ertis_numba.network.messages import (
     SILENCE_LIMIT_S,
-    Group,
-    Image,
     Message,
-    Points,
     Product,
-    Raw,
-    Report,
     Subscribe,
     encode,
 )
+from ertis_numba.network.product_messages import ProductMessage
 from ertis_numba.network.status import SubscriberStatus
 
 __all__ = ["DESCRIPTIONS", "ConnectedSubscriber", "QueuedProduct", "Subscribers"]
@@ -35,8 +31,6 @@ _DESCRIBED: Final = 16  # Number of descriptions of each sensor that an applicat
 _UNDER_WAY_BYTES: Final = 64_000_000  # Limit on the bytes under way to an application.
 _AFTER_S: Final = 60.0  # Time after which a silent application is forgotten.
 
-Header: TypeAlias = Image | Points | Raw | Group | Report
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QueuedProduct:
@@ -44,7 +38,7 @@ class QueuedProduct:
 
     product: Product
     sensor: str  # empty for products without one
-    header: Header  # without its numbers
+    header: ProductMessage  # without its numbers
     payloads: "list[bytes | memoryview | zmq.Frame]" = field(default_factory=list)  # frames after `share`
     description: tuple[int, Sequence[bytes]] | None = None  # (number, frames), sent before
 
@@ -238,7 +232,7 @@ class Subscribers:
                         return
                     described.append(about)
             changes: dict[str, Any] = {"number": number, "dropped": each.dropped}
-            if isinstance(item.header, Image | Points):
+            if hasattr(item.header, "published_ns"):
                 changes["published_ns"] = time.monotonic_ns()
             header = encode(msgspec.structs.replace(item.header, **changes))
             if not self._put(routing_id, [header, *item.payloads]):
