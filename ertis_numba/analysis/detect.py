@@ -196,7 +196,10 @@ def _peaks(image: Energyscape, each_top: list[Tops], errors_rad: list[float], no
 def left_out_at_edges(
     image: Energyscape, peaks: Sequence[Peak], *, min_level_db: float = -30.0, false_alarm: float | None = None
 ) -> int:
-    """Return the number of maxima that `find_peaks` left out because an echo beyond an edge may have caused them."""
+    """Return the number of maxima that `find_peaks` left out because an echo beyond an edge may have caused them.
+
+    ``peaks`` are those of `find_peaks` with the same arguments; their side lobes do not count.
+    """
     if image.points is not None:
         return 0
     directions = unit_vectors(image.azimuth_rad, image.elevation_rad)

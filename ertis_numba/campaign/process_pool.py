@@ -26,7 +26,10 @@ class _WorkerProcess:
 
 
 class ProcessPool:
-    """`WorkerPool` of local processes; one that dies costs its recording, or before it is ready raises DeviceError."""
+    """`WorkerPool` of processes on this machine; one that dies costs its recording, and is replaced.
+
+    `wait` raises DeviceError if processes end before they are ready.
+    """
 
     def __init__(self, size: int) -> None:
         self._size = size

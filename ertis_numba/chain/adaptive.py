@@ -20,7 +20,8 @@ class AdaptiveBeamform:
 
     An echo that reaches all microphones alike has the same level as with delay-and-sum. ``offsets`` (direction, mic)
     index each microphone's first sample in a flattened (mic, phase, sample); ``weights`` (direction, mic) are the phase
-    of the carrier and the calibration, with magnitudes that add up to about 1. ``budget`` is the permitted error power.
+    of the carrier and the calibration, with magnitudes that add up to about 1. ``budget`` is the permitted error power;
+    0 requires the highest precision of the kernel.
     """
 
     def __init__(

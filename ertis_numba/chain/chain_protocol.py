@@ -32,7 +32,7 @@ class Chain(Protocol):
         threads: int | None = None,
         grid: Grid | None = None,
     ) -> None:
-        """Compute the image ``out`` (direction, range) of ``words`` (sample, word); ``grid`` has level directions."""
+        """Compute the image ``out`` (direction, range) of ``words``; ``grid`` has as many directions for level ones."""
         ...
 
     def process_batch(

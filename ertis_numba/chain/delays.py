@@ -45,7 +45,7 @@ class DelayTable:
         return cls(rows.reshape(flat), samples.reshape(flat) + lead, weights.reshape(flat))
 
     def offsets(self, width: int) -> NDArray[np.int32]:
-        """Return the indices of first samples in a flattened (mic, phase, ``width``); raise if they leave 32 bits."""
+        """Return the indices of first samples in a flattened (mic, phase, ``width``); refuse negative and huge ones."""
         if self.samples.min() < 0:
             raise ArgumentError(
                 "delays reach before the first sample of the record; start processing.range_m at a larger range"

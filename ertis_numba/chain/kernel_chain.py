@@ -129,7 +129,10 @@ class KernelChain(ABC):
     def process_batch(
         self, words: Iterable[NDArray[np.unsignedinteger[Any]]], outs: Iterable[NDArray[np.float32] | None]
     ) -> None:
-        """Process measurements in GPU lanes, or on one thread each; images stay on the GPU where ``outs`` has None."""
+        """Process measurements in GPU lanes, or on one thread each.
+
+        If an item of ``outs`` is None, the image stays in GPU memory until the lane computes its next image.
+        """
         pairs = list(zip(words, outs, strict=True))
         if self._memory.n_lanes == 1:
             self._side_by_side(pairs)

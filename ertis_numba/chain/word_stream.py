@@ -99,7 +99,7 @@ class StreamedImage:
         self._begun_s, self._image_s = 0.0, math.inf if is_turned else self._time_s()
 
     def add(self, first: int, words: NDArray[Any]) -> None:
-        """Copy words, compute signals that depend on no later ones, and the image once it has all signals."""
+        """Copy words, compute signals that depend on no later ones, and the image if it ends before the last words."""
         if first == 0:
             self._n_words = self._n_done = 0
             self._is_done = False

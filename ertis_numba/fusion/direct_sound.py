@@ -216,7 +216,7 @@ class DirectSoundCheck:
 def _both_ways(
     sounds: Mapping[tuple[str, str], DirectSound], chain_s: float
 ) -> tuple[dict[tuple[str, str], tuple[float, float]], dict[tuple[str, str], tuple[float, float]]]:
-    """Return the lateness of the first clock of a pair, and the distance's excess in s, each with its deviation."""
+    """Return the first clock's lateness and the distance's excess in s, with deviations, of pairs heard both ways."""
     clocks_s, distances_s = {}, {}
     names = dict.fromkeys(name for pair in sounds for name in pair)
     for one, other in combinations(names, 2):

@@ -139,22 +139,7 @@ def direction_note(array: Array, grid: DegreesFromRadians, *, is_passive: bool =
 
 
 def require_places(array: Array, sensor: str, *, is_planar: bool) -> None:
-    """Raise ArgumentError if an array observes no places of echoes, not even of those at the elevation of its images.
-
-    Parameters
-    ----------
-    array : Array
-    sensor : str
-        Name for the message.
-    is_planar : bool
-        True if all directions lie at one elevation.
-
-    Examples
-    --------
-    >>> from ertis_numba.geometry import require_places
-    >>> from ertis_numba.settings import Array
-    >>> require_places(Array(), "sensor", is_planar=False)
-    """
+    """Raise ArgumentError if an array observes no places of echoes, not even at the elevation of planar images."""
     seen = observable_angles(array)
     if seen.azimuth and (seen.elevation or is_planar):
         return

@@ -44,6 +44,7 @@ def call_samples(call: Call, *, rate_hz: float | None = None) -> NDArray[np.floa
     Hyperbolic sweeps have the frequency ``f(t) = 1 / (1/f₀ + t (1/f₁ − 1/f₀) / T)`` and the phase
     ``2π T / (1/f₁ − 1/f₀) · ln(f₀ / f(t))``, from t = 0 to T inclusive (J. J. Kroszczynski, Pulse compression by means
     of linear-period modulation, Proc. IEEE 57, 1969). Linear sweeps have the frequency ``f(t) = f₀ + t (f₁ − f₀) / T``.
+    Custom waveforms are interpolated; see `call_at`.
     """
     rate_hz = call.sample_rate_hz if rate_hz is None else rate_hz
     call.require_samples()
@@ -101,7 +102,7 @@ def _phase_rad(call: Call, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
 def call_spectrum(
     call: Call, settings: Settings, *, n_fft: int, decimation: int | None = None
 ) -> NDArray[np.complex128]:
-    """Return the one-sided spectrum of a call in decimated signals: (bin,); the decimation defaults to the settings'.
+    """Return the one-sided spectrum of a call in decimated signals: (bin,); ``n_fft`` is at least the call's length.
 
     The call is sampled at the rate of the record. At the decimated rate, a short call without ramps would alias.
     """
@@ -150,11 +151,12 @@ def matched_guard_s(settings: Settings, *, down_db: float = 60.0) -> float:
 
 
 def matched_filter_spectrum(settings: Settings, *, n_fft: int, decimation: int | None = None) -> MatchedFilterSpectrum:
-    """Return the read-only matched filter, with own filters, for spectra of ``n_fft`` points of decimated signals.
+    """Return the read-only matched filter, with own filters, for spectra of decimated signals.
 
     ``H(f) = g conj(S(f)) W(f) F(f)`` for positive frequencies and 0 for others, with S the spectrum of the call, W a
     window that is 1 over the call's band and falls to 0 outside it as a raised cosine, F the gain of own filters, and g
-    such that the call itself gives an envelope of 1, unless F distorts phases: ``g Σ |S|² W |F| = n_fft``.
+    such that the call itself gives an envelope of 1, unless F distorts phases: ``g Σ |S|² W |F| = n_fft``. The length
+    ``n_fft`` is even or odd, and at least that of the call.
     """
     decimation = settings.decimation if decimation is None else decimation
     band_hz = matched_band_hz(settings)

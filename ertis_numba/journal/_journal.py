@@ -65,7 +65,7 @@ class Journal(WritableJournal):
 
     @classmethod
     def open(cls, path: str | Path) -> Self:
-        """Open a journal, regardless of how the process that wrote it ended."""
+        """Open a journal, however its writer ended; raise JournalInUseError, DataError or FormatVersionError."""
         path = Path(path)
         log = read_log(path)
         if log is not None and log.is_truncated:
@@ -164,7 +164,7 @@ class Journal(WritableJournal):
             fsync(self.path.parent)
 
     def set_aside(self, end: str = "damaged") -> Path:
-        """Close the journal, rename it with the suffix ``end`` so that it is never sealed again; return its path."""
+        """Close the journal, and rename it so that it is never sealed again; after a DataError, it keeps its name."""
         with self._lock:
             try:
                 self._prepare_rename()

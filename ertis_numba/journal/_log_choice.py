@@ -33,6 +33,7 @@ def choose_log(path: Path, log: WriteAheadLog) -> None:
 
     The log stays if the journal is intact with the part that SQLite reads. Otherwise it is replaced by a repaired log,
     which SQLite reads completely, or removed, whichever gives an intact journal; if neither does, raise DamagedError.
+    A journal that another process has open is not changed.
     """
     with _locked(path) as is_unused:
         if not is_unused:

@@ -86,7 +86,8 @@ def read_poses(database: Database, path: Path, *, after: int = 0) -> tuple[list[
 def trajectory_through(poses: Sequence[JournalPose], *, max_gap_s: float) -> Trajectory:
     """Return the trajectory through poses of one platform in any order; of several poses at one time, the first counts.
 
-    The covariance is None if that of any pose is unknown. The source lists the sources of the poses.
+    The covariance is None if that of any pose is unknown. The source lists the sources of the poses. An impossible pose
+    raises ArgumentError or ValueError.
     """
     time_ns, first = np.unique([pose.timestamp_ns for pose in poses], return_index=True)
     kept = [poses[index] for index in first]
@@ -114,7 +115,7 @@ class PosesAround:
         self._sources: dict[str, None] = {}
 
     def add(self, poses: Sequence[JournalPose]) -> None:
-        """Add poses in any order; the first of several poses at one time counts."""
+        """Add poses in any order, the first of each time; raise ArgumentError or ValueError for an impossible one."""
         if not poses:
             return
         self._waiting.append(trajectory_through(poses, max_gap_s=self._max_gap_s))

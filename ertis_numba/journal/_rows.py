@@ -39,7 +39,7 @@ class WritableJournal(ReadableJournal):
         translation_m: Sequence[float] | None = None,
         rotation_xyzw: Sequence[float] | None = None,
     ) -> None:
-        """Register a sensor before its first measurement, with an unknown mounting if both parts are None."""
+        """Register a sensor before its first measurement; the air may differ, and layout files are stored."""
         made = JournalSensor.from_settings(
             name, settings, firmware=firmware, translation_m=translation_m, rotation_xyzw=rotation_xyzw
         )
@@ -53,9 +53,9 @@ class WritableJournal(ReadableJournal):
     def append(self, entries: Sequence[JournalEntry]) -> None:
         """Store measurements of any sensors durably, all or none, with numbers that rise within a session.
 
-        Raises DiskFullError if the disk is nearly full and nothing was written, so that a later call may succeed;
-        DataError if the disk fails (earlier measurements are safe); or JournalInUseError if another process removed or
-        replaced the journal.
+        ``crc32`` is filled in if it is None. Raises DiskFullError if the disk is nearly full and nothing was written,
+        so that a later call may succeed; DataError if the disk fails (earlier measurements are safe); or
+        JournalInUseError if another process removed or replaced the journal.
         """
         with self._lock:
             last = dict(self._last)

@@ -36,7 +36,8 @@ class SealingResult:
     log was damaged: each number belongs to a stored measurement or a gap, or was skipped by the sensor. ``set_aside``
     is the new path of a journal with damaged poses, or damaged or refused measurements; without any, the journal was
     removed. ``damage`` describes losses from a damaged log that no gap covers. ``refused`` has the reasons by sensor.
-    ``pose_damage`` is the number of damaged poses, or the reason why all were left out.
+    ``without_pose`` counts measurements of sensors with poses. ``pose_damage`` is the number of damaged poses, or the
+    reason why all were left out.
     """
 
     journal: Path
@@ -129,10 +130,11 @@ def seal_in_subprocess(
     rests: float | None = None,
     progress: Progress = lambda _done, _of: None,
 ) -> SealingResult:
-    """Make the recording of a journal in a separate process, which Ctrl-C does not reach; it can be repeated.
+    """Make the recording of a journal in a separate process, which Ctrl-C does not reach.
 
-    With ``rests``, it runs at low priority, and pauses after each step for this multiple of its duration. Raise OSError
-    if no process can be started, or KeyboardInterrupt with the place of the measurements as its message.
+    However it ends, the measurements are in the journal or in the recording, and sealing can be repeated. With
+    ``rests``, it runs at low priority, and pauses after each step for this multiple of its duration. Raises also
+    OSError if no process can be started, and KeyboardInterrupt, whose message states where the measurements are.
     """
     replies: list[Sealed | StorageFailed] = []
     try:

@@ -71,7 +71,11 @@ class Memory(Protocol):
 
 
 class NewMemory(Protocol):
-    """Creates the memory of a pipeline; with ``graphs``, the default where supported, lanes replay CUDA graphs."""
+    """Creates the memory of a pipeline.
+
+    With ``graphs``, `Lane.run` records its steps as a CUDA graph and replays it: the default on devices that support
+    graphs, and an ArgumentError on others.
+    """
 
     def __call__(self, *, graphs: bool | None = None) -> Memory: ...
 

@@ -254,7 +254,7 @@ class Sight:
         return float(np.abs(pulse.matched(self.settings, call)).max())
 
     def near_field(self, amplitude: Floats, delay_s: Floats) -> tuple[Floats, Floats]:
-        """Return times in the record, and the highest amplitude in any beam of sound from within the array: (time,)."""
+        """Return times after the image begins, and the highest amplitude of sound within the array in any beam."""
         begin_s = 2 * self.settings.processing.range_m[0] / self.shot.speed_m_s
         time_s = begin_s + np.linspace(0.0, self.settings.call.duration_s, _LAGS)
         every = max(1, len(self._directions) // _LAG_DIRECTIONS)

@@ -20,7 +20,7 @@ _LOWEST = 1e-30  # mean square of −300 dBFS
 
 
 def reflectors(shot: Snapshot, active: frozenset[str]) -> list[Reflector]:
-    """Return the echoes of a sensor's own call, then those of other sensors' calls, strongest first.
+    """Return the echoes of a sensor's own call, then those of others if cross-emission is simulated, strongest first.
 
     The range is half of the length of the sound path, and the direction that from which the sound arrives: over walls,
     that of the mirror image. The level is that of the mean amplitude over the microphones and the call's band, relative

@@ -35,10 +35,10 @@ class CombineCapon(Protocol):
     """Combine the microphones with the Capon (minimum-variance distortionless response) weights.
 
     Let y be as in `WeightCoherence`, and R its covariance over the ``n_snapshots`` ranges around a range, or the
-    nearest ones inside the image. With M microphones and ``R' = R + loading · trace(R) / M · I``, the weights are ``w =
-    R'⁻¹ 1 / (1ᵀ R'⁻¹ 1)``, and ``out[direction, range] = |wᴴ y|``, 0 if all microphones are silent. The type of the
-    steering weights, complex64 or complex128, selects the precision. In single precision, the relative error is about
-    10⁻⁷ M / loading at most.
+    nearest ones inside the image, at most all. With M microphones and ``R' = R + loading · trace(R) / M · I``, the
+    weights are ``w = R'⁻¹ 1 / (1ᵀ R'⁻¹ 1)``, and ``out[direction, range] = |wᴴ y|``, 0 if all microphones are silent.
+    Steering weights of magnitude 1 make it an amplitude, because w adds up to 1. Their type, complex64 or complex128,
+    selects the precision. In single precision, the relative error is about 10⁻⁷ M / loading at most.
     """
 
     def __call__(

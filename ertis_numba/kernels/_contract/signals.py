@@ -31,7 +31,8 @@ class UnpackBits(Protocol):
 class UnpackPcm(Protocol):
     """Convert PCM samples to signals: ``out[mic, n] = scale · words[first + n, channels[mic]]``, 0 elsewhere.
 
-    Samples with a magnitude below ``silence`` become 0 first, because arithmetic with denormal numbers is slow.
+    ``first`` may be negative. Samples with a magnitude below ``silence`` become 0 first, because arithmetic with
+    denormal numbers is slow.
     """
 
     def __call__(

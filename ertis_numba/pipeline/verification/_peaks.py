@@ -20,7 +20,7 @@ _NEAR_DEG, _NEAR_M = 5.0, 0.02  # Half a main lobe and half a pulse; peaks farth
 
 @dataclass(frozen=True, slots=True)
 class PeakErrors:
-    """Largest errors at the reflectors of the exact image that were found, None for none; levels are relative."""
+    """Largest errors at the ``wanted`` reflectors of the exact image, of which ``lost`` were missed; None for none."""
 
     wanted: int
     lost: int

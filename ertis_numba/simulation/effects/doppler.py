@@ -33,7 +33,7 @@ def emission(shot: Snapshot, paths: Paths, received_s: Floats) -> Floats:
     The source is at ``s(t)`` and a microphone at ``m(t)``, both with constant velocity. Sound that arrives at t left u
     earlier, with ``|m(t) - s(t - u)| = c u``. With ``d = m(t) - s(t)`` and the velocity v of the source, u is the
     positive root of ``(c² - v²) u² - 2 (d·v) u - d² = 0``. The sound meets a moving wall after the same fraction of the
-    path as without motion, which is accurate to first order in v / c.
+    path as without motion, which is accurate to first order in v / c. ``paths`` have no targets.
     """
     source, receiver, speed_m_s = paths.transmitter, paths.receiver, shot.speed_m_s
     # A wall moves the image from t - u until the time of reflection, so only a part of its velocity counts in v.
