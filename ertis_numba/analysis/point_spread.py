@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from ertis_numba import kernels
@@ -14,6 +15,8 @@ from ertis_numba.settings import Air, Settings
 
 __all__ = ["PULSE_M", "PointSpread"]
 
+Floats = NDArray[np.float64]
+
 PULSE_M = 0.04
 """Range offset, in metres, at which a compressed pulse of 25 kHz bandwidth is 26 dB down.
 
@@ -21,24 +24,26 @@ At 2.5 times this offset, it is 40 dB down.
 """
 
 _STEPS_PER_WAVE = 512  # Table steps per wavelength at the band's edge: linear interpolation has an error of 5e-6.
+_SKIRTS = (0.05, 0.01)  # Amplitudes at the ends of a pulse and of its skirt.
 
 
 class PointSpread:
-    """Point-spread function of delay-and-sum with plane waves.
+    """Point-spread function of delay-and-sum: ``|Σ_f P(f) Σ_mic w exp(j k(f) d)| / n_mics``.
 
-    The amplitude at a range offset Δr and a direction offset Δu is ``|Σ_f P(f) Σ_mic w exp(j k(f) (2 Δr − p·Δu))| /
-    n_mics``, where P is the power spectrum of the call, and w are the array weights, whose mean is 1. Beyond
-    ``reach_m``, the image ends: a side lobe is as long as the pulse, and its shift is half of the difference of two
-    paths, at most the aperture's radius.
+    P is the power spectrum of the call, w are the array weights, whose mean is 1, and d are differences of paths: for
+    plane waves, 2 Δr − p·Δu at a range offset Δr and a direction offset Δu. Beyond ``reach_m``, the image ends: a side
+    lobe is as long as the pulse, and its shift is half of the difference of two paths, at most the aperture's radius.
+    ``skirt_m`` includes the skirt of the pulse to -40 dB.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._speed_m_s, rate_hz = sound_speed_m_s(settings.air), settings.signal_rate_hz
         self._positions_m = microphones(settings.array).enabled_positions_m
         self._weights = array_weights(settings)
-        self.reach_m = float(np.max(np.linalg.norm(self._positions_m, axis=1))) + PULSE_M
-        # The sum over bins has a period of speed / spacing. Paths differ by at most four times ``reach_m``.
-        spacing_hz = self._speed_m_s / (6 * self.reach_m)
+        radius_m = float(np.max(np.linalg.norm(self._positions_m, axis=1)))
+        self.reach_m, self.skirt_m = (radius_m + max(PULSE_M, end_m) for end_m in self._ends_m(settings))
+        # The sum over bins has a period of speed / spacing. Paths differ by at most four times ``skirt_m``.
+        spacing_hz = self._speed_m_s / (6 * self.skirt_m)
         n_fft = math.ceil(max(settings.call.end_s * rate_hz + 1, rate_hz / spacing_hz))
         matched = matched_filter_spectrum(settings, n_fft=n_fft)
         thinned = slice(None, None, max(1, math.floor(spacing_hz * n_fft / rate_hz)))
@@ -46,8 +51,8 @@ class PointSpread:
         wave_1_m = 2 * math.pi * bins * rate_hz / n_fft / self._speed_m_s
         power = matched.echo_power[thinned]
         self._carrier_1_m = float(wave_1_m[len(wave_1_m) // 2])
-        # Wave numbers are evenly spaced, so the sum is a Fourier transform, with a period of six times ``reach_m``.
-        period_m = 2 * math.pi / float(wave_1_m[1] - wave_1_m[0]) if len(wave_1_m) > 1 else 8 * self.reach_m
+        # Wave numbers are evenly spaced, so the sum is a Fourier transform, with a period of six times ``skirt_m``.
+        period_m = 2 * math.pi / float(wave_1_m[1] - wave_1_m[0]) if len(wave_1_m) > 1 else 8 * self.skirt_m
         count = 2 ** math.ceil(math.log2(len(wave_1_m) * _STEPS_PER_WAVE))
         path_m = np.arange(count) * (period_m / count)
         shares = power / power.sum()
@@ -64,24 +69,46 @@ class PointSpread:
         )
 
     @property
-    def spectrum(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def spectrum(self) -> tuple[Floats, Floats]:
         """Frequencies in Hz, evenly spaced, and their shares of the amplitude of an echo: (frequency,) each."""
         return self._wave_1_m * self._speed_m_s / (2 * math.pi), self._shares
 
-    def __call__(
-        self, direction_offset: NDArray[np.float64], range_offset_m: NDArray[np.float64], air: Air | None = None
-    ) -> NDArray[np.float64]:
+    def __call__(self, direction_offset: Floats, range_offset_m: Floats, air: Air | None = None) -> Floats:
         """Return the amplitude (place,), 1 at zero offset, by differences of unit vectors and ranges, in any air."""
-        found = np.empty(len(range_offset_m))
-        offsets = np.ascontiguousarray(direction_offset), np.ascontiguousarray(range_offset_m)
-        kernels.load_points().spread_amplitudes(self.pulse, *offsets, self.scale(air), found)
+        along_m = direction_offset @ self._positions_m.T
+        return self._amplitudes(self.scale(air) * (2 * range_offset_m[:, None] - along_m))
+
+    def of_echo(self, direction: Floats, range_m: Floats, echo: Floats, echo_m: Floats, *, is_focused: bool) -> Floats:
+        """Return the amplitudes (place,) that point echoes cause elsewhere; focused beams assume spherical waves."""
+        beam_m = (
+            self._paths_m(direction, range_m) if is_focused else 2 * range_m[:, None] - direction @ self._positions_m.T
+        )
+        return self._amplitudes(beam_m - self._paths_m(echo, echo_m))
+
+    def _paths_m(self, direction: Floats, range_m: Floats) -> Floats:
+        """Return the paths from the emitter to a place and to the microphones: (place, mic) float64."""
+        place_m = range_m[:, None] * direction
+        return np.asarray(range_m[:, None] + np.linalg.norm(place_m[:, None] - self._positions_m, axis=2))
+
+    def _amplitudes(self, path_m: Floats) -> Floats:
+        found = np.empty(len(path_m))
+        kernels.load_points().spread_amplitudes(self.pulse, np.ascontiguousarray(path_m), found)
         return found
+
+    def _ends_m(self, settings: Settings) -> list[float]:
+        """Return the range offsets beyond which the pulse is weaker than each of `_SKIRTS`."""
+        rate_hz = settings.signal_rate_hz
+        n_fft = scipy.fft.next_fast_len(2 * math.ceil(settings.call.end_s * rate_hz) + 1)
+        power = matched_filter_spectrum(settings, n_fft=n_fft).echo_power
+        pulse = np.abs(np.fft.ifft(power, n_fft))[: n_fft // 2]
+        ends = (np.flatnonzero(~(pulse < level * pulse[0]))[-1] for level in _SKIRTS)
+        return [(float(end) + 1) / rate_hz * self._speed_m_s / 2 for end in ends]
 
     def scale(self, air: Air | None) -> float:
         """Return the sound speed of the settings relative to that in some air."""
         return 1.0 if air is None else self._speed_m_s / sound_speed_m_s(air)
 
-    def beams(self, directions: NDArray[np.float64], deviation: Deviation | None) -> kernels.BeamErrors:
+    def beams(self, directions: Floats, deviation: Deviation | None) -> kernels.BeamErrors:
         """Return directions with the errors of their beams."""
         if deviation is None:
             none = np.empty((0, len(self._weights)), np.complex64)
@@ -89,7 +116,7 @@ class PointSpread:
         centre_hz = self._carrier_1_m * self._speed_m_s / (2 * math.pi) - deviation.centre_hz
         return kernels.BeamErrors(directions, 1 + deviation.mean + deviation.slope_s * centre_hz, deviation.slope_s)
 
-    def _table(self, spectrum: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def _table(self, spectrum: Floats) -> NDArray[np.complex128]:
         """Return the pulse of a spectrum, relative to its carrier: (path,) complex128."""
         count = len(self._turn)
         return np.asarray(np.fft.ifft(spectrum, count) * count * self._turn)

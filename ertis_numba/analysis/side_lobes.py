@@ -62,7 +62,8 @@ class SideLobes:
         self._samples = np.unique(np.linspace(0, count - 1, min(count, _N_DIRECTIONS)).astype(np.int64))
         self._sampled = directions[self._samples]
         self._factor = math.sqrt(math.log(count / _FALSE_ALARM))
-        self._offsets_m = np.linspace(0.0, self._spread.reach_m, _N_OFFSETS)
+        self._is_focused = image.settings.processing.wavefront == "spherical"
+        self._offsets_m = np.linspace(0.0, self._spread.skirt_m, _N_OFFSETS)
         self._mean = np.zeros(_N_OFFSETS)  # Mean side lobes of a reflector of amplitude 1, for each range offset.
         self._sources: list[tuple[NDArray[np.float64], float, float]] = []
         self._deviations: dict[int, float] = {}  # The keys are range bins.
@@ -71,7 +72,7 @@ class SideLobes:
     @property
     def reach_m(self) -> float:
         """Range offset in metres beyond which reflectors have no side lobes."""
-        return self._spread.reach_m
+        return self._spread.skirt_m
 
     def add(self, direction: NDArray[np.float64], range_m: float, amplitude: float) -> None:
         """Add a reflector. Reflectors must be added in descending order of amplitude."""
@@ -83,12 +84,13 @@ class SideLobes:
     def explain(self, direction: NDArray[np.float64], range_bin: int, level: float) -> bool:
         """Return True if a maximum may be a side lobe of the reflectors added so far."""
         range_m = float(self._image.range_m[range_bin])
-        near = [source for source in self._sources if abs(range_m - source[1]) < self._spread.reach_m]
+        near = [source for source in self._sources if abs(range_m - source[1]) < self._spread.skirt_m]
         if not near:
             return False
         sources, ranges_m, amplitudes = (np.array(each) for each in zip(*near, strict=True))
         offsets_m = range_m - ranges_m
-        predicted = float(amplitudes @ self._spread(direction - sources, offsets_m))
+        places = np.broadcast_to(direction, sources.shape), np.full(len(near), range_m)
+        predicted = float(amplitudes @ self._spread.of_echo(*places, sources, ranges_m, is_focused=self._is_focused))
         if level <= _MARGIN * predicted:
             return True
         # Echoes of real surfaces are longer than the pulse.
@@ -126,11 +128,16 @@ class SideLobes:
         if range_bin not in self._deviations:
             n_samples = len(self._samples)
             sources, ranges_m, amplitudes = (np.array(each) for each in zip(*self._sources, strict=True))
-            offsets_m = float(self._image.range_m[range_bin]) - ranges_m
-            near = np.abs(offsets_m) < self._spread.reach_m
-            sources, offsets_m, amplitudes = sources[near], offsets_m[near], amplitudes[near]
-            directions = (self._sampled - sources[:, None]).reshape(-1, 3)
-            levels = self._spread(directions, np.repeat(offsets_m, n_samples)).reshape(-1, n_samples)
+            range_m = float(self._image.range_m[range_bin])
+            near = np.abs(range_m - ranges_m) < self._spread.skirt_m
+            sources, ranges_m, amplitudes = sources[near], ranges_m[near], amplitudes[near]
+            levels = self._spread.of_echo(
+                np.tile(self._sampled, (len(sources), 1)),
+                np.full(len(sources) * n_samples, range_m),
+                np.repeat(sources, n_samples, axis=0),
+                np.repeat(ranges_m, n_samples),
+                is_focused=self._is_focused,
+            ).reshape(-1, n_samples)
             predicted = np.sqrt(((amplitudes[:, None] * levels) ** 2).sum(axis=0))
             measured = self._image.amplitude[self._samples, range_bin]
             self._deviations[range_bin] = _deviation_of(measured, predicted)

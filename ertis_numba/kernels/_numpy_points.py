@@ -10,9 +10,8 @@ from ertis_numba.kernels._numpy_echo_fits import fit_echoes, pulse_at
 __all__ = ["KERNELS"]
 
 
-def spread_amplitudes(pulse: Pulse, direction_offset: Doubles, offset_m: Doubles, scale: float, out: Doubles) -> None:
+def spread_amplitudes(pulse: Pulse, path_m: Doubles, out: Doubles) -> None:
     """Compute the amplitudes of the image of a reflector, relative to that at its place."""
-    path_m = scale * (2 * offset_m[:, None] - direction_offset @ pulse.positions_m.T)
     value = pulse_at(pulse, path_m, pulse.table) * np.exp(1j * pulse.carrier_1_m * path_m)
     out[:] = np.abs((value * pulse.weights).mean(axis=1))
 

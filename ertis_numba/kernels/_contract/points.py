@@ -92,14 +92,9 @@ class BeamErrors(NamedTuple):
 
 
 class SpreadAmplitudes(Protocol):
-    """Compute the amplitudes (place,) of a reflector's image, relative to that at its place.
+    """Compute the amplitudes (place,) of a reflector's image from differences of paths: (place, mic) float64."""
 
-    Offsets are differences of unit vectors and of ranges; ``scale`` is the table's sound speed relative to the image's.
-    """
-
-    def __call__(
-        self, pulse: Pulse, direction_offset: Doubles, offset_m: Doubles, scale: float, out: Doubles
-    ) -> None: ...
+    def __call__(self, pulse: Pulse, path_m: Doubles, out: Doubles) -> None: ...
 
 
 class FindTops(Protocol):

@@ -14,15 +14,14 @@ __all__ = ["KERNELS"]
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def spread_amplitudes(pulse, direction_offset, offset_m, scale, out):
+def spread_amplitudes(pulse, path_m, out):
     """Compute the amplitudes of the image of a reflector, relative to that at its place."""
     for place in range(len(out)):
         total = 0j
         for mic in range(len(pulse.weights)):
-            path_m = _path_m(pulse, direction_offset[place], offset_m[place], scale, mic)
-            before, between = place_of(pulse, path_m)
-            carrier = pulse.weights[mic] * carrier_of(pulse, path_m)
-            total += at_path(pulse.table, before, between, path_m) * carrier
+            before, between = place_of(pulse, path_m[place, mic])
+            carrier = pulse.weights[mic] * carrier_of(pulse, path_m[place, mic])
+            total += at_path(pulse.table, before, between, path_m[place, mic]) * carrier
         out[place] = abs(total) / len(pulse.weights)
 
 
@@ -70,14 +69,6 @@ def _top(quadrics, fit, rises, out):
     for axis in range(3):
         out[axis] = x * quadrics.axes[fit, 0, axis] + y * quadrics.axes[fit, 1, axis]
     out[3] = 0.5 * (slope_x * x + slope_y * y)
-
-
-@njit(nogil=True, cache=True, error_model="numpy")
-def _path_m(pulse, direction_offset, offset_m, scale, mic):
-    along_m = 0.0
-    for axis in range(3):
-        along_m += direction_offset[axis] * pulse.positions_m[mic, axis]
-    return scale * (2.0 * offset_m - along_m)
 
 
 KERNELS = PointKernels(
