@@ -247,6 +247,7 @@ class Search:
         kept &= self._echoes.is_clear & ~self._is_ambiguous(candidates)
         if self.found:
             kept[kept] = self._locator.overlap(self.found, np.flatnonzero(kept)).power.sum(axis=1) < _DISTURBED
+        n_found = len(self.found)
         for echo in np.flatnonzero(kept)[np.argsort(-self._echoes.power[kept], kind="stable")]:
             sensor, member = receiver[echo : echo + 1], np.array([echo])
             to_m = path_m[echo, sensor[0]] / 2
@@ -255,6 +256,8 @@ class Search:
             if _is_apart(place_m, covariance_m2, self.found):
                 lone = LocatedReflector(place_m, covariance_m2, 0.0, member, sensor)
                 self.found += self._locator.measured([lone])
+        if len(self.found) > n_found:
+            self.found = self._locator.refined(self.found)
 
     def _is_ambiguous(self, candidates: _Candidates) -> NDArray[np.bool_]:
         """Return True for echoes that another call explains as well, if an image is missing: (echo,) bool.

@@ -122,16 +122,20 @@ class Locator:
         for place, row in enumerate(rows):
             is_kept[place] = median_of(overlap.power[row][:, is_kept].sum(axis=1)) <= _DISTURBED
         disturbed, summed_m2 = overlap.by(is_kept), self._summed_m2(found, sight, number, echo, emitter)
-        path_m2 = disturbed.path_m2 + summed_m2 + sight.beside_m[number, emitter] ** 2
+        beside_m = sight.beside_m[number, emitter]
+        path_m2 = disturbed.path_m2 + summed_m2 + beside_m**2
         added = np.stack([path_m2, disturbed.angle_rad2], axis=1)
         slope = sight.toward[number, emitter] + sight.toward[number, self._echoes.receiver[echo]]
-        shift = np.sqrt(summed_m2) / (self._echoes.deviation[echo, 0] ** 2 + path_m2)
+        slope /= (self._echoes.deviation[echo, 0] ** 2 + path_m2)[:, None]
+        # Sums of calls shift all echoes of a reflector alike, and an emitter beside its beam those of its call.
+        summed, sent = np.sqrt(summed_m2)[:, None] * slope, beside_m[:, None] * slope
         refined = []
         for place in np.flatnonzero(is_kept).tolist():
             each, row = found[place], rows[place]
             place_m, covariance_m2 = self.located(each.echo, each.emitter, each.place_m, added[row])
-            shift_m = covariance_m2 @ (shift[row] @ slope[row])
-            refined.append(each._replace(place_m=place_m, covariance_m2=covariance_m2 + np.outer(shift_m, shift_m)))
+            alike = [summed[row].sum(axis=0), *(sent[row][each.emitter == one].sum(axis=0) for one in {*each.emitter})]
+            shifts_m = np.array(alike) @ covariance_m2
+            refined.append(each._replace(place_m=place_m, covariance_m2=covariance_m2 + shifts_m.T @ shifts_m))
         return refined
 
     def _summed_m2(

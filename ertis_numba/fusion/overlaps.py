@@ -14,6 +14,9 @@ _FAINT: Final = 1e-4  # Power relative to that of an echo, below which another o
 _GRAZING: Final = 0.1  # Least cosine of the angle to the axis of the array.
 _SHIFT: Final = 0.28  # Error of a path or a direction relative to the distance of an equally strong echo.
 _DECAY: Final = -1.75  # Compressed pulses are 26 dB down at six widths, and 40 dB at fourteen.
+_SIDE_LOBES: Final = 10 ** (-21.0 / 10)  # Mean power of side lobes of sparse arrays, relative to the main lobe, …
+_SPREAD: Final = 0.33  # … over a path relative to the pulse and to the change of direction in widths of the beam, …
+_TILT: Final = 0.5  # … and the error of a direction by their slopes, relative to the width and to their amplitude.
 _SUMMED: Final = 0.5  # Largest error of the path of a sum of two equal pulses of any phases, in widths of the pulse, …
 _SEPARATE: Final = 2.0  # … and difference of their paths, in such widths, from which their maxima are separate.
 
@@ -69,6 +72,8 @@ def overlap(
 ) -> Overlap:
     """Return how much the echoes of reflectors disturb others.
 
+    Side lobes of echoes from other directions change path and direction, too, but are no part of the power.
+
     Two echoes within the width of the compressed pulse and of the beam have one maximum, or several at other places,
     depending on their phases. The error grows with the ratio of the amplitudes, and with the distance up to the width.
 
@@ -96,12 +101,18 @@ def overlap(
     across = np.sqrt(np.maximum(0.0, np.einsum("eri,eri->er", turned, turned) - along**2))
     pulse = (1 + (late_m / width_m) ** 2) ** _DECAY  # with side lobes
     near = pulse * np.exp(-((across / width) ** 2))[..., None]
-    ratio = near * predicted.power.swapaxes(0, 1)[receiver] / power[:, None, None]
-    ratio = np.where(is_other & (ratio > _FAINT), np.minimum(ratio, 1.0), 0.0)  # False for NaN.
-    path_m2 = np.where(ratio > 0, ratio * np.minimum(_SHIFT * late_m, width_m) ** 2, 0.0).sum(axis=2)
-    total = ratio.sum(axis=2)
-    facing_to = np.maximum(np.einsum("ei,ei->e", direction, facing), _GRAZING)
-    return Overlap(total, path_m2, total * (_SHIFT * np.minimum(across, width) / facing_to[:, None]) ** 2)
+    apart_m = np.maximum(0.0, late_m - _SPREAD * width_m * (across / width)[..., None])
+    aside = _SIDE_LOBES * (1 + (apart_m / width_m) ** 2) ** _DECAY * (across > width)[..., None]
+    strength = predicted.power.swapaxes(0, 1)[receiver] / power[:, None, None]
+    ratio, side = (
+        np.where(is_other & (each * strength > _FAINT), np.minimum(each * strength, 1.0), 0.0)  # False for NaN.
+        for each in (near, aside)
+    )
+    is_any = ratio + side > 0
+    path_m2 = np.where(is_any, (ratio + side) * np.minimum(_SHIFT * late_m, width_m) ** 2, 0.0).sum(axis=2)
+    total, facing_to = ratio.sum(axis=2), np.maximum(np.einsum("ei,ei->e", direction, facing), _GRAZING)[:, None]
+    angle_rad2 = total * (_SHIFT * np.minimum(across, width)) ** 2 + side.sum(axis=2) * (_TILT * width) ** 2
+    return Overlap(total, path_m2, angle_rad2 / facing_to**2)
 
 
 def summed_m2(late_m: Floats, ratio: Floats, width_m: Floats) -> Floats:

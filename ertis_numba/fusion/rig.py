@@ -29,6 +29,9 @@ _N_FREQUENCIES = 12  # of the band, over which the power of an emitter is averag
 _NEAREST_M = kernels.SPREADING_M
 _STRAY_DB = -20.0  # Power that an emitter radiates at least to its front, which no piston model predicts.
 _BEHIND_DB = -30.0
+_TOP_OF_PULSE = 10 ** (-0.2 / 20)
+_FARTHEST_M = 0.03  # Paths beside the maximum of a pulse, over which its width is searched, …
+_N_FARTHEST = 151  # … and their number.
 _PATHS_M = np.linspace(0.0, kernels.LAST_PATH_M, 1025)  # of sound, for which the absorption is tabulated
 
 
@@ -112,6 +115,8 @@ class Emitters:
         Power that each emitter radiates, relative to that ahead, for cosines from -1 to 1.
     lost : (path,) float64
         Logarithm of the power of echoes relative to a path of 2 m, without spreading, for paths from 0 to 256 m.
+    beside_m : (emitter, cosine) float64
+        Errors of the paths of echoes: beside its beam, a piston inverts high frequencies, which splits the pulse.
     """
 
     def __init__(self, settings: Settings, diameters_m: Sequence[float]) -> None:
@@ -124,7 +129,7 @@ class Emitters:
         sine = np.sqrt(1 - self._cosine**2)
         speed_m_s = sound_speed_m_s(settings.air)
         self._radiated: dict[float, Floats] = {}
-        patterns = {}
+        patterns, beside_m = {}, {}
         for diameter_m in {*diameters_m}:
             argument = np.maximum(1e-9, math.pi * diameter_m / speed_m_s * sine[:, None] * frequency_hz)
             self._radiated[diameter_m] = 2 * scipy.special.j1(argument) / argument
@@ -132,7 +137,11 @@ class Emitters:
             if diameter_m:
                 power = np.where(self._cosine > 0, np.maximum(power, 10 ** (_STRAY_DB / 10)), 10 ** (_BEHIND_DB / 10))
             patterns[diameter_m] = power
-        self.patterns = np.array([patterns[diameter_m] for diameter_m in diameters_m])
+            half_m = _half_widths_m(self._radiated[diameter_m], frequency_hz / speed_m_s)
+            beside_m[diameter_m] = np.where(self._cosine > 0, half_m - half_m[-1], half_m.max() - half_m[-1])
+        self.patterns, self.beside_m = (
+            np.array([table[diameter_m] for diameter_m in diameters_m]) for table in (patterns, beside_m)
+        )
         self._diameters_m = tuple(diameters_m)
 
     def power(self, cosine: Floats, emitter: int) -> Floats:
@@ -187,6 +196,21 @@ class Emitters:
         """
         amplitude = np.mean(radiated * np.exp(-self._loss_1_m * (path_m - 2.0)), axis=-1)
         return np.asarray(2 * np.log(np.maximum(np.abs(amplitude), np.finfo(np.float64).tiny)))
+
+
+def _half_widths_m(radiated: Floats, wave_1_m: Floats) -> Floats:
+    """Return the paths up to which compressed pulses are within 0.2 dB of their maxima: (direction,) float64.
+
+    Parameters
+    ----------
+    radiated : (direction, frequency) float64
+    wave_1_m : (frequency,) float64
+        Waves per metre.
+    """
+    path_m = np.linspace(0.0, _FARTHEST_M, _N_FARTHEST)
+    pulse = np.abs(radiated @ np.exp(2j * math.pi * wave_1_m[:, None] * path_m))
+    is_high = pulse >= _TOP_OF_PULSE * pulse.max(axis=1, keepdims=True)
+    return np.asarray(path_m[len(path_m) - 1 - is_high[:, ::-1].argmax(axis=1)])
 
 
 def _frequencies_of(call: Call) -> Floats:

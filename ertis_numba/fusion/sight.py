@@ -49,6 +49,7 @@ class Viewers:
             np.array([places.get(id(emitters.get(number)), -1) for number in range(len(sensors))]),
             np.stack([model.patterns for model in self._models]),
             np.stack([model.lost for model in self._models]),
+            self._models[0].beside_m,
         )
 
     def sight(self, place_m: Floats) -> kernels.SeenPlaces:

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from ertis_numba.kernels._contract.arrays import Real, Turns
 from ertis_numba.kernels._contract.fusion import (
     AUDIBLE,
-    BESIDE_DB,
-    BESIDE_M,
     LAST_PATH_M,
     LEAST_COSINE,
     NEAREST_M,
@@ -290,8 +288,8 @@ def see_places(place_m: Doubles, sensors: ViewingSensors, out: SeenPlaces) -> No
             spread = np.exp(np.interp(apart_m + back_m, path_m, sensors.lost[model])) / (apart_m * back_m) ** 2
             out.gain[:, receiver] = np.where(powers[model] > AUDIBLE, powers[model], 0.0) * spread
     out.radiated[:] = powers[0]
-    power_db = 10 * np.log10(np.maximum(powers[0], _TINY))
-    out.beside_m[:] = BESIDE_M * np.clip((power_db - BESIDE_DB[0]) / (BESIDE_DB[1] - BESIDE_DB[0]), 0.0, 1.0)
+    for emitter, (each, beside_m) in enumerate(zip(depth.T, sensors.beside_m, strict=True)):
+        out.beside_m[:, emitter] = np.interp(each, cosine, beside_m)
 
 
 def _highest(values: NDArray[Any], near: Turns, out: NDArray[Any]) -> None:

@@ -142,3 +142,16 @@ def test_no_echoes_yield_no_reflectors():
     found = reflectors(echoes_of(np.empty((0, 3))))
     assert found.position_m.shape == (0, 3)
     assert found.covariance_m2.shape == (0, 3, 3)
+
+
+def test_error_of_a_split_call_does_not_shrink_with_the_number_of_echoes():
+    """Beside the beam of its emitter, the echoes of a call are early or late alike at all receivers."""
+    model = Emitters(ertis.Settings(), [0.012] * N_SENSORS)
+    place_m = np.array([[0.5, 0.9, 0.0]])  # 72° from the axis of the first sensor
+    echoes = echoes_of(place_m, pairs={(0, receiver) for receiver in range(N_SENSORS)})
+    heard = [each._replace(path_m=each.path_m + 8e-3, power=each.power * 10 ** (-14 / 10)) for each in echoes]
+    found = reflectors(heard, model=model)
+    error_m = found.position_m[0] - place_m[0]
+    along = place_m[0] / np.linalg.norm(place_m)
+    assert abs(along @ error_m) > 2e-3
+    assert abs(along @ error_m) < 1.5 * np.sqrt(along @ found.covariance_m2[0] @ along)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
+from ertis_numba.analysis.points import EchoPointExtractor
 from ertis_numba.fusion.overlaps import PredictedEchoes, overlap
 from tests.small_platforms import images_of, mounted, random_reflectors, rendered, settings_of
 
@@ -80,6 +81,27 @@ def test_overlapping_echoes_have_an_error_of_their_separation(late_m, turn_rad):
     assert np.sqrt(angle_rad2) == pytest.approx(0.28 * np.sqrt(power) * np.sin(turn_rad), rel=0.02)
 
 
-@pytest.mark.parametrize(("late_m", "turn_rad", "power"), [(1.0, 0.0, 1.0), (0.0, 0.6, 1.0), (0.01, 0.05, 1e-5)])
+@pytest.mark.parametrize(("late_m", "turn_rad", "power"), [(1.0, 0.0, 1.0), (0.3, 0.6, 1.0), (0.01, 0.05, 1e-5)])
 def test_distant_and_faint_echoes_disturb_nothing(late_m, turn_rad, power):
     assert disturbed(late_m, turn_rad, power) == [0.0, 0.0, 0.0]
+
+
+def test_side_lobes_of_another_echo_shift_directions_within_their_deviations():
+    """A post ahead, and one of 4 dB more, far beside it in angle, at about the same range."""
+    random, place, extract = np.random.default_rng(500), mounted(1), EchoPointExtractor(settings_of())
+    height_m, sensor_x_m = place["front"][0][2], place["front"][0][0]
+    error_rad, sd_rad = [], []
+    for _ in range(12):
+        turn_rad, range_m = random.uniform(0.4, 1.0) * np.array([-1.0, 0.6]), random.uniform(1.0, 2.5)
+        late_m = random.uniform(-0.04, 0.04)
+        away_m = range_m + np.array([0.0, late_m / 2])
+        places_m = np.stack([sensor_x_m + away_m * np.cos(turn_rad), away_m * np.sin(turn_rad), [height_m] * 2], axis=1)
+        signals = rendered(
+            place, settings_of(), places_m, np.array([0.0, 4.0]), diameter_m=0.0, random=random, noise=1e-6
+        )
+        found_m = extract(images_of(signals, settings_of())["front"]).position_m
+        found_rad = np.arctan2(found_m[:, 1], found_m[:, 0])
+        error_rad.append(found_rad[np.abs(found_rad - turn_rad[0]).argmin()] - turn_rad[0])
+        sd_rad.append(np.sqrt(disturbed(late_m, turn_rad[1] - turn_rad[0], 10**0.4)[2]) / np.cos(turn_rad[0]))
+    assert np.degrees(np.sqrt(np.mean(np.square(error_rad)))) > 0.2
+    assert 0.3 < np.sqrt(np.mean((np.array(error_rad) / sd_rad) ** 2)) < 1.3

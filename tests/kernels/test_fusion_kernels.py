@@ -82,8 +82,9 @@ def views(draws, n_places=9, n_sensors=3):
     ahead /= np.linalg.norm(ahead, axis=1)[:, None]
     patterns = draws.uniform(0.0, 0.1, (2, n_sensors, 33)) * np.linspace(0.0, 1.0, 33)
     lost = -np.linspace(0.0, 40.0, 129) * draws.uniform(0.5, 2.0, (2, 1))
+    beside_m = draws.uniform(0.0, 0.01, (n_sensors, 33))
     is_flat, model = np.array([True, False, True]), np.array([1, -1, 0])
-    return place_m, kernels.ViewingSensors(sensor_m, ahead, is_flat, model, patterns, lost)
+    return place_m, kernels.ViewingSensors(sensor_m, ahead, is_flat, model, patterns, lost, beside_m)
 
 
 @functools.cache

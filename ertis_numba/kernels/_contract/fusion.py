@@ -15,8 +15,6 @@ from ertis_numba.kernels._contract.arrays import Real, Turns
 
 __all__ = [
     "AUDIBLE",
-    "BESIDE_DB",
-    "BESIDE_M",
     "LAST_PATH_M",
     "LEAST_COSINE",
     "NEAREST_M",
@@ -31,10 +29,6 @@ __all__ = [
 
 AUDIBLE: Final = 10 ** (-25.0 / 10)
 """Power that an emitter radiates in a direction, relative to ahead, above which its echoes are audible."""
-BESIDE_DB: Final = (-13.0, -16.0)
-"""Power of a call to the side from which its path is uncertain, and most uncertain."""
-BESIDE_M: Final = 6e-3
-"""Largest error of such a path."""
 LAST_PATH_M: Final = 256.0
 """Last path of sound whose absorption is tabulated."""
 SPREADING_M: Final = 0.05
@@ -300,7 +294,7 @@ class ViewingSensors(NamedTuple):
 
     ``model`` (receiver,): that of the emitters in its air, -1 without an image. ``patterns`` (model, emitter, cosine):
     power relative to ahead for evenly spaced cosines from -1 to 1. ``lost`` (model, path): logarithm of the power after
-    evenly spaced paths from 0 to `LAST_PATH_M`, without spreading.
+    evenly spaced paths from 0 to `LAST_PATH_M`, without spreading. ``beside_m`` (emitter, cosine): as in `SeenPlaces`.
     """
 
     sensor_m: Doubles
@@ -309,6 +303,7 @@ class ViewingSensors(NamedTuple):
     model: Places
     patterns: Doubles
     lost: Doubles
+    beside_m: Doubles
 
 
 class SeenPlaces(NamedTuple):

@@ -11,8 +11,6 @@ from numba import njit
 
 from ertis_numba.kernels._contract.fusion import (
     AUDIBLE,
-    BESIDE_DB,
-    BESIDE_M,
     LAST_PATH_M,
     LEAST_COSINE,
     NEAREST_M,
@@ -336,10 +334,9 @@ def see_places(place_m, sensors, out):
             twice = 2.0 * min(cosine, 0.0) if sensors.is_flat[sensor] else 0.0
             for axis in range(3):
                 out.seen[place, sensor, axis] = toward[axis] - twice * ahead[axis]
-            power = _at(sensors.patterns[0, sensor], cosine, -1.0, cosine_step)
-            fallen = (10.0 * np.log10(max(power, 1e-30)) - BESIDE_DB[0]) / (BESIDE_DB[1] - BESIDE_DB[0])
             out.apart_m[place, sensor], out.depth[place, sensor] = apart_m, cosine
-            out.radiated[place, sensor], out.beside_m[place, sensor] = power, BESIDE_M * min(max(fallen, 0.0), 1.0)
+            out.radiated[place, sensor] = _at(sensors.patterns[0, sensor], cosine, -1.0, cosine_step)
+            out.beside_m[place, sensor] = _at(sensors.beside_m[sensor], cosine, -1.0, cosine_step)
         _see_echoes(out.apart_m[place], out.depth[place], sensors, out.gain[place])
 
 
