@@ -434,7 +434,7 @@ def note_layout(array: "Array", *, recorded: "Array | None" = None) -> None:
 
 
 def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
-    """Print a note for each sensor whose array cannot observe some angles, which are not listed.
+    """Print a note for each sensor whose sound contradicts its settings, or whose array cannot observe some angles.
 
     Fused images have no array of their own. There is a note if their points are missing.
     """
@@ -443,6 +443,8 @@ def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
     for name in sensors:
         with open_energyscapes(path, sensor=name) as images:
             note_missing_points(images)
+            for text in filter(None, (images.call_warning, images.start_warning, images.layout_warning)):
+                note(f"sensor {name}: {text}")
             if images.has_points:
                 note_unknown_places(name, images.settings)
             elif images.points_note is None:

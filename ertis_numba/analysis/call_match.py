@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.analysis.call_start import WIDER, start_error_s, start_match
 from ertis_numba.analysis.emission_time import emission_time_s
+from ertis_numba.analysis.foreign_call import foreign_sweep
 from ertis_numba.analysis.health.limits import MAX_SHIFT_S
 from ertis_numba.analysis.sound_spectra import SoundSpectra, some_signals, sound_spectra
 from ertis_numba.analysis.sweep_search import (
@@ -35,6 +36,7 @@ _WRONG: Final = "another call was emitted, and ranges in the image are wrong"
 _MIN_RATIO: Final = 1.3
 """Ratio of the peak powers of another sweep and the call, above which the call does not match."""
 _MAX_DOPPLER: Final = 0.03  # Change of the slope of linear sweeps by motion at 2.5 m/s.
+_BEYOND: Final = 1.3  # Largest range errors of calls of another kind, relative to the tolerance of the start.
 _MIN_CREST: Final = 12.0  # Peak to mean power around the call's own strongest peak; higher values indicate the call.
 _MIN_SNR: Final = 40.0  # Peak to median power after the best filter; noise reaches about 20.
 _SMEAR: Final = 0.2  # Extent of the peak after the filter of another call, relative to the call's duration.
@@ -64,6 +66,8 @@ class CallMatch:
         Reason why the match is unknown; empty by default.
     start_error_s : float, optional
         Largest error of the time of emission, for a call that matches; None if the sound does not show it.
+    foreign : Sweep, optional
+        Another sweep in the band of a call that matches, such as that of another sensor.
     """
 
     verdict: Literal["matches", "differs", "unknown"]
@@ -72,10 +76,16 @@ class CallMatch:
     call: Call | None = None
     note: str = ""
     start_error_s: float | None = None
+    foreign: Sweep | None = None
 
     @property
     def warning(self) -> str:
-        """Mismatch, or the reason why the match is unknown, in one line; empty if the call matches."""
+        """Mismatch, another call, or the reason why the match is unknown, in one line; empty without any."""
+        if self.foreign is not None:
+            return (
+                f"beside the call of the settings, the record contains {self.foreign}, perhaps of another sensor. Its "
+                "echoes appear as rings of ghosts; silence it, or use equal calls on one SYNC chain and 'ertis fuse'"
+            )
         if self.sweep is None or self.call is None:
             return self.note
         text = f"echoes do not match the call of the settings: they look like {self.sweep}"
@@ -134,6 +144,8 @@ def call_match(measurement: Measurement) -> CallMatch:
     if len(sound.frequency_hz) < _MIN_BINS:
         return SILENT
     found = _match(sound, call)
+    if found.verdict == "matches" and (curve := curve_of(call)) is not None:
+        return replace(found, foreign=foreign_sweep(sound, call, curve))
     is_clear = found is SILENT or found.verdict != "unknown"
     emission_s = None if is_clear else emission_time_s(measurement)
     if emission_s is None or abs(emission_s) > MAX_SHIFT_S:
@@ -219,7 +231,7 @@ def _judged(
     """Return the match of a call whose curve is nearly that of the sound, by the start of the emission."""
     start = start_match(sound, call, curves, arrival)
     if start == "same":
-        return CallMatch("matches", loss_db, start_error_s=start_error_s(call, curves[0]))
+        return CallMatch("matches", loss_db, start_error_s=_BEYOND * start_error_s(call, curves[0]))
     sweep = sweep_along(sound, curves[1], call.low_frequency_hz / WIDER, call.high_frequency_hz * WIDER)
     if start == "before":
         return CallMatch("differs", loss_db, sweep, call)

@@ -98,7 +98,7 @@ def start_match(sound: SoundSpectra, call: Call, curves: tuple[Curve, Curve], ar
 
 
 def start_error_s(call: Call, curve: Curve) -> float:
-    """Return the largest error of the time of emission if the start is the ``same``."""
+    """Return the error of the time of emission up to which the start is the ``same``."""
     slope_s_hz = abs(float(curve.slopes_s_hz(np.array(call.start_frequency_hz))))
     return _MAX_ERROR_S + _RESOLUTION_HZ * slope_s_hz + _EARLY * call.ramp_fraction * call.duration_s
 

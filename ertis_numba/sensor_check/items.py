@@ -206,7 +206,8 @@ def of_call(match: CallMatch | None) -> CheckResult:
         shown = "but do not show its start, which determines ranges"
         if match.start_error_s is not None:
             shown = f"which determines ranges to within {50 * match.start_error_s * sound_speed_m_s(Air()):.1f} cm"
-        return CheckResult("ok", f"echoes match the call of the settings, {shown}")
+        texts = f"echoes match the call of the settings, {shown}", match.warning
+        return CheckResult("ok", "; ".join(filter(None, texts)))
     text, _, rest = match.warning.partition(". ")
     return _result_of([CheckFault(check=CALL, text=text, remedy=rest.partition("; ")[2])], "")
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -238,3 +239,35 @@ def test_call_match_ignores_dead_channels(emitted, n_dead):
     if emitted is not CALL:
         assert match.sweep.low_hz == pytest.approx(intact.sweep.low_hz, rel=0.02)
         assert match.sweep.duration_s == pytest.approx(intact.sweep.duration_s, rel=0.02)
+
+
+OWN = (50, 25, 2.5, "hyperbolic")
+OTHERS = [(48, 27, 5, "linear"), (25, 50, 2.5, "hyperbolic"), (60, 30, 5, "linear")]
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_call_match_names_the_call_of_another_sensor(other):
+    own, foreign = chirps(*OWN, echoes=[(5e-3, 1.0), (9e-3, 0.5)]), chirps(*other, echoes=[(7e-3, 1.0)], noise=0.0)
+    found = compared(replace(own, data=own.data + foreign.data), *OWN[:3])
+    assert (found.verdict, found.foreign.modulation) == ("matches", other[3])
+    assert found.foreign.duration_s == pytest.approx(1e-3 * other[2], rel=0.35)
+    assert "rings of ghosts; silence it, or use equal calls on one SYNC chain" in found.warning
+
+
+@pytest.mark.parametrize("count", [1, 4, 20])
+@pytest.mark.parametrize("noise", [0.01, 0.3])
+def test_call_match_names_no_other_call_without_one(count, noise):
+    echoes = [(3e-3 + 0.7e-3 * place, 0.9**place) for place in range(count)]
+    found = compared(chirps(*OWN, echoes=echoes, noise=noise), *OWN[:3])
+    assert (found.verdict, found.warning) == ("matches", "")
+
+
+def test_process_notes_the_call_of_another_sensor(tmp_path):
+    own, foreign = chirps(*OWN, echoes=[(5e-3, 1.0)]), chirps(*OTHERS[0], echoes=[(7e-3, 1.0)], noise=0.0)
+    path = write_recording(tmp_path / "two.h5", [replace(own, data=own.data + foreign.data)])
+    done = CliRunner().invoke(cli, ["process", str(path)])
+    assert done.exit_code == 0, (done.stderr, done.exception)
+    assert "beside the call of the settings, the record contains a linear sweep from about 4" in done.stderr
+    done = CliRunner().invoke(cli, ["peaks", str(tmp_path / "two.energy.h5")])
+    assert "note: sensor sensor: beside the call of the settings" in done.stderr, done.stderr
+    assert "perhaps of another sensor" in CliRunner().invoke(cli, ["sensors", "check", str(path)]).stdout
