@@ -112,7 +112,7 @@ def _show(found: "AcousticMap", bearings: "Sequence[Bearing]", age_ms: float | N
         band = f"{each.band_hz[0] / 1e3:.1f}-{each.band_hz[1] / 1e3:.1f} kHz"
         azimuth, elevation = _angle(each.azimuth_deg, each.sideways_deg), _angle(each.elevation_deg, each.upwards_deg)
         level, unit = each.level
-        doubt = "  may be crosstalk" if each.may_be_crosstalk else ""
+        doubt = "".join(f"  may be {name}" for name in each.doubts)
         click.echo(f"{start}  {band:>15}  {azimuth:>14}  {elevation:>14}  {level:.1f} {unit}{doubt}")
 
 

@@ -499,13 +499,19 @@ def note_unknown_bearings(sensor: str, settings: "Settings") -> None:
 
 def note_doubts(sensor: str, bearings: "Iterable[Bearing]") -> bool:
     """Print a note on bearings that may not be those of sound, and return True if there are any."""
-    found = any(each.may_be_crosstalk for each in bearings)
-    if found:
+    doubts = {name for each in bearings for name in each.doubts}
+    if "crosstalk" in doubts:
         note(
             f"sensor {sensor}: a source marked as possible crosstalk has the same signal in all channels, as "
             "electrical crosstalk has; cover the microphones: crosstalk remains, and sound does not"
         )
-    return found
+    if "interference" in doubts:
+        note(
+            f"sensor {sensor}: a source marked as possible interference is a tone that few microphones cannot tell "
+            "from one of random phases, as of electronics; cover the microphones: interference remains, and sound does "
+            "not"
+        )
+    return bool(doubts)
 
 
 def note_open_edges(

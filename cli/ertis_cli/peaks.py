@@ -32,6 +32,7 @@ _ERROR_COLUMNS: dict[str, _tables.Side] = {
     "reflector": "left",
 }
 _BEARING = {"azimuth_deg": "+.2f", "sideways_deg": ".2f", "elevation_deg": "+.2f", "upwards_deg": ".2f"}
+_DOUBTS = ("crosstalk", "interference")
 _LEVELS = ("level_dbfs", "level_db", "source_level_db")
 _OF_IMAGES = ("detector", "false_alarm", "everything", "truth")
 _DIGITS = dict.fromkeys((*_PLACE, "angle_deg", "level_dbfs", "grid_error_deg", "angle_sd_deg", "level_sd_db"), 4) | {
@@ -121,8 +122,9 @@ def peaks(
     vertically, because of noise. Levels are those of the band, without noise; level_dbfs is the mean square, where a
     full-scale tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones. source_level_db, in
     dB re 20 µPa at 1 m from the source, also needs the distance of the source (process --focus). snr_db is relative to
-    the noise of a microphone. A source marked 'crosstalk?' may be electrical crosstalk (may_be_crosstalk in JSON). Maps
-    are counted from 0, regardless of the number of measurements that they average. --measurement chooses a
+    the noise of a microphone. A source marked 'crosstalk?' may be electrical crosstalk, and one marked
+    'interference?' a tone of the electronics (may_be_crosstalk and may_be_interference in JSON). Maps are
+    counted from 0, regardless of the number of measurements that they average. --measurement chooses a
     map. Of the other options, --sensor, --top, --min-level and --json apply to maps.
     """
     from ertis_numba.storage import file_kind
@@ -238,7 +240,7 @@ def _list_sources(
     more = {name: ".1f" for name in (*_LEVELS, "snr_db") if any(row[name] is not None for row in rows)}
     columns: dict[str, _tables.Side] = {"sensor": "left"}
     columns |= dict.fromkeys(("map", "band_khz", *_BEARING, *more), "right")
-    columns |= {"doubt": "left"} if any(row["may_be_crosstalk"] for row in rows) else {}
+    columns |= {"doubt": "left"} if any(row[f"may_be_{name}"] for row in rows for name in _DOUBTS) else {}
     _tables.TextTable(columns, [_source_cells(row, more)[: len(columns)] for row in rows]).print()
 
 
@@ -259,7 +261,7 @@ def _has_grid_errors(rows: list[dict[str, Any]]) -> bool:
 
 def _source_cells(row: dict[str, Any], more: dict[str, str]) -> tuple[str, ...]:
     band = "–".join(f"{edge_hz / 1e3:.1f}" for edge_hz in row["band_hz"])
-    doubt = "crosstalk?" if row["may_be_crosstalk"] else ""
+    doubt = " ".join(f"{name}?" for name in _DOUBTS if row[f"may_be_{name}"])
     return (row["sensor"], str(row["map"]), band, *_formatted(row, _BEARING), *_formatted(row, more), doubt)
 
 

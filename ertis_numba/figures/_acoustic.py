@@ -183,7 +183,7 @@ def _loudest_text(canvas: Canvas, shown: AcousticMap) -> str:
     if shown.bearings:
         loudest = max(shown.bearings, key=lambda each: each.level_dbfs)
         level_db, unit = loudest.level
-        doubt = ", may be crosstalk" if loudest.may_be_crosstalk else ""
+        doubt = "".join(f", may be {name}" for name in loudest.doubts)
         text = f"loudest source at {_towards(loudest)}: {minus(f'{level_db:.1f}')} {unit}{doubt}"
     elif shown.has_bearings:
         return "no source that noise does not explain"

@@ -41,6 +41,10 @@ class Bearing(RadiansFromDegrees):
         A signal that is equal in all channels fits as well as this direction: electrical crosstalk cannot be told from
         a source straight ahead of a flat array. No sound is equal in all channels of an array that is not flat. False
         by default.
+    may_be_interference : bool
+        A tone with random phases at the microphones, as of interference in the electronics, would fit a direction as
+        well by chance, more often than the requested false alarms. Arrays of up to about six microphones cannot tell
+        such tones from sources. False by default.
 
     Examples
     --------
@@ -62,6 +66,13 @@ class Bearing(RadiansFromDegrees):
     level_db: float | None = None
     source_level_db: float | None = None
     may_be_crosstalk: bool = False
+    may_be_interference: bool = False
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Causes other than sound that the bearing may have: ``"crosstalk"``, ``"interference"``, or both."""
+        every = {"crosstalk": self.may_be_crosstalk, "interference": self.may_be_interference}
+        return tuple(name for name, may_be in every.items() if may_be)
 
     @property
     def level(self) -> tuple[float, LevelUnit]:
@@ -83,6 +94,7 @@ class Bearing(RadiansFromDegrees):
             **{name: _rounded(getattr(self, name)) for name in reversed(LEVEL_UNITS)},
             "snr_db": round(self.snr_db, 3),
             "may_be_crosstalk": self.may_be_crosstalk,
+            "may_be_interference": self.may_be_interference,
         }
 
     @property

@@ -45,8 +45,9 @@ class BearingFinder:
         contain all directions that the array can tell apart, those of `search_changes` are searched instead. The method
         of its maps has no influence.
     false_alarm : float
-        Probability that noise alone yields any bearing, 1e-9 to 0.5; 0.001 by default. It does not hold for tones with
-        phases at random, as of electronics, at twelve microphones or fewer: they resemble a wave by chance.
+        Probability that noise alone yields any bearing, 1e-9 to 0.5; 0.001 by default. Tones with
+        phases at random, as of electronics, resemble a wave at twelve microphones or fewer; these are marked. See
+        `Bearing.may_be_interference`.
     top : int
         Largest number of bearings in a band; 8 by default.
     min_level_db : float
@@ -185,5 +186,6 @@ def _bearing(source: FoundSource, band_hz: NDArray[np.float64], settings: Settin
         level_dbfs=level_dbfs,
         snr_db=10 * math.log10(max(source.ratio, _LEAST)),
         may_be_crosstalk=source.may_be_crosstalk,
+        may_be_interference=source.may_be_interference,
         **{name: levels[name] for name in ("level_db", "source_level_db")},
     )

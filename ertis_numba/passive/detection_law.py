@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.passive.scan_extent import ScanExtent
 
-__all__ = ["LAGS", "exceedance", "independent_samples"]
+__all__ = ["LAGS", "chance_of_phases", "exceedance", "independent_samples"]
 
 _CELL_RAD: Final = math.pi / 2
 _ROUNDING: Final = 1e-12
@@ -47,6 +47,25 @@ def exceedance(share: float, *, n_samples: float, n_dimensions: int, extent: Sca
     expected += extent.area * slope / scale
     n_cells = extent.n_parts + extent.length / _CELL_RAD + extent.area / _CELL_RAD**2
     return -math.expm1(n_cells * math.log1p(-min(expected / n_cells, 1 - _ROUNDING)))
+
+
+def chance_of_phases(share: float, *, n_bins: float, n_mics: int, extent: ScanExtent) -> float:
+    """Return the probability that random phases of the microphones give a direction at least a share of their power.
+
+    The share of a direction whose phases differ by δ is about ``exp(−Σ |δ|² / M)`` with M microphones. Such phases fill
+    a tube around those of all directions, whose volume is that of ``extent`` times a ball, relative to the torus of all
+    phases (H. Weyl, On the volume of tubes, 1939). Further independent bins have the same direction.
+    """
+    n, radius = n_mics - 1, math.sqrt(-n_mics * math.log(min(max(share, 1e-12), 1.0)))
+    cell = math.sqrt(n_mics) / (2 * math.pi) ** n
+
+    def tube(n_directions: int, size: float) -> float:
+        left = n - n_directions
+        ball = math.pi ** (left / 2) / math.gamma(left / 2 + 1) * radius**left if left >= 0 else math.inf
+        return size * n_mics ** (n_directions / 2) * ball * cell if size else 0.0
+
+    of_any = sum(tube(k, size) for k, size in enumerate((extent.n_parts, extent.length, extent.area)))
+    return float(min(1.0, of_any) * min(1.0, tube(0, 1.0)) ** max(0.0, n_bins - 1))
 
 
 def independent_samples(

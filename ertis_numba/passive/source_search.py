@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
-from ertis_numba.passive.detection_law import LAGS, exceedance, independent_samples
+from ertis_numba.passive.detection_law import LAGS, chance_of_phases, exceedance, independent_samples
 from ertis_numba.passive.direction_errors import covariance_of, powers_in_noise
 from ertis_numba.passive.heard_band import HeardBand
 from ertis_numba.passive.likelihood import BandLikelihood, Delays, moved
@@ -25,6 +25,8 @@ _BLIND: Final = 0.3  # Size of a wave outside of other sources, relative to its 
 _SHARE_STEPS: Final = 10  # Per decade of white noise. Between steps, extents change by a few hundredths.
 _STARTS: Final = 3  # Directions from which the most likely one is searched.
 _MAY_BE_LOUDEST: Final = 0.5  # Share of the power of a start, relative to the largest.
+_BINS_OF_TONE: Final = 2.2  # Bins over which a Hann window spreads a tone.
+_LEAST: Final = 1e-30
 _SWEEPS: Final = 2  # Corrections of all sources after each new one.
 _OWN: Final = 0.75  # Largest distance of sound from the centre of its bin, in spacings of bins.
 _WITHIN_NOISE: Final = 4.5  # Log-likelihood below its maximum: three standard deviations of a direction.
@@ -50,6 +52,7 @@ class FoundSource(NamedTuple):
     ratio: float  # power relative to the noise of a microphone
     covariance_rad2: Floats  # (2, 2), infinite where not resolved
     may_be_crosstalk: bool  # a signal equal at all microphones fits as well
+    may_be_interference: bool = False  # random phases fit as well more often than the requested false alarms
 
 
 class BandSearch:
@@ -106,6 +109,12 @@ class BandSearch:
             return []
         likelihood, _ = self._likelihood(band, places)
         sources = [self._source(likelihood, places, k, band) for k in range(len(places))]
+        certain: list[int] = []
+        for k in sorted(range(len(sources)), key=lambda k: -sources[k].power):
+            if self._chance_of_phases(places, k, certain, band) > false_alarm:
+                sources[k] = sources[k]._replace(may_be_interference=True)
+            else:
+                certain.append(k)
         strongest = max((source.power for source in sources), default=0.0)
         return [source for source in sources if source.power >= least * strongest]
 
@@ -241,6 +250,34 @@ class BandSearch:
         covariance = covariance_of(likelihood, places, k, band, level=self._scan.level)
         may_be_crosstalk = self._may_be_crosstalk(band.beside(likelihood, places, k), places[k], band)
         return FoundSource(places[k], max(0.0, power), max(0.0, ratio), covariance, may_be_crosstalk)
+
+    def _chance_of_phases(self, places: Floats, k: int, certain: list[int], band: HeardBand) -> float:
+        """Return the probability that the sound of a source, with random phases, fits a direction as well as it does.
+
+        The fit is that of its loudest bin. Sound beside louder sources, which are certain, and outside of the direction
+        is a misfit: it may belong to these phases, unless noise explains it. So is what noise may hide.
+        """
+        plain = BandLikelihood(band.matrix, None, band.omega, band.weights, self._delays)
+        beside, n_mics = band.beside(plain, places, k), band.matrix.shape[1]
+        powers = np.maximum(band.shares * band.level * powers_in_noise(beside, places[k], band.width)[0], 0)
+        if not powers.any():
+            return 1.0
+        loudest = int(powers.argmax())
+        values = np.linalg.eigvalsh(plain.beside(places[[*certain, k]], band.omegas[:, [*certain, k]]).rest[loudest])
+        n = n_mics - len(certain) - 1
+        values = values[-n:] if n else np.zeros(1)
+        noise = values[:-1].mean() if n > 1 else 0.0
+        n_samples = independent_samples(np.ones(1), band.n_blocks)
+        hidden = noise * math.sqrt(2 / n_samples)
+        misfit = max(float(values[-1] - noise * (1 + math.sqrt(n / n_samples)) ** 2), hidden)
+        alone = plain.beside(places[certain], band.omegas[:, certain], band.omegas[:, k])
+        beam = max(float(alone.beams(places[k : k + 1])[0][loudest, 0] - noise), 0.0)
+        return chance_of_phases(
+            beam / max(beam + misfit, _LEAST),
+            n_bins=powers.sum() ** 2 / (powers @ powers) / _BINS_OF_TONE,
+            n_mics=n_mics,
+            extent=self._of_noise(0.0)[0],
+        )
 
     def _may_be_crosstalk(self, beside: BandLikelihood, place: Floats, band: HeardBand) -> bool:
         """Return True if equal channels are as likely as a direction within its noise, or as errors of the array."""

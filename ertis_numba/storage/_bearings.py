@@ -17,7 +17,7 @@ __all__ = ["BEARING_SIZES", "BearingReader", "write_bearings"]
 
 BEARING_SIZES: Final = {"angle": 2, "edge": 2}
 """Lengths of the axes of bearings."""
-_DOUBTS: Final = ("may_be_crosstalk",)  # by the number of their bit
+_DOUBTS: Final = ("may_be_crosstalk", "may_be_interference")  # by the number of their bit
 _FIELDS: Final[dict[str, tuple[str, ...]]] = {
     "bearing_direction": ("azimuth_deg", "elevation_deg"),
     "bearing_uncertainty": ("sideways_deg", "upwards_deg"),

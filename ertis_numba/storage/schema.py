@@ -211,7 +211,13 @@ BEARINGS: Final = (
     Variable("bearing_band", ("bearing", "edge"), "<f8", "lower and upper edge of the band", "Hz", optional=True),
     Variable("bearing_level", ("bearing",), "<f8", "level at the array without noise, in dBFS", "dB", optional=True),
     Variable("bearing_snr", ("bearing",), "<f8", "power relative to the noise of a microphone", "dB", optional=True),
-    Variable("bearing_doubts", ("bearing",), "<u1", "bit 0: the signal may be electrical crosstalk", optional=True),
+    Variable(
+        "bearing_doubts",
+        ("bearing",),
+        "<u1",
+        "bit 0: may be crosstalk; bit 1: interference",
+        optional=True,
+    ),
 )
 """Bearings of the sources in acoustic maps; those of the first map come first."""
 

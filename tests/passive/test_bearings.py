@@ -321,6 +321,30 @@ def test_levels_never_exceed_the_sound_or_fall_below_the_least_level(directions)
     assert finder.warning is None
 
 
+@pytest.mark.parametrize(
+    ("n_mics", "is_source", "marked"),
+    [(4, True, (22, 24)), (8, False, (18, 24)), (8, True, (0, 2)), (12, True, (0, 2))],
+)
+def test_tones_that_random_phases_resemble_are_marked(n_mics, is_source, marked):
+    turn, random = np.arange(n_mics) * 2.399963, np.random.default_rng(n_mics)
+    places_m = 0.03 * np.stack([0 * turn, np.cos(turn), np.sin(turn)] * np.sqrt((np.arange(n_mics) + 0.5) / n_mics)).T
+    settings = passive_bearings.plane_wave_settings().replace(
+        **{"array.positions_m": np.round(places_m, 6).tolist(), "passive.resolution_hz": None}
+    )
+    places_m = microphones(settings.array).enabled_positions_m
+    time_s, counts = np.arange(settings.recording.n_samples)[:, None] / settings.recording.sample_rate_hz, []
+    with AcousticCamera(settings, "cpu", 1, false_alarm=0.1, check=False) as camera:
+        for _ in range(24):
+            direction = unit_vectors(*np.radians([[random.uniform(-60, 60)], [random.uniform(-40, 40)]]))[0]
+            delay_s = -places_m @ direction / sound_speed_m_s(settings.air)
+            omega = 2 * np.pi * random.uniform(36e3, 44e3)
+            phases = -omega * delay_s if is_source else random.uniform(0, 2 * np.pi, n_mics)
+            heard = np.cos(omega * time_s + phases) + 0.05 * random.standard_normal((len(time_s), n_mics))
+            found = camera.process(ertis.Measurement(heard.astype(np.float32), settings)).bearings
+            counts.append(all(each.may_be_interference for each in found))
+    assert marked[0] <= sum(counts) <= marked[1]
+
+
 def test_silence_has_no_bearings():
     settings = settings_of(**SPACE)
     with AcousticCamera(settings, "cpu") as camera:
