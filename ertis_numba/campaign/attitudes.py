@@ -17,10 +17,7 @@ _UNTURNED = (0.0, 0.0, 0.0, 1.0)
 
 
 class Attitudes:
-    """Rotations from the frame of a sensor to the world frame, by default with its recorded mounting.
-
-    ``note`` describes poses that are hardly those of a platform, such as those that tilt it.
-    """
+    """Rotations from a sensor to the world, by default with its recorded mounting, and a note on unlikely poses."""
 
     def __init__(
         self, recording: RecordingReader, stamps: Sequence[Stamp], rotation_xyzw: Sequence[float] | None = None

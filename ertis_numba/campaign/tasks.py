@@ -125,10 +125,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class TaskUpdate:
-    """Message of a worker about a task: measurements done, and at its end the result or the ``error``.
-
-    ``by_chance`` marks a failure that may be temporary.
-    """
+    """Message of a worker: measurements done, then the result; ``by_chance`` marks errors that may be temporary."""
 
     number: int
     done: int = 0

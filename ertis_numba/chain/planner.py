@@ -35,11 +35,7 @@ _ROUNDED_DB = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """Plan with its predicted error and time.
-
-    ``parts`` is the power of each part of the error relative to that of the exact image, by the names of
-    `accuracy.PARTS`.
-    """
+    """Plan with its predicted times and parts of the error power, relative to the exact image; see `accuracy.PARTS`."""
 
     settings: Settings
     parts: dict[str, float]

@@ -26,10 +26,7 @@ class StreamTables(NamedTuple):
 
 
 def amplitudes_of_stream(recipe: Recipe, place: int, n_mics: int) -> NDArray[np.float64]:
-    """Return the weight of each microphone in the sum of a stream: (mic,).
-
-    The products of an order are divided by their number, so that no sum overflows single precision.
-    """
+    """Return microphone weights (mic,) in a stream's sum; division by the number of products avoids overflow."""
     stream = recipe.streams[place]
     number = math.comb(n_mics, recipe.order) ** (1 / recipe.order) if place < recipe.order else n_mics
     return np.full(n_mics, float(number) ** -(stream.turns if place < recipe.order else stream.power))

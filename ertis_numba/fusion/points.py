@@ -153,10 +153,7 @@ def _floor(image: Energyscape) -> EchoFloor:
 
 
 def joined(reflectors: Reflectors, image: Energyscape, grid: PolarGrid) -> PointCloud:
-    """Return one point for each reflector, in the frame of the platform, strongest first.
-
-    The fused image limits the amplitudes of reflectors that are not confirmed.
-    """
+    """Return a point for each reflector in the platform frame, strongest first; ``image`` limits unconfirmed ones."""
     position_m = reflectors.position_m
     amplitude = np.sqrt(reflectors.reflectivity)
     # Ghosts would grow with range, and with the correction of the emitter's directivity.

@@ -177,10 +177,7 @@ def responses(
     frequency_hz: Floats,
     clock: CostStopwatch,
 ) -> Floats | Complexes:
-    """Return the gain of a call due to distance, air, walls, targets and directivity: (path, mic, frequency).
-
-    It is complex if a target shifts the phase. `emitted` returns the transducer's own response.
-    """
+    """Return the gain (path, mic, frequency) of a call without the transducer's response; see `emitted`."""
     strength = _strength(paths, spreads="spreading" in active)
     amplitude = (paths.reflection * strength)[:, None, None] * np.ones((*paths.second_m.shape, 1))
     for name, act in acting("gain", active):

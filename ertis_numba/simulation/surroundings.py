@@ -47,10 +47,7 @@ def change_db(part: Floats, beside: Floats) -> float:
 
 
 def greatest(bounds: Floats, exact: Callable[[NDArray[np.intp]], Floats]) -> tuple[int, float]:
-    """Return the index of the greatest number, and the number; 0 and 0 if none is positive.
-
-    ``exact`` computes numbers only while their upper bounds (path,) exceed the greatest number so far.
-    """
+    """Return index and value of the greatest number, computed only where bounds allow; 0 and 0 if none is positive."""
     order = np.argsort(-bounds, kind="stable")
     bounds = bounds[order] * _ROUNDED
     numbers, first, step = np.zeros(len(order)), 0, _FEW

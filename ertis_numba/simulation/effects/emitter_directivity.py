@@ -18,10 +18,7 @@ __all__ = ["estimate", "gain"]
 def gain(
     shot: Snapshot, paths: Paths, emitter: Emitter, frequency_hz: NDArray[np.float64]
 ) -> NDArray[np.float64] | float:
-    """Return the emitter's directivity: (path, mic or 1, frequency), 0 behind it.
-
-    The model is a circular piston in a baffle, ``2 J₁(v) / v`` with ``v = π d f sin θ / c``.
-    """
+    """Return the emitter's directivity, that of a piston in a baffle, 0 behind it: (path, mic or 1, frequency)."""
     if not emitter.diameter_m:
         return 1.0
     leaving = paths.leaving[:, :1] if len(paths.targets) and not paths.surface else paths.leaving
