@@ -110,7 +110,7 @@ def test_variables_that_are_not_options_cause_no_warning(images):
         ("proces a.h5", "No such command 'proces' (did you mean 'process'?); see 'ertis --help'"),
         ("devices", "No such command 'devices' (did you mean 'sensors list'?)"),
         ("import-poses a.h5 b.tum", "No such command 'import-poses' (did you mean 'import poses'?)"),
-        ("xyz", "No such command 'xyz' (choose one of bench, capture, compare, demo, "),
+        ("xyz", "No such command 'xyz' (choose one of acoustic, bench, capture, compare, "),
     ],
 )
 def test_unknown_command_suggests_known_ones(tmp_path, line, message):

@@ -167,7 +167,7 @@ def test_page_without_the_chosen_band_is_noted(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     commands = (
         f"import signals {folder / 'a.wav'} --layout {folder / 'lay.csv'} --passive -o a.h5 --quiet",
-        "process a.h5 -o maps.h5 --directions 2d:19 --quiet",
+        "acoustic a.h5 -o maps.h5 --directions 2d:19 --quiet",
     )
     for line in commands:
         assert run(tmp_path, monkeypatch, line).exit_code == 0

@@ -40,6 +40,7 @@ _WAITING_S: Final = {"sensors configure": 2.5, "sensors status": 2.5}
 _UNCAUGHT = re.compile(r"Traceback|Error:|Exception|Fatal|Assertion")
 
 COMMANDS: Final[dict[str, Sequence[str]]] = {
+    "acoustic": ("{recording}", "-o", "{out}/sound.h5"),
     "bench": ("scaling", "--count", "1", "--quiet"),
     "capture": ("--port", "{port}", "-o", "{out}/captured.h5"),
     "compare": ("{images}",),

@@ -171,7 +171,8 @@ def test_released_kind_is_released_in_a_preparing_worker(loop, monkeypatch):
     runner.prepare(kind)
     runner.forget(kind)
     loop.until(lambda: loop.workers("idle"))
-    assert [type(note).__name__ for note in sent] == ["Prepare", "Release"]
+    of_kind = [type(note).__name__ for note in sent if note.kind == kind.number]  # others may still get images
+    assert of_kind == ["Prepare", "Release"]
     assert 99 not in worker.kinds
 
 
