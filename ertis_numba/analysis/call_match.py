@@ -52,22 +52,10 @@ _MIN_BANDWIDTH_HZ: Final = 12e3  # Bandwidth of a call that is no tone.
 class CallMatch:
     """Comparison of the call with the sweep of the strongest sound of a measurement.
 
-    Attributes
-    ----------
-    verdict : {"matches", "differs", "unknown"}
-        ``differs`` if the sound is a sweep other than the call.
-    loss_db : float
-        Peak level after the matched filter of that sweep, relative to the peak after the call's own; 0 by default.
-    sweep : Sweep, optional
-        Sweep of the sound if it differs from the call.
-    call : Call, optional
-        Call with which it was compared.
-    note : str
-        Reason why the match is unknown; empty by default.
-    start_error_s : float, optional
-        Largest error of the time of emission, for a call that matches; None if the sound does not show it.
-    foreign : Sweep, optional
-        Another sweep in the band of a call that matches, such as that of another sensor.
+    ``verdict`` is "differs" if the sound is a sweep other than the call; the field ``sweep`` then states it, and
+    ``loss_db`` its peak level after the call's matched filter relative to that after its own. ``note`` is the reason of
+    "unknown". For a call that matches, ``start_error_s`` is the largest error of the time of emission, None if the
+    sound does not show it, and ``foreign`` another sweep in its band, such as that of another sensor.
     """
 
     verdict: Literal["matches", "differs", "unknown"]
@@ -104,12 +92,9 @@ SILENT: Final = CallMatch("unknown", note="the record contains no sweep above th
 
 
 def first_call_match(measurements: Iterable[Measurement], *, best: bool = False) -> CallMatch:
-    """Return the first match among 8 measurements that is known; otherwise the first unknown one with sound.
+    """Return the first known match among 8 measurements; otherwise the first unknown one with sound.
 
-    Parameters
-    ----------
-    best : bool
-        Prefer a later match to a mismatch, because another sonar may be louder at times; False by default.
+    With ``best``, a later match is preferred to a mismatch, because another sonar may be louder at times.
     """
     every = []
     for measurement in itertools.islice(measurements, _MAX_MEASUREMENTS):
@@ -125,17 +110,8 @@ def call_match(measurement: Measurement) -> CallMatch:
 
     If the call's filter compresses part of the sound, and no similar sweep compresses that part better, the call
     matches, because another sensor may be louder. Its emission must begin at the first frequency of the call, because
-    ranges are wrong otherwise.
-
-    Returns
-    -------
-    CallMatch
-        The verdict is ``unknown`` if the sound is not above the noise or not a sweep, or hides its first frequency.
-
-    Raises
-    ------
-    DataError
-        The samples do not match the settings.
+    ranges are wrong otherwise. The verdict is ``unknown`` if the sound is not above the noise or not a sweep, or hides
+    its first frequency.
     """
     call = measurement.settings.call
     signals, rate_hz = some_signals(measurement, _MAX_MICS)

@@ -48,22 +48,10 @@ _MIN_POWER: Final = 1e-3  # Power that counts in the comparison of curves, relat
 def start_match(sound: SoundSpectra, call: Call, curves: tuple[Curve, Curve], arrival: GatedArrival) -> StartMatch:
     """Compare the first frequency of the strongest arrival with that of a call.
 
-    Parameters
-    ----------
-    call : Call
-        Call with a curve near that of the sound.
-    curves : (Curve, Curve)
-        Curve of the call, and the one that compresses the arrival best.
-    arrival : GatedArrival
-        Strongest arrival after the filter of the call, in its band.
-
-    Returns
-    -------
-    {"same", "before", "after", "unknown"}
-        ``same`` if the range error is at most 1 cm, besides the resolution of the record and a fifth of the ramp.
-        ``before`` if the emission begins with other frequencies than the call. ``after`` if the first frequencies of
-        the call are missing: they may be absorbed, or not emitted. ``unknown`` if noise hides the start, or a ramp may
-        explain the difference.
+    ``same`` if the range error is at most 1 cm, besides the resolution of the record and a fifth of the ramp.
+    ``before`` if the emission begins with other frequencies than the call. ``after`` if the first frequencies of the
+    call are missing: they may be absorbed, or not emitted. ``unknown`` if noise hides the start, or a ramp may explain
+    the difference. ``curves`` are that of the call, and the one that compresses the arrival best.
     """
     curve, better = curves
     slope_s_hz = abs(float(curve.slopes_s_hz(np.array(call.start_frequency_hz))))

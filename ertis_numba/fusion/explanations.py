@@ -34,17 +34,10 @@ _FEW: Final = 1024  # Fits that there is space for at first.
 
 
 class _Candidates(NamedTuple):
-    """Possible reflectors, each derived from one echo and one emitter.
+    """Possible reflectors (candidate,), each derived from one echo and one emitter.
 
-    Attributes
-    ----------
-    echo, emitter : (candidate,) int64
-    place_m : (candidate, axis) float64
-    across : (candidate, axis) float64
-        Horizontal vector across the direction, as long as one standard deviation.
-    reflectivity : (candidate,) float64
-    is_ahead : (candidate,) bool
-        True in front of the receiver.
+    ``across`` is a horizontal vector across the direction, as long as one standard deviation; ``is_ahead`` of the
+    receiver.
     """
 
     echo: Numbers
@@ -62,15 +55,8 @@ class _Candidates(NamedTuple):
 class Search:
     """Greedy search for reflectors: the candidate that fits the most echoes explains them, the next one the others.
 
-    Parameters
-    ----------
-    bound : (cell,) float32
-        Highest reflectivity of each cell of the grid that the images allow.
-
-    Attributes
-    ----------
-    is_free : (echo,) bool
-        Echoes that no reflector explains together with others, except faint ones.
+    ``bound`` (cell,) is the highest reflectivity that the images allow. ``is_free`` (echo,) are those that no reflector
+    explains together with others, except faint ones.
     """
 
     def __init__(
@@ -173,7 +159,7 @@ class Search:
     def _support(
         self, places: tuple[_Candidates, kernels.SeenPlaces], which: Numbers, echo: Numbers, emitter: Numbers
     ) -> Floats:
-        """Return the share of an echo that emitters have whose calls arrive together over a candidate: (fit,) float64.
+        """Return the share (fit,) of an echo that emitters have whose calls arrive together over a candidate.
 
         Calls whose difference is unknown, because the place is, do not count as arriving together.
         """
@@ -190,7 +176,7 @@ class Search:
         return np.asarray(np.minimum(np.sum(shares[group] * (late_m < _TOGETHER_M), axis=1), 1.0))
 
     def _surprise(self, candidates: _Candidates) -> Floats:
-        """Return how much stronger candidates reflect than usual: (candidate,) float64.
+        """Return how much stronger candidates reflect than usual: (candidate,).
 
         Where an image is missing, the echoes of its sensor's call fit the calls of its neighbours as well. But these
         would reach the place beside their beams, so that its reflector must be stronger.
@@ -260,7 +246,7 @@ class Search:
             self.found = self._locator.refined(self.found)
 
     def _is_ambiguous(self, candidates: _Candidates) -> NDArray[np.bool_]:
-        """Return True for echoes that another call explains as well, if an image is missing: (echo,) bool.
+        """Return True for echoes (echo,) that another call explains as well, if an image is missing.
 
         Several sensors that could contradict the call of one without an image may fail to. Other calls must explain a
         second echo.
@@ -278,10 +264,7 @@ class Search:
 
 
 def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[LocatedReflector]) -> bool:
-    """Return True if no reflector is at a place.
-
-    Another echo at a reflector is a shoulder of its main lobe, or overlaps with other echoes.
-    """
+    """Return True if no reflector is at a place, where another echo would be a shoulder of a main lobe or overlap."""
     if not found:
         return True
     offset_m = place_m - np.array([each.place_m for each in found])

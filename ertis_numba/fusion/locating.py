@@ -31,15 +31,7 @@ _LEAST_INFORMATION_1_M2: Final = 1 / 10.0**2
 
 
 class LocatedReflector(NamedTuple):
-    """Located reflector.
-
-    Attributes
-    ----------
-    place_m : (axis,) float64
-    covariance_m2 : (axis, axis) float64
-    echo, emitter : (member,) int64
-        Echoes that locate it, and the emitters of their calls.
-    """
+    """Located reflector, and the echoes (member,) that locate it with the emitters of their calls."""
 
     place_m: Floats
     covariance_m2: Floats
@@ -49,13 +41,7 @@ class LocatedReflector(NamedTuple):
 
 
 class Locator:
-    """Locator of reflectors by their echoes.
-
-    Parameters
-    ----------
-    pulse_m, beam : (sensor,) float64
-        Widths of the compressed pulses and of the main lobes, as in `overlap`.
-    """
+    """Locator of reflectors by their echoes, with widths (sensor,) of pulses and main lobes as in `overlap`."""
 
     def __init__(self, echoes: PulseEchoes, viewers: Viewers, pulse_m: Floats, beam: Floats) -> None:
         self._echoes, self._viewers, self._pulse_m, self._beam = echoes, viewers, pulse_m, beam
@@ -64,10 +50,7 @@ class Locator:
     def located(
         self, members: Numbers, emitter: Numbers, place_m: Floats, added: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """Return the position of a reflector and its covariance: (axis,) and (axis, axis) float64.
-
-        Variances of paths and directions in addition to those of the echoes, (member, 2), may be given.
-        """
+        """Return the position of a reflector and its covariance; ``added`` are more variances, (member, 2)."""
         deviation = self._echoes.deviation[members]
         if added is not None:
             deviation = np.sqrt(deviation**2 + added)
@@ -146,10 +129,7 @@ class Locator:
         echo: Numbers,
         emitter: Numbers,
     ) -> Floats:
-        """Return the variances of paths by the calls that other emitters send over the same reflectors: (echo,).
-
-        These shift the echoes at all receivers alike.
-        """
+        """Return path variances (echo,) by other emitters' calls over the same reflectors, alike at all receivers."""
         receiver = self._echoes.receiver[echo]
         power = sight.gain[number, receiver] * np.array([each.reflectivity for each in found])[number, None]
         power[~np.isfinite(self._echoes.path_m[echo])] = 0.0

@@ -22,16 +22,7 @@ _SEPARATE: Final = 2.0  # … and difference of their paths, in such widths, fro
 
 
 class PredictedEchoes(NamedTuple):
-    """Echoes that reflectors cause.
-
-    Attributes
-    ----------
-    path_m : (reflector, receiver, emitter) float64
-    power : (reflector, receiver, emitter) float64
-        0 for inaudible echoes.
-    direction : (reflector, receiver, axis) float64
-        Unit vectors from the receiver, in the frame of the platform.
-    """
+    """Echoes (reflector, receiver, …) that reflectors cause, unit vectors in the platform frame; 0 if inaudible."""
 
     path_m: Floats
     power: Floats
@@ -39,14 +30,9 @@ class PredictedEchoes(NamedTuple):
 
 
 class Overlap(NamedTuple):
-    """Disturbance of echoes by other ones, as squares, which add up over reflectors.
+    """Disturbance (echo, reflector) of echoes by others: relative power, variances of path and direction; they add up.
 
-    Attributes
-    ----------
-    power : (echo, reflector) float64
-        Power of the echoes of each reflector that overlap, relative to the echo.
-    path_m2, angle_rad2 : (echo, reflector) float64
-        Variances that they add to its path and to its direction.
+    Side lobes of echoes from other directions change path and direction, too, but are no part of the power.
     """
 
     power: Floats
@@ -72,26 +58,10 @@ def overlap(
 ) -> Overlap:
     """Return how much the echoes of reflectors disturb others.
 
-    Side lobes of echoes from other directions change path and direction, too, but are no part of the power.
-
     Two echoes within the width of the compressed pulse and of the beam have one maximum, or several at other places,
     depending on their phases. The error grows with the ratio of the amplitudes, and with the distance up to the width.
-
-    Parameters
-    ----------
-    receiver : (echo,) int64
-    path_m : (echo, emitter) float64
-        Length of the path if the emitter's call caused the echo; NaN for silent ones.
-    direction : (echo, axis) float64
-    power : (echo,) float64
-    is_other : (echo, reflector, emitter) bool
-        False for the prediction that is the echo.
-    ahead : (sensor, axis) float64
-        Directions in which the receivers look.
-    pulse_m : (sensor,) float64
-        Width of the compressed pulse, as length of a path.
-    beam : (sensor,) float64
-        Width of the main lobe, as difference of unit vectors.
+    ``path_m`` (echo, emitter) is NaN for silent emitters, and ``is_other`` (echo, reflector, emitter) False for the
+    prediction that is the echo. ``pulse_m`` (sensor,) is a path, and ``beam`` a difference of unit vectors.
     """
     facing, width_m, width = ahead[receiver], pulse_m[receiver, None, None], beam[receiver, None]
     late_m = np.abs(path_m[:, None] - predicted.path_m.swapaxes(0, 1)[receiver])
@@ -116,18 +86,10 @@ def overlap(
 
 
 def summed_m2(late_m: Floats, ratio: Floats, width_m: Floats) -> Floats:
-    """Return the variances of the paths of echoes that are sums of the calls of several emitters: (echo,) float64.
+    """Return the variances of the paths of echoes (echo,) that are sums of the calls of several emitters.
 
     Their maxima are not between those of the calls if these cancel each other, so that errors reach half of the width.
-
-    Parameters
-    ----------
-    late_m : (echo, emitter) float64
-        Differences of the paths from that of the call to which the echo is attributed.
-    ratio : (echo, emitter) float64
-        Power of each call relative to the echo.
-    width_m : (echo, 1) float64
-        Width of the compressed pulse.
+    ``late_m`` and ``ratio`` (echo, emitter) are differences of paths and powers relative to the attributed echo.
     """
     here = np.minimum(ratio * np.exp(-2 * (late_m / (_SEPARATE * width_m)) ** 4), 1.0)
     here[here < _FAINT] = 0.0

@@ -36,14 +36,7 @@ _PATHS_M = np.linspace(0.0, kernels.LAST_PATH_M, 1025)  # of sound, for which th
 
 
 class MountedSensor(NamedTuple):
-    """Position and orientation of a sensor on its platform.
-
-    Attributes
-    ----------
-    translation_m : (axis,) float64
-    rotation : (axis, axis) float64
-        Rotation from the sensor frame to the platform frame.
-    """
+    """Position of a sensor on its platform, and rotation (axis, axis) from its frame to that of the platform."""
 
     name: str
     translation_m: Floats
@@ -55,13 +48,7 @@ class MountedSensor(NamedTuple):
 
 
 def mounted_sensors(mountings: Mountings) -> tuple[MountedSensor, ...]:
-    """Return mounted sensors, in the order of their mountings.
-
-    Raises
-    ------
-    ArgumentError
-        No mounting is given, or one is invalid.
-    """
+    """Return mounted sensors, in the order of their mountings, of which there must be one."""
     if not isinstance(mountings, Mapping):
         raise ArgumentError(
             f"mountings is of type {type(mountings).__name__}; pass a dictionary with (translation_m, rotation_xyzw) "
@@ -81,15 +68,7 @@ def mounted_sensors(mountings: Mountings) -> tuple[MountedSensor, ...]:
 
 
 def emitter_diameter_m(settings: Settings, given_m: float | None = None) -> float:
-    """Return the diameter of an emitter: the given one, that of the settings or their layout, or else 0.012.
-
-    Parameters
-    ----------
-    settings : Settings
-        Settings of the sensor.
-    given_m : float, optional
-        Diameter that replaces that of the settings.
-    """
+    """Return the diameter of an emitter: the given one, that of the settings or their layout, or else 0.012."""
     stated_m = _stated_diameter_m(settings.array) if given_m is None else given_m
     return USUAL_DIAMETER_M if stated_m is None else stated_m
 
@@ -100,23 +79,12 @@ def _stated_diameter_m(array: Array) -> float | None:
 
 
 class Emitters:
-    """Model of the sound that the emitters of a platform radiate: circular pistons in a baffle.
+    """Model of the sound that a platform's emitters radiate: circular pistons in a baffle; diameter 0 is all around.
 
-    Parameters
-    ----------
-    settings : Settings
-        Settings with the call and the air.
-    diameters_m : sequence of float
-        Diameter of each piston; 0 radiates equally in all directions.
-
-    Attributes
-    ----------
-    patterns : (emitter, cosine) float64
-        Power that each emitter radiates, relative to that ahead, for cosines from -1 to 1.
-    lost : (path,) float64
-        Logarithm of the power of echoes relative to a path of 2 m, without spreading, for paths from 0 to 256 m.
-    beside_m : (emitter, cosine) float64
-        Errors of the paths of echoes: beside its beam, a piston inverts high frequencies, which splits the pulse.
+    ``patterns`` (emitter, cosine) are powers relative to ahead for cosines from -1 to 1. ``beside_m`` (emitter, cosine)
+    are errors of the paths of echoes: beside its beam, a piston inverts high frequencies, which splits the pulse.
+    ``lost`` (path,) is the logarithm of the power of echoes relative to a path of 2 m, without spreading, for paths
+    from 0 to 256 m.
     """
 
     def __init__(self, settings: Settings, diameters_m: Sequence[float]) -> None:
@@ -145,15 +113,7 @@ class Emitters:
         self._diameters_m = tuple(diameters_m)
 
     def power(self, cosine: Floats, emitter: int) -> Floats:
-        """Return the power that an emitter radiates, relative to that ahead.
-
-        Parameters
-        ----------
-        cosine : ndarray of float64
-            Cosine of the angle to the emitter's axis.
-        emitter : int
-            Index of the emitter.
-        """
+        """Return the power that an emitter radiates at the cosine of an angle to its axis, relative to that ahead."""
         return np.asarray(np.interp(cosine, self._cosine, self.patterns[emitter]))
 
     def spreading(self, to_point_m: Floats, from_point_m: Floats) -> Floats:
@@ -162,17 +122,10 @@ class Emitters:
         return np.asarray(np.exp(np.interp(there + back, _PATHS_M, self.lost)) / (there * back) ** 2)
 
     def echo_powers(self, cosine: Floats, to_point_m: Floats, from_point_m: Floats) -> Floats:
-        """Return the power of echoes in images, relative to that at 1 m ahead: (echo, emitter) float64.
+        """Return the power of echoes in images, relative to that at 1 m ahead: (echo, emitter).
 
         Unlike `powers`, it follows the matched filter, which adds the amplitudes of all frequencies: an emitter
         radiates low frequencies to its side, which air absorbs less.
-
-        Parameters
-        ----------
-        cosine, to_point_m : (echo, emitter) float64
-            Cosine of the angle to the axis of each emitter, and its distance from the reflector.
-        from_point_m : (echo,) float64
-            Distance of the receiver of each echo.
         """
         there, back = np.maximum(to_point_m, _NEAREST_M), np.maximum(from_point_m, _NEAREST_M)[:, None]
         place = np.rint((cosine + 1) / 2 * (len(self._cosine) - 1)).astype(np.int64)
@@ -186,27 +139,13 @@ class Emitters:
         return np.asarray(found / (there * back) ** 2)
 
     def _echo(self, radiated: Floats, path_m: Floats) -> Floats:
-        """Return the logarithm of the power of echoes after the matched filter, without spreading: (...,) float64.
-
-        Parameters
-        ----------
-        radiated : (..., frequency) float64
-            Amplitude that the emitter radiates.
-        path_m : (..., 1) float64
-        """
+        """Return the log of the power of echoes (...,) after the matched filter, without spreading."""
         amplitude = np.mean(radiated * np.exp(-self._loss_1_m * (path_m - 2.0)), axis=-1)
         return np.asarray(2 * np.log(np.maximum(np.abs(amplitude), np.finfo(np.float64).tiny)))
 
 
 def _half_widths_m(radiated: Floats, wave_1_m: Floats) -> Floats:
-    """Return the paths up to which compressed pulses are within 0.2 dB of their maxima: (direction,) float64.
-
-    Parameters
-    ----------
-    radiated : (direction, frequency) float64
-    wave_1_m : (frequency,) float64
-        Waves per metre.
-    """
+    """Return the paths (direction,) up to which compressed pulses are within 0.2 dB of their maxima."""
     path_m = np.linspace(0.0, _FARTHEST_M, _N_FARTHEST)
     pulse = np.abs(radiated @ np.exp(2j * math.pi * wave_1_m[:, None] * path_m))
     is_high = pulse >= _TOP_OF_PULSE * pulse.max(axis=1, keepdims=True)

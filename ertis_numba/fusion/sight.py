@@ -18,21 +18,7 @@ _VERTICAL: Final = 1e-6
 
 
 class Viewers:
-    """Sensors of a platform that see places.
-
-    Parameters
-    ----------
-    emitters : mapping of int to Emitters
-        Model of the emitters in the air of each receiver.
-    flat : collection of int
-        Receivers that do not distinguish front and back.
-
-    Attributes
-    ----------
-    sensor_m, ahead : (sensor, axis) float64
-        Positions and axes.
-    is_flat : (sensor,) bool
-    """
+    """Sensors of a platform that see places, with emitters in each one's air; ``is_flat``: front and back are alike."""
 
     def __init__(
         self, sensors: Sequence[MountedSensor], emitters: Mapping[int, Emitters], flat: Collection[int]
