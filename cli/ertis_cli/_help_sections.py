@@ -16,7 +16,7 @@ _SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
         *("preset", "directions", "azimuth", "elevation", "range", "level"),
     ),
     "Settings (default: those of the recording)": (
-        *("settings", "method", "beamformer", "weighting", "dmas-order", "snapshots", "diagonal-loading"),
+        *("settings", "method", "beamformer", "weighting"),
         *("clean-within", "clean-above-mean", "array-weights", "wavefront", "last-stage", "bands", "average", "focus"),
     ),
     "Accuracy": ("max-error", "plan", "explain", "verify"),

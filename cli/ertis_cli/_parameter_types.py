@@ -7,8 +7,10 @@ from typing import Any
 import click
 
 from ertis_numba.base.constants import MAX_MICROPHONES
+from ertis_numba.settings.beamformers import BEAMFORMERS
 
 __all__ = [
+    "BEAMFORMER",
     "CHANNELS",
     "DIRECTION",
     "ELEVATION",
@@ -21,6 +23,29 @@ __all__ = [
 ]
 
 _MAX_DEG = 90.0  # limit of azimuth and elevation in front of an array
+
+
+class _Beamformer(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    """Beamformer with its options, as fields of `Processing`."""
+
+    name = "NAME[:OPTION=X,...]"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> dict[str, Any]:
+        name, colon, text = str(value).partition(":")
+        declared = {str(known): each.options for known, each in BEAMFORMERS.items()}
+        if name not in declared:
+            self.fail(f"{name!r} is not a beamformer; choose one of {', '.join(declared)}", param, ctx)
+        known = {option.name.removeprefix(f"{name}_"): option for option in declared[name]}
+        found: dict[str, Any] = {"beamformer": name}
+        for each in text.split(",") if colon else ():
+            key, _, number = each.partition("=")
+            if key not in known:
+                usage = f"use {name}:{', '.join(f'{other}=X' for other in known)}" if known else f"use {name} alone"
+                self.fail(f"{each!r} is not an option of {name}; {usage}", param, ctx)
+            low, high = known[key].low, known[key].high
+            kind: Any = click.IntRange(low, int(high)) if isinstance(low, int) else click.FloatRange(low, high)
+            found[known[key].name] = kind.convert(number, param, ctx)
+        return found
 
 
 class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
@@ -116,6 +141,7 @@ class _Folder(_File):
     noun = "folder"
 
 
+BEAMFORMER = _Beamformer()
 CHANNELS = _Channels()
 DIRECTION = _Direction()
 ELEVATION = _Elevation()

@@ -16,6 +16,7 @@ from click.shell_completion import CompletionItem
 from ertis_cli import _progress
 from ertis_cli._naming import with_options
 from ertis_cli._parameter_types import (
+    BEAMFORMER,
     CHANNELS,
     DIRECTION,
     ELEVATION,
@@ -27,7 +28,7 @@ from ertis_cli._parameter_types import (
     TEXT_PATH,
 )
 from ertis_numba.base.units import counted
-from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS, BeamformerOption
+from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
@@ -161,39 +162,26 @@ settings_file: Decorator = click.option(
 )
 
 
-def _number(option: BeamformerOption) -> click.IntRange | click.FloatRange:
-    """Return the type of the option of a beamformer, with its limits."""
-    if isinstance(option.low, int):
-        return click.IntRange(option.low, int(option.high))
-    return click.FloatRange(option.low, option.high)
-
-
 def beamforming(default: str = "") -> Decorator:
-    """Return the options of all registered beamformers and weightings, named like the fields of `Processing`.
+    """Return the options of beamformers and weightings, named like the fields of `Processing`.
 
     ``default`` ends the help of each option, unless a heading above them states the default.
     """
-    declared = (option for beamformer in BEAMFORMERS.values() for option in beamformer.options)
-    added = [
-        click.option("--beamformer", type=click.Choice(list(BEAMFORMERS)), help=f"Beamformer{default}."),
-        click.option("--weighting", type=click.Choice(list(WEIGHTINGS)), help=f"Weighting of amplitudes{default}."),
-        *(
-            click.option(
-                "--" + option.name.replace("_", "-"),
-                type=_number(option),
-                metavar="N" if isinstance(option.low, int) else "X",
-                help=f"{option.help}{default}.",
-            )
-            for option in declared
-        ),
-    ]
-
-    def add(command: Any) -> Any:
-        for option in reversed(added):
-            command = option(command)
-        return command
-
-    return add
+    about = "; ".join(
+        f"{name.removeprefix(f'{beamformer}_')}: {option.help}, {option.low:g} to {option.high:g}"
+        for beamformer, declared in BEAMFORMERS.items()
+        for option in declared.options
+        for name in [option.name]
+    )
+    named = click.option(
+        "--beamformer",
+        type=BEAMFORMER,
+        help=f"Beamformer: {', '.join(BEAMFORMERS)}{default}. Options follow its name, as in dmas:order=3. {about}.",
+    )
+    weighted = click.option(
+        "--weighting", type=click.Choice(list(WEIGHTINGS)), help=f"Weighting of amplitudes{default}."
+    )
+    return lambda command: named(weighted(command))
 
 
 def cleaning(default: str = "") -> Decorator:
@@ -348,6 +336,7 @@ def settings_with(
         keys = preset_tables(preset, "processing")["processing"]
         settings = settings.replace(processing=settings.processing.replace(**keys))
     given = {name: value for name, value in options.items() if value is not None}
+    given |= given.pop("beamformer", {})
     if elevation is not None:
         given["elevation_deg" if isinstance(elevation, float) else "elevation_limits_deg"] = elevation
     directions = given.get("directions", settings.processing.directions)
@@ -374,22 +363,9 @@ def settings_with(
             ctx=click.get_current_context(),
         )
     settings = settings.replace(processing=settings.processing.replace(**given))
-    _require_own_options(settings.processing.beamformer, given)
     if max_error_db is None:
         return settings
     return settings.replace(accuracy=settings.accuracy.replace(max_error_db=max_error_db))
-
-
-def _require_own_options(beamformer: str, given: Iterable[str]) -> None:
-    """Raise UsageError for an option of another beamformer, which would have no effect."""
-    for name, other in BEAMFORMERS.items():
-        unused = {option.name for option in other.options}.intersection(given) if name != beamformer else ()
-        for option in sorted(unused):
-            raise click.UsageError(
-                f"--{option.replace('_', '-')} is an option of {name}, but the beamformer is {beamformer}; "
-                f"add --beamformer {name}, or omit the option",
-                ctx=click.get_current_context(),
-            )
 
 
 def pipeline(

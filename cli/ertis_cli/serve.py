@@ -103,6 +103,7 @@ def serve(
     every: bool,
     quiet: bool,
     as_json: bool,
+    beamformer: dict[str, Any] | None,
     **other: Any,
 ) -> None:
     """Run a central node that computes and publishes images.
@@ -129,6 +130,7 @@ def serve(
         "range_m": range_m,
         "method": method,
         **other,
+        **(beamformer or {}),
     }
     chosen = {} if preset is None else preset_tables(preset, "processing")["processing"]
     keys = _network.server_keys(key, allow)

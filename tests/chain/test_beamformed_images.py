@@ -195,8 +195,8 @@ def test_process_command_selects_a_beamformer(tmp_path):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ("--beamformer dmas --dmas-order 3", {"dmas_order": 3}),
-        ("--beamformer capon --snapshots 7 --diagonal-loading 0.5", {"snapshots": 7, "diagonal_loading": 0.5}),
+        ("--beamformer dmas:order=3", {"dmas_order": 3}),
+        ("--beamformer capon:snapshots=7,diagonal_loading=0.5", {"snapshots": 7, "diagonal_loading": 0.5}),
     ],
 )
 def test_process_command_takes_the_options_of_a_beamformer(tmp_path, options, expected):
@@ -208,9 +208,20 @@ def test_process_command_takes_the_options_of_a_beamformer(tmp_path, options, ex
     assert {name: getattr(processing, name) for name in expected} == expected
 
 
-def test_process_command_refuses_the_option_of_another_beamformer(tmp_path):
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("capon:order=3", "'order=3' is not an option of capon; use capon:snapshots=X, diagonal_loading=X"),
+        ("delay_and_sum:order=3", "'order=3' is not an option of delay_and_sum; use delay_and_sum alone"),
+        ("dmas:order=9", "9 is not in the range 2<=x<=8"),
+        ("dmas:order=x", "'x' is not a valid integer"),
+        ("dmas:", "'' is not an option of dmas; use dmas:order=X"),
+        ("loudest", "'loudest' is not a beamformer; choose one of delay_and_sum, dmas, capon"),
+    ],
+)
+def test_process_command_refuses_options_of_other_beamformers(tmp_path, given, message):
     recording, target = write_recording(tmp_path / "rec.h5", noise(count=1)), tmp_path / "img.h5"
-    done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), "--dmas-order", "3"])
+    done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), "--beamformer", given])
     assert done.exit_code == 2
-    assert "--dmas-order is an option of dmas, but the beamformer is delay_and_sum; add" in done.stderr
+    assert message in done.stderr
     assert not target.exists()

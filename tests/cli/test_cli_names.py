@@ -55,13 +55,13 @@ USAGE = {
     "sensors calibrate r.h5 -o a.toml --gain-tolerance nan": "--gain-tolerance is nan; use a finite number",
     "sensors status tcp://127.0.0.1:9 --patience 0": "--patience is 0; use a number above 0",
     "listen localhost": "address 'localhost' cannot be used; use tcp://HOST:PORT",
+    "export i.h5 -o a.mcap --ascii": "option --ascii is given, but format 'mcap' does not have it; leave it out, or",
+    "export i.h5 -o a.ply --topic points": "option --topic is given, but format 'ply' does not have it; leave it out",
+    "export i.h5 -o a.npz --top 3": "option --top is given, but format 'npz' does not have it; leave it out, or write",
 }
 """Values that are wrong whatever the files contain."""
 
 FAILURES = {
-    "export i.h5 -o a.mcap --ascii": "option --ascii is given, but format 'mcap' does not have it; leave it out, or",
-    "export i.h5 -o a.ply --topic points": "option --topic is given, but format 'ply' does not have it; leave it out",
-    "export i.h5 -o a.npz --top 3": "option --top is given, but format 'npz' does not have it; leave it out, or write",
     "plot i.h5 -o a.png --columns 1": "--columns is 1, which theme 'dark' does not have; use theme 'paper'",
     "plot i.h5 -o a.png --kind slices --height 300": "--height is 300, where the image shows nothing",
     "plot r.h5 -o a.png --kind signals --microphone 77": "microphone 77 is none of the 32 enabled ones; use",
