@@ -289,7 +289,7 @@ def _opened_pcm(
         whole_range = settings.processing.range_m == _UNSTATED_M
     elif raw[0].is_dir() or raw[0].suffix.lower() not in _PCM - {".wav"}:
         _require_samples(raw[0])
-        _require("--settings")
+        _require("--layout" if given["passive"] else "--settings")
     return open_pcm(raw, settings, whole_range=whole_range, **given)
 
 

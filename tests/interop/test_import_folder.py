@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_cli.main import cli
+from scipy.io import wavfile
 
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.interop import open_rtis_folder
@@ -346,3 +347,11 @@ def test_import_of_files_needs_settings(tmp_path, option):
     done = CliRunner().invoke(cli, ["import", "signals", str(tmp_path / "a.bin"), *sum(given.items(), ())])
     assert done.exit_code == 2
     assert f"Missing option '{option}'" in done.stderr
+
+
+def test_import_of_sound_needs_a_layout(tmp_path):
+    path = tmp_path / "a.wav"
+    wavfile.write(path, 48_000, np.ones((480, 4), np.int16))
+    done = CliRunner().invoke(cli, ["import", "signals", str(path), "--passive"])
+    assert done.exit_code == 2
+    assert "Missing option '--layout'" in done.stderr
