@@ -21,6 +21,8 @@ _UNIFORM = 0.34  # A uniform distribution has 68 % of its values within this sha
 _UNKNOWN = 1.0  # Variance of what a fit does not determine, in square metres, radians or nepers.
 _OTHER = 0.05  # Error of the model beyond the noise, above which samples are not those of a single echo at rest.
 _CHANCE = 0.6  # Error of the model relative to the noise, up to which noise alone may have caused the misfit.
+_PLAN = 3.0  # The same relative to that of the plan.
+_LEAST = 0.002  # The same of all plans.
 _SAME = 1e-9  # Distance in radians below which two directions are one.
 
 Floats = NDArray[np.float64]
@@ -123,7 +125,7 @@ class EchoFits:
             sd[1],
             np.hypot(sd[2], np.where(is_sparse, _SPARSE_NP, 0.0)),
             is_sparse,
-            np.sqrt(np.maximum(out[:, 21] ** 2 - model**2 - (_CHANCE * chance) ** 2, 0.0)),
+            np.sqrt(np.maximum(out[:, 21] ** 2 - (_PLAN * model) ** 2 - (_CHANCE * chance) ** 2 - _LEAST**2, 0.0)),
         )
 
     def _axes(self, middle: NDArray[np.int64]) -> Floats:

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.peak_interpolation import Tops
+from ertis_numba.analysis.peak_interpolation import MODEL, Tops
+from ertis_numba.analysis.plan_errors import plan_error
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import array_weights, microphones, unit_vectors
@@ -21,6 +22,8 @@ _WAVES = 64  # Number of frequencies of the call's band from which its widths ar
 _CLOSE_M, _CLOSE_RAD = 0.7, 1.7
 _CLOSE_NP = 0.25  # Error of its level.
 _SEEN = 0.45  # Misfit that other points cause, relative to their amplitude at the maximum.
+# Bias of the range in widths of the pulse, relative to the error of the plan: it is alike in all bins.
+_BIAS = 4.0
 _HALF = math.sqrt(0.5)  # Half of the power of a disturbance changes the amplitude, half the phase.
 _FLAT = 1e-12  # Relative variance of an array below which its extent counts as zero.
 _UNIFORM = 0.34  # A uniform distribution has 68 % of its values within this share of its width around the middle.
@@ -73,7 +76,8 @@ class PositionUncertainty:
         self._settings, self._is_planar, self._noise_only = settings, is_planar, noise_only
         self._width_hz = math.sqrt(mean_square - float(power @ frequency_hz) ** 2)
         self._frequency_hz = math.sqrt(mean_square)
-        self._spread = PointSpread(settings)
+        self._spread, self._plan = PointSpread(settings), 0.0 if noise_only else plan_error(settings)
+        self._bias = math.hypot(MODEL, self._plan) * (1.0 if settings.accuracy.delay_taps == 1 else _BIAS)
         self._covariance_m2 = _effective_covariance_m2(positions_m, array_weights(settings))
 
     def __call__(self, image: Energyscape, tops: Tops, *, noise: float) -> Uncertainty:
@@ -92,7 +96,8 @@ class PositionUncertainty:
         if not self._noise_only:
             is_fitted = np.isfinite(tops.across_sd_rad)
             range_m = np.where(is_fitted, tops.range_sd_m, range_m)
-            level = np.where(is_fitted, tops.level_sd, level)
+            range_m = np.hypot(range_m, self._bias * pulse_m)
+            level = np.hypot(np.where(is_fitted, tops.level_sd, level), self._plan)
             across_rad = np.where(is_fitted & (reach_m > 0), tops.across_sd_rad, across_rad)
             others = self._others(image, tops)
             unseen = np.sqrt(np.maximum(tops.misfit**2 - (_SEEN * others) ** 2, 0.0))

@@ -75,6 +75,16 @@ def test_errors_of_each_case_are_about_those_that_are_stated(errors, name):
     assert (rms < 1.5).all()
 
 
+@pytest.mark.parametrize(("directions", "budget_db"), [("2d:91", -20.0), ("2d:181", -35.0), ("3d:600", -14.0)])
+def test_errors_of_the_plan_are_part_of_those_that_are_stated(directions, budget_db):
+    """Where noise is far below the budget, errors of the plan remain, which are alike in all bins."""
+    draws, rng = Draws(Case(directions, 70, budget_db=budget_db, **MIDDLE)), np.random.default_rng(45)
+    found = np.array([each for _ in range(DRAWS) if (each := standardised(draws, rng)) is not None])
+    assert len(found) > DRAWS / 2
+    assert (np.sqrt(np.mean(found**2, axis=0)) < 1.5).all()
+    assert np.abs(found).max() < 4
+
+
 @pytest.mark.parametrize("directions", ["2d:91", "3d:600"])
 def test_points_and_peaks_state_the_same_errors(directions):
     draws, rng = Draws(Case(directions, 30, **MIDDLE)), np.random.default_rng(12)
