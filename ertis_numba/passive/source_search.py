@@ -130,7 +130,10 @@ class BandSearch:
                 return False
         powers = np.maximum(band.shares @ (likelihood.separated(places, band.omegas)[0] * band.level[:, None]), 0)
         is_heard = powers[-1] > 0 and powers[-1] >= least * powers.max()
-        return bool(is_heard and powers.sum() <= _MAX_EXCESS * (band.shares @ band.level))
+        waves = likelihood.unwhitened_waves(places, band.omegas)
+        beams = (waves.conj() * (band.matrix @ waves)).sum(axis=1).real / waves.shape[1] ** 2
+        is_in_map = powers <= _MAX_EXCESS * (band.shares @ (beams * band.level[:, None]))
+        return bool(is_heard and is_in_map.all() and powers.sum() <= _MAX_EXCESS * (band.shares @ band.level))
 
     def _place(self, rest: BandLikelihood, whole: BandLikelihood) -> Floats:
         """Return the most likely direction of a further source."""
