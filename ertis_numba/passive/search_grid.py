@@ -42,12 +42,16 @@ def _map_warning(settings: Settings, check: GridCheck) -> str | None:
     """Return the warning of a grid that is too coarse for maps, or of an ambiguous array."""
     bands_hz, lobe_at = _bands_hz(settings), _lobes(settings, _map_peak(settings))
     coarse_hz = _lowest(bands_hz, lambda high_hz: check.suffices(lobe_at(high_hz)))
-    ambiguous_hz = _lowest(bands_hz, lambda high_hz: not check.is_ambiguous(lobe_at(high_hz)))
     found = "" if coarse_hz is None else _coarse(settings, check, lobe_at, coarse_hz, float(bands_hz.max()))
-    if ambiguous_hz is None:
-        return found or None
+    return "; also, ".join(filter(None, (found, _ambiguity(bands_hz, check, lobe_at)))) or None
+
+
+def _ambiguity(bands_hz: NDArray[np.float64], check: GridCheck, lobe_at: Callable[[float], Lobe]) -> str | None:
+    """Return the warning that side lobes in the directions of a grid are as strong as the main lobe."""
+    if _lowest(bands_hz, lambda high_hz: not check.is_ambiguous(lobe_at(high_hz))) is None:
+        return None
     limit_hz = _highest_hz(lambda high_hz: not check.is_ambiguous(lobe_at(high_hz)), float(bands_hz.max()))
-    return (f"{found}; also, " if found else "") + (
+    return (
         f"above {limit_hz / 1e3:g} kHz, side lobes of this array are as strong as its main lobe, so a source may "
         f"appear in another direction on any grid; use bands_hz up to {limit_hz:g} Hz, or narrower limits of azimuth "
         "and elevation"
@@ -117,7 +121,9 @@ def search_warning(settings: Settings) -> str | None:
     Bearings and their levels are refined beyond the grid, so a source in the middle between directions may lose 6 dB.
     An array that is not a horizontal line resolves elevations, so its directions need several.
     """
-    found = (block_warning(settings, heard_bands(settings)), _search_warning(settings))
+    check, lobe_at = GridCheck(direction_grid(settings.processing), settings.processing), _lobes(settings, np.asarray)
+    ambiguity = None if check.is_single else _ambiguity(_bands_hz(settings), check, lobe_at)
+    found = (block_warning(settings, heard_bands(settings)), _search_warning(settings), ambiguity)
     return "; also, ".join(filter(None, found)) or None
 
 

@@ -152,3 +152,11 @@ def test_warnings_of_irregular_lists_state_the_largest_gap():
     maps = listed.replace(**{"passive.bands_hz": ((20e3, 40e3),)})
     for warning in (spacing_warning(listed, direction_grid(listed.processing)), coarse_map_warning(maps)):
         assert warning.startswith("directions are up to 58.0° apart")
+
+
+def test_search_warns_of_side_lobes_as_strong_as_the_main_lobe():
+    """Half a wavelength at 20 kHz is 8.6 mm; of microphones in a row 20 mm apart, two directions have equal phases."""
+    row = {"array.positions_m": [[0.0, 0.02 * k, 0.0] for k in range(6)], "passive.bands_hz": ((18e3, 20e3),)}
+    assert "side lobes of this array are as strong as its main lobe" in search_warning(settings_with("2d:181", **row))
+    near = {"array.positions_m": [[0.0, 0.005 * k, 0.0] for k in range(6)], "passive.bands_hz": ((18e3, 20e3),)}
+    assert search_warning(settings_with("2d:181", **near)) is None
