@@ -81,6 +81,7 @@ from .passive import (
     BearingFinder as BearingFinder,
     BearingTracker as BearingTracker,
     find_bearings as find_bearings,
+    find_sound_sources as find_sound_sources,
     heterodyned as heterodyned,
     listen_to as listen_to,
     time_differences as time_differences,

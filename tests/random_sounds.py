@@ -1,14 +1,16 @@
-"""Random arrays, grids and images, rendered in double precision by NumPy alone."""
+"""Random arrays, grids, acoustic maps and images, rendered in double precision by NumPy alone."""
 
 import math
 
 import numpy as np
 
-from ertis_numba.frames import Energyscape
+from ertis_numba.frames import AcousticMap, Energyscape
 from ertis_numba.geometry import direction_grid, layout_names, load_layout, unit_vectors
-from ertis_numba.settings import Array, Processing, Settings
+from ertis_numba.settings import Array, Passive, Processing, Settings
 
 C_M_S = 343.2
+NO_DIAGONAL = ("delay_and_sum", "clean_sc", "hr_clean_sc")  # Others need the powers of single microphones.
+METHODS = ("delay_and_sum", "functional", "capon", "music", "clean_sc", "hr_clean_sc")
 BEAMFORMERS = (
     ("delay_and_sum", "none"),
     ("delay_and_sum", "coherence_factor"),
@@ -81,6 +83,66 @@ def positions_m(array):
         layout = load_layout(array)
         return layout.enabled_positions_m
     return array - array.mean(axis=0)
+
+
+def random_map(seed, most=2000):
+    """An acoustic map of one or two bands: of sources, noise, or silence, by a random method."""
+    rng = np.random.default_rng([1, seed])
+    array, method = random_array(rng), str(rng.choice(METHODS))
+    places_m = positions_m(array)
+    settings = settings_of(array, random_directions(rng, most))
+    order, removed = float(rng.choice([1, 2, 8, 20])), bool(rng.integers(2)) and method in NO_DIAGONAL
+    passive = Passive(method=method, functional_order=order, diagonal_removal=removed)
+    settings = settings.replace(passive=passive)
+    grid = direction_grid(settings.processing)
+    directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
+    sources, noise = random_sources(rng, directions), 10 ** rng.uniform(-6, 0) * rng.choice([0, 1, 1, 1])
+    bands = []
+    edges_hz = np.sort(10 ** rng.uniform(3, 4.9, 4)).reshape(2, 2)[: rng.integers(1, 3)]
+    levels = 10 ** rng.uniform(-3, 0, len(sources))
+    for low_hz, high_hz in edges_hz:
+        band = 0.0
+        for frequency_hz in np.linspace(low_hz, high_hz, 3):
+            wave = 2 * math.pi * frequency_hz / C_M_S
+            heard = np.exp(1j * wave * places_m @ sources.T) * levels
+            own = rng.standard_normal((len(places_m), 40, 2)).view(complex)[..., 0] * noise
+            matrix = heard @ heard.conj().T + own @ own.conj().T / 40
+            band = band + map_power(np.exp(1j * wave * directions @ places_m.T), matrix, method, order, removed=removed)
+        bands.append(band)
+    return AcousticMap(
+        np.stack(bands, axis=1).astype(np.float32), grid.azimuth_rad, grid.elevation_rad, edges_hz, settings
+    )
+
+
+def map_power(waves, matrix, method, order, *, removed):
+    """Power of a matrix for each wave: (direction,) float64."""
+    n_mics = len(matrix)
+    load = 1e-6 * np.trace(matrix).real / n_mics + 1e-30
+    values, vectors = np.linalg.eigh(matrix)
+    if method == "functional":
+        roots = (vectors * np.maximum(values, 0) ** (1 / order)) @ vectors.conj().T
+        return np.maximum(form(waves, roots) / n_mics, 0) ** order / n_mics
+    if method == "capon":
+        return 1 / np.maximum(form(waves, np.linalg.inv(matrix + load * np.eye(n_mics))), 1e-30)
+    if method == "music":
+        return 1 / np.maximum(1 - form(waves, vectors[:, -1:] @ vectors[:, -1:].conj().T) / n_mics, 1e-6)
+    if method == "delay_and_sum":
+        kept = 1 - np.eye(n_mics) if removed else 1.0
+        return np.maximum(form(waves, matrix * kept), 0) / (n_mics**2 - n_mics if removed else n_mics**2)
+    out, rest = np.zeros(len(waves)), matrix.copy()
+    for _ in range(8):
+        power = form(waves, rest) / n_mics**2
+        place = int(power.argmax())
+        if not power[place] > 1e-12:
+            break
+        sound = rest @ waves[place] / (n_mics * math.sqrt(power[place]))
+        rest = rest - np.outer(sound, sound.conj())
+        out[place] += power[place]
+    return out
+
+
+def form(waves, matrix):
+    return np.einsum("di,di->d", waves.conj() @ matrix, waves).real
 
 
 def random_image(seed, most=600, n_ranges=None):

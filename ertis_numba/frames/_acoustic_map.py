@@ -31,6 +31,18 @@ class SoundDirection(NamedTuple):
     level_dbfs: float | None  # None for the method music
     level_db: float | None  # re 20 µPa; needs the sensitivity
     source_level_db: float | None  # re 20 µPa at 1 m; needs the distance, and at most 60 dB of absorption
+    grid_error_rad: float = math.nan
+
+    @classmethod
+    def of(
+        cls, found: "AcousticMap", band: int, azimuth_rad: float, elevation_rad: float, *, power: float, **more: float
+    ) -> Self:
+        """Return a direction in band number ``band`` of a map, with all known levels of a power above 0."""
+        levels: dict[str, float | None] = dict.fromkeys(LEVEL_UNITS)
+        if found.has_level:
+            levels = known_levels(found.settings, float(found.centre_hz[band]), 10 * math.log10(power))
+        low_hz, high_hz = found.band_hz[band].tolist()
+        return cls((low_hz, high_hz), azimuth_rad, elevation_rad, **levels, **more)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the direction in degrees and the levels for JSON; unknown or infinite numbers are null."""
@@ -202,28 +214,23 @@ class AcousticMap(DegreesFromRadians):
         """Return the loudest direction of the grid in each band; none in bands of silence.
 
         It may be noise or a side lobe, and a source may lie between the directions of the grid, with a higher level:
-        ``bearings`` has the sources.
+        ``bearings`` has the sources, and `find_sound_sources` interpolates.
 
         Returns
         -------
         list of SoundDirection
         """
         return [
-            SoundDirection(
-                (float(self.band_hz[band, 0]), float(self.band_hz[band, 1])),
+            SoundDirection.of(
+                self,
+                band,
                 float(self.azimuth_rad[place]),
                 float(self.elevation_rad[place]),
-                **self._levels(band, float(self.power[place, band])),
+                power=float(self.power[place, band]),
             )
             for band, place in enumerate(np.argmax(self.power, axis=0))
             if not self.is_silent[band]
         ]
-
-    def _levels(self, band: int, power: float) -> dict[str, float | None]:
-        """Return the known levels of a power, which is above 0."""
-        if not self.has_level:
-            return dict.fromkeys(LEVEL_UNITS)
-        return known_levels(self.settings, float(self.centre_hz[band]), 10 * math.log10(power))
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed.

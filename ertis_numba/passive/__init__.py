@@ -7,6 +7,7 @@ from ertis_numba.passive.bearings import BearingFinder, find_bearings
 from ertis_numba.passive.camera import AcousticCamera
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.heard_signals import HeardSignals
+from ertis_numba.passive.sound_sources import find_sound_sources
 from ertis_numba.passive.time_differences import TimeDifference, time_differences
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "TimeDifference",
     "band_edges",
     "find_bearings",
+    "find_sound_sources",
     "heterodyned",
     "listen_to",
     "octave_bands",

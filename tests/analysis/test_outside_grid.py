@@ -1,4 +1,4 @@
-"""Reflectors beyond the limits of a grid: none is listed inside with a small error."""
+"""Sources and reflectors beyond the limits of a grid: none is listed inside with a small error."""
 
 import math
 
@@ -9,12 +9,14 @@ import ertis_numba as ertis
 from ertis_numba.analysis.detect import peaks_of_grid
 from ertis_numba.analysis.outside_grid import OutsidePatterns
 from ertis_numba.analysis.points import PointExtractor
-from ertis_numba.frames import Energyscape
+from ertis_numba.frames import AcousticMap, Energyscape
 from ertis_numba.geometry import Grid, direction_grid, unit_vectors
+from ertis_numba.passive.sound_sources import sources_of_grid
 from ertis_numba.settings import Call, Processing
 from ertis_numba.simulation import Point, Scene, Sensor
-from tests.random_sounds import C_M_S, settings_of
+from tests.random_sounds import C_M_S, map_power, settings_of
 
+METHODS = ("delay_and_sum", "functional", "capon", "music")
 LIMITS = {"azimuth_limits_deg": (-40.0, 30.0), "elevation_limits_deg": (-25.0, 25.0)}
 INSIDE = [(10.0, 5.0), (-30.0, -12.0), (22.0, 17.0)]
 OUTSIDE = [(45.0, 5.0), (60.0, -10.0), (-58.0, 15.0), (5.0, 48.0), (-20.0, -60.0), (34.0, 0.0)]
@@ -27,6 +29,21 @@ def places(count=24, size_m=0.12):
 
 def towards_of(azimuth_deg, elevation_deg):
     return unit_vectors(np.radians([azimuth_deg]), np.radians([elevation_deg]))[0]
+
+
+def tone_map(method, azimuth_deg, elevation_deg, directions="3d:400", frequency_hz=12e3):
+    """Map of a plane wave in white noise, in closed form."""
+    settings = settings_of(places(), {"directions": directions, **LIMITS})
+    settings = settings.replace(passive=settings.passive.replace(method=method))
+    grid = direction_grid(settings.processing)
+    places_m = places() - places().mean(axis=0)
+    wave_1_m = 2 * np.pi * frequency_hz / C_M_S
+    heard = np.exp(1j * wave_1_m * places_m @ towards_of(azimuth_deg, elevation_deg))
+    matrix = np.outer(heard, heard.conj()) + 0.03 * np.eye(len(places_m))
+    waves = np.exp(1j * wave_1_m * unit_vectors(grid.azimuth_rad, grid.elevation_rad) @ places_m.T)
+    power = map_power(waves, matrix, method, settings.passive.functional_order, removed=False)
+    band_hz = np.array([[frequency_hz - 1, frequency_hz + 1]])
+    return AcousticMap(power[:, None].astype(np.float32), grid.azimuth_rad, grid.elevation_rad, band_hz, settings)
 
 
 def echo_image(azimuth_deg, elevation_deg, range_m=0.8):
@@ -46,6 +63,30 @@ def echo_image(azimuth_deg, elevation_deg, range_m=0.8):
     beams = np.exp(1j * (away @ places_m.T)[..., None] * wave_1_m).mean(axis=1)
     amplitude = np.abs((beams * shares) @ np.exp(-2j * wave_1_m[:, None] * (ranges_m - range_m)))
     return Energyscape(amplitude.astype(np.float32), grid.azimuth_rad, grid.elevation_rad, ranges_m, settings)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("place", OUTSIDE)
+def test_sources_beyond_the_limits_have_an_unknown_direction(method, place):
+    sources = sources_of_grid(tone_map(method, *place))
+    assert sources
+    assert all(math.isinf(each.grid_error_rad) for each in sources)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("place", INSIDE)
+def test_sources_inside_have_a_known_direction(method, place):
+    loudest = sources_of_grid(tone_map(method, *place))[0]
+    found = unit_vectors(np.array([loudest.azimuth_rad]), np.array([loudest.elevation_rad]))[0]
+    assert math.isfinite(loudest.grid_error_rad)
+    assert np.degrees(np.arccos(min(1.0, found @ towards_of(*place)))) < 1.5
+
+
+@pytest.mark.parametrize(("azimuth_deg", "is_known"), [(10.0, True), (45.0, False), (-60.0, False)])
+def test_planar_grids_are_examined_along_their_circle(azimuth_deg, is_known):
+    sources = sources_of_grid(tone_map("delay_and_sum", azimuth_deg, 0.0, "2d:60"))
+    assert sources
+    assert all(math.isfinite(each.grid_error_rad) == is_known for each in sources)
 
 
 @pytest.mark.parametrize("place", [*INSIDE, *OUTSIDE])
