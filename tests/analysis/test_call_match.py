@@ -18,6 +18,7 @@ from ertis_numba.geometry.waveform import call_at
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Array, Call, Processing, Recording, Settings
 from ertis_numba.storage import open_energyscapes, write_recording
+from tests.health_recordings import REAL, real
 
 SETTINGS = Settings(
     recording=Recording(sample_rate_hz=450e3, n_samples=8100, encoding="float32"),
@@ -260,6 +261,15 @@ def test_call_match_names_no_other_call_without_one(count, noise):
     echoes = [(3e-3 + 0.7e-3 * place, 0.9**place) for place in range(count)]
     found = compared(chirps(*OWN, echoes=echoes, noise=noise), *OWN[:3])
     assert (found.verdict, found.warning) == ("matches", "")
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_call_match_names_no_other_call_in_a_real_record(seed):
+    """Echoes of a real room, with any microphones missing, are no call of another sensor."""
+    rng = np.random.default_rng(seed)
+    missing = (4, 9) if seed == 0 else tuple(rng.choice(32, rng.integers(1, 20), replace=False).tolist())
+    settings = REAL.replace(array=REAL.array.replace(disabled=missing))
+    assert call_match(replace(real(), settings=settings)).foreign is None
 
 
 def test_process_notes_the_call_of_another_sensor(tmp_path):
