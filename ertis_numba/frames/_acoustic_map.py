@@ -35,14 +35,14 @@ class SoundDirection(NamedTuple):
 
     @classmethod
     def of(
-        cls, found: "AcousticMap", band: int, azimuth_rad: float, elevation_rad: float, *, power: float, **more: float
+        cls, found: "AcousticMap", band: int, angles_rad: tuple[float, float], power: float, error_rad: float = math.nan
     ) -> Self:
         """Return a direction in band number ``band`` of a map, with all known levels of a power above 0."""
         levels: dict[str, float | None] = dict.fromkeys(LEVEL_UNITS)
         if found.has_level:
             levels = known_levels(found.settings, float(found.centre_hz[band]), 10 * math.log10(power))
         low_hz, high_hz = found.band_hz[band].tolist()
-        return cls((low_hz, high_hz), azimuth_rad, elevation_rad, **levels, **more)
+        return cls((low_hz, high_hz), *angles_rad, **levels, grid_error_rad=error_rad)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the direction in degrees and the levels for JSON; unknown or infinite numbers are null."""
@@ -224,9 +224,8 @@ class AcousticMap(DegreesFromRadians):
             SoundDirection.of(
                 self,
                 band,
-                float(self.azimuth_rad[place]),
-                float(self.elevation_rad[place]),
-                power=float(self.power[place, band]),
+                (float(self.azimuth_rad[place]), float(self.elevation_rad[place])),
+                float(self.power[place, band]),
             )
             for band, place in enumerate(np.argmax(self.power, axis=0))
             if not self.is_silent[band]

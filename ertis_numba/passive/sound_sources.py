@@ -162,7 +162,7 @@ def sources_of_grid(
             angles_rad = math.atan2(y, x), math.asin(max(-1.0, min(1.0, z)))
             error_rad = each.width_rad / math.sqrt(12)
             listed = min(each.power, highest)
-            out.append(SoundDirection.of(found, band, *angles_rad, power=listed, grid_error_rad=error_rad))
+            out.append(SoundDirection.of(found, band, angles_rad, listed, error_rad))
     return out
 
 
