@@ -42,7 +42,8 @@ class SoundDirection(NamedTuple):
         if found.has_level:
             levels = known_levels(found.settings, float(found.centre_hz[band]), 10 * math.log10(power))
         low_hz, high_hz = found.band_hz[band].tolist()
-        return cls((low_hz, high_hz), *angles_rad, **levels, grid_error_rad=error_rad)
+        in_units = levels["level_dbfs"], levels["level_db"], levels["source_level_db"]
+        return cls((low_hz, high_hz), *angles_rad, *in_units, error_rad)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the direction in degrees and the levels for JSON; unknown or infinite numbers are null."""
