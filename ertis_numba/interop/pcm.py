@@ -166,7 +166,7 @@ def _require_emissions(skip_s: float, *, passive: bool) -> None:
 def _require_settings(settings: Settings | None, first: PcmFile) -> Settings:
     known = settings or first.settings
     if known is None:
-        raise ArgumentError(f"{first.path} contains no array and no call; add them (settings)")
+        raise ArgumentError(f"{first.path} contains no array; add it (settings), and the call, if one was emitted")
     return known
 
 

@@ -319,7 +319,7 @@ def test_acoular_files_are_read_in_slices(tmp_path):
 
 
 def test_wav_without_settings_is_refused(tmp_path):
-    with pytest.raises(ArgumentError, match=r"contains no array and no call; add them"):
+    with pytest.raises(ArgumentError, match=r"contains no array; add it"):
         ertis.open_pcm(write_wav(tmp_path / "a.wav", numbers()))
 
 
