@@ -353,7 +353,7 @@ def test_acoular_file_without_settings_is_refused(tmp_path):
         file["time_data"].attrs["sample_freq"] = float(RATE_HZ)
     (measurement,) = ertis.open_pcm(tmp_path / "a.h5", PCM)
     assert np.array_equal(measurement.data, given)
-    with pytest.raises(ArgumentError, match="add them"):
+    with pytest.raises(ArgumentError, match="add it"):
         ertis.open_pcm(tmp_path / "a.h5")
 
 
