@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from ertis_numba.analysis.directional_noise import is_short, pulse_steps
 from ertis_numba.analysis.noise import EchoFloor, echo_floor
 from ertis_numba.analysis.points import EchoPointExtractor
+from ertis_numba.base.forks import call_in_forks
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.fusion.association import Reflectors
 from ertis_numba.fusion.attribution import Shares
@@ -74,20 +76,36 @@ class PointFuser:
         self._number, self._mounting, self._receiver = number, sensors[number], receiver
         self._is_deaf = deaf[(image.range_m / receiver.step_m).astype(np.int64)]
         self._n_pulse = pulse_steps(image)
-        self._kept: tuple[tuple[Energyscape, HeardImage], ...] = ()
+        self._kept: dict[int, tuple[Energyscape, Future[HeardImage]]] = {}  # by identity of the image
+        call_in_forks(self._forget)
         self._extract = EchoPointExtractor(
             image.settings, Grid(image.azimuth_rad, image.elevation_rad), top=_TOP, min_level_db=_MIN_LEVEL_DB
         )
 
     def heard(self, image: Energyscape) -> HeardImage:
         """Return threshold and echoes, found once for each of the latest images. Threads may call it."""
-        for known, heard in self._kept:
-            if known is image:
-                return heard
-        floor = _floor(image)
-        heard = HeardImage(floor, self._echoes(image, floor))
-        self._kept = (*self._kept, (image, heard))[-_N_KEPT:]
-        return heard
+        return self.find(image).result()
+
+    def find(self, image: Energyscape) -> "Future[HeardImage]":
+        """Find threshold and echoes, unless another thread has begun to; return the result of either."""
+        result: Future[HeardImage] = Future()
+        try:
+            # A lock could keep other threads from ending while a signal handler waits for them.
+            _, known = self._kept.setdefault(id(image), (image, result))
+            if known is not result:
+                return known
+            for earlier in [*self._kept][:-_N_KEPT]:
+                self._kept.pop(earlier, None)
+            floor = _floor(image)
+            result.set_result(HeardImage(floor, self._echoes(image, floor)))
+        except BaseException as error:  # noqa: BLE001  Others may wait for it.
+            self._kept.pop(id(image), None)
+            result.set_exception(error)
+        return result
+
+    def _forget(self) -> None:
+        """Forget results of threads that do not exist in a fork."""
+        self._kept.clear()
 
     def echoes(self, image: Energyscape, shares: Shares, late_m: Mapping[int, float]) -> SensorEchoes:
         """Return the echoes of an image above its noise, strongest first; ``late_m`` is as in `pair_of`."""

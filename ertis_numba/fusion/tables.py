@@ -117,7 +117,7 @@ class FusionTables:
     def prepare(self, number: int, image: Energyscape) -> None:
         """Find the echoes of an image of a receiver whose tables exist. Threads may call it."""
         if number in self._points:
-            self._points[number].heard(image)
+            self._points[number].find(image)
 
     def coarse(self, number: int, image: Energyscape) -> CoarseImage:
         """Return the powers of an image of a receiver."""
@@ -176,7 +176,9 @@ class FusionTables:
 
         ``attributed`` is the attribution without those that the pulses before have not heard, ``unheard``.
         """
-        floor = {number: self._points[number].heard(each).floor for number, each in group.items()}
+        # Those that no other thread has begun are found before it waits for others.
+        heard = {number: self._points[number].find(each) for number, each in group.items()}
+        floor = {number: each.result().floor for number, each in heard.items()}
         explained = self._explained(group, attributed, floor, unheard)
         every = frozenset(group)
         if attributed.suspects == every and len(every) > 1:

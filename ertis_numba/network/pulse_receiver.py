@@ -3,11 +3,14 @@
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
 
+from ertis_numba.base.forks import usable_cores
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.fusion.pulses import PulseGroups
 from ertis_numba.fusion.rig import Mountings
@@ -57,7 +60,8 @@ class PulseReceiver:
     A pulse is complete when all sensors of the two pulses before have sent their image, when three later pulses have
     begun, or when no image has come for 0.25 s. A slow application gets the latest pulses. A sensor without a mounting,
     in ``mountings`` or from the central node, and one that sends NaN, is left out with a note. A thread calls
-    ``on_note`` for each change of the connection, and ``on_image`` for images unless a pulse waits for `receive`.
+    ``on_note`` for each change of the connection. As many threads as there are cores call ``on_image`` for
+    images as they arrive, unless a pulse waits for `receive`.
     """
 
     def __init__(
@@ -77,12 +81,13 @@ class PulseReceiver:
         self._subscriber: Subscriber[Energyscape] = Subscriber(
             address, products=("energyscape",), sensors=sensors, keys=keys, on_note=on_note, credit=_CREDIT
         )
-        self._note, self._on_image = on_note or (lambda _: None), on_image or (lambda _: None)
+        self._note, self._on_image = on_note or (lambda _: None), on_image
         self.counts: SubscriberCounts = self._subscriber.counts
         self._groups: PulseGroups[_Received] = PulseGroups.of(self._given, self._note)
         self.queue: PulseQueue[dict[str, _Received]] = PulseQueue()
         self._mountings: dict[str, _Place] = dict(self._given)
         self._left_out: set[str] = set()  # Sensors without a mounting, or with numbers that are not finite.
+        self._n_threads = usable_cores()
         self._owner = Owner("receiver")
         self._thread = threading.Thread(target=self._run, name="ertis-pulse-receiver", daemon=True)
         self._thread.start()
@@ -122,6 +127,7 @@ class PulseReceiver:
     def _run(self) -> None:
         """Form groups until `close`."""
         latest_s = time.monotonic()
+        pool = ThreadPoolExecutor(self._n_threads, thread_name_prefix="ertis-images")
         try:
             while not self._subscriber.closed:
                 image = self._subscriber.receive(_POLL_S)
@@ -129,19 +135,24 @@ class PulseReceiver:
                     latest_s = time.monotonic()
                     received = self._received(image)
                     if received is not None:
-                        self._add(received)
+                        self._add(received, pool)
                 elif time.monotonic() - latest_s > _PATIENCE_S and (group := self._groups.close()):
                     self._put(group)
         except Exception as error:  # noqa: BLE001  whatever it is, who waits must not do so for ever
             self.queue.fail(error)
+        finally:
+            pool.shutdown(cancel_futures=True)
 
-    def _add(self, received: _Received) -> None:
+    def _add(self, received: _Received, pool: ThreadPoolExecutor) -> None:
         """Add an image to its group."""
-        groups = self._groups.add(received)
-        for group in groups:
+        if self._on_image is not None and self.queue.is_empty:
+            if self._n_threads == 1:  # Others would only compete with this one.
+                self._on_image(received.image)
+            else:
+                with suppress(RuntimeError):  # No thread can start, or the main thread has ended.
+                    pool.submit(self._on_image, received.image)
+        for group in self._groups.add(received):
             self._put(group)
-        if not groups and self.queue.is_empty:
-            self._on_image(received.image)
 
     def _received(self, image: Energyscape) -> _Received | None:
         """Return an image with its mounting; None, with one note, if that is unknown or the image is not finite."""

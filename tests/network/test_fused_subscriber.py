@@ -52,6 +52,42 @@ def test_each_pulse_is_fused_once():
     assert sorted(round(float(x), 1) for x in last.points.position_m[:, 0]) == [-1.1, 1.4]
 
 
+@pytest.mark.parametrize(("n_cores", "name"), [(1, "ertis-pulse-receiver"), (2, "ertis-images")])
+def test_threads_find_echoes_as_images_arrive_and_end_with_the_subscriber(monkeypatch, n_cores, name):
+    prepare, used, found = Fuser.prepare, threading.Semaphore(0), []
+
+    def seen(fuser, each):
+        found.append((threading.current_thread().name, each))
+        prepare(fuser, each)
+
+    def one_after_the_other():
+        front, back, *others = pulses()
+        yield from (front, back)
+        for each in zip(others[::2], others[1::2], strict=True):
+            assert used.acquire(timeout=PATIENCE_S)
+            yield from each
+
+    monkeypatch.setattr(Fuser, "prepare", seen)
+    monkeypatch.setattr("ertis_numba.network.pulse_receiver.usable_cores", lambda: n_cores)
+    arrivals = []
+    with (
+        Publisher() as publisher,
+        FusedSubscriber(publisher.address, mountings=MOUNTINGS) as subscriber,
+        publisher.playing(one_after_the_other()),
+    ):
+        for _ in range(3):
+            arrivals.append(subscriber.receive(PATIENCE_S))
+            used.release()
+        sent = {id(each) for arrival in arrivals[1:] for each in arrival.images.values()}
+        assert until(lambda: sent <= {id(each) for _, each in found}, timeout_s=PATIENCE_S)
+    assert {thread.rpartition("_")[0] or thread for thread, _ in found} == {name}
+    assert not any(each.name.startswith("ertis-images") for each in threading.enumerate())
+    fuser = Fuser(MOUNTINGS, spacing_deg=2.0, range_step_m=0.02)
+    for arrival in arrivals:
+        again = fuser(arrival.images.values())
+        np.testing.assert_array_equal(arrival.fused.image.amplitude, again.image.amplitude)
+
+
 def test_pulses_that_arrive_while_tables_are_computed_are_fused_later(monkeypatch):
     fuse = Fuser.__call__
     begun = threading.Event()
