@@ -66,7 +66,7 @@ def require_fitting(name: str, paths: "Sequence[Path]") -> None:
         require_options(name, {option: True for option in of_formats if typed(option)})
     except ArgumentError as error:
         raise click.UsageError(_naming.named(str(error), context), context) from error
-    if len(paths) > 1 and EXPORT_FORMATS[name].takes != "drive":
+    if len(paths) > 1 and EXPORT_FORMATS[name].content != "drive":
         raise click.UsageError(
             f"format {name} exports one recording, but {len(paths)} are given; choose one of them", context
         )

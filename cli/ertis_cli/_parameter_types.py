@@ -44,7 +44,10 @@ class _Beamformer(click.ParamType):  # type: ignore[type-arg]  # generic since c
                 self.fail(f"{each!r} is not an option of {name}; {usage}", param, ctx)
             low, high = known[key].low, known[key].high
             kind: Any = click.IntRange(low, int(high)) if isinstance(low, int) else click.FloatRange(low, high)
-            found[known[key].name] = kind.convert(number, param, ctx)
+            try:
+                found[known[key].name] = kind.convert(number, param, ctx)
+            except click.BadParameter as error:
+                self.fail(f"{each!r}: {error.message}", param, ctx)
         return found
 
 

@@ -95,7 +95,8 @@ def acoustic(
     """Process recordings of sound into acoustic maps.
 
     A map shows the sound power from each direction, in bands of frequencies. All measurements become maps. If the
-    sensor emitted its call, the time of the call is left out, but its echoes remain.
+    sensor emitted its call, the time of the call is left out, but its echoes remain. The file also contains the
+    sources that are found in each map: 'ertis peaks' lists them.
 
     The settings file overrides the settings of the recording, and options override both. All sensors of a recording go
     into one file.

@@ -115,14 +115,14 @@ def export(
     from ertis_numba import interop
 
     name = interop.choose_format(target, file_format)
-    takes = interop.EXPORT_FORMATS[name].takes
+    content = interop.EXPORT_FORMATS[name].content
     _export_drive.require_fitting(name, paths)
-    if takes == "poses":
+    if content == "poses":
         _export_poses.export_poses(paths[0], target, sensor, force=force, quiet=quiet, as_json=as_json)
         return
     from ertis_numba.storage import check_target, file_kind, open_recording, sensor_names
 
-    if takes == "sound":
+    if content == "sound":
         sound = _export_sound.SoundOptions(direction, heterodyne_hz, expansion, with_silence)
         _export_sound.require_possible(sound)
         with open_recording(paths[0], sensor=sensor) as reader:
@@ -136,11 +136,11 @@ def export(
     fitting = interop.FORMATS[name].options
     chosen: dict[str, Any] = {key: value for key, value in given.items() if key in fitting}
     with ExitStack() as stack:
-        every, readers = _readers(takes, paths, sensor, stack)
+        every, readers = _readers(content, paths, sensor, stack)
         known = _known(every, mounting) if "mounting" in fitting else None
-        process = takes not in {"signals", "drive"} and file_kind(paths[0]) == "recording"
-        items = _Items(readers, places, process=process, echoes=takes == "drive", quiet=quiet)
-        if takes == "drive":
+        process = content not in {"signals", "drive"} and file_kind(paths[0]) == "recording"
+        items = _Items(readers, places, process=process, echoes=content == "drive", quiet=quiet)
+        if content == "drive":
             (ears,), (indices,) = readers, items.indices
             chosen["drive"] = _export_drive.drive_of(every, ears, indices, known or {}, **drive, quiet=quiet)
         written = interop.export(
@@ -152,12 +152,12 @@ def export(
             **chosen,
         )
     if known is not None:
-        for reader in readers if name != "batslam" else ():
+        for reader in () if content == "drive" else readers:
             options.note_unknown_places(reader.sensor, reader.settings, quiet=quiet)
         unknown = [reader.sensor for reader in readers if reader.sensor not in known]
         remedy = "the export uses the frame of the sensor; add --mounting FILE for the frame of the platform"
         _mountings.note_unknown(unknown, remedy, quiet=quiet)
-    if takes == "topics" and sum(len(sensor_names(path)) for path in paths) > 1 and "scan" in (topics or TOPICS):
+    if content == "topics" and sum(len(sensor_names(path)) for path in paths) > 1 and "scan" in (topics or TOPICS):
         options.note(
             "scans of single sensors contain echoes of the other sensors' calls; for /fused/scan, export the file that "
             "'ertis fuse' writes",
@@ -178,21 +178,21 @@ def export(
 
 
 def _readers(
-    takes: str, paths: tuple[Path, ...], sensor: str | None, stack: ExitStack
+    content: str, paths: tuple[Path, ...], sensor: str | None, stack: ExitStack
 ) -> "tuple[Sequence[Any], Sequence[Any]]":
     """Open files; return the readers of all sensors of the platform, and of those to export."""
     from ertis_numba.storage import file_kind, open_energyscapes, open_recording
 
-    if takes == "drive":
+    if content == "drive":
         every, ears = _export_drive.open_ears(paths, sensor, stack)
         return every, [ears]
     path = paths[0]
     open_file: Callable[..., Any] = (
-        open_recording if takes == "signals" or file_kind(path) == "recording" else open_energyscapes
+        open_recording if content == "signals" or file_kind(path) == "recording" else open_energyscapes
     )
     readers = [stack.enter_context(open_file(path, sensor=each)) for each in options.sensors_of(path, sensor)]
     for reader in readers:
-        options.note_missing_points(reader, quiet=takes == "results")
+        options.note_missing_points(reader, quiet=content == "results")
     return readers, readers
 
 
@@ -266,8 +266,8 @@ def _with_call(reader: "RecordingReader | EnergyscapeReader", chosen: range) -> 
     found = [place for place in chosen if not is_passive(reader.settings, stamps[place])]
     if chosen and not found:
         raise DataError(
-            f"{reader.path}: all chosen measurements of sensor {reader.sensor} are passive and have no echoes; make "
-            "maps of their sound with 'ertis acoustic', and export these"
+            f"{reader.path}: all chosen measurements of sensor {reader.sensor} are passive and have no echoes; use "
+            "'ertis acoustic' for maps of their sound, or write wav"
         )
     return found
 

@@ -483,9 +483,9 @@ def note_doubts(sensor: str, bearings: "Iterable[Bearing]") -> bool:
         )
     if "interference" in doubts:
         note(
-            f"sensor {sensor}: a source marked as possible interference is a tone that few microphones cannot tell "
-            "from one of random phases, as of electronics; cover the microphones: interference remains, and sound does "
-            "not"
+            f"sensor {sensor}: a source marked as possible interference is a tone, and with so few microphones, a "
+            "tone of the electronics with random phases would look the same; cover the microphones: interference "
+            "remains, and sound does not"
         )
     return bool(doubts)
 

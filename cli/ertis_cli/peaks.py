@@ -57,7 +57,7 @@ _SD = {"angle_sd_deg": ".2g", "range_sd_m": ".2g", "level_sd_db": ".2g"}
     type=float,
     metavar="DB",
     help=f"Lowest level relative to the strongest peak; {_MIN_LEVEL_DB:g} by default, no limit with cfar. In acoustic "
-    "maps, relative to the loudest source of the band; -20 by default, and at least.",
+    "maps, relative to the loudest source of the band; these contain no sources below -20.",
 )
 @options.measurement("One measurement, or map of a file of acoustic maps, counted from 0; all by default.")
 @click.option(
@@ -99,8 +99,8 @@ def peaks(
     direction may cause. Images that are cleaned keep all maxima. angle_sd_deg,
     range_sd_m and level_sd_db are standard deviations, if the noise is known. grid_error_deg is the
     part of angle_sd_deg from directions that cannot be interpolated; other directions have 0. It is -, and null in
-    JSON, where the source may lie beyond the edge of the grid. No level is more than 1 dB above its image
-    or map. Angles that the array cannot observe are shown as –, and as null in JSON: both for one microphone, the
+    JSON, where the reflector may lie beyond the edge of the grid. No level is more than 1 dB above its image.
+    Angles that the array cannot observe are shown as –, and as null in JSON: both for one microphone, the
     elevation for microphones on a horizontal line.
 
     With --detector cfar, a reflector exceeds the noise around it in range, at any level, and is at most 10 dB below the
@@ -116,16 +116,16 @@ def peaks(
     false, and "missed" lists missed reflectors.
 
     For a file of acoustic maps, there is one entry per source, the loudest of each map and band first: the bearings
-    that 'ertis acoustic' has found in the sound of the map, in all directions that the array can tell apart, whatever
-    the method and the directions of the map. Noise alone yields a source in one of 1000 maps. Side lobes yield none.
+    that 'ertis acoustic' has found in all directions that the array can tell apart, whatever the method and the
+    directions of the map. Noise alone yields a source in one of 1000 maps. Side lobes yield none.
     sideways_deg and upwards_deg are the standard deviations of the direction along the sphere, horizontally and
     vertically, because of noise. Levels are those of the band, without noise; level_dbfs is the mean square, where a
     full-scale tone has -3. level_db, in dB re 20 µPa, needs the sensitivity of the microphones. source_level_db, in
-    dB re 20 µPa at 1 m from the source, also needs the distance of the source (process --focus). snr_db is relative to
-    the noise of a microphone. A source marked 'crosstalk?' may be electrical crosstalk, and one marked
-    'interference?' a tone of the electronics (may_be_crosstalk and may_be_interference in JSON). Maps are
-    counted from 0, regardless of the number of measurements that they average. --measurement chooses a
-    map. Of the other options, --sensor, --top, --min-level and --json apply to maps.
+    dB re 20 µPa at 1 m from the source, also needs the distance of the source (--focus of 'ertis acoustic'). snr_db is
+    relative to the noise of a microphone. A source marked 'crosstalk?' may be electrical crosstalk, and one marked
+    'interference?' may be a tone of the electronics (may_be_crosstalk and may_be_interference in JSON). Maps are
+    counted from 0, regardless of the number of measurements that they average. --measurement chooses a map. Of the
+    other options, --sensor, --top, --min-level and --json apply to maps.
     """
     from ertis_numba.storage import file_kind
 
@@ -235,7 +235,7 @@ def _list_sources(
         options.print_json({"sources": rows})
         return
     if not rows:
-        click.echo("nothing found", err=True)
+        click.echo("no source found", err=True)
         return
     more = {name: ".1f" for name in (*_LEVELS, "snr_db") if any(row[name] is not None for row in rows)}
     columns: dict[str, _tables.Side] = {"sensor": "left"}

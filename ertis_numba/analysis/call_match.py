@@ -71,7 +71,7 @@ class CallMatch:
         """Mismatch, another call, or the reason why the match is unknown, in one line; empty without any."""
         if self.foreign is not None:
             return (
-                f"beside the call of the settings, the record contains {self.foreign}, perhaps of another sensor. Its "
+                f"besides the call of the settings, the record contains {self.foreign}, perhaps of another sensor. Its "
                 "echoes appear as rings of ghosts; silence it, or use equal calls on one SYNC chain and 'ertis fuse'"
             )
         if self.sweep is None or self.call is None:

@@ -16,7 +16,7 @@ __all__ = ["RESULT_SUFFIXES", "RecordingFile", "ResultKind", "find_recordings", 
 ResultKind = Literal["energyscape", "acoustic_map"]
 
 RESULT_SUFFIXES: Final[dict[ResultKind, str]] = {"energyscape": ".energy.h5", "acoustic_map": ".acoustic.h5"}
-"""Ends of the names of result files, which replace ``.h5`` of the recording."""
+"""Suffixes of result files, which replace ``.h5`` of the recording."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ def known_sensors(recordings: Iterable[RecordingFile]) -> set[str]:
 
 
 def output_paths(recordings: Sequence[RecordingFile], folder: Path, kind: ResultKind = "energyscape") -> list[Path]:
-    """Return the energyscape file in ``folder`` for each recording; see `map_path` for those without images."""
+    """Return the result file in ``folder`` for each recording."""
     if folder.exists() and not folder.is_dir():
         raise ArgumentError(f"output {folder} is a file, but several recordings need a folder; choose another name")
     if not folder.parent.is_dir():

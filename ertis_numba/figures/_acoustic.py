@@ -180,19 +180,17 @@ def _loudest_text(canvas: Canvas, shown: AcousticMap) -> str:
     """Return the direction and the level of the loudest source in words; of the grid, if no sources were searched."""
     if shown.is_silent[0]:
         return "silence: all values are 0"
+    if shown.has_bearings and not shown.bearings:
+        return "no source found"
     if shown.bearings:
         loudest = max(shown.bearings, key=lambda each: each.level_dbfs)
         level_db, unit = loudest.level
         doubt = "".join(f", may be {name}" for name in loudest.doubts)
-        text = f"loudest source at {_towards(loudest)}: {minus(f'{level_db:.1f}')} {unit}{doubt}"
-    elif shown.has_bearings:
-        return "no source that noise does not explain"
-    else:
-        place = int(shown.power.argmax())
-        level = f": {minus(f'{10 * math.log10(shown.power[place, 0]):.1f}')} {canvas.unit}" if shown.has_level else ""
-        azimuth_deg, elevation_deg = float(shown.azimuth_deg[place]), float(shown.elevation_deg[place])
-        text = f"loudest direction: azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}{level}"
-    return text
+        return f"loudest source at {_towards(loudest)}: {minus(f'{level_db:.1f}')} {unit}{doubt}"
+    place = int(shown.power.argmax())
+    level = f": {minus(f'{10 * math.log10(shown.power[place, 0]):.1f}')} {canvas.unit}" if shown.has_level else ""
+    azimuth_deg, elevation_deg = float(shown.azimuth_deg[place]), float(shown.elevation_deg[place])
+    return f"loudest direction: azimuth {angle(azimuth_deg)}, elevation {angle(elevation_deg)}{level}"
 
 
 def _towards(bearing: Bearing) -> str:

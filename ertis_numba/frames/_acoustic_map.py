@@ -214,8 +214,8 @@ class AcousticMap(DegreesFromRadians):
     def loudest(self) -> list[SoundDirection]:
         """Return the loudest direction of the grid in each band; none in bands of silence.
 
-        It may be noise or a side lobe, and a source may lie between the directions of the grid, with a higher level:
-        ``bearings`` has the sources, and `find_sound_sources` interpolates.
+        It may be noise or a side lobe: ``bearings`` has the sources. A source may also lie between the directions of
+        the grid, with a higher level: `find_sound_sources` interpolates.
 
         Returns
         -------

@@ -42,9 +42,9 @@ class Bearing(RadiansFromDegrees):
         a source straight ahead of a flat array. No sound is equal in all channels of an array that is not flat. False
         by default.
     may_be_interference : bool
-        A tone with random phases at the microphones, as of interference in the electronics, would fit a direction as
-        well by chance, more often than the requested false alarms. Arrays of up to about six microphones cannot tell
-        such tones from sources. False by default.
+        The source may be interference of the electronics: a tone with random phases at the microphones would fit a
+        direction as well with more than the requested probability of a false alarm. Arrays of up to about six
+        microphones cannot tell such tones from sources. False by default.
 
     Examples
     --------

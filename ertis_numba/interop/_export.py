@@ -75,7 +75,7 @@ def export(
         Mounting of each sensor on its platform, by name, as for `RecordingWriter`. Points of ``ply``, ``pcd`` and
         ``csv`` are then in the platform frame, otherwise in the sensor frame. ``batslam`` contains the
         poses of the sensor, not of the platform.
-    topics : collection of {"points", "image", "sonar_image"}, optional
+    topics : collection of {"points", "scan", "image", "sonar_image"}, optional
         Topics of each sensor in ``mcap``; all by default.
     top : int, optional
         Maximum number of points per image; the strongest 256 by default.
@@ -124,7 +124,7 @@ def export(
     try:
         with ExitStack() as stack:
             parts = [stack.enter_context(atomic_write(each, overwrite=overwrite)) for each in paths]
-            match FORMATS[name].takes:
+            match FORMATS[name].content:
                 case "signals":
                     _write_signals(name, parts, items)
                 case "results":
@@ -184,7 +184,7 @@ def _write_points(
     from ertis_numba.interop._points import PointTable  # noqa: PLC0415
 
     find, write = PointFinder(**finding), FORMATS[name].load()
-    if FORMATS[name].takes == "topics":
+    if FORMATS[name].content == "topics":
         write(path, images, find, mountings, topics=topics)
         return
     table = PointTable.from_images(images, find, mountings)

@@ -22,7 +22,7 @@ class ExportFormat:
     """Export format."""
 
     suffix: str
-    takes: Literal["points", "topics", "results", "signals", "drive", "poses", "sound"]
+    content: Literal["points", "topics", "results", "signals", "drive", "poses", "sound"]
     writer: str  # module and function, imported when they are needed: some need an extra
     fields: tuple[str, ...] = ()
     options: tuple[str, ...] = ("places",)  # that do not apply to all formats
@@ -41,28 +41,28 @@ EXPORT_FORMATS: Final[Mapping[str, ExportFormat]] = MappingProxyType(
     {
         "mcap": ExportFormat(
             suffix=".mcap",
-            takes="topics",
+            content="topics",
             writer="ertis_numba.interop._mcap:write_mcap",
             fields=(*TOPICS, "tf_static"),
             options=(*_POINT_OPTIONS, "topics"),
         ),
         "ply": ExportFormat(
             suffix=".ply",
-            takes="points",
+            content="points",
             writer=f"{_FILES}:write_ply",
             fields=_POINTS,
             options=(*_POINT_OPTIONS, "text"),
         ),
         "pcd": ExportFormat(
             suffix=".pcd",
-            takes="points",
+            content="points",
             writer=f"{_FILES}:write_pcd",
             fields=_POINTS,
             options=(*_POINT_OPTIONS, "text"),
         ),
         "csv": ExportFormat(
             suffix=".csv",
-            takes="points",
+            content="points",
             writer=f"{_FILES}:write_csv",
             fields=(
                 *("sensor", "session_id", "sequence", "sync_count", "timestamp_ns"),
@@ -72,7 +72,7 @@ EXPORT_FORMATS: Final[Mapping[str, ExportFormat]] = MappingProxyType(
         ),
         "npz": ExportFormat(
             suffix=".npz",
-            takes="results",
+            content="results",
             writer="ertis_numba.interop._npz:write_npz",
             fields=(
                 *("amplitude", "azimuth_rad", "elevation_rad", "range_m"),
@@ -82,14 +82,14 @@ EXPORT_FORMATS: Final[Mapping[str, ExportFormat]] = MappingProxyType(
         ),
         "acoular": ExportFormat(
             suffix=".h5",
-            takes="signals",
+            content="signals",
             writer="ertis_numba.interop._acoular:write_acoular",
             fields=("time_data", "metadata"),
             about="and .xml for Acoular",
         ),
         "batslam": ExportFormat(
             suffix=".mat",
-            takes="drive",
+            content="drive",
             writer="ertis_numba.interop._batslam:write_batslam",
             fields=(
                 *("gt_pose", "gt_delta", "odom_delta", "t", "lap"),
@@ -100,14 +100,14 @@ EXPORT_FORMATS: Final[Mapping[str, ExportFormat]] = MappingProxyType(
         ),
         "tum": ExportFormat(
             suffix=".tum",
-            takes="poses",
+            content="poses",
             writer="ertis_numba.interop.trajectory_files:write_tum",
             options=(),
             about="for poses",
         ),
         "wav": ExportFormat(
             suffix=".wav",
-            takes="sound",
+            content="sound",
             writer="ertis_numba.base.wav:wav_bytes",
             options=("places", "direction", "heterodyne_hz", "expansion", "with_silence"),
             about="for sound",
@@ -116,5 +116,5 @@ EXPORT_FORMATS: Final[Mapping[str, ExportFormat]] = MappingProxyType(
 )
 """Formats by name; the how-to guide on exports states the content of each."""
 
-FORMATS: Final = {name: each for name, each in EXPORT_FORMATS.items() if each.takes not in {"poses", "sound"}}
+FORMATS: Final = {name: each for name, each in EXPORT_FORMATS.items() if each.content not in {"poses", "sound"}}
 """Formats of `export`."""

@@ -32,7 +32,8 @@ class AcousticMapSubscriber(ResultSubscriber[Measurement, AcousticMap]):
     changes : mapping of str to value, optional
         Changes of the settings of each sensor, such as ``{"passive.averages": 10, "processing.directions": "3000"}``.
     false_alarm : float, optional
-        Find bearings with each map, with this probability that noise alone yields any; none by default.
+        Probability that noise alone yields any bearing. If given, bearings are found with each map; none are searched
+        by default.
     device : {"auto", "cpu", "cuda", "numpy"}
     threads : int, optional
         Number of threads; all cores by default.

@@ -45,8 +45,8 @@ class BearingFinder:
         contain all directions that the array can tell apart, those of `search_changes` are searched instead. The method
         of its maps has no influence.
     false_alarm : float
-        Probability that noise alone yields any bearing, 1e-9 to 0.5; 0.001 by default. Tones with
-        phases at random, as of electronics, resemble a wave at twelve microphones or fewer; these are marked. See
+        Probability that noise alone yields any bearing, 1e-9 to 0.5; 0.001 by default. At twelve microphones or fewer,
+        tones with random phases, as of electronics, may also yield bearings, which are then marked: see
         `Bearing.may_be_interference`.
     top : int
         Largest number of bearings in a band; 8 by default.
@@ -57,7 +57,8 @@ class BearingFinder:
     Attributes
     ----------
     warning : str or None
-        Warning that the searched directions are too far apart, because no grid suffices for the array; else None.
+        Warning that bearings may be wrong, because no grid or no length of blocks suffices for the array, or because
+        it cannot tell directions apart; None without these.
     direction_note : str or None
         Note on sound that bearings cannot locate, such as sound from behind a flat array, as a predicate of the sensor:
         `ertis_numba.geometry.direction_note`.
@@ -91,10 +92,8 @@ class BearingFinder:
         self.direction_note = direction_note(settings.array, grid, is_passive=True)
         directions = unit_vectors(grid.azimuth_rad, grid.elevation_rad)
         reach_rad = _REACH * min(spacing_rad(directions), _MAX_SPACING_RAD)
-        delays, waves = (
-            WaveDelays(settings),
-            camera.waves if settings is camera.settings else camera.waves_of(directions),
-        )
+        delays = WaveDelays(settings)
+        waves = camera.waves if settings is camera.settings else camera.waves_of(directions)
         scan = Scan(directions, ScanMesh(directions, delays(directions)), reach_rad, is_level(directions))
         self._bins: list[NDArray[np.intp]] = []
         self._searches: list[BandSearch] = []

@@ -57,8 +57,8 @@ class AcousticCamera:
         Issue a `CoarseGridWarning` if ``warning`` is not None, and an `OutsideBandsWarning`, once, if ``band_note`` is
         not None when a map is made.
     false_alarm : float, optional
-        Find the bearings of sources with each map, with this probability that noise alone yields any, as for
-        `BearingFinder`; none by default.
+        Probability that noise alone yields any bearing, as for `BearingFinder`. If given, the bearings of sources are
+        found with each map; none are searched by default.
 
     Attributes
     ----------

@@ -70,9 +70,9 @@ def find_sound_sources(
 ) -> list[SoundDirection]:
     """Return the sources of sound in an acoustic map, band by band, strongest first.
 
-    A map shows no uncertainty, so that its sources may be noise, or side lobes where arrays are sparse.
-    ``AcousticMap.bearings`` has the sources that noise does not explain, with standard deviations, if the camera
-    searched them; `ertis peaks` lists these.
+    A map shows no uncertainty, so that its sources may be noise, or side lobes where arrays are sparse. If the
+    camera searched for bearings, ``AcousticMap.bearings`` has the sources that are neither, with standard deviations;
+    `ertis peaks` lists these.
 
     Maps of CLEAN-SC and HR-CLEAN-SC hold the powers of sources, each at a direction of the grid. Direction and level
     are those of the map: the level is the sum of the components of all bins in this direction and its neighbours.

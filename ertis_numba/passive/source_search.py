@@ -78,7 +78,7 @@ class BandSearch:
         self._laws: dict[int, tuple[ScanExtent, NDArray[np.float64]]] = {}
 
     def __call__(self, heard: CrossSpectrum, *, false_alarm: float, top: int, least: float) -> list[FoundSource]:
-        """Return up to ``top`` sources that noise does not explain, at least ``least`` times the strongest.
+        """Return up to ``top`` sources above noise, whose powers are at least ``least`` times the strongest.
 
         Noise alone yields a source with the probability ``false_alarm``.
         """

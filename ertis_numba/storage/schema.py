@@ -197,7 +197,7 @@ ACOUSTIC_MAP: Final = (
 """Variables of acoustic maps; the stamp of a map is that of its last measurement."""
 
 BEARINGS: Final = (
-    Variable("bearing_count", ("time",), "<u4", "number of sources that noise does not explain", optional=True),
+    Variable("bearing_count", ("time",), "<u4", "number of sources that were found", optional=True),
     Variable("bearing_direction", ("bearing", "angle"), "<f8", "azimuth and elevation", "degree", optional=True),
     Variable(
         "bearing_uncertainty",

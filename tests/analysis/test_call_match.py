@@ -277,7 +277,7 @@ def test_process_notes_the_call_of_another_sensor(tmp_path):
     path = write_recording(tmp_path / "two.h5", [replace(own, data=own.data + foreign.data)])
     done = CliRunner().invoke(cli, ["process", str(path)])
     assert done.exit_code == 0, (done.stderr, done.exception)
-    assert "beside the call of the settings, the record contains a linear sweep from about 4" in done.stderr
+    assert "besides the call of the settings, the record contains a linear sweep from about 4" in done.stderr
     done = CliRunner().invoke(cli, ["peaks", str(tmp_path / "two.energy.h5")])
-    assert "note: sensor sensor: beside the call of the settings" in done.stderr, done.stderr
+    assert "note: sensor sensor: besides the call of the settings" in done.stderr, done.stderr
     assert "perhaps of another sensor" in CliRunner().invoke(cli, ["sensors", "check", str(path)]).stdout
