@@ -14,9 +14,9 @@ from ertis_numba.analysis.quadric_fits import MAX_RISE_DB, QuadricFits
 from ertis_numba.frames import Energyscape
 from ertis_numba.settings import Settings
 
-__all__ = ["MODEL", "PeakInterpolator", "Tops", "listed"]
+__all__ = ["PeakInterpolator", "Tops", "listed"]
 
-MODEL = 3e-4  # Least error of a predicted sample, relative to the amplitude.
+_MODEL = 3e-4  # Least error of a predicted sample, relative to the amplitude.
 _EDGE_OF_LOBE = 0.5  # Amplitude relative to the maximum, below which a sample is not part of the main lobe.
 _NOISE = 10 ** (0.5 / 20)  # Noise may raise a maximum above a main lobe through its strongest sample.
 _NARROWER = 3.0  # The main lobe of adaptive beamformers in decibels, relative to that of delay-and-sum, is at most so.
@@ -72,7 +72,7 @@ class PeakInterpolator:
         self._spread = PointSpread(settings)
         is_predicted = settings.processing.method == "fast" and not settings.processing.is_adaptive
         self._echoes = EchoFits(settings, directions, self._spread) if is_predicted else None
-        self._model = math.hypot(MODEL, plan_error(settings)) if is_predicted else 0.0
+        self._model = math.hypot(_MODEL, plan_error(settings)) if is_predicted else 0.0
 
     def __call__(
         self, image: Energyscape, directions: NDArray[np.int64], ranges: NDArray[np.int64], *, noise: float

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.peak_interpolation import MODEL, Tops
+from ertis_numba.analysis.peak_interpolation import Tops
 from ertis_numba.analysis.plan_errors import plan_error
 from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.frames import Energyscape
@@ -22,8 +22,8 @@ _WAVES = 64  # Number of frequencies of the call's band from which its widths ar
 _CLOSE_M, _CLOSE_RAD = 0.7, 1.7
 _CLOSE_NP = 0.25  # Error of its level.
 _SEEN = 0.45  # Misfit that other points cause, relative to their amplitude at the maximum.
-# Bias of the range in widths of the pulse, relative to the error of the plan: it is alike in all bins.
-_BIAS = 4.0
+# Bias of the range in widths of the pulse, relative to the error of the plan: it is alike in all bins. Measured.
+_BIAS, _BIAS_OF_ONE_TAP, _BIAS_OF_FOUR_BEAM_TAPS = 2.0, 1.0, 9.0
 _HALF = math.sqrt(0.5)  # Half of the power of a disturbance changes the amplitude, half the phase.
 _FLAT = 1e-12  # Relative variance of an array below which its extent counts as zero.
 _UNIFORM = 0.34  # A uniform distribution has 68 % of its values within this share of its width around the middle.
@@ -77,7 +77,8 @@ class PositionUncertainty:
         self._width_hz = math.sqrt(mean_square - float(power @ frequency_hz) ** 2)
         self._frequency_hz = math.sqrt(mean_square)
         self._spread, self._plan = PointSpread(settings), 0.0 if noise_only else plan_error(settings)
-        self._bias = math.hypot(MODEL, self._plan) * (1.0 if settings.accuracy.delay_taps == 1 else _BIAS)
+        bias = _BIAS_OF_ONE_TAP if settings.accuracy.delay_taps == 1 else _BIAS
+        self._bias = self._plan * (_BIAS_OF_FOUR_BEAM_TAPS if settings.accuracy.beam_taps == 4 else bias)
         self._covariance_m2 = _effective_covariance_m2(positions_m, array_weights(settings))
 
     def __call__(self, image: Energyscape, tops: Tops, *, noise: float) -> Uncertainty:

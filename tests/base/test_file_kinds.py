@@ -294,7 +294,7 @@ def test_no_command_overwrites_one_of_its_inputs(tmp_path, monkeypatch, command)
 
 
 WANTED = {
-    "peaks": f"{IMAGES} or a file of acoustic maps ('ertis process' writes them)",
+    "peaks": f"{IMAGES} or a file of acoustic maps ('ertis process' and 'ertis acoustic' write them)",
     "compare": IMAGES,
     "map -o map.h5": "choose a recording, or save its signals as WAV",
     "odometry": "choose a recording, or save its signals as WAV",
