@@ -180,7 +180,7 @@ def stopped_by_signals() -> Iterator[Signals]:
 
 @contextmanager
 def broken_off_by_signals() -> Iterator[None]:
-    """Let signals interrupt the block for its cleanup, even if ignored, as by shells for background jobs."""
+    """Let signals interrupt the block, so that it cleans up, even signals that shells ignore for background jobs."""
     with _handled_by(interruption):
         yield
 

@@ -77,7 +77,7 @@ class Lobe(NamedTuple):
 
 
 class GridCheck:
-    """Sources between the directions of a grid, named by ``processing``, for lobes of one array."""
+    """Check of sources between the directions of a grid, which ``processing`` names, for lobes of one array."""
 
     def __init__(
         self, grid: DegreesFromRadians, processing: Processing, *, side_lobes: dict[Response, float] | None = None

@@ -37,7 +37,7 @@ class QuadricFits:
 
     A plane needs neighbours all around. Otherwise, as at the edge of a grid, a parabola through two opposite neighbours
     remains, and no fit at all if there are none, as in a corner. ``width_rad`` (direction,) is the distance of the
-    nearest other direction, infinite for none; the cell of a direction ends half-way to each of the others in ``grid``.
+    nearest other direction, infinite for none. The cell of a direction ends half-way to each of the others in ``grid``.
     """
 
     quadrics: kernels.Quadrics

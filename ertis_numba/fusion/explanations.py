@@ -264,7 +264,7 @@ class Search:
 
 
 def _is_apart(place_m: Floats, covariance_m2: Floats, found: list[LocatedReflector]) -> bool:
-    """Return True if no reflector is at a place, where another echo would be a shoulder of a main lobe or overlap."""
+    """Return True if no reflector is near a place; an echo there would be a shoulder of a main lobe, or an overlap."""
     if not found:
         return True
     offset_m = place_m - np.array([each.place_m for each in found])

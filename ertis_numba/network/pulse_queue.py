@@ -77,7 +77,7 @@ class PulseQueue(Generic[Pulse]):
 
     @contextmanager
     def keeping(self) -> Iterator[None]:
-        """Keep all pulses, up to 64 MB of images, until the application caught up within twice the block's time."""
+        """Keep all pulses, up to 64 MB of images, during the block and for up to twice its time afterwards."""
         begun_s = time.monotonic()
         self._kept_until_s = math.inf
         try:
