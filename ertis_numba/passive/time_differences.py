@@ -29,8 +29,11 @@ _MANY_BY_CHANCE: Final = 0.01  # Probability that so many frequencies look coher
 # Approximate power that leaks, by distance in frequencies.
 _LEAKED_SHARES: Final = (0.5, 0.1, *(1e-3 * (3 / apart) ** 6 for apart in range(3, 13)))
 _N_STEPS: Final = 4
-_WIDENED: Final = 3.0
 _MAX_COHERENCE: Final = 1 - 1e-9
+_FALSE_SHARE: Final = 5e-4  # Share of frequencies by chance among the coherent ones.
+_ALONE: Final = 0.01  # Probability by chance of coherent neighbours.
+_CERTAIN: Final = 120.0  # Squared lead of a maximum, relative to the noise, that leaves no doubt.
+_BEYOND: Final = 0.004  # Probability of delays beyond four uncertainties.
 _INDEPENDENT: Final = 0.947  # Share of independent blocks: neighbours have a correlation of 1/6 under Hann windows.
 
 
@@ -68,17 +71,20 @@ def time_differences(
 ) -> list[TimeDifference]:
     """Return the time difference of arrival of each pair of microphones, by generalised cross-correlation.
 
-    The cross-spectrum G of two signals is averaged over blocks under Hann windows that overlap by half. The correlation
-    of ``G / |G|`` (``phat``), ``G / √(G₁₁ G₂₂)`` (``scot``) or G (``none``) has its largest maximum at the delay (C.
-    Knapp and G. Carter, The generalized correlation method for estimation of time delay, 1976). Frequencies without
-    coherence, and those whose sound may be that of neighbours under the window, are left out. Blocks of the later
-    signal are taken later by the delay in whole samples.
+    The cross-spectrum G of two signals is averaged over blocks under Hann windows that overlap by half. It yields the
+    weights of frequencies: ``1 / |G|`` (``phat``), ``1 / √(G₁₁ G₂₂)`` (``scot``) or 1 (``none``). The correlation of
+    the whole signals under these weights has its largest maximum at the delay (C. Knapp and G. Carter, The generalized
+    correlation method for estimation of time delay, 1976). Frequencies without coherence, and those whose sound may be
+    that of neighbours under the window, are left out. The later signal is taken later by the delay in whole samples.
 
     The uncertainty is that of the same work for the weighting W: ``∫ W² ω² G₁₁ G₂₂ (1 − γ²) df / 2 T (∫ W ω² |G| df)²``
-    is the variance for the time T and the measured coherence γ², corrected for its bias. Each further maximum at a
-    delay Δ from the first one adds ``p Δ²`` for its probability p to be the right one. In weak or narrow-band sound,
-    the uncertainty is therefore about that of whole periods. Sound of a steep spectrum, such as 1/f² at 40 dB above
-    the noise, needs ``phat`` or ``scot``: unweighted, its errors may exceed the uncertainty.
+    is the variance for the time T and the coherence γ² as measured in blocks, corrected for its bias. Each further
+    maximum at a delay Δ from the first one adds ``p Δ²`` for its probability p to be the right one. Four uncertainties
+    reach all maxima but those whose probability sums up to 0.4 %. In weak or narrow-band sound, the uncertainty is
+    therefore about that of whole periods. One source without echoes is assumed: where the correlations of several
+    sources, or of a source and its echo, overlap, the delay is that of their sum, and its error may exceed the
+    uncertainty. Sound of a steep spectrum, such as 1/f² at 40 dB above the noise, needs ``phat`` or ``scot``:
+    unweighted, its errors may exceed the uncertainty.
 
     Parameters
     ----------
@@ -198,7 +204,6 @@ class _Correlator:
                 f"band_hz {band_hz[0]:g} to {band_hz[1]:g} contains none of the frequencies {frequency_hz[1]:g} "
                 "Hz apart; use a wider band, or a smaller resolution_hz"
             )
-        self._omega = 2 * np.pi * np.asarray(frequency_hz, np.float64)
         largest = np.abs(signals.rows).max()  # Powers of very large or small sound exceed single precision.
         signals = signals._replace(rows=signals.rows / (largest if largest > 0 else np.float32(1)))
         self._signals, self._n_block, self._weighting = signals, n_block, weighting
@@ -219,97 +224,133 @@ class _Correlator:
             most_s = float(np.linalg.norm(signals.positions_s[second] - signals.positions_s[first])) + 1 / rate_hz
         limit_s = self._n_block / rate_hz / 2
         most_s = limit_s if most_s is None else min(most_s, limit_s)
-        rough = self._cross(self._spectra[first], self._spectra[second], 0.0, own_s)
-        n_late = round((rough.delay_s(most_s) + own_s) * rate_hz)
-        if n_late == 0:
-            return rough.result(first, second, most_s)
-        # Blocks of the same sound have no error of windows that cut it at different times.
-        late = signals.rows[second][max(n_late, 0) :], signals.rows[first][max(-n_late, 0) :]
-        n_common = min(each.size for each in late)
-        if n_common < 4 * self._n_block:
-            return rough.result(first, second, most_s)
-        spectra = [self._spectra_of(each[:n_common]) for each in late]
-        return self._cross(spectra[1], spectra[0], n_late / rate_hz, own_s).result(first, second, most_s)
+        rows = signals.rows[first], signals.rows[second]
+        bins = self._bins(self._spectra[first], self._spectra[second])
+        found = _Correlation(*rows, bins, -own_s, rate_hz)
+        n_late = round((found.delay_s(most_s) + own_s) * rate_hz)
+        n_common = rows[0].size - abs(n_late)
+        if n_late != 0 and n_common >= 4 * self._n_block:
+            # Blocks of the same sound have no error of windows that cut it at different times.
+            rows = rows[0][max(-n_late, 0) :][:n_common], rows[1][max(n_late, 0) :][:n_common]
+            bins = self._bins(*(self._spectra_of(each) for each in rows))
+            found = _Correlation(*rows, bins, n_late / rate_hz - own_s, rate_hz)
+        return found.result(first, second, most_s)
 
-    def _cross(
-        self, first: NDArray[np.complex64], second: NDArray[np.complex64], late_s: float, own_s: float
-    ) -> "_CrossSpectrum":
-        """Return the cross-spectrum of blocks, the second of which are late by a time."""
+    def _bins(self, first: NDArray[np.complex64], second: NDArray[np.complex64]) -> "_Bins":
+        """Return the cross-spectrum of blocks, and the weights of frequencies."""
         cross = (second * first.conj()).mean(axis=0, dtype=np.complex128)
+        size = np.abs(cross)
         power: list[NDArray[np.float64]] = [
             (np.abs(each) ** 2).mean(axis=0, dtype=np.float64) for each in (first, second)
         ]
-        return _CrossSpectrum(
-            cross * np.exp(-1j * self._omega * (late_s - own_s)),
-            np.sqrt(power[0] * power[1]),
-            self._omega,
-            self._chosen,
-            len(first),
-            self._weighting,
+        scale = np.maximum(np.sqrt(power[0] * power[1]), _TINY)
+        n_blocks = _INDEPENDENT * len(first)
+        coherence = np.minimum((size / scale) ** 2, _MAX_COHERENCE)
+        n_free = max(n_blocks - 1, _TINY)
+        candidates = self._chosen & (size > _leaked(size))
+        chance_of_any = (1 - coherence) ** n_free
+        chance = np.where(candidates, chance_of_any, 1.0)
+        n_chosen = float(self._chosen.sum())
+        n_found = int((chance < _BY_CHANCE).sum())
+        is_coherent = bool(
+            scipy.stats.poisson.sf(n_found - 1, _BY_CHANCE * n_chosen) < _MANY_BY_CHANCE
+            or chance.min() < _BY_CHANCE / n_chosen
         )
+        # As many as leave few among them by chance (Y. Benjamini and Y. Hochberg, 1995).
+        ordered = np.sort(chance)
+        allowed = ordered[ordered <= _FALSE_SHARE * np.arange(1, ordered.size + 1) / n_chosen]
+        limit = min(float(allowed[-1]), _BY_CHANCE) if allowed.size else _BY_CHANCE
+        # Under the window, sound of one frequency is in its neighbours too, chance is not.
+        padded = np.pad(chance_of_any, 1, constant_values=1.0)
+        is_alone = np.minimum(padded[:-2], padded[2:]) > _ALONE
+        coherent = chance <= np.where(is_alone, _ALONE * limit, limit)
+        coherent = coherent if coherent.any() else chance <= limit
+        divisor = np.maximum({"phat": size, "scot": scale, "none": np.ones_like(scale)}[self._weighting], _TINY)
+        weights = np.where(coherent if is_coherent else self._chosen, 1 / divisor, 0.0)
+        most = n_chosen if self._weighting == "phat" else float((scale / divisor)[self._chosen].sum())
+        # The mean of γ² / (1 - γ²) as measured in n blocks is (1 + n γ² / (1 - γ²)) / (n - 2).
+        measured = coherence / (1 - coherence)
+        ratio = np.maximum(((n_blocks - 2) * measured - 1) / n_blocks, 0.0)
+        # A coherence that noise may reach by chance does not tell which of several maxima is right.
+        by_chance = 1 - _BY_CHANCE ** (1 / n_free)
+        evidence = np.maximum(1 - by_chance / np.maximum(coherence, _TINY), 0.0)
+        return _Bins(self._n_block, cross, weights, most, ratio / (1 + ratio), evidence, is_coherent and n_blocks > 2)
 
 
-class _CrossSpectrum:
-    """Cross-spectrum of two signals, weighted at the frequencies where they are coherent."""
+class _Bins(NamedTuple):
+    """Cross-spectrum of blocks, weights of frequencies, and the correlation of equal signals under them."""
+
+    n_block: int
+    cross: NDArray[np.complex128]
+    weights: NDArray[np.float64]
+    most: float
+    coherence: NDArray[np.float64]
+    evidence: NDArray[np.float64]
+    is_coherent: bool
+
+
+class _Correlation:
+    """Generalised cross-correlation of two signals, the second of which is late by a time."""
 
     def __init__(
-        self,
-        cross: NDArray[np.complex128],
-        scale: NDArray[np.float64],
-        omega: NDArray[np.float64],
-        chosen: NDArray[np.bool_],
-        n_blocks: int,
-        weighting: Weighting,
+        self, first: NDArray[np.float32], second: NDArray[np.float32], bins: _Bins, late_s: float, rate_hz: float
     ) -> None:
-        self._n_blocks, self._omega = _INDEPENDENT * n_blocks, omega
-        self._n_fine = _FINER * 2 * (omega.size - 1)
-        size, scale = np.abs(cross), np.maximum(scale, _TINY)
-        coherence = np.minimum((size / scale) ** 2, _MAX_COHERENCE)
-        coherent = chosen & (size > _leaked(size)) & (coherence > self._by_chance(_BY_CHANCE))
-        n_chosen = float(chosen.sum())
-        self._is_coherent = bool(
-            scipy.stats.poisson.sf(coherent.sum() - 1, _BY_CHANCE * n_chosen) < _MANY_BY_CHANCE
-            or (coherence[coherent] > self._by_chance(_BY_CHANCE / n_chosen)).any()
+        n = first.size
+        self._bins, self._late_s, self._rate_hz, self._n = bins, late_s, rate_hz, n
+        # Ends fade, so that a shift does not wrap them around.
+        window = scipy.signal.get_window(("tukey", bins.n_block / n), n)
+        squares = float((window**2).sum())
+        frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
+        grid_hz = np.arange(bins.weights.size) * rate_hz / bins.n_block
+        weights = np.interp(frequency_hz, grid_hz, bins.weights)
+        weights *= bins.n_block / n * float((scipy.signal.get_window("hann", bins.n_block) ** 2).sum()) / squares
+        spectra = [scipy.fft.rfft(each * window.astype(np.float32)) for each in (first, second)]
+        self._spectrum = spectra[1] * spectra[0].conj() * weights
+        used = np.flatnonzero(weights)
+        self._weighted, self._omega = self._spectrum[used].astype(np.complex128), 2 * np.pi * frequency_hz[used]
+        self._coherence, self._evidence = (
+            np.interp(frequency_hz[used], grid_hz, each) for each in (bins.coherence, bins.evidence)
         )
-        used = coherent if self._is_coherent else chosen
-        divisor = np.maximum({"phat": size, "scot": scale, "none": np.ones_like(scale)}[weighting], _TINY)
-        self._weighted = np.where(used, cross / divisor, 0)
-        self._most = n_chosen if weighting == "phat" else float((scale / divisor)[chosen].sum())
-        # The mean of γ² / (1 − γ²) as measured in n blocks is (1 + n γ² / (1 − γ²)) / (n − 2).
-        ratio = ((self._n_blocks - 2) * coherence / (1 - coherence) - 1) / self._n_blocks
-        # A coherence that noise may reach by chance does not tell which of several maxima is right.
-        chance = self._by_chance(_BY_CHANCE) / np.maximum(coherence, _TINY)
-        self._evidence = np.abs(self._weighted) * np.maximum(1 - chance, 0)
-        # Variance of a component of the weighted spectrum; doubled, as windows correlate it with its neighbours.
-        self._noise = np.where(used, np.abs(self._weighted) ** 2 / np.maximum(ratio, _TINY), 0.0) / self._n_blocks
+        # The window correlates neighbouring frequencies.
+        self._correlated = n * float((window**4).sum()) / squares**2
 
-    def _by_chance(self, probability: float) -> float:
-        """Return the coherence that noise exceeds with a probability: (1 − γ²)^(n − 1) for n blocks."""
-        return 1 - probability ** (1 / (self._n_blocks - 1)) if self._n_blocks > 1 else 1.0
+    def _at(self, apart_s: float) -> NDArray[np.complex128]:
+        """Return the weighted spectrum without a delay relative to the late one."""
+        turned: NDArray[np.complex128] = self._weighted * np.exp(1j * self._omega * apart_s)
+        return turned
 
-    def _correlation(self, delay_s: float) -> float:
-        """Return the correlation at a delay."""
-        return float((self._weighted * np.exp(1j * self._omega * delay_s)).real.sum())
-
-    def _maxima_s(self, most_s: float) -> NDArray[np.float64]:
-        """Return the delays of the maxima up to a largest delay, to a fraction of a sample, the largest first."""
-        step_s = 2 * np.pi / (self._omega[1] * self._n_fine)
-        reach = min(int(most_s / step_s), self._n_fine // 2 - 1)
-        lags = np.arange(-reach, reach + 1)
-        values = (scipy.fft.irfft(self._weighted, self._n_fine) * self._n_fine / 2)[lags]
+    def _maxima_s(self, most_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the delays of maxima up to a largest delay, to a fraction of a sample, and the values there."""
+        step_s = 1 / (_FINER * self._rate_hz)
+        lags = np.arange(math.ceil((-most_s - self._late_s) / step_s), int((most_s - self._late_s) // step_s) + 1)
+        lags = lags if lags.size else np.array([round(-self._late_s / step_s)])
+        values = scipy.fft.irfft(self._spectrum, self._n)
+        n_near = 8 * self._bins.n_block  # Only small delays are needed at the finer step.
+        if n_near < self._n:
+            fade = np.fft.ifftshift(scipy.signal.get_window("tukey", n_near, fftbins=False))
+            values = values[np.fft.ifftshift(np.arange(n_near) - n_near // 2) % self._n] * fade
+        n_fine = _FINER * values.size
+        values = (scipy.fft.irfft(scipy.fft.rfft(values), n_fine) * _FINER * self._n / 2)[lags % n_fine]
         beside = np.pad(values, 1, constant_values=-np.inf)
         tops = np.flatnonzero((values >= beside[:-2]) & (values >= beside[2:]))
-        found_s: NDArray[np.float64] = lags[tops[np.argsort(-values[tops], kind="stable")]] * step_s
-        return found_s
+        # A parabola through three samples has its top between them; a sample may miss several thousandths of it.
+        before, top, after = beside[tops], values[tops], beside[tops + 2]
+        inside = np.isfinite(before) & np.isfinite(after) & (before + after < 2 * top)
+        before, after = np.where(inside, before, top - 1), np.where(inside, after, top - 1)
+        slope = after - before
+        shift = slope / (2 * (2 * top - before - after))
+        tallest = top + slope * shift / 4
+        order = np.argsort(-tallest, kind="stable")
+        return ((lags[tops] + shift) * step_s + self._late_s)[order], tallest[order]
 
     def delay_s(self, most_s: float) -> float:
         """Return the delay of the largest maximum."""
-        return self._refined_s(float(self._maxima_s(most_s)[0]), most_s)
+        return self._refined_s(float(self._maxima_s(most_s)[0][0]), most_s)
 
     def _refined_s(self, delay_s: float, most_s: float) -> float:
         """Return the maximum next to a delay by Newton's method, within the limits."""
         for _ in range(_N_STEPS):
-            turned = self._weighted * np.exp(1j * self._omega * delay_s)
+            turned = self._at(delay_s - self._late_s)
             curvature = float((self._omega**2 * turned.real).sum())
             if curvature <= 0:
                 break
@@ -318,33 +359,52 @@ class _CrossSpectrum:
 
     def result(self, first: int, second: int, most_s: float) -> TimeDifference:
         """Return the time difference up to a largest one, and its uncertainty."""
-        maxima_s = self._maxima_s(most_s)
+        maxima_s, values = self._maxima_s(most_s)
         found_s = self._refined_s(float(maxima_s[0]), most_s)
-        here = self._correlation(found_s)
-        uncertainty_s = self._uncertainty_s(found_s, here, maxima_s[1:]) if abs(found_s) < most_s else math.inf
-        return TimeDifference(first, second, found_s, uncertainty_s, here / max(self._most, _TINY))
+        turned = self._at(found_s - self._late_s)
+        uncertainty_s = math.inf
+        if self._bins.is_coherent and abs(found_s) < most_s:
+            uncertainty_s = self._uncertainty_s(found_s, turned, maxima_s[1:], values[1:])
+        omega = 2 * np.pi * np.arange(self._bins.weights.size) * self._rate_hz / self._bins.n_block
+        turned_bins = self._bins.weights * self._bins.cross * np.exp(1j * omega * (found_s - self._late_s))
+        height = float(turned_bins.real.sum())
+        return TimeDifference(first, second, found_s, uncertainty_s, height / max(self._bins.most, _TINY))
 
-    def _uncertainty_s(self, found_s: float, here: float, others_s: NDArray[np.float64]) -> float:
+    def _uncertainty_s(
+        self,
+        found_s: float,
+        turned: NDArray[np.complex128],
+        others_s: NDArray[np.float64],
+        values: NDArray[np.float64],
+    ) -> float:
         """Return the uncertainty of a maximum beside others."""
-        if not self._is_coherent or self._n_blocks <= 2:
-            return math.inf
-        turned = self._weighted * np.exp(1j * self._omega * found_s)
         curvature = float((self._omega**2 * turned.real).sum())
         if curvature <= 0:
             return math.inf
-        variance = float((self._omega**2 * self._noise).sum()) / curvature**2
-        # A window widens the band of a sound by up to three frequencies.
-        width = self._evidence.sum() ** 2 / (self._evidence**2).sum()
-        offset = (self._omega - np.average(self._omega, weights=self._evidence)) * max(0.0, 1 - _WIDENED / width)
-        odds, squares = 1.0, 0.0
-        for other_s in others_s.tolist():
-            apart = np.abs(1 - np.exp(1j * offset * (other_s - found_s))) ** 2
-            spread = math.sqrt(float((apart * self._noise).sum()))
-            lead = min(here - self._correlation(other_s), float((self._evidence * apart).sum()) / 2)
-            wrong = float(scipy.special.ndtr(-lead / max(spread, _TINY)))
-            odds += wrong / (1 - wrong)
-            squares += wrong / (1 - wrong) * (other_s - found_s) ** 2
-        return math.sqrt(variance + squares / odds)
+        # Each frequency has a square of G₁₁ G₂₂ (1 + γ²), and noise of half of G₁₁ G₂₂ (1 - γ²) across its phase.
+        square, coherence = np.abs(turned) ** 2, self._coherence
+        noise = self._correlated * square * (1 - coherence) / (1 + coherence) / 2
+        size = self._evidence * np.sqrt(square * coherence / (1 + coherence))
+        n_free = max(float(np.sqrt(noise).sum() ** 2 / max(noise.sum(), _TINY)) / self._correlated, 3.0)
+        variance = float((self._omega**2 * noise).sum()) / curvature**2
+        lead = float(turned.real.sum()) - values
+        near = lead**2 < _CERTAIN * noise.sum()
+        apart_s, odds = [0.0], [1.0]
+        for other_s in others_s[near].tolist():
+            change = 1 - np.exp(1j * self._omega * (other_s - found_s))
+            ahead = float((turned * change).real.sum())
+            expected = min(float((turned.real * change.real).sum()), float((size * change.real).sum()))
+            spread = float((np.abs(change) ** 2 * noise).sum())
+            # Log odds of one delay against another; the noise is estimated, so the odds are those of Student.
+            evidence = 2 * max(ahead, 0.0) * max(expected, 0.0) / max(spread, _TINY)
+            odds.append((1 + 2 * evidence / n_free) ** (-n_free / 2))
+            apart_s.append(abs(other_s - found_s))
+        order = np.argsort(apart_s)
+        shares = np.array(odds)[order] / sum(odds)
+        distances_s = np.array(apart_s)[order]
+        beyond = np.cumsum(shares[::-1])[::-1] > _BEYOND
+        rare_s = float(distances_s[beyond].max()) / 4
+        return math.sqrt(variance + max(float((shares * distances_s**2).sum()), rare_s**2))
 
 
 def _leaked(size: NDArray[np.float64]) -> NDArray[np.float64]:

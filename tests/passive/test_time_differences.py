@@ -89,8 +89,10 @@ def errors_in_uncertainties(weighting, band_hz, snr_db, n, *, n_draws=50):
         ((20e3, 80e3), 0, 4096),
         ((20e3, 80e3), 10, 1000),
         ((20e3, 80e3), 30, 4096),
+        ((25e3, 35e3), 5, 4096),
         ((25e3, 35e3), 10, 4096),
         ((25e3, 35e3), 30, 32768),
+        ((38e3, 42e3), 20, 4096),
         ((1e3, 99e3), 20, 1000),
     ],
 )
@@ -118,6 +120,15 @@ def test_narrow_or_weak_sound_has_an_uncertainty_of_periods(weighting, band_hz, 
     assert len(errors) >= min_known
     assert len(errors) < 10 or np.sqrt(np.mean(errors**2)) < 1.3
     assert np.abs(errors).max(initial=0) < 4
+
+
+def test_narrow_band_far_above_the_noise_has_no_uncertainty_of_periods():
+    random = np.random.default_rng(8)
+    for _ in range(30):
+        rows, delay_s = heard_of_band(random, 38e3, 42e3, 20, 4096)
+        (found,) = time_differences(rows, rate_hz=RATE_HZ, max_delay_s=150e-6)
+        assert found.delay_s == pytest.approx(delay_s, abs=0.3e-6)
+        assert found.uncertainty_s < 0.2e-6
 
 
 def test_delay_beyond_the_largest_is_unknown():
