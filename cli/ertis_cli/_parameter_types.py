@@ -42,6 +42,8 @@ class _Beamformer(click.ParamType):  # type: ignore[type-arg]  # generic since c
             if key not in known:
                 usage = f"use {name}:{', '.join(f'{other}=X' for other in known)}" if known else f"use {name} alone"
                 self.fail(f"{each!r} is not an option of {name}; {usage}", param, ctx)
+            if known[key].name in found:
+                self.fail(f"{key} appears twice; state it once", param, ctx)
             low, high = known[key].low, known[key].high
             kind: Any = click.IntRange(low, int(high)) if isinstance(low, int) else click.FloatRange(low, high)
             try:

@@ -34,7 +34,8 @@ def stands_out(
         return np.ones(len(row), np.bool_)
     top = image.amplitude[row, column]
     floor = echo_floor(image, false_alarm)
-    floor = floor._replace(by_range=np.zeros_like(floor.by_range))  # Side lobes of other echoes would raise it.
+    if floor.exponent == 1.0:  # Side lobes of other echoes would raise it, unless the beamformer suppresses them.
+        floor = floor._replace(by_range=np.zeros_like(floor.by_range))
     limit = floor.at(image.amplitude, row, column, quantile=_QUANTILE)
     return np.asarray((top > limit) & is_short(image, row, column, top, n_pulse))
 

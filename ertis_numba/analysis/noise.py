@@ -71,7 +71,8 @@ class EchoFloor(NamedTuple):
             around = np.where(is_own, -np.inf, around)
             rank = np.minimum(n_own + (quantile * (n_around - n_own - 1)).astype(np.int64), n_around - 1)
         found = np.take_along_axis(np.sort(around, axis=2), rank[..., None], axis=2)[..., 0]
-        ratio = self.ratio * (math.log(2) / -math.log1p(-quantile)) ** (self.exponent / 2)
+        # Noise from one direction is coherent there, so that no beamformer changes its distribution.
+        ratio = self.ratio ** (1 / self.exponent) * (math.log(2) / -math.log1p(-quantile)) ** 0.5
         clicks = np.maximum(found, 0).max(axis=0) * np.float32(ratio)
         return np.asarray(np.maximum(np.maximum(self.by_direction[direction], self.by_range[place]), clicks))
 

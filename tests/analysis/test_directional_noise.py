@@ -1,13 +1,17 @@
 """Images of sound from one direction without an echo list no reflectors; echoes in quiet are listed."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import ertis_numba as ertis
 from ertis_numba.analysis.detect import find_peaks, left_out_in_noise
+from ertis_numba.settings import Recording
 from tests.echo_draws import AMPLITUDE, Case, Draws, unit
 
+REFLECTORS = Path(__file__).parents[2] / "data" / "synthetic" / "reflectors.h5"
 FALSE_ALARM, N_DRAWS = 1e-3, 5
 MIDDLE = {"azimuth_deg": (-50, 50), "range_m": (0.72, 0.98)}
 CASES = {
@@ -76,3 +80,30 @@ def test_echo_above_a_hiss_is_a_reflector(draws):
     (peak, *_) = find_peaks(made.image(made.signals(unit(20, 0), 0.85) + hiss), false_alarm=FALSE_ALARM)
     assert (peak.azimuth_deg, peak.range_m) == (pytest.approx(20, abs=1), pytest.approx(0.85, abs=2e-3))
     assert peak.level_dbfs == pytest.approx(20 * math.log10(AMPLITUDE), abs=1)
+
+
+BEAMFORMERS = [
+    ({}, "none"),
+    ({"beamformer": "dmas", "dmas_order": 4}, "none"),
+    ({}, "coherence_factor"),
+    ({"beamformer": "dmas", "dmas_order": 5}, "coherence_factor"),
+    ({"beamformer": "capon"}, "none"),
+]
+
+
+@pytest.mark.parametrize(("beamformer", "weighting"), BEAMFORMERS)
+def test_every_beamformer_lists_the_reflectors_and_no_noise(beamformer, weighting):
+    """The scene has five reflectors; noise of single microphones may be steady, or swell within the record."""
+    with ertis.open_recording(REFLECTORS) as recording:
+        measurement, settings = recording[0], recording.settings.replace("processing.directions", "2d:91")
+    for name, value in {**beamformer, "weighting": weighting}.items():
+        settings = settings.replace(f"processing.{name}", value)
+    found = find_peaks(ertis.Pipeline(settings).process(measurement), false_alarm=FALSE_ALARM)
+    assert sorted(each.range_m for each in found) == pytest.approx([1.15, 1.6, 2.45, 3.3, 4.4], abs=0.01)
+    pcm = Recording(sample_rate_hz=450e3, n_samples=16_384, encoding="float32")
+    pipeline, rng = ertis.Pipeline(settings.replace(recording=pcm)), np.random.default_rng(1)
+    swelling = 1 + 9 * np.exp(-(((np.arange(16_384) - 8000) / 1500) ** 2))[:, None]
+    for gain in (1.0, swelling):
+        noise = (0.01 * gain * rng.standard_normal((16_384, 32))).astype("f4")
+        image = pipeline.process(ertis.Measurement(noise, settings.replace(recording=pcm)))
+        assert find_peaks(image, false_alarm=FALSE_ALARM) == []
