@@ -408,6 +408,7 @@ def test_each_function_and_class_has_a_replacement():
     assert len(rows) == len(names) == 33
 
 
+@pytest.mark.filterwarnings("ignore:besides the call of the settings")  # The scene's other sensor emits one.
 def test_replacements_run(tmp_path):
     rows, text = replacements()
     names = {}

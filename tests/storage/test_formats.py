@@ -8,6 +8,7 @@ import pytest
 from ertis_numba.settings import PRESETS, Settings
 from ertis_numba.storage.schema import (
     ACOUSTIC_MAP,
+    BEARINGS,
     CONVENTIONS,
     ENERGYSCAPE,
     FORMAT_VERSION,
@@ -46,7 +47,7 @@ def rows(first):
         ("scene", TRUTH),
         ("log_odds", OCCUPANCY_MAP),
         ("amplitude", [*(variable for variable in ENERGYSCAPE if variable not in SHARED), *POINTS]),
-        ("power", [variable for variable in ACOUSTIC_MAP if variable.name not in SHARED_NAMES]),
+        ("power", [*(variable for variable in ACOUSTIC_MAP if variable.name not in SHARED_NAMES), *BEARINGS]),
     ],
 )
 def test_format_tables_match_the_code(first, table):
