@@ -185,7 +185,7 @@ class ErrorModel:
         return _UNLIKE * float(wrong.sum() / beams.sum())
 
     def zones(self, aperture: Aperture, curvature_2: float, *, sound_speed_m_s: float) -> float:
-        """Return the error power of focal zones by the mean squared deviation of the curvature, in 1/m².
+        """Return the error power of focal zones whose curvatures deviate by this mean square, in 1/m².
 
         A wavefront of curvature b = 1/r reaches a microphone at p with the extra delay ``b (p² − (u·p)²) / 2c``. The
         mean extra delay of all microphones turns the phase of the beam and shifts its envelope. Only the phase at the

@@ -77,7 +77,7 @@ def test_errors_of_each_case_are_about_those_that_are_stated(errors, name):
 
 @pytest.mark.parametrize(("directions", "budget_db"), [("2d:91", -20.0), ("2d:181", -35.0), ("3d:600", -14.0)])
 def test_errors_of_the_plan_are_part_of_those_that_are_stated(directions, budget_db):
-    """Where noise is far below the budget, errors of the plan remain, which are alike in all bins."""
+    """Far above the noise, the errors of the plan remain. They are alike in all bins."""
     draws, rng = Draws(Case(directions, 70, budget_db=budget_db, **MIDDLE)), np.random.default_rng(45)
     found = np.array([each for _ in range(DRAWS) if (each := standardised(draws, rng)) is not None])
     assert len(found) > DRAWS / 2
