@@ -2,7 +2,6 @@
 
 import glob
 import json
-import math
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -70,6 +69,7 @@ __all__ = [
     "note_layout",
     "note_missing_points",
     "note_noise",
+    "note_of",
     "note_open_edges",
     "note_unknown_angles",
     "note_unknown_bearings",
@@ -455,12 +455,9 @@ def note_unknown_places(sensor: str, settings: "Settings", *, quiet: bool = Fals
 
 def note_noise(sensor: str, count: int, *, quiet: bool = False) -> None:
     """Print a note on images whose strongest maximum is noise from its direction, if there are any."""
-    if count:
-        note(
-            f"sensor {sensor}: the strongest maximum of {counted(count, 'image')} left out because a hiss, a tone or a "
-            "click from its direction may have caused it; 'ertis peaks --all' lists it",
-            quiet=quiet,
-        )
+    from ertis_numba.analysis.peak_notes import noise_note
+
+    note_of(sensor, noise_note(count), quiet=quiet)
 
 
 def note_unknown_bearings(sensor: str, settings: "Settings") -> None:
@@ -494,13 +491,9 @@ def note_open_edges(
     sensor: str, grid: "DegreesFromRadians", grid_errors: "Iterable[float]", *, quiet: bool = False
 ) -> None:
     """Print a note on listed directions whose sources may lie beyond the edges of the grid, if there are any."""
-    count = sum(map(math.isinf, grid_errors))
-    if count and len(grid.azimuth_rad) > 1:
-        note(
-            f"sensor {sensor}: {counted(count, 'listed direction')} may have a source beyond the edges of the grid, "
-            "so grid_error_deg is unknown; use 'ertis process' with a wider --azimuth or --elevation",
-            quiet=quiet,
-        )
+    from ertis_numba.analysis.peak_notes import open_edge_note
+
+    note_of(sensor, open_edge_note(grid, grid_errors), quiet=quiet)
 
 
 def say(text: str, *, quiet: bool) -> None:
@@ -512,6 +505,12 @@ def say(text: str, *, quiet: bool) -> None:
 def note(text: str, *, quiet: bool = False) -> None:
     """Print a note on stderr, unless ``quiet``: results are right, and this may matter."""
     say(f"note: {with_options(text)}", quiet=quiet)
+
+
+def note_of(sensor: str, text: str | None, *, quiet: bool = False) -> None:
+    """Print a note about the results of a sensor, if there is any."""
+    if text:
+        note(f"sensor {sensor}: {text}", quiet=quiet)
 
 
 def warn(text: str) -> None:

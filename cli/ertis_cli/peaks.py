@@ -288,6 +288,7 @@ def _found(
     path: Path, sensor: str, find: "Callable[[Energyscape], list[Peak]]", measurement: int | None
 ) -> list[dict[str, Any]]:
     """Return a row for each peak of a sensor."""
+    from ertis_numba.analysis.peak_notes import left_out_note, unconfirmed_note
     from ertis_numba.storage import open_energyscapes
 
     with open_energyscapes(path, sensor=sensor) as images:
@@ -295,10 +296,12 @@ def _found(
         places = options.places(measurement, len(images))
         by_place = {index: find(images[index]) for index in places}
         found = [(index, peak) for index, peaks in by_place.items() for peak in peaks]
-        _note_left_out(sensor, sum(_n_left_out(images[index], peaks, find) for index, peaks in by_place.items()))
+        n_left_out = sum(_n_left_out(images[index], peaks, find) for index, peaks in by_place.items())
+        options.note_of(sensor, left_out_note(n_left_out))
         options.note_noise(sensor, sum(_is_noisy(images[index], find) for index in places))
         clouds = [images[index].points for index in places] if images.has_points else []
-        _note_unconfirmed(sensor, sum(int((~each.is_certain).sum()) for each in clouds if each is not None))
+        n_unconfirmed = sum(int((~each.is_certain).sum()) for each in clouds if each is not None)
+        options.note_of(sensor, unconfirmed_note(n_unconfirmed))
         options.note_open_edges(sensor, images, (peak.grid_error_deg for _, peak in found))
         return [{"sensor": sensor, "measurement": index, **_rounded(peak)} for index, peak in found]
 
@@ -321,27 +324,6 @@ def _is_noisy(image: "Energyscape", find: "Callable[[Energyscape], list[Peak]]")
         return False
     limits = {name: find.keywords[name] for name in ("min_level_db", "false_alarm")}
     return left_out_in_noise(image, **limits)
-
-
-def _note_left_out(sensor: str, count: int) -> None:
-    """Print a note on maxima that were left out near the edges of the range axis."""
-    if count:
-        maxima = "1 maximum" if count == 1 else f"{count} maxima"
-        cause = "it may be a side lobe" if count == 1 else "they may be side lobes"
-        options.note(
-            f"sensor {sensor}: {maxima} near the first or last range left out because {cause} of an echo outside the "
-            "range; use a wider range with 'ertis process --range'"
-        )
-
-
-def _note_unconfirmed(sensor: str, count: int) -> None:
-    """Print a note on points of a fusion that are not listed."""
-    if count:
-        points = options.counted(count, "point")
-        options.note(
-            f"sensor {sensor}: {points} left out because too few pairs of emitter and receiver confirm them: they may "
-            "be ghosts, or reflectors that few sensors hear; the file contains them with point_confirmed = 0"
-        )
 
 
 def _compared(place: dict[str, Any], comparison: "Comparison") -> Iterator[dict[str, Any]]:

@@ -28,6 +28,7 @@ from ertis_numba.figures import (
     _images,
     _map,
     _pareto_front,
+    _points,
     _signals,
     _slices,
 )
@@ -35,7 +36,7 @@ from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._page import compose
 from ertis_numba.figures._pareto_front import Rated
 from ertis_numba.figures.style import StyleOptions, parameters, style_of
-from ertis_numba.frames import AcousticMap, Energyscape, Measurement, OccupancyMap, Peak, Trajectory
+from ertis_numba.frames import AcousticMap, Energyscape, Measurement, OccupancyMap, Peak, PointCloud, Trajectory
 from ertis_numba.geometry import observable_angles
 from ertis_numba.settings import Array, Settings
 
@@ -49,6 +50,7 @@ __all__ = [
     "matched_filter",
     "occupancy",
     "plot",
+    "points",
     "polar",
     "projection",
     "save",
@@ -222,6 +224,28 @@ def slices(
     return _slices.draw(
         _canvas_with_directions(image, dynamic_range_db, look, peaks), image, height_m=height_m, left_m=left_m
     )
+
+
+def points(cloud: PointCloud, *, dynamic_range_db: float = 40.0, **look: Unpack[StyleOptions]) -> Figure:
+    """Draw points from above in metres, in colours of their levels.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+        Points to draw, at least one. Those that a fusion has not confirmed are rings.
+    dynamic_range_db, **look
+        Range of the colours in dB and the style, as for `plot`.
+
+    Raises
+    ------
+    ArgumentError
+        An argument is invalid, or there is no point.
+    """
+    checks.instance("cloud", cloud, PointCloud, "PointExtractor returns")
+    if not len(cloud):
+        raise ArgumentError("cloud contains no points; pass a cloud with one or more")
+    checks.finite_array("position_m", cloud.position_m)
+    return _points.draw(_canvas(dynamic_range_db, look), cloud)
 
 
 def signals(

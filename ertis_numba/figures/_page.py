@@ -7,8 +7,8 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._captions import Heading
@@ -31,7 +31,7 @@ _SHARE_ALONE = 0.8  # of its box that a colour bar takes which no list is under
 class Panel:
     """Picture that is drawn in two steps, because labels find their places only after the axes have theirs."""
 
-    paint: Callable[[Axes], AxesImage | None]  # draws, and returns the raster of the colour bar
+    paint: Callable[[Axes], ScalarMappable | None]  # draws, and returns the raster of the colour bar
     height: Callable[[float], float]  # of the axes from their width, in points
     finish: Callable[[Axes], None] = lambda _: None  # draws by the final position
     title: str = ""
@@ -119,7 +119,7 @@ def _place(
 def _explain(
     figure: Figure,
     canvas: Canvas,
-    raster: AxesImage,
+    raster: ScalarMappable,
     rows: list[str],
     box_pt: tuple[float, float, float, float],
 ) -> None:

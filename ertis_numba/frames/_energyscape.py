@@ -10,6 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 from ertis_numba.base import checks
 from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.base.errors import ArgumentError
+from ertis_numba.base.html_parts import shown_in_notebooks
 from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames._stamp import Stamp
@@ -73,6 +74,8 @@ class Energyscape(DegreesFromRadians):
     settings: Settings
     stamp: Stamp = Stamp()
     points: PointCloud | None = None
+
+    _repr_html_ = shown_in_notebooks
 
     def __post_init__(self) -> None:
         for name in ("amplitude", "azimuth_rad", "elevation_rad", "range_m"):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.base import checks
 from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.base.errors import ArgumentError
+from ertis_numba.base.html_parts import shown_in_notebooks
 from ertis_numba.frames._replacing import replaced
 from ertis_numba.frames._stamp import Stamp
 from ertis_numba.settings import Settings
@@ -73,6 +74,8 @@ class PointCloud(DegreesFromRadians):
     rotation_xyzw: tuple[float, float, float, float] | None = None
     uncertainty_m: NDArray[np.float32] | None = None
     confirmed: NDArray[np.bool_] | None = None
+
+    _repr_html_ = shown_in_notebooks
 
     def __post_init__(self) -> None:
         for name in ("position_m", "amplitude"):

@@ -1,9 +1,7 @@
 """HTML page of checks, without external resources; every text from files is escaped."""
 
-import base64
-import html
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -11,6 +9,7 @@ from typing import Final
 from ertis_numba import figures
 from ertis_numba.base.atomic_files import atomic_write
 from ertis_numba.base.errors import DataError, ErtisError
+from ertis_numba.base.html_parts import escaped, picture, table
 from ertis_numba.frames import Measurement
 from ertis_numba.sensor_check.result import RecordingCheck, SensorCheck
 from ertis_numba.storage import open_recording
@@ -89,10 +88,10 @@ def write_page(target: str | Path, checked: Iterable[RecordingCheck], *, overwri
 
 def _of_recording(checked: RecordingCheck) -> str:
     state = "ok" if checked.is_fit else "fault"
-    lines = [f"<section><h2>{_text(checked.path.name)}</h2><p class='verdict {state}'>{_text(checked.verdict)}</p>"]
+    lines = [f"<section><h2>{escaped(checked.path.name)}</h2><p class='verdict {state}'>{escaped(checked.verdict)}</p>"]
     if checked.faults:
-        rows = [[(_text(fault.text), ""), (_text(fault.remedy), "")] for fault in checked.faults]
-        lines.append(_table([("fault", ""), ("remedy", "")], rows))
+        rows = [[(escaped(fault.text), ""), (escaped(fault.remedy), "")] for fault in checked.faults]
+        lines.append(table([("fault", ""), ("remedy", "")], rows))
     lines += [_of_sensor(checked.path, each) for each in checked.sensors]
     return "\n".join([*lines, "</section>\n"])
 
@@ -103,17 +102,21 @@ def _of_sensor(path: Path, checked: SensorCheck) -> str:
         f"{checked.stored.measurements}, without a call: {checked.n_passive}, examined: {len(checked.examined)}"
     )
     rows = [
-        [(_text(item.check), ""), (_text(item.result), f"result {_CLASSES[item.result]}"), (_text(item.detail), "")]
+        [
+            (escaped(item.check), ""),
+            (escaped(item.result), f"result {_CLASSES[item.result]}"),
+            (escaped(item.detail), ""),
+        ]
         for item in checked.items
     ]
     lines = [
-        f"<h3>Sensor {_text(checked.sensor)}</h3><p>{_text(about)}</p>",
-        _table([("check", ""), ("result", ""), ("details", "")], rows),
+        f"<h3>Sensor {escaped(checked.sensor)}</h3><p>{escaped(about)}</p>",
+        table([("check", ""), ("result", ""), ("details", "")], rows),
     ]
     if checked.health is not None:
-        lines.append(f"<h3>Microphones of sensor {_text(checked.sensor)}</h3>{_microphones(checked)}")
+        lines.append(f"<h3>Microphones of sensor {escaped(checked.sensor)}</h3>{_microphones(checked)}")
         if checked.health.not_observable:
-            items = "".join(f"<li>{_text(str(line))}</li>" for line in checked.health.not_observable)
+            items = "".join(f"<li>{escaped(str(line))}</li>" for line in checked.health.not_observable)
             lines.append(f"<p>Not observable in this recording:</p><ul>{items}</ul>")
     return "\n".join([*lines, *_pictures(path, checked)])
 
@@ -130,7 +133,7 @@ def _microphones(checked: SensorCheck) -> str:
     for item in checked.health.channels if checked.health is not None else ():
         row = [
             (str(item.channel), "number"),
-            (_text(item.state), "ok" if item.state == "ok" else "fault"),
+            (escaped(item.state), "ok" if item.state == "ok" else "fault"),
             (_number(item.level_db), "number"),
             (_number(item.noise_dbfs), "number"),
         ]
@@ -138,7 +141,7 @@ def _microphones(checked: SensorCheck) -> str:
             delay_s, gain_db = deviations.get(item.channel, (None, None))
             row += [(_number(None if delay_s is None else 1e6 * delay_s), "number"), (_number(gain_db), "number")]
         rows.append(row)
-    return _table(columns, rows)
+    return table(columns, rows)
 
 
 def _pictures(path: Path, checked: SensorCheck) -> list[str]:
@@ -150,7 +153,7 @@ def _pictures(path: Path, checked: SensorCheck) -> list[str]:
         with open_recording(path, sensor=checked.sensor) as recording:
             measurement = replace(recording[index], settings=checked.settings)
     except (DataError, OSError) as error:  # The file may have changed since the check.
-        return [f"<p>No plots: {_text(str(error))}</p>"]
+        return [f"<p>No plots: {escaped(str(error))}</p>"]
     names = list(_PLOTS)[measurement.stamp.behaviour == "passive" :]  # The matched filter is that of a call.
     return [_picture(name, measurement, index) for name in names]
 
@@ -161,22 +164,9 @@ def _picture(name: str, measurement: Measurement, index: int) -> str:
         # A narrow page has one column, which is readable on a phone.
         figures.save(_PLOTS[name](measurement, theme="paper", columns=1), content, format="png")
     except ErtisError as error:  # Short records, for example, have no echoes to plot.
-        return f"<p>{name}: {_text(str(error))}</p>"
-    data = base64.b64encode(content.getvalue()).decode()
-    alt = f"{name}, measurement {index}"
-    return f"<h3>{alt}</h3><img alt='{alt}' src='data:image/png;base64,{data}'>"
-
-
-def _table(columns: Sequence[tuple[str, str]], rows: Iterable[Sequence[tuple[str, str]]]) -> str:
-    """Return a table of cells with their classes; the cells are HTML."""
-    heading = "".join(f"<th class='{kind}'>{name}</th>" for name, kind in columns)
-    lines = ("".join(f"<td class='{kind}'>{cell}</td>" for cell, kind in row) for row in rows)
-    body = "".join(f"<tr>{line}</tr>\n" for line in lines)
-    return f"<div class=scroll><table><tr>{heading}</tr>\n{body}</table></div>"
-
-
-def _text(text: str) -> str:
-    return html.escape(text, quote=True)
+        return f"<p>{name}: {escaped(str(error))}</p>"
+    title = f"{name}, measurement {index}"
+    return f"<h3>{title}</h3>{picture(content.getvalue(), title)}"
 
 
 def _number(value: float | None) -> str:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from ertis_numba.base.errors import ArgumentError, SettingsError
+from ertis_numba.base.html_parts import shown_in_notebooks
 from ertis_numba.settings.accuracy import Accuracy
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.beamformers import BEAMFORMERS
@@ -69,6 +70,8 @@ class Settings(TomlDocument, frozen=True, kw_only=True):
     processing: Processing = Processing()
     accuracy: Accuracy = Accuracy()
     passive: Passive = Passive()
+
+    _repr_html_ = shown_in_notebooks
 
     max_bytes: ClassVar[int] = 262_144  # An array of 1024 microphones needs 170,000 bytes …
     max_items: ClassVar[int] = 30_000  # … and 16,500 items.

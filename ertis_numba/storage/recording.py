@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, DamagedError, DataError
+from ertis_numba.base.html_parts import shown_in_notebooks
 from ertis_numba.frames import Measurement, SequenceGap, Trajectory
 from ertis_numba.frames.pose_doubts import warn_of_poses
 from ertis_numba.frames.sample_format import SampleFormat, sample_format
@@ -299,6 +300,8 @@ class RecordingReader(FileReader[Measurement]):
     translation_m: NDArray[np.float64] | None
     rotation_xyzw: NDArray[np.float64] | None
     trajectory: Trajectory | None
+
+    _repr_html_ = shown_in_notebooks
 
     def _select_table(self) -> None:
         self._data, table = _data_and_table(pdm="pcm" not in self._group)

@@ -1,0 +1,52 @@
+"""Notes on omissions and unknown values in lists of reflectors."""
+
+import math
+from collections.abc import Iterable
+
+from ertis_numba.base.angles import DegreesFromRadians
+from ertis_numba.base.units import counted
+
+__all__ = ["left_out_note", "noise_note", "open_edge_note", "unconfirmed_note"]
+
+
+def left_out_note(count: int) -> str | None:
+    """Return a note on maxima that were left out near the ends of the range axis; None if there are none."""
+    if not count:
+        return None
+    maxima = "1 maximum" if count == 1 else f"{count} maxima"
+    cause = "it may be a side lobe" if count == 1 else "they may be side lobes"
+    return (
+        f"{maxima} near the first or last range left out because {cause} of an echo outside the range; use a wider "
+        "range with 'ertis process --range'"
+    )
+
+
+def noise_note(count: int) -> str | None:
+    """Return a note on images whose strongest maximum is noise from its direction; None if there are none."""
+    if not count:
+        return None
+    return (
+        f"the strongest maximum of {counted(count, 'image')} left out because a hiss, a tone or a click from its "
+        "direction may have caused it; 'ertis peaks --all' lists it"
+    )
+
+
+def open_edge_note(grid: DegreesFromRadians, grid_errors: Iterable[float]) -> str | None:
+    """Return a note on listed directions whose sources may lie beyond the edges of the grid; None without any."""
+    count = sum(map(math.isinf, grid_errors))
+    if not count or len(grid.azimuth_rad) == 1:
+        return None
+    return (
+        f"{counted(count, 'listed direction')} may have a source beyond the edges of the grid, so grid_error_deg is "
+        "unknown; use 'ertis process' with a wider --azimuth or --elevation"
+    )
+
+
+def unconfirmed_note(count: int) -> str | None:
+    """Return a note on points of a fusion that are not listed; None if there are none."""
+    if not count:
+        return None
+    return (
+        f"{counted(count, 'point')} left out because too few pairs of emitter and receiver confirm them: they may be "
+        "ghosts, or reflectors that few sensors hear; the file contains them with point_confirmed = 0"
+    )
