@@ -326,9 +326,9 @@ class BeamGrid:
         for k, place in enumerate(inside):
             points = np.concatenate([moved[k] + patch, (moved[k] + place)[None]])
             delays_s = self._aperture.delays_s(points, sound_speed_m_s=self._sound_speed_m_s, range_m=nearest_m)
-            waves = np.exp(2j * math.pi * delays_s.T[mics, None, :] * self.frequency_hz[:, None])
-            made = gain * (waves[:, :, :-1] @ weights[:, k])
-            errors += np.mean(np.abs(made - waves[:, :, -1]) ** 2, axis=0)
+            waves = _waves_of(delays_s[:, mics], self.frequency_hz)
+            made = np.einsum("wpm,p->mw", waves[:, :-1], weights[:, k]) * gain
+            errors += np.mean(np.abs(made - waves[:, -1].T) ** 2, axis=0)
         return errors / len(inside)
 
     def gain(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
@@ -356,6 +356,13 @@ class BeamGrid:
         np.cos(turns, out=waves.real)  # Sine and cosine together take half as long as a complex exponential.
         np.sin(turns, out=waves.imag)
         return waves.reshape(-1, len(points))
+
+
+def _waves_of(delay_s: NDArray[np.float64], frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return waves (wave, ...) of delays as products, because frequencies have few different steps."""
+    steps_hz, which = np.unique(np.diff(frequency_hz, prepend=0.0), return_inverse=True)
+    factors = np.exp(2j * math.pi * steps_hz.reshape(-1, *[1] * delay_s.ndim) * delay_s)
+    return np.asarray(np.multiply.accumulate(factors[which], axis=0))
 
 
 def estimated_mics(n_mics: int) -> NDArray[np.intp]:

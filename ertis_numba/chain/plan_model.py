@@ -178,8 +178,7 @@ class PlanModel:
 
     def uses_streams(self, plan: ImagePlan) -> bool:
         """Return True if a plan computes an adaptive beamformer from streams."""
-        accuracy = Accuracy(precision=plan.precision, delay_taps=plan.delay_taps, beam_taps=plan.beam_taps)  # type: ignore[arg-type]
-        return uses_streams(self.settings.processing, accuracy)
+        return uses_streams(self.settings.processing, plan)
 
     def _stream_parts(self, plan: ImagePlan, *, noise_only: bool) -> dict[str, float]:
         assert self._stream_planner is not None  # noqa: S101

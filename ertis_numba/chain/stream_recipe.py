@@ -1,8 +1,8 @@
 """Recipes: streams of a beamformer and a weighting, and the numbers that combine their sums."""
 
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
-from ertis_numba.settings import Accuracy, Processing
+from ertis_numba.settings import Processing
 from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS, SignalStream
 
 __all__ = ["LINEAR", "Recipe", "recipe_of", "uses_streams"]
@@ -36,7 +36,18 @@ def recipe_of(processing: Processing) -> Recipe | None:
     return Recipe(whole, len(streams), beam, total)
 
 
-def uses_streams(processing: Processing, accuracy: Accuracy) -> bool:
+class _Plan(Protocol):
+    """Accuracy settings, or a plan that has a value for each of these."""
+
+    @property
+    def precision(self) -> str: ...
+    @property
+    def delay_taps(self) -> int | None: ...
+    @property
+    def beam_taps(self) -> int | None: ...
+
+
+def uses_streams(processing: Processing, accuracy: _Plan) -> bool:
     """Return True if a complete plan computes an adaptive beamformer from streams, not from all microphones at once."""
     plan = accuracy.precision, accuracy.delay_taps or 1, accuracy.beam_taps or 0
     return processing.is_adaptive and recipe_of(processing) is not None and plan != ("float32", 1, 0)
