@@ -79,7 +79,8 @@ def _versions(_folder: Path) -> Iterator[InstallationFinding]:
         try:
             found.append(f"{name} {version(name)}")
         except PackageNotFoundError:
-            missing.append(name)
+            if name != "numba":  # which `_processor` notes, because NumPy can replace it
+                missing.append(name)
     yield InstallationFinding("libraries", "good", ", ".join(found))
     if missing:
         yield InstallationFinding(
@@ -97,10 +98,21 @@ def _versions(_folder: Path) -> Iterator[InstallationFinding]:
 
 def _processor(_folder: Path) -> Iterator[InstallationFinding]:
     from ertis_numba import kernels
+    from ertis_numba.base.errors import DeviceError
+
+    try:
+        kernels.require_numba("fast processing")
+    except DeviceError as error:
+        text, _, remedy = str(error).partition("; ")
+        yield InstallationFinding("Numba", "note", text, remedy)
+        yield _processing("numpy")
+    else:
+        yield from _compiled()
+
+
+def _compiled() -> Iterator[InstallationFinding]:
+    from ertis_numba import kernels
     from ertis_numba.base.forks import usable_cores
-    from ertis_numba.frames import Measurement
-    from ertis_numba.pipeline import Pipeline
-    from ertis_numba.settings import Settings
 
     cores = usable_cores()
     kernel_set = kernels.load("cpu")
@@ -115,20 +127,7 @@ def _processor(_folder: Path) -> Iterator[InstallationFinding]:
     speed = _INSTRUCTION_SETS[kernel_set.instruction_set]
     yield InstallationFinding("instructions", "good", f"{kernel_set.instruction_set}: {speed}")
     yield _kernel_cache()
-    settings = Settings()
-    with Pipeline(settings, device="cpu", predict=False) as pipeline:
-        silence = Measurement(_silence(settings.recording.n_samples), settings)
-        times_s = []
-        for _ in range(_RUNS):
-            begun_s = time.perf_counter()
-            pipeline.process(silence)
-            times_s.append(time.perf_counter() - begun_s)
-        n_directions = len(pipeline.grid)
-    yield InstallationFinding(
-        "processing",
-        "good",
-        f"an image of {n_directions} directions takes {1e3 * min(times_s):.1f} ms",
-    )
+    yield _processing("cpu")
     layer = _threading_layer()
     slow = layer == "workqueue"
     yield InstallationFinding(
@@ -137,6 +136,23 @@ def _processor(_folder: Path) -> Iterator[InstallationFinding]:
         f"Numba's {layer} layer" + (", which computes only one image at a time" if slow else ""),
         "pip install tbb, or install OpenMP (libgomp1 on Debian, libomp on macOS)" if slow else "",
     )
+
+
+def _processing(device: Literal["cpu", "numpy"]) -> InstallationFinding:
+    from ertis_numba.frames import Measurement
+    from ertis_numba.pipeline import Pipeline
+    from ertis_numba.settings import Settings
+
+    settings = Settings()
+    with Pipeline(settings, device=device, predict=False) as pipeline:
+        silence = Measurement(_silence(settings.recording.n_samples), settings)
+        times_s = []
+        for _ in range(_RUNS):
+            begun_s = time.perf_counter()
+            pipeline.process(silence)
+            times_s.append(time.perf_counter() - begun_s)
+        text = f"an image of {len(pipeline.grid)} directions takes {1e3 * min(times_s):.1f} ms"
+    return InstallationFinding("processing", "good", text)
 
 
 def _kernel_cache() -> InstallationFinding:

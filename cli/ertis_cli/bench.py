@@ -65,6 +65,9 @@ def bench() -> None:
 
     The wheel contains paper and accuracy. The others exist only in the source folder.
     """
+    from ertis_numba import kernels
+
+    kernels.require_numba("'ertis bench'")
 
 
 @bench.command()

@@ -73,6 +73,9 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     publishes images to an application. The images of all sensors are then fused into one, with a list of
     reflectors and a picture. The demo prints each command and writes all files to one folder.
     """
+    from ertis_numba import kernels
+
+    kernels.require_numba("'ertis demo', which renders 120 measurements,")
     _make(folder, force=force)
     scene = folder / _SCENE
     (item,) = _examples.named(_SCENE).values()

@@ -57,7 +57,7 @@ class _Filter:
     """Decimation filter of the bits of all channels, on one thread; the number of symmetric taps is odd."""
 
     def __init__(self, n_samples: int, taps: NDArray[np.int16], scale: float, step: int) -> None:
-        self._kernels = kernels.load("cpu")
+        self._kernels = kernels.load_host()
         self._channels = np.arange(CHANNELS, dtype=np.int32)
         self._taps, self._scale, self._step = taps, np.float32(scale), step
         self._out = np.empty((CHANNELS, -(-(n_samples + step // 2) // step)), dtype=np.float32)

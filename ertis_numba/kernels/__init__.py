@@ -32,9 +32,11 @@ from ertis_numba.kernels._dispatch import (
     DEVICES,
     load,
     load_fusion,
+    load_host,
     load_mapping,
     load_points,
     load_steering,
+    require_numba,
     usable,
 )
 from ertis_numba.kernels._kernel_set import KernelSet
@@ -64,9 +66,11 @@ __all__ = [
     "ViewingSensors",
     "load",
     "load_fusion",
+    "load_host",
     "load_mapping",
     "load_points",
     "load_steering",
     "on_compiling",
+    "require_numba",
     "usable",
 ]

@@ -16,7 +16,17 @@ from ertis_numba.kernels._contract.points import PointKernels
 from ertis_numba.kernels._contract.steering import SteeringKernels
 from ertis_numba.kernels._kernel_set import KernelSet
 
-__all__ = ["DEVICES", "load", "load_fusion", "load_mapping", "load_points", "load_steering", "usable"]
+__all__ = [
+    "DEVICES",
+    "load",
+    "load_fusion",
+    "load_host",
+    "load_mapping",
+    "load_points",
+    "load_steering",
+    "require_numba",
+    "usable",
+]
 
 _LOG = logging.getLogger("ertis_numba")
 
@@ -30,15 +40,15 @@ DEVICES: Final = {
 
 @functools.cache
 def load(device: str = "auto") -> KernelSet:
-    """Return the kernels of a device; "auto" is "cuda" if a GPU and its libraries are available, otherwise "cpu".
+    """Return the kernels of a device; "auto" is "cuda" if a GPU and its libraries are available, else `load_host`.
 
     Raise ArgumentError for an unknown device, and DeviceError for one that cannot be used on this machine.
     """
     checks.choice("device", device, ("auto", *DEVICES))
     if device == "auto":
-        chosen = "cuda" if _has_gpu() else "cpu"
-        _LOG.info("device 'auto' is %r", chosen)
-        return load(chosen)
+        chosen = load("cuda") if _has_gpu() else load_host()
+        _LOG.info("device 'auto' is %r", chosen.device)
+        return chosen
     try:
         if device != "numpy":
             _numba_setup.prepare()
@@ -53,6 +63,18 @@ def load(device: str = "auto") -> KernelSet:
             f"device {device!r} cannot be loaded ({error}); use device 'cpu', or install ertis-numba[cu12] or [cu13]"
         ) from error
     return kernels
+
+
+@functools.cache
+def load_host() -> KernelSet:
+    """Return the kernels of device "cpu"; those of "numpy", with a warning, if Numba cannot be imported."""
+    reason = _numba_setup.import_error()
+    if reason:
+        _LOG.warning(
+            "NumPy replaces Numba, which cannot be imported (%s), and takes longer; run 'pip install numba'",
+            reason,
+        )
+    return load("numpy" if reason else "cpu")
 
 
 @functools.cache
@@ -99,6 +121,15 @@ def _compiled(name: str) -> Any:
 
 def _in_numpy(name: str) -> Any:
     return importlib.import_module(f"ertis_numba.kernels._numpy_{name}").KERNELS
+
+
+def require_numba(user: str) -> None:
+    """Raise DeviceError, which names the user, if Numba cannot be imported on this machine."""
+    reason = _numba_setup.import_error()
+    if reason:
+        raise DeviceError(
+            f"{user} needs Numba, which cannot be imported ({reason}); install it with 'pip install numba'"
+        )
 
 
 def usable() -> tuple[str, ...]:

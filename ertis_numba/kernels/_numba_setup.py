@@ -1,5 +1,6 @@
 """Check of Numba's environment variables, and a folder for its cache, before kernels are loaded."""
 
+import functools
 import importlib
 import logging
 import os
@@ -11,7 +12,7 @@ from typing import Any, Final
 
 from ertis_numba.base.errors import DeviceError
 
-__all__ = ["prepare"]
+__all__ = ["import_error", "prepare"]
 
 _LOG = logging.getLogger("ertis_numba")
 _REMEDY: Final = "set NUMBA_CACHE_DIR to a writable folder"
@@ -44,12 +45,27 @@ def prepare() -> None:
     _require_cache_folder()
 
 
+@functools.cache
+def import_error() -> str:
+    """Return the reason why Numba cannot be imported on this machine; empty if it can."""
+    try:
+        _imported()
+    except DeviceError as error:
+        return str(error.__cause__) if isinstance(error.__cause__, (ImportError, OSError)) else ""
+    return ""
+
+
 def _imported() -> Any:
-    """Return Numba; raise DeviceError if it cannot interpret its environment variables."""
+    """Return Numba; raise DeviceError if it is missing, or cannot interpret its environment variables."""
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("error", r"\s*Environment variable", RuntimeWarning)
             return importlib.import_module("numba")
+    except (ImportError, OSError) as error:  # OSError: llvmlite cannot load its library
+        raise DeviceError(
+            f"devices 'cpu' and 'cuda' need Numba, which cannot be imported ({error}); install it with 'pip install "
+            "numba', or use device 'numpy'"
+        ) from error
     except (ValueError, RuntimeWarning) as error:
         given = ", ".join(f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith("NUMBA_"))
         reason = str(error).split("\n")[0].strip()

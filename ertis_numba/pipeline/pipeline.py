@@ -437,7 +437,7 @@ class Pipeline:
     def _beam_chain(self) -> tuple[Settings, Chain]:
         from ertis_numba.chain.beam_chain import BeamChain, beam_settings  # noqa: PLC0415  few want them
 
-        host = kernels.load("numpy" if self.device == "numpy" else "cpu")
+        host = kernels.load("numpy") if self.device == "numpy" else kernels.load_host()
         threads = min(self._threads, host.max_threads)
         settings = beam_settings(self._uncleaned_settings, host, threads=threads)
         return settings, BeamChain(settings, host, threads=threads)

@@ -131,14 +131,14 @@ def _noise(seed: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
 
 
 def _chain(settings: Settings) -> FastChain:
-    kernel_set = kernels.load("cpu")
+    kernel_set = kernels.load_host()
     return FastChain(_planned(settings), kernel_set, threads=kernel_set.max_threads)
 
 
 @functools.lru_cache(maxsize=8)  # Planning takes as long as a render, and scenes often share their sensors.
 def _planned(settings: Settings) -> Settings:
     """Return settings with the plan of a chain."""
-    kernel_set = kernels.load("cpu")
+    kernel_set = kernels.load_host()
     single = settings.replace(
         processing=settings.processing.replace(method="fast"),
         accuracy=settings.accuracy.replace(precision="float32"),

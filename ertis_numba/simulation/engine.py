@@ -47,7 +47,7 @@ class Engine:
         sensor.require_microphones()
         self._layout = microphones(self.sensor.array)
         self._settings = self.sensor.settings()
-        self._threads = kernels.load("cpu").max_threads if threads is None else threads
+        self._threads = kernels.load_host().max_threads if threads is None else threads
         rate_hz = self.sensor.recording.sample_rate_hz
         calls = [*(other.call for other in scene.sensors), *(sonar.call for sonar in scene.sonars)]
         tops_hz = [synthesis.highest_hz(call, rate_hz) for call in calls]

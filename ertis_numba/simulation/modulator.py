@@ -46,7 +46,7 @@ class Modulator:
         self._states = np.zeros((n_mics, _MAX_ORDER))
         self._loop = np.array([*loop_gains(order, band), dither, _LIMIT])
         self._first = 0
-        self._kernels = kernels.load("cpu")
+        self._kernels = kernels.load_host()
         self._threads = self._kernels.max_threads if threads is None else threads
 
     def process(self, signals: NDArray[np.float64], *, out: NDArray[np.unsignedinteger]) -> None:

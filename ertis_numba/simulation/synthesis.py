@@ -126,7 +126,7 @@ def _add(
     n_bins: int = min(math.ceil(highest_hz(entry.call, rate_hz) * n_fft / rate_hz) + 1, spectra.shape[1])
     out = np.zeros((len(spectra), n_bins), dtype=np.complex128)
     turns, amplitude = delay_samples / n_fft, np.ascontiguousarray(entry.amplitude[chosen])
-    kernel_set, nodes_per_bin = kernels.load("cpu"), rate_hz / n_fft / NODE_HZ
+    kernel_set, nodes_per_bin = kernels.load_host(), rate_hz / n_fft / NODE_HZ
 
     def add(call: NDArray[np.complex128], paths: NDArray[np.intp]) -> None:
         """Add some paths. The kernel accepts real amplitudes, so imaginary parts use the call rotated by 90°."""

@@ -57,6 +57,9 @@ RUN_BY = {
     ("fusion", "python"): ["test_fusion::test_commands_and_code_of_the_page_run"],
     ("gallery", "$"): ["test_readme::test_gallery_starts_like_the_readme"],
     ("gpu", "$"): ["test_guide::test_commands_of_the_gpu_page_run"],
+    ("install", "$"): [
+        "test_without_numba::test_install_page_names_all_dependencies_but_numba_and_commands_that_run_without_it"
+    ],
     ("health", "$"): ["test_health_commands::test_health_page_shows_the_printed_output"],
     ("mapping", "$"): ["test_map_command::test_commands_and_code_of_the_page_run"],
     ("mapping", "python"): ["test_map_command::test_commands_and_code_of_the_page_run"],
