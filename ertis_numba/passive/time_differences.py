@@ -1,7 +1,6 @@
 """Time differences of arrival between pairs of microphones, by generalised cross-correlation."""
 
 import itertools
-import math
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -13,6 +12,7 @@ from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import microphones
 from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.passive.correlation import Bins, Correlation
 from ertis_numba.passive.heard_signals import HeardSignals
 
 __all__ = ["TimeDifference", "Weighting", "time_differences"]
@@ -20,7 +20,6 @@ __all__ = ["TimeDifference", "Weighting", "time_differences"]
 Weighting = Literal["phat", "scot", "none"]
 
 _WEIGHTINGS: Final = ("phat", "scot", "none")
-_FINER: Final = 8  # Samples of the correlation per sample of the signals.
 _MIN_BLOCK: Final = 8
 _MAX_BLOCK: Final = 1e15  # More than any record has.
 _TINY: Final = 1e-30
@@ -28,12 +27,9 @@ _BY_CHANCE: Final = 1e-3  # Probability that one frequency looks coherent in noi
 _MANY_BY_CHANCE: Final = 0.01  # Probability that so many frequencies look coherent in noise.
 # Approximate power that leaks, by distance in frequencies.
 _LEAKED_SHARES: Final = (0.5, 0.1, *(1e-3 * (3 / apart) ** 6 for apart in range(3, 13)))
-_N_STEPS: Final = 4
 _MAX_COHERENCE: Final = 1 - 1e-9
 _FALSE_SHARE: Final = 5e-4  # Share of frequencies by chance among the coherent ones.
 _ALONE: Final = 0.01  # Probability by chance of coherent neighbours.
-_CERTAIN: Final = 120.0  # Squared lead of a maximum, relative to the noise, that leaves no doubt.
-_BEYOND: Final = 0.004  # Probability of delays beyond four uncertainties.
 _INDEPENDENT: Final = 0.947  # Share of independent blocks: neighbours have a correlation of 1/6 under Hann windows.
 
 
@@ -81,8 +77,12 @@ def time_differences(
     is the variance for the time T and the coherence γ² as measured in blocks, corrected for its bias. Each further
     maximum at a delay Δ from the first one adds ``p Δ²`` for its probability p to be the right one. Four uncertainties
     reach all maxima but those whose probability sums up to 0.4 %. In weak or narrow-band sound, the uncertainty is
-    therefore about that of whole periods. One source without echoes is assumed: where the correlations of several
-    sources, or of a source and its echo, overlap, the delay is that of their sum, and its error may exceed the
+    therefore about that of whole periods.
+
+    One source without echoes is assumed. If its delay fits the phases of the band significantly worse than the noise
+    allows, there are others: the misfit widens the uncertainty, and so does each maximum above 0.7 times the largest
+    one. Sources or echoes may fit as one where the band does not resolve them (less than about 0.2 divided by its width
+    apart), or where it is narrower than a tenth of its frequencies. The error of their common delay may then exceed the
     uncertainty. Sound of a steep spectrum, such as 1/f² at 40 dB above the noise, needs ``phat`` or ``scot``:
     unweighted, its errors may exceed the uncertainty.
 
@@ -226,17 +226,17 @@ class _Correlator:
         most_s = limit_s if most_s is None else min(most_s, limit_s)
         rows = signals.rows[first], signals.rows[second]
         bins = self._bins(self._spectra[first], self._spectra[second])
-        found = _Correlation(*rows, bins, -own_s, rate_hz)
+        found = Correlation(*rows, bins, -own_s, rate_hz)
         n_late = round((found.delay_s(most_s) + own_s) * rate_hz)
         n_common = rows[0].size - abs(n_late)
         if n_late != 0 and n_common >= 4 * self._n_block:
             # Blocks of the same sound have no error of windows that cut it at different times.
             rows = rows[0][max(-n_late, 0) :][:n_common], rows[1][max(n_late, 0) :][:n_common]
             bins = self._bins(*(self._spectra_of(each) for each in rows))
-            found = _Correlation(*rows, bins, n_late / rate_hz - own_s, rate_hz)
-        return found.result(first, second, most_s)
+            found = Correlation(*rows, bins, n_late / rate_hz - own_s, rate_hz)
+        return TimeDifference(first, second, *found.result(most_s))
 
-    def _bins(self, first: NDArray[np.complex64], second: NDArray[np.complex64]) -> "_Bins":
+    def _bins(self, first: NDArray[np.complex64], second: NDArray[np.complex64]) -> Bins:
         """Return the cross-spectrum of blocks, and the weights of frequencies."""
         cross = (second * first.conj()).mean(axis=0, dtype=np.complex128)
         size = np.abs(cross)
@@ -274,137 +274,7 @@ class _Correlator:
         # A coherence that noise may reach by chance does not tell which of several maxima is right.
         by_chance = 1 - _BY_CHANCE ** (1 / n_free)
         evidence = np.maximum(1 - by_chance / np.maximum(coherence, _TINY), 0.0)
-        return _Bins(self._n_block, cross, weights, most, ratio / (1 + ratio), evidence, is_coherent and n_blocks > 2)
-
-
-class _Bins(NamedTuple):
-    """Cross-spectrum of blocks, weights of frequencies, and the correlation of equal signals under them."""
-
-    n_block: int
-    cross: NDArray[np.complex128]
-    weights: NDArray[np.float64]
-    most: float
-    coherence: NDArray[np.float64]
-    evidence: NDArray[np.float64]
-    is_coherent: bool
-
-
-class _Correlation:
-    """Generalised cross-correlation of two signals, the second of which is late by a time."""
-
-    def __init__(
-        self, first: NDArray[np.float32], second: NDArray[np.float32], bins: _Bins, late_s: float, rate_hz: float
-    ) -> None:
-        n = first.size
-        self._bins, self._late_s, self._rate_hz, self._n = bins, late_s, rate_hz, n
-        # Ends fade, so that a shift does not wrap them around.
-        window = scipy.signal.get_window(("tukey", bins.n_block / n), n)
-        squares = float((window**2).sum())
-        frequency_hz = np.fft.rfftfreq(n, 1 / rate_hz)
-        grid_hz = np.arange(bins.weights.size) * rate_hz / bins.n_block
-        weights = np.interp(frequency_hz, grid_hz, bins.weights)
-        weights *= bins.n_block / n * float((scipy.signal.get_window("hann", bins.n_block) ** 2).sum()) / squares
-        spectra = [scipy.fft.rfft(each * window.astype(np.float32)) for each in (first, second)]
-        self._spectrum = spectra[1] * spectra[0].conj() * weights
-        used = np.flatnonzero(weights)
-        self._weighted, self._omega = self._spectrum[used].astype(np.complex128), 2 * np.pi * frequency_hz[used]
-        self._coherence, self._evidence = (
-            np.interp(frequency_hz[used], grid_hz, each) for each in (bins.coherence, bins.evidence)
-        )
-        # The window correlates neighbouring frequencies.
-        self._correlated = n * float((window**4).sum()) / squares**2
-
-    def _at(self, apart_s: float) -> NDArray[np.complex128]:
-        """Return the weighted spectrum without a delay relative to the late one."""
-        turned: NDArray[np.complex128] = self._weighted * np.exp(1j * self._omega * apart_s)
-        return turned
-
-    def _maxima_s(self, most_s: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the delays of maxima up to a largest delay, to a fraction of a sample, and the values there."""
-        step_s = 1 / (_FINER * self._rate_hz)
-        lags = np.arange(math.ceil((-most_s - self._late_s) / step_s), int((most_s - self._late_s) // step_s) + 1)
-        lags = lags if lags.size else np.array([round(-self._late_s / step_s)])
-        values = scipy.fft.irfft(self._spectrum, self._n)
-        n_near = 8 * self._bins.n_block  # Only small delays are needed at the finer step.
-        if n_near < self._n:
-            fade = np.fft.ifftshift(scipy.signal.get_window("tukey", n_near, fftbins=False))
-            values = values[np.fft.ifftshift(np.arange(n_near) - n_near // 2) % self._n] * fade
-        n_fine = _FINER * values.size
-        values = (scipy.fft.irfft(scipy.fft.rfft(values), n_fine) * _FINER * self._n / 2)[lags % n_fine]
-        beside = np.pad(values, 1, constant_values=-np.inf)
-        tops = np.flatnonzero((values >= beside[:-2]) & (values >= beside[2:]))
-        # A parabola through three samples has its top between them; a sample may miss several thousandths of it.
-        before, top, after = beside[tops], values[tops], beside[tops + 2]
-        inside = np.isfinite(before) & np.isfinite(after) & (before + after < 2 * top)
-        before, after = np.where(inside, before, top - 1), np.where(inside, after, top - 1)
-        slope = after - before
-        shift = slope / (2 * (2 * top - before - after))
-        tallest = top + slope * shift / 4
-        order = np.argsort(-tallest, kind="stable")
-        return ((lags[tops] + shift) * step_s + self._late_s)[order], tallest[order]
-
-    def delay_s(self, most_s: float) -> float:
-        """Return the delay of the largest maximum."""
-        return self._refined_s(float(self._maxima_s(most_s)[0][0]), most_s)
-
-    def _refined_s(self, delay_s: float, most_s: float) -> float:
-        """Return the maximum next to a delay by Newton's method, within the limits."""
-        for _ in range(_N_STEPS):
-            turned = self._at(delay_s - self._late_s)
-            curvature = float((self._omega**2 * turned.real).sum())
-            if curvature <= 0:
-                break
-            delay_s -= float((self._omega * turned.imag).sum()) / curvature
-        return min(max(delay_s, -most_s), most_s)
-
-    def result(self, first: int, second: int, most_s: float) -> TimeDifference:
-        """Return the time difference up to a largest one, and its uncertainty."""
-        maxima_s, values = self._maxima_s(most_s)
-        found_s = self._refined_s(float(maxima_s[0]), most_s)
-        turned = self._at(found_s - self._late_s)
-        uncertainty_s = math.inf
-        if self._bins.is_coherent and abs(found_s) < most_s:
-            uncertainty_s = self._uncertainty_s(found_s, turned, maxima_s[1:], values[1:])
-        omega = 2 * np.pi * np.arange(self._bins.weights.size) * self._rate_hz / self._bins.n_block
-        turned_bins = self._bins.weights * self._bins.cross * np.exp(1j * omega * (found_s - self._late_s))
-        height = float(turned_bins.real.sum())
-        return TimeDifference(first, second, found_s, uncertainty_s, height / max(self._bins.most, _TINY))
-
-    def _uncertainty_s(
-        self,
-        found_s: float,
-        turned: NDArray[np.complex128],
-        others_s: NDArray[np.float64],
-        values: NDArray[np.float64],
-    ) -> float:
-        """Return the uncertainty of a maximum beside others."""
-        curvature = float((self._omega**2 * turned.real).sum())
-        if curvature <= 0:
-            return math.inf
-        # Each frequency has a square of G₁₁ G₂₂ (1 + γ²), and noise of half of G₁₁ G₂₂ (1 - γ²) across its phase.
-        square, coherence = np.abs(turned) ** 2, self._coherence
-        noise = self._correlated * square * (1 - coherence) / (1 + coherence) / 2
-        size = self._evidence * np.sqrt(square * coherence / (1 + coherence))
-        n_free = max(float(np.sqrt(noise).sum() ** 2 / max(noise.sum(), _TINY)) / self._correlated, 3.0)
-        variance = float((self._omega**2 * noise).sum()) / curvature**2
-        lead = float(turned.real.sum()) - values
-        near = lead**2 < _CERTAIN * noise.sum()
-        apart_s, odds = [0.0], [1.0]
-        for other_s in others_s[near].tolist():
-            change = 1 - np.exp(1j * self._omega * (other_s - found_s))
-            ahead = float((turned * change).real.sum())
-            expected = min(float((turned.real * change.real).sum()), float((size * change.real).sum()))
-            spread = float((np.abs(change) ** 2 * noise).sum())
-            # Log odds of one delay against another; the noise is estimated, so the odds are those of Student.
-            evidence = 2 * max(ahead, 0.0) * max(expected, 0.0) / max(spread, _TINY)
-            odds.append((1 + 2 * evidence / n_free) ** (-n_free / 2))
-            apart_s.append(abs(other_s - found_s))
-        order = np.argsort(apart_s)
-        shares = np.array(odds)[order] / sum(odds)
-        distances_s = np.array(apart_s)[order]
-        beyond = np.cumsum(shares[::-1])[::-1] > _BEYOND
-        rare_s = float(distances_s[beyond].max()) / 4
-        return math.sqrt(variance + max(float((shares * distances_s**2).sum()), rare_s**2))
+        return Bins(self._n_block, cross, weights, most, ratio / (1 + ratio), evidence, is_coherent and n_blocks > 2)
 
 
 def _leaked(size: NDArray[np.float64]) -> NDArray[np.float64]:

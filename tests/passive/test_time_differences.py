@@ -131,6 +131,36 @@ def test_narrow_band_far_above_the_noise_has_no_uncertainty_of_periods():
         assert found.uncertainty_s < 0.2e-6
 
 
+@pytest.mark.parametrize("apart", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("snr_db", [10, 40])
+def test_uncertainty_covers_the_shift_by_an_echo(apart, snr_db):
+    """Coherent echoes of one microphone, 3 to 15 dB weaker; ``apart`` is in the inverse of the width of the band."""
+    random = np.random.default_rng([int(10 * apart), snr_db])
+    for _ in range(20):
+        rows, delay_s = heard_of_band(random, 20e3, 80e3, 200, 8192)
+        late = np.fft.rfftfreq(8192, 1 / RATE_HZ)
+        echo = np.fft.irfft(np.fft.rfft(rows[1]) * np.exp(-2j * np.pi * late * apart / 60e3))
+        rows[1] += 10 ** (-random.uniform(3, 15) / 20) * echo
+        rows += 10 ** (-snr_db / 20) * random.standard_normal(rows.shape)
+        (found,) = time_differences(rows, rate_hz=RATE_HZ, max_delay_s=150e-6)
+        assert abs(found.delay_s - delay_s) < 3 * found.uncertainty_s < 6e-6
+
+
+@pytest.mark.parametrize("apart", [0.5, 1.0, 2.0])
+def test_uncertainty_covers_the_shift_by_another_source(apart):
+    """Independent sources of the same band; the nearer one counts."""
+    random = np.random.default_rng(int(10 * apart))
+    for _ in range(20):
+        rows, delay_s = heard_of_band(random, 20e3, 80e3, 40, 8192)
+        others, other_s = heard_of_band(random, 20e3, 80e3, 40, 8192)
+        late = np.fft.rfftfreq(8192, 1 / RATE_HZ)
+        moved_s = delay_s + apart / 60e3 - other_s
+        others[1] = np.fft.irfft(np.fft.rfft(others[1]) * np.exp(-2j * np.pi * late * moved_s))
+        rows += 10 ** (-random.uniform(1, 10) / 20) * others
+        (found,) = time_differences(rows, rate_hz=RATE_HZ, max_delay_s=300e-6)
+        assert abs(found.delay_s - delay_s) < 4 * found.uncertainty_s < 8e-6
+
+
 def test_delay_beyond_the_largest_is_unknown():
     (found,) = time_differences(delayed_noise((0.0, 31e-6)), rate_hz=RATE_HZ, max_delay_s=29e-6)
     assert abs(found.delay_s) <= 29e-6
