@@ -121,7 +121,7 @@ gpu: $(VENV)/ready  ## test and time this machine's NVIDIA GPU in less than ten 
 release: $(VENV)/ready  ## build the distributions of the last commit in dist, and try them in empty environments
 	$(BIN)/python -m pip install --quiet --editable '.[release]'
 	$(BIN)/cffconvert --validate
-	$(BIN)/python -m tests.release dist
+	$(BIN)/python -m tests.release dist docs/how-to/install.md
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info demo site

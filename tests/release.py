@@ -1,8 +1,8 @@
-"""Build the distributions, and try each of them in empty environments: ``python -m tests.release FOLDER``.
+"""Build the distributions, and try each of them in empty environments: ``python -m tests.release FOLDER [PAGE]``.
 
 The distributions are built from the last commit. Every trial has an environment of its own, a folder of its own, and
 an empty home folder, so that nothing of this repository can help. The table of results states what was tried, and the
-command exits with 1 if anything failed.
+command exits with 1 if anything failed. A page with a place for the tables receives them.
 """
 
 import configparser
@@ -17,10 +17,12 @@ import time
 import zipfile
 from collections import Counter
 from collections.abc import Iterator
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import NamedTuple
 
 import click
+from ertis_bench import markdown
 
 ROOT = Path(__file__).parents[1]
 TYPED_ELSEWHERE = re.compile(
@@ -40,6 +42,14 @@ WITH_EXTRA = {
     "ros": "ertis export images.h5 -o images.mcap",
     "xarray": "python -c \"import ertis_numba as e; print(e.open_energyscapes('images.h5')[0].to_xarray().dims)\"",
 }
+WITHOUT_NUMBA = """
+ertis doctor
+ertis example reflectors
+ertis process reflectors.h5 -o images.h5 --device numpy
+ertis peaks images.h5
+ertis export images.h5 -o images.ply
+ertis plot images.h5 -o picture.png
+"""
 FOR_AUTHORS = {"test", "docs", "check", "peers", "release"}
 """Extras that only those who work on the package install."""
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
@@ -53,37 +63,66 @@ class Trial(NamedTuple):
     python: str
     extra: str = ""
     lowest: bool = False
+    numba: bool = True
 
     @property
     def name(self) -> str:
-        extra = f" with extra {self.extra}" if self.extra else ""
-        return f"{self.distribution}{extra}, {'lowest' if self.lowest else 'newest'} dependencies, Python {self.python}"
+        kind = f" with extra {self.extra}" if self.extra else "" if self.numba else " without Numba"
+        return f"{self.distribution}{kind}, {'lowest' if self.lowest else 'newest'} dependencies, Python {self.python}"
 
 
 class TrialError(Exception):
     """Step of a trial that failed, with the end of its output."""
 
 
-def main(folder: Path) -> int:
+def main(folder: Path, page: Path | None = None) -> int:
     """Build, check and try the distributions; return the exit code."""
+    _find_interpreters()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     paths = build(folder)
     failures = [f"FAIL contents: {each}" for each in wrong_contents(paths)]
     rows = ["| tried | result | s from install to picture |", "| --- | --- | ---: |"]
+    sizes = ""
     for trial in trials():
         begun_s = time.monotonic()
         try:
             pictured_s = perform(trial, paths[trial.distribution], folder / "trial")
             rows.append(f"| {trial.name} | passed | {pictured_s:.0f} |")
         except (TrialError, subprocess.TimeoutExpired) as error:
-            rows.append(f"| {trial.name} | failed | |")
+            rows.append(f"| {trial.name} | failed | – |")
             failures.append(f"FAIL {trial.name}: {error}")
+        sizes = sizes or size_table(folder / "trial")
         click.echo(f"{rows[-1]}  # {time.monotonic() - begun_s:.0f} s in all")
-    click.echo("\n".join(("", *rows, "", *failures)))
-    missing = [each for each in PYTHONS if not _has(each)]
-    click.echo(f"not tried, because this machine lacks them: {' '.join(missing) or 'none'} of Python")
+    missing = " and ".join(f"Python {each}" for each in PYTHONS if not _has(each)) or "none"
+    wheel_mb = paths["wheel"].stat().st_size / 1e6
+    text = "\n".join((*rows, "", f"Not tried, because the machine lacked it: {missing}.", ""))
+    text += f"\nThe wheel has {wheel_mb:.2f} MB. It installs these packages:\n\n{sizes}"
+    click.echo("\n".join(("", text, "", *failures)))
+    if page is not None:
+        markdown.update(page, "make release", text)
     return 1 if failures else 0
+
+
+def _find_interpreters() -> None:
+    """Put the interpreters of pyenv before its shims, which fail for all versions but the selected one."""
+    folders = sorted(Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")).glob("versions/3.*/bin"))
+    os.environ["PATH"] = os.pathsep.join([*map(str, folders), os.environ["PATH"]])
+
+
+def size_table(folder: Path) -> str:
+    """Return a table of the packages of a trial's environment, and the size of their files without bytecode."""
+    (place,) = folder.glob("venv/lib/python*/site-packages")
+    sizes_mb = {
+        each.name: sum(path.stat().st_size for file in each.files or () if (path := place / file).suffix != ".pyc")
+        / 1e6
+        for each in distributions(path=[str(place)])
+    }
+    rows = sorted(sizes_mb.items(), key=lambda item: -item[1])
+    small = [name for name, size_mb in rows if size_mb < 0.5]
+    shown = [(name, f"{size_mb:.1f}") for name, size_mb in rows if name not in small]
+    rest = (f"{len(small)} others: {', '.join(sorted(small))}", f"{sum(sizes_mb[name] for name in small):.1f}")
+    return markdown.table(("package", "MB"), (*shown, rest, ("all", f"{sum(sizes_mb.values()):.1f}")))
 
 
 def trials() -> Iterator[Trial]:
@@ -93,6 +132,7 @@ def trials() -> Iterator[Trial]:
             yield Trial("wheel", python)
     yield Trial("sdist", PYTHONS[0])
     yield Trial("wheel", PYTHONS[0], lowest=True)
+    yield Trial("wheel", PYTHONS[0], numba=False)
     yield from (Trial("wheel", PYTHONS[0], extra) for extra in USES)
 
 
@@ -138,11 +178,16 @@ def perform(trial: Trial, distribution: Path, folder: Path) -> float:
     if trial.lowest:
         wanted += ["--resolution", "lowest-direct", *_requirements()]
     _uv("pip", "install", "--python", folder / "venv/bin/python", *wanted)
+    if not trial.numba:
+        _uv("pip", "uninstall", "--python", folder / "venv/bin/python", "numba", "llvmlite")
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "ERTIS", "NUMBA"))}
     environment |= {"HOME": str(home), "MPLBACKEND": "agg", "PATH": f"{folder / 'venv/bin'}:{os.environ['PATH']}"}
     environment.pop("VIRTUAL_ENV", None)
     place = folder / "empty"
     place.mkdir()
+    if not trial.numba:
+        _typed(WITHOUT_NUMBA, place, environment)
+        return time.monotonic() - begun_s
     _typed("ertis doctor\nertis demo", place, environment)
     pictured_s = time.monotonic() - begun_s
     if not (place / "demo" / "image.png").stat().st_size:
@@ -210,4 +255,4 @@ def _run(command: list[str | Path], *, check: bool = True) -> subprocess.Complet
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1]).absolute()))
+    sys.exit(main(*(Path(each).absolute() for each in sys.argv[1:])))
