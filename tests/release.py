@@ -25,10 +25,8 @@ import click
 from ertis_bench import markdown
 
 ROOT = Path(__file__).parents[1]
-TYPED_ELSEWHERE = re.compile(
-    r"[A-Z]{3,}\.\w+|FOLDER|RAW|ertis (?:sensors emulate|serve|capture|listen|view|ros|sensors)"
-)
-"""Commands with a reader's own files, and those of the blocks of sensors and of the network, which the demo covers."""
+TYPED_ELSEWHERE = re.compile(r"[A-Z]{3,}\.\w+|FOLDER|RAW|platform|tcp:|ertis (?:doctor|demo|serve|sensors list)")
+"""Commands with a reader's own files, and those of the block of the network, which the demo covers."""
 USES = {
     "cluster": "import distributed, ertis_numba.campaign",
     "metrics": "import prometheus_client",
@@ -92,6 +90,7 @@ def main(folder: Path, page: Path | None = None) -> int:
         except (TrialError, subprocess.TimeoutExpired) as error:
             rows.append(f"| {trial.name} | failed | – |")
             failures.append(f"FAIL {trial.name}: {error}")
+            click.echo(failures[-1])
         sizes = sizes or size_table(folder / "trial")
         click.echo(f"{rows[-1]}  # {time.monotonic() - begun_s:.0f} s in all")
     missing = " and ".join(f"Python {each}" for each in PYTHONS if not _has(each)) or "none"
@@ -204,7 +203,7 @@ def perform(trial: Trial, distribution: Path, folder: Path) -> float:
 
 
 def _commands(text: str) -> Iterator[str]:
-    """Yield the commands of a page that need no file of the reader and no sensor."""
+    """Yield the commands of a page that need no file of the reader and no real sensor."""
     for line in re.findall(r"^\$ (ertis .*?)(?:\s+#.*)?$", text, re.MULTILINE):
         if not TYPED_ELSEWHERE.search(line):
             yield line
@@ -220,7 +219,7 @@ def _requirements() -> list[str]:
 def _typed(script: str, place: Path, environment: dict[str, str]) -> None:
     """Run lines as a shell does, and end whatever they leave running."""
     process = subprocess.Popen(
-        ["bash", "-euo", "pipefail", "-c", script],
+        ["bash", "-euo", "pipefail", "-c", f"trap 'kill $(jobs -p) 2>/dev/null || true' EXIT\n{script}"],
         cwd=place,
         env=environment,
         stdin=subprocess.DEVNULL,
