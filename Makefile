@@ -10,7 +10,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 ELSEWHERE := --ignore=tests/cuda --ignore=tests/ptx --ignore=tests/kernels
 CORE := base settings geometry frames chain analysis pipeline
 
-.PHONY: demo test test-core test-kernels test-host test-simulator test-ptx test-arm check docs reference data pictures bench peers soak gpu release clean
+.PHONY: demo test test-core test-kernels test-host test-simulator test-ptx test-arm check docs reference data notebooks pictures bench peers soak gpu release clean
 
 $(VENV)/ready: setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -69,6 +69,9 @@ data: $(VENV)/ready  ## rebuild data/synthetic from its scenes, and the gallery
 	$(BIN)/python data/build.py
 	$(BIN)/python data/hall.py
 	$(BIN)/python data/gallery.py
+
+notebooks: $(VENV)/ready-to-test  ## run the notebooks and store their texts
+	$(BIN)/python docs/notebooks/build.py
 
 pictures: $(VENV)/ready  ## redraw the pictures of the README; the viewer needs Chromium
 	$(BIN)/python -m pip install --quiet --editable '.[view,browser]'

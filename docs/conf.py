@@ -1,5 +1,6 @@
 """Sphinx configuration of the documentation site: `make docs`, with warnings as errors and no external resources."""
 
+import os
 import re
 import sys
 from pathlib import Path
@@ -8,15 +9,23 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "cli"), str(ROOT / "bench")]
 
+os.environ["PATH"] = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))  # for the notebooks
+
 project = "ertis-numba"
 author = "The authors of ertis-numba"
-extensions = ["myst_parser", "numpydoc", "sphinx.ext.autodoc", "sphinx_copybutton"]
+extensions = ["myst_nb", "numpydoc", "sphinx.ext.autodoc", "sphinx_copybutton"]
 smartquotes = False
 html_theme = "furo"
 html_title = "ertis-numba"
 html_show_sphinx = False
 html_show_copyright = False  # LICENSE has it
 html_copy_source = False
+nb_execution_mode = "cache"  # A notebook runs again only if its code has changed.
+nb_execution_cache_path = str(ROOT / "build" / "notebooks")
+nb_execution_in_temp = True
+nb_execution_timeout = 600
+nb_execution_raise_on_error = True
+nb_output_stderr = "remove"
 myst_heading_anchors = 3
 myst_enable_extensions = ["colon_fence"]
 copybutton_prompt_text = r"^(\w*)\$ "

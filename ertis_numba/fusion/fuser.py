@@ -36,7 +36,7 @@ class Fused:
     stamp : Stamp
         That of the earliest image, with the sensor ``base_link``.
     image : Energyscape
-        Image around the platform, computed at the first access, together with the points. Amplitudes are those of
+        Image around the platform with its points, computed at the first access. Amplitudes are those of
         echoes at 1 m from reflectors of the same strength. Echoes of confirmed points appear at the points only, with
         their amplitude.
     points : PointCloud
@@ -88,8 +88,8 @@ class Fused:
 
     @functools.cached_property
     def image(self) -> Energyscape:
-        """Image around the platform."""
-        return self._render(self._solve())
+        """Image around the platform, with its points, because maxima of the image may be ghosts."""
+        return self._render(self._solve()).replace(points=self.points)
 
     @functools.cached_property
     def points(self) -> PointCloud:

@@ -110,6 +110,13 @@ def test_fused_image_suppresses_foreign_echoes():
     assert np.sum(levels[:, 0] ** 2) < 10 ** (-20 / 10) * np.sum(levels[:, 1] ** 2)
 
 
+def test_peaks_of_the_fused_image_are_its_points():
+    fused = ertis.fuse(list(images().values()), mountings())
+    listed = fused.points.strongest(10, -30.0)
+    peaks = ertis.find_peaks(fused.image)
+    assert [peak.range_m for peak in peaks] == pytest.approx(np.hypot(*listed.position_m[:, :2].T).tolist())
+
+
 def test_power_of_a_pixel_counts_once(monkeypatch):
     """Power that no reflector explains is no echo of several emitters at once."""
     kept = []
@@ -598,7 +605,7 @@ def test_peaks_refuses_searches_of_images_with_points(fused_file, option):
 
 
 def test_fused_files_without_points_are_noted(tmp_path):
-    path = write_energyscapes(tmp_path / "old.h5", [fused().image])
+    path = write_energyscapes(tmp_path / "old.h5", [fused().image.replace(points=None)])
     with open_energyscapes(path) as stored:
         assert not stored.has_points
     for line in (["peaks", path], ["plot", path, "-o", tmp_path / "a.svg"], ["export", path, "-o", tmp_path / "a.csv"]):
@@ -607,13 +614,13 @@ def test_fused_files_without_points_are_noted(tmp_path):
 
 
 def test_find_peaks_refuses_bins_for_images_with_points():
-    image = fused().image.replace(points=fused().points)
+    image = fused().image
     with pytest.raises(ArgumentError, match="where selects bins, but the image has the points of a fusion"):
         ertis.find_peaks(image, where=image.amplitude > 0)
 
 
 def test_parts_of_fused_images_keep_only_their_points():
-    image = fused().image.replace(points=fused().points)
+    image = fused().image
     x_m, y_m, _ = image.points.position_m.T
     chosen = (np.hypot(x_m, y_m) <= 2.0) & (np.abs(np.degrees(np.arctan2(y_m, x_m))) <= 60.0)
     assert 0 < np.count_nonzero(chosen) < len(chosen)
@@ -649,7 +656,7 @@ def test_view_draws_the_points_of_the_fusion():
 
 def test_images_with_and_without_points_are_refused_in_one_file(tmp_path):
     image = fused().image
-    for several in ([image, image.replace(points=fused().points)], [image.replace(points=fused().points), image]):
+    for several in ([image, image.replace(points=None)], [image.replace(points=None), image]):
         with pytest.raises(ArgumentError, match="pass points with all images of a sensor, or with none"):
             write_energyscapes(tmp_path / "mixed.h5", several)
 
@@ -662,7 +669,7 @@ def test_images_with_and_without_points_are_refused_in_one_file(tmp_path):
     ],
 )
 def test_damaged_points_are_refused(tmp_path, change, reported):
-    path = write_energyscapes(tmp_path / "damaged.h5", [fused().image.replace(points=fused().points)])
+    path = write_energyscapes(tmp_path / "damaged.h5", [fused().image])
     with h5py.File(path, "r+") as file:
         change(file["sensors/base_link"])
     with pytest.raises(DamagedError, match=reported):

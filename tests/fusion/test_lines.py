@@ -46,7 +46,7 @@ def fused():
 
 
 def test_export_of_fused_lines_states_no_uncertainty_that_is_too_small(fused, tmp_path):
-    image = fused.image.replace(points=fused.points)
+    image = fused.image
     (path,) = export(tmp_path / "points.csv", [image])
     rows = np.genfromtxt(path, delimiter=",", names=True, dtype=None, encoding="utf-8")
     listed_m = np.stack([rows["x_m"], rows["y_m"], rows["z_m"]], axis=1)
@@ -57,7 +57,7 @@ def test_export_of_fused_lines_states_no_uncertainty_that_is_too_small(fused, tm
 
 
 def test_peaks_of_fused_lines_have_no_elevation(fused):
-    peaks = ertis.find_peaks(fused.image.replace(points=fused.points))
+    peaks = ertis.find_peaks(fused.image)
     assert peaks
     assert np.isnan([peak.elevation_deg for peak in peaks]).all()
 

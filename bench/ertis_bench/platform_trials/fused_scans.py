@@ -51,7 +51,7 @@ def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:
             random = np.random.default_rng([number, 1])
             signals = rendered(_SENSORS, settings, room, diameter_m=diameter_m, random=random)
             fused = fuser(images_of(signals, settings).values())
-            scan = scan_message(fused.image.replace(points=fused.points))
+            scan = scan_message(fused.image)
             found += (0, 0, 0, 0, len(room.posts_m))
             if scan is not None:
                 found[:4] += _compared(scan, room)
