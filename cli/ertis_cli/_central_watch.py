@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _watchdog, options
 from ertis_cli._config import typed
 from ertis_cli._lines import JsonLines
 from ertis_cli._progress import StatusLine
@@ -188,7 +188,7 @@ def run(
         if metrics is not None:
             stack.enter_context(metrics)
         made.clear()
-        with watch.shows(lambda: node.latest):
+        with watch.shows(lambda: node.latest), _watchdog.follow(lambda: node.latest.uptime_s):
             node.run(duration_s)
 
 

@@ -231,7 +231,7 @@ def _permission(path: Path) -> str:
     if sys.platform != "linux":
         return "ask the owner of the port to give your group read and write permission"
     return (
-        f"as root, write '{_RULE}' to /etc/udev/rules.d/60-ertis.rules, join the group 'dialout' and plug it in again"
+        f"as root, write '{_RULE}' to /etc/udev/rules.d/65-ertis.rules, join the group 'dialout' and plug it in again"
     )
 
 

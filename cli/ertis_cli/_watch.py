@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import options
+from ertis_cli import _watchdog, options
 from ertis_cli._progress import StatusLine
 
 if TYPE_CHECKING:
@@ -76,7 +76,8 @@ class Watch:
                 )
 
     def tick(self) -> None:
-        """Redraw the progress line when due."""
+        """Report that the capture runs, and redraw the progress line when due."""
+        _watchdog.beat()
         if self._line.is_drawn and time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + _REFRESH_S
             self._line.draw(self._progress())

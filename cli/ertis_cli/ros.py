@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from ertis_cli import _mountings, _network, _ros_sources, options
+from ertis_cli import _mountings, _network, _ros_sources, _watchdog, options
 from ertis_cli._naming import with_options
 from ertis_cli._recording_settings import recording_settings, settings_from
 from ertis_cli._stop_signals import stopped_by_signals
@@ -233,6 +233,7 @@ def ros(
         report = _RosReport(publisher, notes, quiet=quiet, as_json=as_json)
 
         def is_over() -> bool:
+            _watchdog.beat()
             report.show_notes()
             if watched is not None:
                 watched.poll(publisher, report.note)

@@ -11,6 +11,7 @@ from ertis_cli.devices import devices
 from ertis_cli.emulate import emulate
 from ertis_cli.reset import reset
 from ertis_cli.rtisdev import rtisdev
+from ertis_cli.service import service
 from ertis_cli.status import status
 
 __all__ = ["sensors"]
@@ -22,5 +23,5 @@ def sensors() -> None:
 
 
 _config.add_variables(rtisdev, ("rtisdev",))  # named like those that scripts without this command read
-for each in (calibrate, check, command, configure, devices, emulate, reset, rtisdev, status):
+for each in (calibrate, check, command, configure, devices, emulate, reset, rtisdev, service, status):
     sensors.add_command(each)
