@@ -23,7 +23,8 @@ Matrices = NDArray[np.complex128]
 _NONE: Final = np.zeros((0, 3))
 _BLIND: Final = 0.3  # Size of a wave outside of other sources, relative to its whole, below which it is theirs.
 _SHARE_STEPS: Final = 10  # Per decade of white noise. Between steps, extents change by a few hundredths.
-_STARTS: Final = 3  # Directions from which the most likely one is searched.
+_CANDIDATES: Final = 16  # Maxima between directions of the scan that are compared, …
+_STARTS: Final = 3  # … and those from which the most likely direction is searched.
 _MAY_BE_LOUDEST: Final = 0.5  # Share of the power of a start, relative to the largest.
 _BINS_OF_TONE: Final = 2.2  # Bins over which a Hann window spreads a tone.
 _LEAST: Final = 1e-30
@@ -32,6 +33,7 @@ _OWN: Final = 0.75  # Largest distance of sound from the centre of its bin, in s
 _WITHIN_NOISE: Final = 4.5  # Log-likelihood below its maximum: three standard deviations of a direction.
 _ARRAY_ERROR_RAD: Final = math.radians(0.4)  # Two standard deviations, as in `BearingTracker`.
 _AROUND: Final = np.array([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)])
+_DIAGONAL: Final = np.array([(1.0, 1.0), (-1.0, 1.0)])
 _MAX_EXCESS: Final = 10**0.1  # Power of all sources relative to that of the band: 1 dB for errors of estimates.
 
 
@@ -137,8 +139,12 @@ class BandSearch:
 
     def _place(self, rest: BandLikelihood, whole: BandLikelihood) -> Floats:
         """Return the most likely direction of a further source."""
-        scan = self._scan
-        tops = [rest.maximum(each, reach_rad=scan.reach_rad, level=scan.level) for each in self._loudest(rest, whole)]
+        scan, loudest = self._scan, self._loudest(rest, whole)
+        around = scan.reach_rad * np.concatenate([[(0.0, 0.0)], _AROUND / 3, _AROUND @ _DIAGONAL / 3])
+        near = np.stack([moved(each, around, level=scan.level) for each in loudest])
+        powers = rest.relative_power(near.reshape(-1, 3)).reshape(near.shape[:2])
+        starts = [near[k, powers[k].argmax()] for k in np.argsort(-powers.max(axis=1))[:_STARTS]]
+        tops = [rest.maximum(each, reach_rad=scan.reach_rad, level=scan.level) for each in starts]
         return tops[int(rest.relative_power(np.array(tops)).argmax())]
 
     def _is_found(
@@ -237,7 +243,7 @@ class BandSearch:
         shares, directions = (weights / rest.power) @ ratio, self._scan.directions
         found: list[int] = []
         least = _MAY_BE_LOUDEST * shares.max()
-        while (len(found) < _STARTS and shares.max() >= least > 0) or not found:
+        while (len(found) < _CANDIDATES and shares.max() >= least > 0) or not found:
             found.append(int(shares.argmax()))
             shares[directions @ directions[found[-1]] > math.cos(self._scan.reach_rad)] = 0
         return directions[found]

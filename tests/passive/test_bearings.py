@@ -211,8 +211,7 @@ def test_false_alarms_have_the_requested_rate(directions, band_hz, diffuse):
             camera.reset()
             camera.add(diffuse_sound(settings, diffuse, seed))
             alarms += bool(finder.find())
-    low, _ = scipy.stats.binom.interval(0.998, n_seeds, asked / 2)  # Directions of a fine search are not independent.
-    _, high = scipy.stats.binom.interval(0.998, n_seeds, asked)
+    low, high = scipy.stats.binom.interval(0.998, n_seeds, asked)
     assert low <= alarms <= high
 
 
