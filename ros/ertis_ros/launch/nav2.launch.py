@@ -1,0 +1,1 @@
+../../../examples/nav2.launch.py
