@@ -74,7 +74,9 @@ def demo(*, folder: Path, count: int, force: bool, quiet: bool) -> None:
     reflectors and a picture. The demo prints each command and writes all files to one folder.
     """
     from ertis_numba import kernels
+    from ertis_numba.devices.links import require_terminals
 
+    require_terminals()
     kernels.require_numba("'ertis demo', which renders 120 measurements,")
     _make(folder, force=force)
     scene = folder / _SCENE
