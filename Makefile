@@ -119,7 +119,7 @@ soak: $(VENV)/ready-to-test  ## test faults, kills, full disks and random scenes
 
 gpu: $(VENV)/ready  ## test and time this machine's NVIDIA GPU in less than ten minutes; GPU=cu13 for CUDA 13
 	$(BIN)/python -m pip install --quiet --editable '.[test,$(GPU)]'
-	$(BIN)/ertis bench gpu --results bench/results --update docs/explanation/gpu.md --update README.md
+	$(BIN)/ertis bench gpu --results bench/results --update docs/explanation/gpu.md
 
 release: $(VENV)/ready  ## build the distributions of the last commit in dist, and try them in empty environments
 	$(BIN)/python -m pip install --quiet --editable '.[release]'

@@ -192,7 +192,8 @@ def perform(trial: Trial, distribution: Path, folder: Path) -> float:
     if not (place / "demo" / "image.png").stat().st_size:
         raise TrialError("the demo drew no picture")
     readme = (ROOT / "README.md").read_text("utf-8")
-    _typed("\n".join(_commands(readme)), place, environment)
+    tour = (ROOT / "docs" / "tutorial" / "tour.md").read_text("utf-8")
+    _typed("\n".join(_commands(readme + tour)), place, environment)
     (code,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
     (place / "readme.py").write_text(code, "utf-8")
     _typed("python readme.py", place, environment)

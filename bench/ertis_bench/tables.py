@@ -8,10 +8,12 @@ from ertis_bench.accuracy import PAPER, TURN
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import or_dash, table
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS, RESTRICTED
+from ertis_numba.base.units import counted
 from ertis_numba.pipeline.verification import PEAKS
 
-__all__ = ["FORMS", "accuracy", "accuracy_front", "paper"]
+__all__ = ["FORMS", "accuracy", "accuracy_front", "paper", "paper_short"]
 
+_FASTEST = "GPU GTX 1080 Ti"
 _MEANING = {
     "scipy": "`scipy`: the paper's algorithm, NumPy and SciPy",
     "paper": "`paper`: the paper's method, Numba",
@@ -49,6 +51,16 @@ def paper(report: dict[str, Any]) -> str:
             _checked(report),
         ]
     )
+
+
+def paper_short(report: dict[str, Any]) -> str:
+    """Return the median times of this package and of the paper's algorithm, and the times that the paper published."""
+    found = {(row["backend"], row["directions"]): row["median_ms"] for row in report["rows"]}
+    named = {"scipy": "the paper's algorithm in SciPy", "cpu": f"this package, {report['instruction_set']}"}
+    rows = [[name, *(f"{found[backend, n]:.1f}" for n in DIRECTIONS)] for backend, name in named.items()]
+    rows.append([f"published in the paper, {_FASTEST}", *(f"{mean:.1f}" for mean, _ in PUBLISHED_MS[_FASTEST])])
+    times = table(["ms", *(f"{n} directions" for n in DIRECTIONS)], rows)
+    return f"{times}\n\nMedians on {report['machine']['cpu']}, {counted(report['machine']['cores'], 'core')}."
 
 
 def _checked(report: dict[str, Any]) -> str:
@@ -150,7 +162,7 @@ def _accuracy_conditions(report: dict[str, Any]) -> str:
 
 
 FORMS: dict[str, dict[str, Callable[[dict[str, Any]], str]]] = {
-    "paper": {"paper": paper},
+    "paper": {"paper": paper, "paper short": paper_short},
     "accuracy": {"accuracy": accuracy, "accuracy front": accuracy_front},
 }
 """Forms of the table of each command in the wheel, by the name in its markers. A file's markers select the form."""

@@ -9,12 +9,16 @@ import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 import ertis_numba as ertis
 from ertis_numba import figures
 
 HERE = Path(__file__).parent
+LAP, LAP_STEP, SHOWN_PULSE = 423, 6, 60
+"""Pulses of the first lap of the hall, of which every sixth is mapped, and the one whose image is drawn."""
 BEAMFORMERS: dict[str, dict[str, Any]] = {
     "Delay-and-sum": {},
     "Coherence factor": {"weighting": "coherence_factor"},
@@ -92,8 +96,41 @@ def kinds() -> None:
     sheet.quantize(256, dither=Image.Dither.NONE).save(HERE / "kinds.png", optimize=True)
 
 
+def platform() -> None:
+    """Draw a fused pulse in the hall and the map of its first lap, both with the true reflectors as small dots."""
+    scene = ertis.load_scene(HERE.parents[1] / "data" / "synthetic" / "scenes" / "hall.toml")
+    simulators = {each.name: ertis.Simulator(scene, sensor=each.name) for each in scene.sensors}
+    pipelines = {each.name: ertis.Pipeline(each.settings()) for each in scene.sensors}
+    mountings = {each.name: (each.position_m, each.quaternion()) for each in scene.sensors}
+    mapper, path = ertis.Mapper(mountings, cell_m=0.05), scene.platform.trajectory(np.arange(LAP) / scene.rate_hz)
+    for number in range(0, LAP, LAP_STEP):
+        images = [pipelines[name].process(simulators[name].render(number)) for name in simulators]
+        pose = path.position_m[number], path.rotation_xyzw[number]
+        mapper.add(images, (tuple(pose[0].tolist()), tuple(pose[1].tolist())))
+        if number == SHOWN_PULSE:
+            fused, place = ertis.fuse(images, mountings), pose
+    true_m = np.array([point.position_m for point in scene.points])
+    polar = figures.plot(fused.image, dynamic_range_db=30, peaks=ertis.find_peaks(fused.image, top=None))
+    seen_m = Rotation.from_quat(place[1]).inv().apply(true_m - place[0])
+    seen_m = seen_m[np.hypot(*seen_m[:, :2].T) < fused.image.range_m[-1]]
+    polar.axes[0].plot(-seen_m[:, 1], seen_m[:, 0], ".", color="white", markersize=2.5, scalex=False, scaley=False)
+    above = figures.occupancy(mapper.map, trajectory=path, theme="dark")
+    above.axes[0].plot(*true_m[:, :2].T, ".", color="#00aaff", markersize=1.5, scalex=False, scaley=False)
+    parts = []
+    for figure in (polar, above):
+        file = io.BytesIO()
+        figure.savefig(file, format="png", dpi=1000 / figure.get_figwidth())
+        parts.append(Image.open(file).convert("RGB"))
+    height = max(part.height for part in parts)
+    sheet = Image.new("RGB", (2000, height), parts[0].getpixel((0, 0)))
+    for number, part in enumerate(parts):
+        sheet.paste(part, (1000 * number, (height - part.height) // 2))
+    sheet.quantize(256, dither=Image.Dither.NONE).save(HERE / "platform.png", optimize=True)
+
+
 if __name__ == "__main__":
     real()
+    platform()
     beamformers()
     kinds()
     leak()

@@ -93,6 +93,7 @@ RUN_BY = {
     ("ros", "$"): ["test_guide::test_commands_of_the_ros_page_run"],
     ("simulation", "$"): ["test_readme::test_commands_of_the_simulation_page_run"],
     ("simulation", "python"): ["test_readme::test_commands_of_the_simulation_page_run"],
+    ("tour", "$"): ["test_readme::test_commands_of_the_readme_and_the_tour_run"],
     ("view", "$"): ["test_view_command::test_commands_of_the_page_on_the_view_run"],
     ("view", "python"): ["test_view_command::test_commands_of_the_page_on_the_view_run"],
 }

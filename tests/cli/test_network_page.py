@@ -1,4 +1,4 @@
-"""Network commands of the README and of docs/how-to/network.md, with other ports, hosts, sounds and grids.
+"""Network commands of the tour and of docs/how-to/network.md, with other ports, hosts, sounds and grids.
 
 The emulated sensors of the platform repeat one measurement, because rendering the scene takes longer than all other
 work together. Commands that end by themselves run in this process.
@@ -25,7 +25,7 @@ from tests.pages import page, run_here
 from tests.ports import reserved_address
 
 ROOT = Path(__file__).parents[2]
-README = (ROOT / "README.md").read_text("utf-8")
+TOUR = page("tour")
 PAGE = page("network")
 READY = {"sensors emulate": "/dev/", "serve": '"listening"', "record": '"listening"', "capture": '"kept"'}
 SENSORS = ("front", "left")
@@ -130,8 +130,8 @@ def on_one_machine(text):
     return lines_of(next(block for block in text.split("```") if "$ ertis serve" in block), "")
 
 
-def test_network_commands_of_the_readme_are_those_of_the_page():
-    assert on_one_machine(README) == on_one_machine(PAGE)
+def test_network_commands_of_the_tour_are_those_of_the_page():
+    assert on_one_machine(TOUR) == on_one_machine(PAGE)
 
 
 def test_network_page_on_one_machine_runs(place, ports, platform):

@@ -18,7 +18,8 @@ ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 SIMULATION = page("simulation")
 DEVICES = page("devices")
-NETWORK = next(block for block in README.split("```") if "ertis serve" in block)
+TOUR = page("tour")
+NETWORK = next(block for block in TOUR.split("```") if "ertis serve" in block)
 ELSEWHERE = {
     *(
         "demo",
@@ -66,7 +67,7 @@ def test_readme_describes_every_folder():
     } == set()
 
 
-def test_readme_commands_run(place, tmp_path_factory):
+def test_commands_of_the_readme_and_the_tour_run(place, tmp_path_factory):
     """Each command imports its own modules at its first occurrence.
 
     The emulator replays a recording of its scene, which starts sooner.
@@ -75,7 +76,9 @@ def test_readme_commands_run(place, tmp_path_factory):
     with contextlib.ExitStack() as stack:
         run_forked = stack.enter_context(forking(place, tmp_path_factory.mktemp("output")))
         for command in commands_in(
-            README.replace(NETWORK, "").replace("sensors emulate reflectors.toml", "sensors emulate reflectors.h5")
+            (README + TOUR)
+            .replace(NETWORK, "")
+            .replace("sensors emulate reflectors.toml", "sensors emulate reflectors.h5")
         ):
             name, *arguments = shlex.split(command)
             if name in ELSEWHERE or command.startswith("sensors calibrate"):
@@ -140,7 +143,8 @@ def test_files_named_on_pages_exist(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["README.md", "docs/tutorial/quickstart.md", "docs/how-to/network.md", "docs/how-to/applications.md"]
+    "name",
+    ["docs/tutorial/tour.md", "docs/tutorial/quickstart.md", "docs/how-to/network.md", "docs/how-to/applications.md"],
 )
 def test_emulator_blocks_can_be_pasted_unchanged(name):
     """Pasted commands run before the emulator is ready, so each block waits for its sensor."""
@@ -153,6 +157,6 @@ def test_emulator_blocks_can_be_pasted_unchanged(name):
 
 
 def test_network_blocks_give_the_mounting_of_their_sensors():
-    for path in ("README.md", "docs/how-to/network.md", "docs/how-to/applications.md"):
+    for path in ("docs/tutorial/tour.md", "docs/how-to/network.md", "docs/how-to/applications.md"):
         (captured,) = re.findall(r"^\$ ertis capture .*--to .*$", (ROOT / path).read_text(), re.MULTILINE)
         assert "--mounting platform.toml" in captured

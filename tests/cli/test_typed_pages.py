@@ -52,6 +52,8 @@ def inputs_and_outputs(command):
         return [], [file for each in words[2:] if each != "&" for file in _examples.named(each)]
     if name in {"mkdir", "cp"}:
         return words[1:-1], [words[-1]]
+    if words[:2] == ["ros2", "launch"] and not FILE.fullmatch(words[2]):
+        words = words[4:]  # a file of a ROS package
     written = [after for before, after in itertools.pairwise(words) if WRITES.fullmatch(before)]
     needed = [word.removeprefix("./") for word in words[1:] if FILE.fullmatch(word) and word not in written]
     if words[1:3] == ["keys", "new"]:

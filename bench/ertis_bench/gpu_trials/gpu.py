@@ -39,7 +39,7 @@ __all__ = [
     "tested",
 ]
 
-FORMS = {"gpu": gpu_tables.gpu, "gpu short": gpu_tables.gpu_short}
+FORMS = {"gpu": gpu_tables.gpu}
 REFUSED = 3
 """Exit code of a process without a GPU. Its output states the reason."""
 

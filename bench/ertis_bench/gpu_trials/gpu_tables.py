@@ -7,7 +7,7 @@ from ertis_bench.gpu_trials import rival_mach
 from ertis_bench.markdown import table
 from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
 
-__all__ = ["gpu", "gpu_short"]
+__all__ = ["gpu"]
 
 _UNMEASURED = "not measured"
 _PUBLISHED = "GPU GTX 1080 Ti"
@@ -28,16 +28,6 @@ def gpu(report: dict[str, Any]) -> str:
         return f"{_times(_lines({}))}\n\n{_NO_RESULTS}"
     parts = [_stages(report), _maps(report), _rivals(report), _reached(report), _verdicts(report), _machine(report)]
     return "\n\n".join([_times(_lines(report)), *(part for part in parts if part), _CONDITIONS.format(**report)])
-
-
-def gpu_short(report: dict[str, Any]) -> str:
-    """Return the times of single measurements and streams for the paper's direction grids, with the paper's times."""
-    if not report:
-        return "No GPU has run the kernels yet. They are simulated and compiled, but not measured."
-    lines = _lines(report)
-    times = _times({name: lines[name] for name in (next(iter(_SINGLE)), next(iter(_STREAMS)), _PAPER)})
-    about = f"Medians on {report['gpu']['name']}, {report['date'][:10]}; docs/explanation/gpu.md has the rest."
-    return f"{times}\n\n{about}"
 
 
 def _rows(report: dict[str, Any], part: str) -> list[dict[str, Any]]:
