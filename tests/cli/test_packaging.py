@@ -3,6 +3,7 @@
 import ast
 import configparser
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -15,6 +16,7 @@ from ertis_cli.bench import bench
 from ertis_cli.main import cli
 
 ROOT = Path(__file__).parents[2]
+CONTAINER = (ROOT / "Containerfile").read_text()
 IN_THE_REPOSITORY_ONLY = {
     f"ertis_bench.{name}"
     for name in (
@@ -63,6 +65,20 @@ def wheel(tmp_path_factory):
     subprocess.run([*command, "--wheel-dir", folder, ROOT], env=environment, check=True, timeout=240)
     (path,) = folder.glob("*.whl")
     return path
+
+
+def test_container_contains_every_package_and_its_stages_are_extras():
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    copied = {line[1:] for line in (ROOT / ".containerignore").read_text().split() if line.startswith("!")}
+    folders = {line.partition("=")[2].split("/")[0].strip() for line in config["options"]["package_dir"].split("\n")}
+    assert (folders - {""}) | {"setup.cfg", "pyproject.toml", "README.md", "LICENSE", "NOTICE", "ertis_numba"} <= copied
+    stages = re.findall(
+        r'FROM extra AS (\w+)\nRUN pip install --no-cache-dir "\$\(ls /dist/\*.whl\)\[(\w+)\]"', CONTAINER
+    )
+    assert all(name == extra and extra in config["options.extras_require"] for name, extra in stages)
+    assert [name for name, _ in stages] == re.findall("FROM extra AS (.+)", CONTAINER)
+    assert CONTAINER.count("\nUSER ertis\n") == 1 + len(stages)
 
 
 def test_wheel_contains_every_example(wheel):
