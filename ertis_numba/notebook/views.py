@@ -51,13 +51,12 @@ def html_of(shown: Any) -> str:
 
 @html_of.register
 def _(image: Energyscape) -> str:
-    found: list[Peak] | None = None
-    try:
+    found: list[Peak] = []
+    listed, problems = ("", f"Reflectors are unknown: {_flaw(image.amplitude)}"), list[str]()
+    if not _flaw(image.amplitude):
         found = find_peaks(image, top=_TOP, false_alarm=FALSE_ALARM)
         listed = _peak_rows(found), "no echo above the noise"
-        problems = list(filter(None, _notes_of_image(image, found)))
-    except ErtisError as error:  # An image of a user may contain NaN.
-        listed, problems = ("", f"Reflectors are unknown: {error}"), []
+        problems += filter(None, _notes_of_image(image, found))
     axes = [
         Axis("amplitude", "direction, range", image.amplitude, "", "1 is a full-scale echo in every microphone"),
         Axis("azimuth", "direction", image.azimuth_deg, "°", "from x forward towards y left"),
@@ -66,7 +65,7 @@ def _(image: Energyscape) -> str:
     ]
 
     def draw(figures: Any) -> Any:
-        return None if found is None else figures.plot(image, peaks=found)
+        return None if _flaw(image.amplitude) else figures.plot(image, peaks=found)
 
     title = _title("Energyscape", image.stamp, "measurement" if image.points is None else "pulse")
     return page(title, axes, listed, problems, draw)
@@ -126,15 +125,17 @@ def _(cloud: PointCloud) -> str:
         }
     rows = _rows({name: (form, values.__getitem__) for name, (form, values) in columns.items()}, range(len(found)))
     problems = list(filter(None, _notes_of_points(cloud)))
+    flaw = _flaw(cloud.position_m) or _flaw(cloud.amplitude)
+    listed = ("", f"Points are unknown: {flaw}") if flaw and len(cloud) else (rows, "no point")
     axes = [
         Axis("position", "point, axis", cloud.position_m, "m", "x forward, y left, z up, in the sensor frame"),
         Axis("amplitude", "point", cloud.amplitude, "", "1 is a full-scale echo in every microphone"),
     ]
 
     def draw(figures: Any) -> Any:
-        return figures.points(cloud) if len(cloud) else None
+        return None if flaw else figures.points(cloud)
 
-    return page(_title("Points", cloud.stamp), axes, (rows, "no point"), problems, draw)
+    return page(_title("Points", cloud.stamp), axes, listed, problems, draw)
 
 
 def _notes_of_points(cloud: PointCloud) -> Iterator[str | None]:
@@ -167,10 +168,12 @@ def _(found: AcousticMap) -> str:
         missing = "sources were not searched; ertis.BearingFinder finds them"
 
     def draw(figures: Any) -> Any:
-        several = len(found.azimuth_rad) > 1
-        return figures.acoustic_map(found) if several else figures.spectrum(found)
+        if _flaw(found.power):
+            return None
+        return figures.acoustic_map(found) if len(found.azimuth_rad) > 1 else figures.spectrum(found)
 
-    problems = [f"sources may be {name}" for name in sorted({name for each in loudest for name in each.doubts})]
+    problems = [f"no picture: {flaw}"] if (flaw := _flaw(found.power)) else []
+    problems += [f"sources may be {name}" for name in sorted({name for each in loudest for name in each.doubts})]
     return page(_title("Acoustic map", found.stamp), axes, (_bearing_rows(loudest), missing), problems, draw)
 
 
@@ -254,6 +257,13 @@ def _about(settings: Settings) -> dict[str, str]:
 
 def _facts(about: dict[str, str]) -> str:
     return table([("property", ""), ("value", "")], [[(escaped(k), ""), (escaped(v), "")] for k, v in about.items()])
+
+
+def _flaw(values: "NDArray[Any]") -> str:
+    """Return the reason for which values are not shown; empty if there is none."""
+    if not values.size:
+        return "there are no values"
+    return "" if np.isfinite(values).all() else "values contain NaN or infinity"
 
 
 def _rows(columns: dict[str, tuple[str, Callable[[Any], float]]], items: Iterable[Any]) -> str:

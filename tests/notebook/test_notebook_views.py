@@ -106,6 +106,28 @@ def test_image_with_nan_has_neither_reflectors_nor_a_picture():
     assert "with NaN or infinity" in page.cells
 
 
+def test_empty_image_has_neither_reflectors_nor_a_picture():
+    empty = image().replace(amplitude=image().amplitude[:, :0], range_m=image().range_m[:0])
+    page = shown(empty)
+    assert "Reflectors are unknown: there are no values" in page.cells
+    assert not page.images
+
+
+def test_points_with_nan_are_not_listed():
+    cloud = ertis.PointExtractor(image().settings)(image(reflectors=[(20.0, 1.5, 0.1)]))
+    for name in ("position_m", "amplitude"):
+        page = shown(cloud.replace(**{name: np.nan * getattr(cloud, name)}))
+        assert "Points are unknown: values contain NaN or infinity" in page.cells
+        assert not page.images
+        assert "x (m)" not in page.cells
+
+
+def test_map_with_nan_has_no_picture():
+    page = shown(acoustic_map().replace(power=np.nan * acoustic_map().power))
+    assert "Note: no picture: values contain NaN or infinity" in page.cells
+    assert not page.images
+
+
 def test_angles_that_an_array_cannot_observe_are_unknown():
     single = image(reflectors=[(0.0, 1.5, 0.1)])
     array = single.settings.array.replace(disabled=tuple(range(1, 32)))
