@@ -15,7 +15,7 @@ from ertis_numba.frames import Measurement
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Accuracy, Array, Processing, Recording, Settings
 
-RATE_HZ, N_SAMPLES = 450_000.0, 4_096
+RATE_HZ = 450_000.0
 AMPLITUDE = 0.01
 
 
@@ -34,6 +34,8 @@ class Case:
     wavefront: str = "spherical"
     encoding: str = "float32"
     is_plane: bool = False
+    window_m: tuple[float, float] = (0.6, 1.1)
+    n_samples: int = 4_096
 
     @property
     def is_planar(self):
@@ -56,6 +58,24 @@ def sweep(time_s, *, first_hz=50e3, last_hz=25e3, duration_s=2.5e-3, ramp=0.1):
     return np.where(
         inside, np.sin(phase) * np.sin(0.5 * math.pi * np.minimum(1.0, edge_s / (ramp * duration_s))) ** 2, 0
     )
+
+
+def absorption_1_m(frequency_hz):
+    """Nepers per metre of air of 20 °C and 50 % humidity at sea level, after ISO 9613-1: an array like the argument."""
+    water = 50 * 10 ** (4.6151 - 6.8346 * (273.16 / 293.15) ** 1.261)
+    oxygen_hz = 24 + 4.04e4 * water * (0.02 + water) / (0.391 + water)
+    nitrogen_hz = 9 + 280 * water
+    oxygen = 0.01275 * math.exp(-2239.1 / 293.15) / (oxygen_hz + frequency_hz**2 / oxygen_hz)
+    nitrogen = 0.1068 * math.exp(-3352.0 / 293.15) / (nitrogen_hz + frequency_hz**2 / nitrogen_hz)
+    return frequency_hz**2 * (1.84e-11 + oxygen + nitrogen)
+
+
+def compressed(path_m):
+    """Amplitude of the compressed pulse after a path through air, relative to that of the call."""
+    frequency_hz, bins = np.fft.rfftfreq(2_048, 1 / RATE_HZ), np.fft.rfft(sweep(np.arange(2_048) / RATE_HZ))
+    inside = np.clip(np.minimum((frequency_hz - 20e3) / 5e3, (55e3 - frequency_hz) / 5e3), 0, 1)
+    power = np.abs(bins) ** 2 * np.sin(math.pi / 2 * inside) ** 2
+    return float(power @ np.exp(-path_m * absorption_1_m(frequency_hz)) / power.sum())
 
 
 @njit(cache=True)
@@ -81,14 +101,14 @@ class Draws:
         low_deg, high_deg = (0.0, 0.0) if case.is_planar else case.limits_deg[2:]
         spatial = {} if case.is_planar else {"elevation_limits_deg": (low_deg, high_deg)}
         is_pdm = case.encoding == "pdm"
-        self.rate_hz, self.n_samples = (4.5e6, 40_960) if is_pdm else (RATE_HZ, N_SAMPLES)
+        self.rate_hz, self.n_samples = (10 * RATE_HZ, 10 * case.n_samples) if is_pdm else (RATE_HZ, case.n_samples)
         settings = Settings(
             array=Array(layout=case.layout),
             recording=Recording(sample_rate_hz=self.rate_hz, n_samples=self.n_samples, encoding=case.encoding),
             processing=Processing(
                 directions=case.directions,
                 azimuth_limits_deg=case.limits_deg[:2],
-                range_m=(0.6, 1.1),
+                range_m=case.window_m,
                 range_decimation=100 if is_pdm else 10,
                 wavefront=case.wavefront,
                 **spatial,
@@ -106,14 +126,17 @@ class Draws:
         self.noise = math.sqrt(np.mean(noise.amplitude.astype(float) ** 2))
 
     def signals(self, direction, range_m):
-        """Echo of amplitude 1 at each microphone, without noise: (mic, sample)."""
+        """Echo at each microphone whose compressed pulse has the amplitude 1, without noise: (mic, sample)."""
         if self.case.is_plane:
             path_m = 2 * range_m - self.positions_m @ direction
         else:
             path_m = range_m + np.linalg.norm(range_m * direction - self.positions_m, axis=1)
         first = 1 if self.case.encoding == "pdm" else 0  # The modulator delays by a sample.
         time_s = (first + np.arange(self.n_samples)) / self.rate_hz
-        return sweep(time_s - path_m[:, None] / self.speed_m_s)
+        heard = sweep(time_s - path_m[:, None] / self.speed_m_s)
+        loss_1_m = absorption_1_m(np.fft.rfftfreq(self.n_samples, 1 / self.rate_hz))
+        bins = np.fft.rfft(heard) * np.exp(-path_m[:, None] * loss_1_m)
+        return np.fft.irfft(bins, self.n_samples) / compressed(2 * range_m)
 
     def image(self, signals):
         """Image of signals, (mic, sample)."""

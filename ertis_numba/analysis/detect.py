@@ -23,6 +23,7 @@ from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vecto
 __all__ = ["find_peaks", "left_out_at_edges", "left_out_in_noise", "neighbours_of", "observed", "peaks_of_grid"]
 
 _SAME_DIGITS = 9  # Decimals in which the unit vectors of equal directions agree.
+_BESIDE = 8  # Number of further maxima that are examined as disturbances.
 _NEIGHBOURS = 8  # Number of directions around each direction of a dense grid.
 
 
@@ -146,11 +147,11 @@ def peaks_of_grid(
     each_top: list[Tops] = []
     is_limited, noise = has_outside(image.settings, directions), noise_of(image)
     for k in order:
-        if len(found) == top:
-            break
         # Each candidate is compared only with the few reflectors found before it, at their interpolated positions. The
         # prediction of a side lobe is several decibels off if its reflector is half a bin off.
-        if side_lobes.explain(directions[places[k, 0]], int(places[k, 1]), levels[k]):
+        is_beside = [abs(image.range_m[places[k, 1]] - each[1]) < side_lobes.reach_m for each in found[:top]]
+        is_left_out = len(found) >= top and (len(found) >= top + _BESIDE or not any(is_beside))
+        if is_left_out or side_lobes.explain(directions[places[k, 0]], int(places[k, 1]), levels[k]):
             continue
         tops = interpolate(image, places[k : k + 1, 0], places[k : k + 1, 1], noise=noise)
         found.append((tops.direction[0], float(tops.range_m[0]), float(tops.amplitude[0])))
@@ -166,11 +167,11 @@ def peaks_of_grid(
             side_lobes.add(outside.direction, found[-1][1], max(math.sqrt(outside.power), found[-1][2]))
         else:
             side_lobes.add(*found[-1])
-    return _peaks(image, each_top, errors_rad, noise)
+    return _peaks(image, each_top, errors_rad[:top], noise)
 
 
 def _peaks(image: Energyscape, each_top: list[Tops], errors_rad: list[float], noise: float) -> list[Peak]:
-    """Return interpolated maxima as peaks, strongest first."""
+    """Return the first interpolated maxima as peaks, strongest first; further ones disturb them."""
     if not each_top:
         return []
     tops = Tops(*(np.concatenate(column) for column in zip(*each_top, strict=True)))
@@ -189,7 +190,7 @@ def _peaks(image: Energyscape, each_top: list[Tops], errors_rad: list[float], no
             range_sd_m=float(uncertainty.range_m[k]),
             level_sd_db=20 / math.log(10) * float(level_sd[k]),
         )
-        for k in np.argsort(-levels, kind="stable").tolist()
+        for k in np.argsort(-levels[: len(errors_rad)], kind="stable").tolist()
     ]
 
 

@@ -51,9 +51,10 @@ class Fitted(NamedTuple):
 class EchoFits:
     """Fits of single echoes to maxima of images of delay-and-sum, with unit vectors (direction, axis)."""
 
-    def __init__(self, settings: Settings, directions: Floats, spread: PointSpread) -> None:
-        self._directions, self._spread = np.ascontiguousarray(directions), spread
-        self._beams = spread.beams(self._directions, deviation_of(settings, directions))
+    def __init__(self, settings: Settings, directions: Floats) -> None:
+        self._directions = np.ascontiguousarray(directions)
+        self._spread = PointSpread(settings, path_m=sum(settings.processing.range_m))
+        self._beams = self._spread.beams(self._directions, deviation_of(settings, directions))
         self._is_planar = bool(np.ptp(directions[:, 2]) == 0)
 
     def __call__(
@@ -81,6 +82,7 @@ class EchoFits:
         axes, width_rad = self._axes(middle), _widths_rad(offsets)
         at_border = self._at_border(width_rad, axes)
         is_sparse = at_border < _SPARSE
+        tilt_s, heard = self._spread.tilts(image.range_m[columns[:, 1]].astype(np.float64), image.settings.air)
         samples = kernels.EchoSamples(
             rows,
             is_used,
@@ -88,6 +90,7 @@ class EchoFits:
             image.range_m[columns] - image.range_m[columns[:, 1:2]],
             image.range_m[columns[:, 1]].astype(np.float64),
             at_border < _COARSE,
+            tilt_s,
         )
         step_m = float(image.range_m[1] - image.range_m[0]) if len(image.range_m) > 1 else 0.0
         starts = self._starts(tops, step_m, offsets, axes, amplitude[:, 1])
@@ -104,6 +107,7 @@ class EchoFits:
             self._spread.scale(image.settings.air),
             out,
         )
+        out[:, 3] += np.log(heard)
         covariance = out[:, 5:21].reshape(-1, 4, 4)
         covariance[~np.isfinite(covariance).all(axis=(1, 2))] = _UNKNOWN * np.eye(4)
         across = covariance[:, 1:3, 1:3]

@@ -16,7 +16,7 @@ from ertis_numba.settings import Settings
 
 __all__ = ["PeakInterpolator", "Tops", "listed"]
 
-_MODEL = 3e-4  # Least error of a predicted sample, relative to the amplitude.
+_MODEL = 2e-4  # Least error of a predicted sample, relative to the amplitude.
 _EDGE_OF_LOBE = 0.5  # Amplitude relative to the maximum, below which a sample is not part of the main lobe.
 _NOISE = 10 ** (0.5 / 20)  # Noise may raise a maximum above a main lobe through its strongest sample.
 _NARROWER = 3.0  # The main lobe of adaptive beamformers in decibels, relative to that of delay-and-sum, is at most so.
@@ -71,7 +71,7 @@ class PeakInterpolator:
         self._fits = QuadricFits.of(directions, neighbours, wanted)
         self._spread = PointSpread(settings)
         is_predicted = settings.processing.method == "fast" and not settings.processing.is_adaptive
-        self._echoes = EchoFits(settings, directions, self._spread) if is_predicted else None
+        self._echoes = EchoFits(settings, directions) if is_predicted else None
         self._model = math.hypot(_MODEL, plan_error(settings)) if is_predicted else 0.0
 
     def __call__(

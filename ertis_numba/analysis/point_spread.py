@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba import kernels
 from ertis_numba.chain.plan_response import Deviation
 from ertis_numba.geometry import array_weights, microphones
-from ertis_numba.geometry.air import sound_speed_m_s
+from ertis_numba.geometry.air import absorption_db_m, sound_speed_m_s
 from ertis_numba.geometry.waveform import matched_filter_spectrum
 from ertis_numba.settings import Air, Settings
 
@@ -33,10 +33,10 @@ class PointSpread:
     P is the power spectrum of the call, w are the array weights, whose mean is 1, and d are differences of paths: for
     plane waves, 2 Δr − p·Δu at a range offset Δr and a direction offset Δu. Beyond ``reach_m``, the image ends: a side
     lobe is as long as the pulse, and its shift is half of the difference of two paths, at most the aperture's radius.
-    ``skirt_m`` includes the skirt of the pulse to -40 dB.
+    ``skirt_m`` includes the skirt of the pulse to -40 dB. ``path_m`` of air absorb a part of P.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, *, path_m: float = 0.0) -> None:
         self._speed_m_s, rate_hz = sound_speed_m_s(settings.air), settings.signal_rate_hz
         self._positions_m = microphones(settings.array).enabled_positions_m
         self._weights = array_weights(settings)
@@ -49,19 +49,22 @@ class PointSpread:
         thinned = slice(None, None, max(1, math.floor(spacing_hz * n_fft / rate_hz)))
         bins = (matched.first_bin + np.arange(len(matched.values)))[thinned]
         wave_1_m = 2 * math.pi * bins * rate_hz / n_fft / self._speed_m_s
-        power = matched.echo_power[thinned]
+        frequency_hz = wave_1_m * self._speed_m_s / (2 * math.pi)
+        power = matched.echo_power[thinned] * np.exp(-path_m * _absorption_1_m(Air(), frequency_hz))
         self._carrier_1_m = float(wave_1_m[len(wave_1_m) // 2])
         # Wave numbers are evenly spaced, so the sum is a Fourier transform, with a period of six times ``skirt_m``.
         period_m = 2 * math.pi / float(wave_1_m[1] - wave_1_m[0]) if len(wave_1_m) > 1 else 8 * self.skirt_m
         count = 2 ** math.ceil(math.log2(len(wave_1_m) * _STEPS_PER_WAVE))
-        path_m = np.arange(count) * (period_m / count)
+        steps_m = np.arange(count) * (period_m / count)
         shares = power / power.sum()
-        self._turn = np.exp(1j * (wave_1_m[0] - self._carrier_1_m) * path_m)
-        self._shares, self._wave_1_m = shares, wave_1_m
+        self._turn = np.exp(1j * (wave_1_m[0] - self._carrier_1_m) * steps_m)
+        self._shares, self._wave_1_m, self._path_m, self._air = shares, wave_1_m, path_m, settings.air
+        # Paths may differ by half of the period.
+        self.valid_m = period_m / 4 - radius_m
         self.pulse = kernels.Pulse(
             self._table(shares),
             self._table(shares * (wave_1_m - self._carrier_1_m) * self._speed_m_s / (2 * math.pi)),
-            float(path_m[1]),
+            float(steps_m[1]),
             self._carrier_1_m,
             np.ascontiguousarray(self._positions_m),
             np.array(self._weights, np.float64),
@@ -77,6 +80,12 @@ class PointSpread:
         """Return the amplitude (place,), 1 at zero offset, by differences of unit vectors and ranges, in any air."""
         along_m = direction_offset @ self._positions_m.T
         return self._amplitudes(self.scale(air) * (2 * range_offset_m[:, None] - along_m))
+
+    def along(self, range_offset_m: Floats, tilt_s: float) -> Floats:
+        """Return the amplitude, in the direction of an echo, at differences of ranges in an array of any shape."""
+        table = self.pulse.table + tilt_s * self.pulse.tilted_hz if tilt_s else self.pulse.table
+        place = np.minimum(2 * np.abs(range_offset_m) / self.pulse.step_m, len(table) - 1)
+        return np.asarray(np.abs(table[np.rint(place).astype(np.intp)] / table[0]))
 
     def of_echo(self, direction: Floats, range_m: Floats, echo: Floats, echo_m: Floats, *, is_focused: bool) -> Floats:
         """Return the amplitudes (place,) that point echoes cause elsewhere; focused beams assume spherical waves."""
@@ -108,6 +117,20 @@ class PointSpread:
         """Return the sound speed of the settings relative to that in some air."""
         return 1.0 if air is None else self._speed_m_s / sound_speed_m_s(air)
 
+    def tilts(self, range_m: Floats, air: Air | None) -> tuple[Floats, Floats]:
+        """Return the tilts of the spectra of echoes relative to the pulse in 1/Hz, and their amplitudes: (place,).
+
+        Air absorbs high frequencies more. The tilts are lines over frequency that fit the spectra best.
+        """
+        frequency_hz, shares = self.spectrum
+        offset_hz = frequency_hz - self._carrier_1_m * self._speed_m_s / (2 * math.pi)
+        mean_hz = float(shares @ offset_hz)
+        loss = 2 * np.outer(range_m, _absorption_1_m(air or self._air, frequency_hz))
+        change = np.exp((loss @ shares)[:, None] - loss + self._path_m * _absorption_1_m(Air(), frequency_hz))
+        slope_s = change @ (shares * (offset_hz - mean_hz)) / float(shares @ (offset_hz - mean_hz) ** 2 or 1.0)
+        tilt_s = slope_s / (change @ shares - slope_s * mean_hz)
+        return tilt_s, 1 + tilt_s * mean_hz
+
     def beams(self, directions: Floats, deviation: Deviation | None) -> kernels.BeamErrors:
         """Return directions with the errors of their beams."""
         if deviation is None:
@@ -120,3 +143,8 @@ class PointSpread:
         """Return the pulse of a spectrum, relative to its carrier: (path,) complex128."""
         count = len(self._turn)
         return np.asarray(np.fft.ifft(spectrum, count) * count * self._turn)
+
+
+def _absorption_1_m(air: Air, frequency_hz: Floats) -> Floats:
+    """Return the absorption of air in nepers per metre."""
+    return math.log(10) / 20 * absorption_db_m(air, frequency_hz)

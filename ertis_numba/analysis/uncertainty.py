@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.other_echoes import listed_echoes, unlisted_echoes
 from ertis_numba.analysis.peak_interpolation import Tops
 from ertis_numba.analysis.plan_errors import plan_error
 from ertis_numba.analysis.point_spread import PointSpread
@@ -20,7 +21,7 @@ __all__ = ["PositionUncertainty", "Uncertainty"]
 _WAVES = 64  # Number of frequencies of the call's band from which its widths are computed.
 # Errors of a maximum that is two echoes, relative to the widths of pulse and main lobe, and to the root of the misfit.
 _CLOSE_M, _CLOSE_RAD = 0.7, 1.7
-_CLOSE_NP = 0.25  # Error of its level.
+_CLOSE_NP, _MOST_NP = 1.25, 0.25  # Error of its level, and its limit.
 _SEEN = 0.45  # Misfit that other points cause, relative to their amplitude at the maximum.
 # Bias of the range in widths of the pulse, relative to the error of the plan: it is alike in all bins. Measured.
 _BIAS, _BIAS_OF_ONE_TAP, _BIAS_OF_FOUR_BEAM_TAPS = 2.0, 1.0, 9.0
@@ -56,8 +57,9 @@ class PositionUncertainty:
       covariances have the weights in brackets. This expression is the inverse of the covariance of the maximum of a
       weighted beam, at the same power of noise in the image.
 
-    The images of other points at about the same range disturb a point, like noise of their amplitude there. A deviation
-    of the bins that neither these nor noise explain is a sign of two echoes in one maximum. It adds errors as measured
+    The images of other points at about the same range disturb a point, like noise of their amplitude there, and so do
+    echoes on the slopes of its pulse: see `ertis_numba.analysis.other_echoes`. A deviation of the bins that neither
+    these nor noise explain is a sign of two echoes in one maximum. It adds errors as measured
     for random pairs of echoes, 6° to 10° apart for an eRTIS: about half of their distance. Pairs whose sum has the
     shape of one echo are not recognised.
 
@@ -76,7 +78,8 @@ class PositionUncertainty:
         self._settings, self._is_planar, self._noise_only = settings, is_planar, noise_only
         self._width_hz = math.sqrt(mean_square - float(power @ frequency_hz) ** 2)
         self._frequency_hz = math.sqrt(mean_square)
-        self._spread, self._plan = PointSpread(settings), 0.0 if noise_only else plan_error(settings)
+        self._spread = PointSpread(settings, path_m=sum(settings.processing.range_m))
+        self._plan = 0.0 if noise_only else plan_error(settings)
         bias = _BIAS_OF_ONE_TAP if settings.accuracy.delay_taps == 1 else _BIAS
         self._bias = self._plan * (_BIAS_OF_FOUR_BEAM_TAPS if settings.accuracy.beam_taps == 4 else bias)
         self._covariance_m2 = _effective_covariance_m2(positions_m, array_weights(settings))
@@ -100,22 +103,14 @@ class PositionUncertainty:
             range_m = np.hypot(range_m, self._bias * pulse_m)
             level = np.hypot(np.where(is_fitted, tops.level_sd, level), self._plan)
             across_rad = np.where(is_fitted & (reach_m > 0), tops.across_sd_rad, across_rad)
-            others = self._others(image, tops)
+            others = listed_echoes(self._spread, image, tops, noise)
             unseen = np.sqrt(np.maximum(tops.misfit**2 - (_SEEN * others) ** 2, 0.0))
+            others = np.hypot(others, unlisted_echoes(self._spread, image, tops, noise))
             range_m = np.hypot(range_m, pulse_m * np.hypot(_HALF * others, _CLOSE_M * np.sqrt(unseen)))
             wrong = np.maximum(np.hypot(_HALF * others, _CLOSE_RAD * np.sqrt(unseen)), _FLAT)
             across_rad = np.hypot(across_rad, lobe_rad * wrong)
-            level = np.hypot(level, np.hypot(_HALF * others, np.where(unseen > 0, _CLOSE_NP, 0.0)))
+            level = np.hypot(level, np.hypot(_HALF * others, np.minimum(_CLOSE_NP * np.sqrt(unseen), _MOST_NP)))
         return Uncertainty(range_m, np.hypot(across_rad, _UNIFORM * tops.width_rad), level)
-
-    def _others(self, image: Energyscape, tops: Tops) -> NDArray[np.float64]:
-        """Return the amplitude of the other points' images at each point, relative to its own: (point,) float64."""
-        is_near = np.abs(tops.range_m - tops.range_m[:, None]) < self._spread.reach_m
-        np.fill_diagonal(is_near, val=False)
-        here, there = np.nonzero(is_near)
-        offset, offset_m = tops.direction[here] - tops.direction[there], tops.range_m[here] - tops.range_m[there]
-        leaked = self._spread(offset, offset_m, image.settings.air) * tops.amplitude[there] / tops.amplitude[here]
-        return np.sqrt(np.bincount(here, leaked**2, len(tops.range_m)))
 
     def _min_variance_m2(self, position_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the least variance of the array across the lines of sight: (point,) float64."""
@@ -125,7 +120,7 @@ class PositionUncertainty:
         sideways = unit_vectors(azimuth_rad + math.pi / 2, np.zeros_like(azimuth_rad))
         aa: NDArray[np.float64] = np.einsum("pi,ij,pj->p", sideways, self._covariance_m2, sideways)
         if self._is_planar:
-            return np.maximum(aa, 0.0)
+            return np.asarray(np.where(aa > _FLAT * np.trace(self._covariance_m2), aa, 0.0))
         upwards = unit_vectors(azimuth_rad, elevation_rad + math.pi / 2)
         ab = np.einsum("pi,ij,pj->p", sideways, self._covariance_m2, upwards)
         bb = np.einsum("pi,ij,pj->p", upwards, self._covariance_m2, upwards)

@@ -83,6 +83,7 @@ class _Fit:
     noise: float
     scale: float
     freedom: float
+    tilt_s: float
 
     @classmethod
     def of(
@@ -119,6 +120,7 @@ class _Fit:
             noise=noise,
             scale=scale,
             freedom=max(1.0, used.sum() - (4.0 if axes[1].any() else 3.0)),
+            tilt_s=float(samples.tilt_s[place]),
         )
 
     def minimum(self, start: Doubles, model: float) -> Doubles:
@@ -181,6 +183,7 @@ class _Fit:
         sides = ((self.axes - np.outer(self.axes @ top, top)) @ pulse.positions_m.T) / size
         path_m = self.scale * (2 * (self.offset_m - at[0])[:, None] + self.lags_m - own_m)
         table, tilted = (pulse_at(pulse, path_m, each) for each in (pulse.table, pulse.tilted_hz))
+        table += self.tilt_s * tilted
         change = 1j * (pulse.carrier_1_m * table + 2 * math.pi / pulse.speed_m_s * tilted)
         if self.gain is not None and self.slope_s is not None:
             table, change = table * self.gain + self.slope_s * tilted, change * self.gain

@@ -50,3 +50,33 @@ def test_errors_of_echoes_at_one_range_are_about_those_that_are_stated(every_dra
     ]
 
     assert (np.mean(np.array(found) > 2, axis=0) <= beyond).all()
+
+
+@pytest.mark.parametrize("apart_deg", [(0, 3), (3, 60)])
+def test_errors_of_echoes_behind_one_another_are_within_those_that_are_stated(every_draws, apart_deg):
+    """Pulses of echoes 5 to 100 mm behind one another overlap, and the weaker one may be no maximum."""
+    rng, found, stated_db = np.random.default_rng([78, *apart_deg]), [], []
+    for draws in every_draws:
+        for _ in range(2 * N_DRAWS):
+            azimuth_deg, elevation_deg, range_m = draws.place(rng)
+            aside_deg = azimuth_deg - math.copysign(rng.uniform(*apart_deg), azimuth_deg)
+            directions = np.stack([unit(azimuth_deg, elevation_deg), unit(aside_deg, elevation_deg)])
+            ranges_m = range_m + np.array([0.0, 0.005 * 20 ** rng.uniform()])
+            level = rng.permutation([1.0, 10 ** (rng.uniform(-30, 0) / 20)])
+            heard = sum(level[k] * draws.signals(directions[k], ranges_m[k]) for k in (0, 1))
+            noise = AMPLITUDE / draws.noise * 10 ** (-rng.uniform(35, 50) / 20)
+            for peak in find_peaks(draws.image(heard + noise * rng.standard_normal(heard.shape)), false_alarm=1e-3):
+                angles = np.arccos(np.minimum(1, directions @ unit(peak.azimuth_deg, peak.elevation_deg)))
+                nearer = int(np.argmin(np.hypot(angles / 0.1, (peak.range_m - ranges_m) / 0.006)))
+                if abs(peak.range_m - ranges_m[nearer]) < 0.02 and angles[nearer] < 0.3:
+                    stated_db.append(peak.level_sd_db)
+                    found.append(
+                        [
+                            abs(peak.range_m - ranges_m[nearer]) / peak.range_sd_m,
+                            math.degrees(angles[nearer]) / peak.angle_sd_deg,
+                            abs(peak.level_dbfs - 20 * math.log10(AMPLITUDE * level[nearer])) / peak.level_sd_db,
+                        ]
+                    )
+    assert len(found) > 70
+    assert np.mean(np.array(found) > 4) <= 0.005
+    assert np.median(stated_db) < 0.5

@@ -196,7 +196,7 @@ def test_uncertainty_is_the_spread_of_noisy_measurements(directions):
         ),
     )
     scene = Scene(seed=1, sensors=(sensor,), points=(Point(azimuth_deg=14.3, elevation_deg=0.0, range_m=0.903),))
-    quiet = heard(scene, "spreading")
+    quiet = heard(scene, "spreading", "absorption")
     settings = planner.complete(sensor.settings(), kernels.load("cpu"), threads=2)
     chain, extractor = FastChain(settings, kernels.load("cpu"), threads=2), PointExtractor(settings)
     grid, rng = direction_grid(settings.processing), np.random.default_rng(2)

@@ -48,14 +48,13 @@ def points(recording, tmp_path, *options):
         return list(csv.DictReader(file))
 
 
-def test_side_lobes_are_points_with_larger_uncertainty(recording, tmp_path):
+def test_reflectors_have_small_uncertainty_and_side_lobes_that_of_no_echo(recording, tmp_path):
     found = points(recording, tmp_path)
     strongest = sorted(found, key=lambda row: -float(row["amplitude"]))
     reflectors, lobes = strongest[:2], strongest[2:]
     assert len(lobes) >= 4
-    of_reflectors, of_lobes = ([float(row["uncertainty_range_m"]) for row in each] for each in (reflectors, lobes))
-    assert max(of_reflectors) < 2e-3  # The points beside them may be echoes, which would disturb them.
-    assert min(of_lobes) > 2 * max(of_reflectors)
+    assert max(float(row["uncertainty_range_m"]) for row in reflectors) < 1e-4
+    assert min(float(row["uncertainty_range_m"]) for row in lobes) > 1e-3
 
 
 @pytest.mark.parametrize("options", [["--min-level", "-5"], ["--top", "2"]])

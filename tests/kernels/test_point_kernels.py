@@ -100,13 +100,16 @@ def test_fitted_echoes_are_those_of_numpy_and_at_their_places(beams_have_errors,
     offset_m[:, 0], offset_m[:, 2] = -STEP_M, STEP_M
     axes = np.tile([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], (N_PLACES, 1, 1))
     place = draws.normal(scale=[0.3 * STEP_M, 0.01, 0.01], size=(N_PLACES, 3))
-    amplitude = np.stack([amplitudes(pulse, beams, place[k], offset_m[k], is_focused) for k in range(N_PLACES)])
+    tilt_s = draws.uniform(-2e-5, 0, N_PLACES)
+    amplitude = np.stack(
+        [amplitudes(pulse, beams, place[k], offset_m[k], is_focused, tilt_s[k]) for k in range(N_PLACES)]
+    )
     amplitude[5:10] += amplitude[10:15]
     amplitude[15:20] *= draws.uniform(0.7, 1.4, (5, N_SAMPLES))
     is_used = np.ones(amplitude.shape, bool)
     is_used[20:23, 3:5] = False
     is_coarse = np.arange(N_PLACES) % 2 == 0
-    samples = kernels.EchoSamples(row, is_used, amplitude, offset_m, np.full(N_PLACES, 0.8), is_coarse)
+    samples = kernels.EchoSamples(row, is_used, amplitude, offset_m, np.full(N_PLACES, 0.8), is_coarse, tilt_s)
     starts = np.zeros((N_PLACES, 4, 4))
     starts[:, 1:, 1:3] = draws.normal(scale=0.01, size=(N_PLACES, 3, 2))
     given = pulse, beams, samples, starts, axes, 1e-3, 1e-3, is_focused, 1.0
@@ -123,7 +126,7 @@ def test_fitted_echoes_are_those_of_numpy_and_at_their_places(beams_have_errors,
     assert np.median(sd[5:10, 1]) > 3 * np.median(sd[single, 1])  # Two echoes are not the image of one.
 
 
-def amplitudes(pulse, beams, place, offset_m, is_focused, range_m=0.8):
+def amplitudes(pulse, beams, place, offset_m, is_focused, tilt_s, range_m=0.8):
     """Amplitudes of an echo as a sum over microphones, with delays of spherical waves."""
 
     def lag_m(direction, at_m):
@@ -142,6 +145,7 @@ def amplitudes(pulse, beams, place, offset_m, is_focused, range_m=0.8):
             + 1j * np.sign(path_m) * np.interp(np.abs(path_m), grid_m, table.imag)
             for table in (pulse.table, pulse.tilted_hz)
         )
+        value = value + tilt_s * tilted
         if len(beams.gain):
             value = value * beams.gain[direction] + beams.slope_s[direction] * tilted
         found.append(abs(np.mean(pulse.weights * value * np.exp(1j * pulse.carrier_1_m * path_m))))

@@ -19,8 +19,8 @@ from ertis_numba.chain import planner
 from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry import direction_grid, microphones, unit_vectors
-from ertis_numba.geometry.air import sound_speed_m_s
-from ertis_numba.geometry.waveform import call_at
+from ertis_numba.geometry.air import absorption_db_m, sound_speed_m_s
+from ertis_numba.geometry.waveform import call_at, matched_filter_spectrum
 from ertis_numba.settings import Accuracy, Processing, Recording, Settings
 
 __all__ = ["BUDGETS_DB", "FORMS", "GRIDS", "RATIOS", "Trials", "form", "run"]
@@ -36,7 +36,7 @@ _AMPLITUDE = 0.01
 
 
 class Trials:
-    """Echoes of points at random positions in noise, as spherical waves, and errors of the detected points.
+    """Echoes of points at random positions in noise, as spherical waves in air that absorbs, and errors of the points.
 
     Parameters
     ----------
@@ -126,7 +126,14 @@ class Trials:
     def _echo(self, direction: NDArray[np.float64], range_m: float) -> NDArray[np.float64]:
         paths_m = range_m + np.linalg.norm(range_m * direction - self._positions_m, axis=1)
         delays_s = paths_m / self._speed_m_s
-        return np.array([call_at(self._settings.call, self._time_s - delay_s) for delay_s in delays_s])
+        heard = np.array([call_at(self._settings.call, self._time_s - delay_s) for delay_s in delays_s])
+        frequency_hz = np.linspace(0, _RATE_HZ / 2, _N_SAMPLES // 2 + 1)
+        loss_1_m = absorption_db_m(self._settings.air, frequency_hz) * math.log(10) / 20
+        matched = matched_filter_spectrum(self._settings, n_fft=_N_SAMPLES // self._settings.decimation)
+        of_call = slice(matched.first_bin, matched.first_bin + len(matched.values))
+        level = np.average(np.exp(-2 * range_m * loss_1_m[of_call]), weights=matched.echo_power)
+        bins = np.fft.rfft(heard) * np.exp(-paths_m[:, None] * loss_1_m)
+        return np.asarray(np.fft.irfft(bins, _N_SAMPLES) / level)
 
 
 def run(*, count: int, seed: int, say: Callable[[str], None]) -> dict[str, Any]:

@@ -118,7 +118,8 @@ class EchoSamples(NamedTuple):
     """Samples (place, sample) of an image around its maxima; the first ``row`` is the direction of the maximum.
 
     ``is_used`` is False for samples that are equal to others or have no amplitude. ``offset_m`` is relative to the
-    range of the maximum. With ``is_coarse``, several echoes may explain the samples.
+    range of the maximum. With ``is_coarse``, several echoes may explain the samples. The spectrum of an echo is
+    that of the pulse times 1 + ``tilt_s`` times the frequency relative to the carrier.
     """
 
     row: Places
@@ -127,6 +128,7 @@ class EchoSamples(NamedTuple):
     offset_m: Doubles
     range_m: Doubles
     is_coarse: NDArray[np.bool_]
+    tilt_s: Doubles
 
 
 class FitEchoes(Protocol):

@@ -48,7 +48,7 @@ def fit_echoes(pulse, beams, samples, starts, axes, noise, model, is_focused, sc
                 n += 1
         freedom = max(1.0, n - (4.0 if axes[place, 1].any() else 3.0))
         middle, range_m = beams.directions[samples.row[place, 0]], samples.range_m[place]
-        given = row[:n], amplitude[:n], middle, range_m, axes[place]
+        given = row[:n], amplitude[:n], middle, range_m, axes[place], samples.tilt_s[place]
         work = value[:n], slopes[:n], noises[:n, :n], paths_m[:n], turned[:n], own, sides, whole[:n], root[:n, :n]
         _steer(pulse, beams.directions, given, offset_m, is_focused, scale, work)
         error = model
@@ -161,7 +161,7 @@ def _combined(found, n_found, out):
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def _steer(pulse, directions, given, offset_m, is_focused, scale, work):
     """Compute the paths that beams assume relative to that to the maximum, their carriers, and the noise of samples."""
-    row, _, _, range_m, _ = given
+    row, _, _, range_m, _, _ = given
     _, _, noises, paths_m, turned, _, _, _, _ = work
     for sample in range(len(row)):
         x, y, z = directions[row[sample]]
@@ -206,7 +206,7 @@ def _noises(pulse, paths_m, turned, out):
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def _misfit(pulse, beams, given, work, noise, model, scale, at):
     """Whiten the residuals, and their derivatives by the place and the logarithm of the amplitude."""
-    row, amplitude, _, _, _ = given
+    row, amplitude, _, _, _, _ = given
     value, slopes, noises, _, _, _, _, whole, root = work
     if not abs(at[3]) < MAX_NP:
         return np.inf
@@ -239,7 +239,7 @@ def _misfit(pulse, beams, given, work, noise, model, scale, at):
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def _predict(pulse, beams, given, work, scale, at):
     """Compute the sums over microphones for an echo at a place, and their derivatives by the place."""
-    row, _, middle, range_m, axes = given
+    row, _, middle, range_m, axes, tilt_s = given
     value, slopes, _, paths_m, turned, own, sides, _, _ = work
     n_mics = len(pulse.weights)
     top = middle + at[1] * axes[0] + at[2] * axes[1]
@@ -261,6 +261,7 @@ def _predict(pulse, beams, given, work, scale, at):
             carrier = own[mic] * turned[sample, mic]
             table = at_path(pulse.table, before, between, path_m) * carrier
             tilted = at_path(pulse.tilted_hz, before, between, path_m) * carrier
+            table += tilt_s * tilted
             change = carrier_j_m * table + turn_j_m * tilted
             if len(beams.gain):
                 gain, slope_s = beams.gain[row[sample], mic], beams.slope_s[row[sample], mic]
