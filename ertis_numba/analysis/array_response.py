@@ -20,6 +20,7 @@ Floats = NDArray[np.float64]
 _FAR: Final = 2.0  # Standard deviation of phases in radians beyond which a maximum is a side lobe.
 _N_SOURCES: Final = 48
 _N_TARGETS: Final = 3072
+_LINE: Final = 1e-3  # Largest width of a line of microphones relative to its length.
 
 
 class Response(Protocol):
@@ -48,6 +49,13 @@ class ArrayAxes:
     def scaled_m(self, directions: Floats) -> Floats:
         """Return points whose distance is the standard deviation of differences of paths: (n, axis) float64."""
         return np.asarray((directions @ self._axes) * self._sizes_m)
+
+    def apart_rad(self, first: Floats, second: Floats) -> Floats:
+        """Return angles (n,) between unit vectors (n, axis), or between their cones around a line of microphones."""
+        if self._sizes_m[1] < _LINE * self._sizes_m[2]:
+            ends = (np.arcsin(np.clip(each @ self.longest, -1.0, 1.0)) for each in (first, second))
+            return np.asarray(np.abs(next(ends) - next(ends)))
+        return np.asarray(2 * np.arcsin(np.minimum(np.linalg.norm(first - second, axis=1) / 2, 1.0)))
 
     @property
     def longest_m(self) -> float:

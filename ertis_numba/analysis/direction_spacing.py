@@ -101,8 +101,8 @@ class GridCheck:
     def apart(self, lobe: Lobe) -> str:
         """Return the distance of the directions in words: the usual one, or the largest gap of an irregular list."""
         sources, near, _ = self.farthest_of(lobe.response.axes)
-        chords = np.linalg.norm(sources - self._directions[near[:, 0]], axis=1)
-        gap_rad = 4 * math.asin(min(1.0, float(chords.max(initial=0.0)) / 2))
+        nearest = self._directions[near[:, 0]]
+        gap_rad = 2 * float(lobe.response.axes.apart_rad(sources, nearest).max(initial=0.0))
         is_irregular = gap_rad > _GAP * self.spacing_rad
         return f"{'up to ' if is_irregular else ''}{math.degrees(gap_rad if is_irregular else self.spacing_rad):.1f}°"
 

@@ -11,7 +11,7 @@ import ertis_numba as ertis
 from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.geometry import direction_grid, spacing_rad, unit_vectors
-from ertis_numba.settings import Processing
+from ertis_numba.settings import Array, Processing, Settings
 
 
 def blank(directions, sensor="sensor"):
@@ -89,3 +89,16 @@ def test_spacing_counts_equal_directions_once(azimuths_deg, spacing_deg):
     azimuth_rad = np.radians(np.array(azimuths_deg, dtype=np.float64))
     spacing = spacing_rad(unit_vectors(azimuth_rad, np.zeros(len(azimuth_rad))))
     assert np.degrees(spacing) == pytest.approx(spacing_deg)
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+def test_directions_of_a_line_are_apart_along_it(axis):
+    """Around the line, they sound alike, so that their distance there does not count."""
+    places_m = np.zeros((16, 3))
+    places_m[:, axis] = np.linspace(-0.15, 0.15, 16)
+    settings = Settings.from_preset("default_25_50")
+    settings = settings.replace(
+        array=Array(positions_m=places_m.tolist()), processing=settings.processing.replace(directions="3d:400")
+    )
+    text = spacing_warning(settings, direction_grid(settings.processing))
+    assert text.startswith("directions are 7.1° apart")
