@@ -39,6 +39,9 @@ CacheDirectory=ertis
 Environment=NUMBA_CACHE_DIR=%C/ertis
 Restart=on-failure
 RestartSec=2
+# Wrong usage remains wrong; 143 is the exit code of a node that SIGTERM has ended in time.
+RestartPreventExitStatus=2
+SuccessExitStatus=143
 # A first start compiles kernels. Afterwards, the node reports every few seconds that its loop runs.
 TimeoutStartSec=600
 WatchdogSec=60
