@@ -95,7 +95,8 @@ def main(folder: Path, page: Path | None = None) -> int:
         click.echo(f"{rows[-1]}  # {time.monotonic() - begun_s:.0f} s in all")
     missing = " and ".join(f"Python {each}" for each in PYTHONS if not _has(each)) or "none"
     wheel_mb = paths["wheel"].stat().st_size / 1e6
-    text = "\n".join((*rows, "", f"Not tried, because the machine lacked it: {missing}.", ""))
+    load = f"{os.cpu_count()} cores, load average {os.getloadavg()[2]:.1f} at the end (other programs included)"
+    text = "\n".join((*rows, "", f"Times on {load}. Not tried, because the machine lacked it: {missing}.", ""))
     text += f"\nThe wheel has {wheel_mb:.2f} MB. It installs these packages:\n\n{sizes}"
     click.echo("\n".join(("", text, "", *failures)))
     if page is not None:
