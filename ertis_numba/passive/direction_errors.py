@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.passive.detection_law import independent_samples
 from ertis_numba.passive.heard_band import HeardBand
 from ertis_numba.passive.likelihood import BandLikelihood
+from ertis_numba.passive.model_errors import beside_others
 
 __all__ = ["covariance_of", "powers_in_noise"]
 
@@ -45,7 +46,7 @@ def covariance_of(likelihood: BandLikelihood, places: Floats, k: int, band: Hear
     The gradient of the likelihood has the variance of products of the beam with the noise outside of it. Sources that
     are not separated leave more power in the changes of the wave than this noise, which shows how far they are apart.
     """
-    place, beside = places[k], band.beside(likelihood, places, k)
+    place, beside = places[k], beside_others(likelihood, places, k, band)
     powers, noise = powers_in_noise(beside, place, band.width)
     powers, (_, changes, size) = np.maximum(powers, 0), beside.slopes(place)
     gains = band.weights * powers / noise

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.passive.cross_spectrum import CrossSpectrum, FrequencyMoments
-from ertis_numba.passive.likelihood import BandLikelihood, Delays
+from ertis_numba.passive.likelihood import Delays
 
 __all__ = ["HeardBand"]
 
@@ -76,10 +76,6 @@ class HeardBand(NamedTuple):
             heard.n_blocks,
             is_beyond,
         )
-
-    def beside(self, likelihood: BandLikelihood, places: Floats, k: int) -> BandLikelihood:
-        """Return the likelihood of a source given the others."""
-        return likelihood.beside(np.delete(places, k, axis=0), np.delete(self.omegas, k, axis=1), self.omegas[:, k])
 
 
 class _Frequencies(NamedTuple):

@@ -51,8 +51,9 @@ class BandLikelihood:
     power outside of them (I. Ziskind and M. Wax, Maximum likelihood localization of multiple sources by alternating
     projection, 1988). ``whitening`` (bin, mode, mic) is that of the matrix (bin, mic, mic), None for microphones; the
     weights (bin,) have a sum of 1; ``delays`` returns those from unit vectors, (direction, mic); ``others`` are
-    (source, axis), with frequencies (bin, source). As attributes, the matrix is (bin, mode, mode), and its trace and
-    number of dimensions outside of the other sources are ``power`` (bin,) and ``dimensions``.
+    (source, axis), with frequencies (bin, source), and numbers of derivatives of their waves by frequency that belong
+    to them, none by default. As attributes, the matrix is (bin, mode, mode), and its trace and number of dimensions
+    outside of the others are ``power`` (bin,) and ``dimensions``.
     """
 
     def __init__(
@@ -64,15 +65,22 @@ class BandLikelihood:
         delays: Delays,
         others: Floats = _NONE,
         others_omega: Floats | None = None,
+        others_orders: tuple[int, ...] = (),
     ) -> None:
         self._whitening, self.omega, self._delays = whitening, omega, delays
         self.is_whitened = whitening is not None
         self.weights = weights
-        self.matrix, self.dimensions = matrix, matrix.shape[1] - len(others)
+        self.matrix, self.others_orders = matrix, others_orders
+        self.dimensions = matrix.shape[1] - len(others) - sum(others_orders)
         power = np.trace(matrix, axis1=1, axis2=2).real
         self._basis = None
         if len(others):
-            self._basis, _ = np.linalg.qr(self.waves(others, others_omega))
+            waves = [self.waves(others, others_omega)]
+            for order in range(1, max(others_orders, default=0) + 1):
+                changed = np.flatnonzero(np.array(others_orders) >= order)
+                omegas = None if others_omega is None else others_omega[:, changed]
+                waves.append(self.waves(others[changed], omegas, order=order))
+            self._basis, _ = np.linalg.qr(np.concatenate(waves, axis=2))
             power = power - (self._basis.conj() * (matrix @ self._basis)).sum(axis=(1, 2)).real
         self.power = np.maximum(power, _LEAST)
 
@@ -95,10 +103,18 @@ class BandLikelihood:
             return waves
         return np.asarray(waves - self._basis @ (self._basis.conj().transpose(0, 2, 1) @ waves))
 
-    def beside(self, others: Floats, others_omega: Floats | None = None, omega: Floats | None = None) -> Self:
+    def beside(
+        self,
+        others: Floats,
+        others_omega: Floats | None = None,
+        omega: Floats | None = None,
+        others_orders: tuple[int, ...] = (),
+    ) -> Self:
         """Return the likelihood given others (source, axis); frequencies are its own by default."""
         omega = self.omega if omega is None else omega
-        return type(self)(self.matrix, self._whitening, omega, self.weights, self._delays, others, others_omega)
+        return type(self)(
+            self.matrix, self._whitening, omega, self.weights, self._delays, others, others_omega, others_orders
+        )
 
     def unwhitened(self, matrices: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the matrices whose powers for a wave are those of given matrices for the whitened wave."""

@@ -12,6 +12,7 @@ from ertis_numba.passive.detection_law import LAGS, chance_of_phases, exceedance
 from ertis_numba.passive.direction_errors import covariance_of, powers_in_noise
 from ertis_numba.passive.heard_band import HeardBand
 from ertis_numba.passive.likelihood import BandLikelihood, Delays, moved
+from ertis_numba.passive.model_errors import beside_others, beside_sources
 from ertis_numba.passive.noise_model import NoiseFluctuations, NoiseModel
 from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
 
@@ -88,18 +89,21 @@ class BandSearch:
         band = HeardBand.of(heard, places, self._shares, self._delays) if _has_power(heard) else None
         while band is not None and len(places) < min(top, n_mics - 1):
             likelihood, share = self._likelihood(band, places)
-            rest = likelihood.beside(places, band.omegas)
+            rest, error = beside_sources(likelihood, places, band.omegas, band, band.omega)
             place = self._place(rest, likelihood)
-            if not self._is_found(place, rest, likelihood, band, share, places, false_alarm=false_alarm, least=least):
+            limits = {"false_alarm": false_alarm, "least": least}
+            if not self._is_found(place, rest, likelihood, band, share, places, error=error, **limits):
                 break
             more = np.concatenate([places, place[None]])
             next_band = HeardBand.of(heard, more, band.shares, self._delays)
             if next_band is None or next_band.is_beyond:
                 break
             likelihood, share = self._likelihood(next_band, more)
-            rest = next_band.beside(likelihood, more, len(places))
+            rest, error = beside_sources(
+                likelihood, places, next_band.omegas[:, :-1], next_band, next_band.omegas[:, -1]
+            )
             if (next_band.shares < band.shares).any() and not self._is_found(
-                place, rest, likelihood, next_band, share, places, false_alarm=false_alarm, least=least
+                place, rest, likelihood, next_band, share, places, error=error, **limits
             ):  # It is sound beyond the band, which the window spreads.
                 band = HeardBand.of(heard, places, next_band.shares, self._delays)
                 continue
@@ -126,7 +130,7 @@ class BandSearch:
         The last of them, which is new, must also have its least power.
         """
         for k, place in enumerate(places):
-            beside = band.beside(likelihood, places, k)
+            beside = beside_others(likelihood, places, k, band)
             size, whole = (band.weights @ each.beams(place[None])[1] for each in (beside, beside.beside(_NONE)))
             if size < _BLIND * whole:
                 return False
@@ -156,11 +160,12 @@ class BandSearch:
         diffuse: float,
         places: Floats,
         *,
+        error: float,
         false_alarm: float,
         least: float,
     ) -> bool:
         """Return False if noise or errors of the known sources may cause a further source."""
-        share = float(rest.relative_power(place[None])[0]) / rest.dimensions
+        share = (float(rest.relative_power(place[None])[0]) - error) / rest.dimensions
         chance = self._chance(share, place, rest, whole, band, diffuse, places)
         known = band.weights @ whole.separated(places, band.omegas[:, : len(places)])[0] if len(places) else np.zeros(0)
         strongest = max(0.0, known.max(initial=0.0))
@@ -182,7 +187,7 @@ class BandSearch:
         extent, similarity = self._of_noise(diffuse)
         of_white = independent_samples(band.weights, band.n_blocks, similarity)
         omegas = np.append(band.omegas[:, : len(places)], rest.omega[:, None], axis=1)
-        beside = whole.beside(np.concatenate([places, place[None]]), omegas)
+        beside = whole.beside(np.concatenate([places, place[None]]), omegas, others_orders=(*rest.others_orders, 0))
         outside = beside.projection
         if self._scan.level:  # The source may be above or below.
             loudest = np.linalg.eigh(beside.rest)[1][:, :, -1:]
@@ -222,7 +227,7 @@ class BandSearch:
         places = places.copy()
         for _ in range(_SWEEPS if len(places) > 1 else 1):
             for k, place in enumerate(places):
-                beside = band.beside(likelihood, places, k)
+                beside = beside_others(likelihood, places, k, band)
                 places[k] = beside.maximum(place, reach_rad=self._scan.reach_rad, level=self._scan.level)
         return places
 
@@ -254,10 +259,10 @@ class BandSearch:
 
     def _source(self, likelihood: BandLikelihood, places: Floats, k: int, band: HeardBand) -> FoundSource:
         """Return one of the sources with its power and uncertainty."""
-        powers, noise = powers_in_noise(band.beside(likelihood, places, k), places[k], band.width)
+        powers, noise = powers_in_noise(beside_others(likelihood, places, k, band), places[k], band.width)
         ratio, power = float(band.weights @ (powers / noise)), float(band.shares @ (powers * band.level))
         covariance = covariance_of(likelihood, places, k, band, level=self._scan.level)
-        may_be_crosstalk = self._may_be_crosstalk(band.beside(likelihood, places, k), places[k], band)
+        may_be_crosstalk = self._may_be_crosstalk(beside_others(likelihood, places, k, band), places[k], band)
         return FoundSource(places[k], max(0.0, power), max(0.0, ratio), covariance, may_be_crosstalk)
 
     def _chance_of_phases(self, places: Floats, k: int, certain: list[int], band: HeardBand) -> float:
@@ -267,7 +272,7 @@ class BandSearch:
         is a misfit: it may belong to these phases, unless noise explains it. So is what noise may hide.
         """
         plain = BandLikelihood(band.matrix, None, band.omega, band.weights, self._delays)
-        beside, n_mics = band.beside(plain, places, k), band.matrix.shape[1]
+        beside, n_mics = beside_others(plain, places, k, band), band.matrix.shape[1]
         powers = np.maximum(band.shares * band.level * powers_in_noise(beside, places[k], band.width)[0], 0)
         if not powers.any():
             return 1.0

@@ -123,6 +123,23 @@ def test_sound_of_one_band_yields_no_bearings_in_others(sources, noise):
     assert sorted(each.azimuth_deg for each in bearings) == pytest.approx(sorted(each[0] for each in sources), abs=0.1)
 
 
+def test_quiet_sources_beside_a_loud_one_are_found():
+    """The frequencies within a bin change the loud source's wave by more than the power of the quiet source."""
+    settings, n_seeds, found = settings_of((38e3, 43e3)), 12, 0
+    with AcousticCamera(settings, "cpu", 1) as camera:
+        finder = BearingFinder(camera, min_level_db=-40)
+        for seed in range(n_seeds):
+            random = np.random.default_rng([17, seed])
+            loud = direction_of(random.choice([-1, 1]) * 45, random.uniform(-10, 10))
+            quiet = moved(loud, np.radians([random.uniform(-1, 1, 2) * 15 + [20, 0]]), level=False)[0]
+            camera.reset()
+            camera.add(heard(settings, [(loud, 300.0, WIDE), (quiet, 10.0, WIDE)], 1.0, random))
+            bearings = finder.find()
+            assert len(bearings) < 3
+            found += any(np.dot(direction_of(each.azimuth_deg, each.elevation_deg), quiet) > 0.998 for each in bearings)
+    assert found >= 11
+
+
 def test_quiet_source_beside_the_band_of_a_loud_one_is_found():
     settings = settings_of((20e3, 36e3), (36e3, 45e3))
     sources = [(direction_of(-25, 0), 1.0, (40e3, 40e3)), (direction_of(20, 5), 2e-3, (22e3, 30e3))]
