@@ -61,7 +61,8 @@ def unlisted_echoes(spread: PointSpread, image: Energyscape, tops: Tops, noise: 
         offset_m = image.range_m[first:last] - range_m
         pulse, middle = spread.along(scale * offset_m, tilt_s[point]), int(np.abs(offset_m).argmin())
         aside = np.tile(directions[nearest] - tops.direction[point], (len(row), 1))
-        image_there = spread(aside, offset_m, image.settings.air) * pulse / spread.along(scale * offset_m, 0.0)
+        untilted = np.maximum(spread.along(scale * offset_m, 0.0), pulse / 2)  # Zeros of a pulse are no reference.
+        image_there = spread(aside, offset_m, image.settings.air) * pulse / untilted
         own = row[middle] / max(image_there[middle], _SLOPE) * image_there
         near = np.flatnonzero(across[point])
         away_m = offset_m - (tops.range_m[near] - range_m)[:, None]

@@ -104,7 +104,7 @@ class PositionUncertainty:
             level = np.hypot(np.where(is_fitted, tops.level_sd, level), self._plan)
             across_rad = np.where(is_fitted & (reach_m > 0), tops.across_sd_rad, across_rad)
             others = listed_echoes(self._spread, image, tops, noise)
-            unseen = np.sqrt(np.maximum(tops.misfit**2 - (_SEEN * others) ** 2, 0.0))
+            unseen = np.sqrt((tops.misfit**2 - (_SEEN * others) ** 2).clip(0.0, 1.0))
             others = np.hypot(others, unlisted_echoes(self._spread, image, tops, noise))
             range_m = np.hypot(range_m, pulse_m * np.hypot(_HALF * others, _CLOSE_M * np.sqrt(unseen)))
             wrong = np.maximum(np.hypot(_HALF * others, _CLOSE_RAD * np.sqrt(unseen)), _FLAT)
