@@ -23,7 +23,8 @@ _GATE_M = 0.1  # Maximum range difference between a reflector and its peak.
 _GATE_HALF_LOBES = 3.0  # Maximum angle between them: one and a half main lobes.
 _HALF_AMPLITUDE = math.sqrt(2 * math.log(2))  # Argument x for which exp(-x² / 2) is one half.
 _SLACK_DB = 3.0  # Tolerance of a level in the image relative to the true level.
-_MAX_FALSE = 100  # Noise alone has thousands of maxima, and more than a hundred add no information.
+_MAX_FALSE = 100  # More than a hundred spurious peaks add no information.
+_FALSE_ALARM = 1e-3  # Probability of a peak of noise alone in an image, as of 'ertis peaks'.
 _MIN_DB = -1000.0
 
 
@@ -103,7 +104,8 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
 
     Peaks and visible reflectors are assigned one to one. The assignment first maximises the number of pairs within
     0.1 m and one and a half main lobes, then minimises the sum of squared distances. SciPy solves this assignment
-    problem after D. F. Crouse, 2016. The number of peaks is limited to that of the reflectors plus 100.
+    problem after D. F. Crouse, 2016. Peaks are those of `find_peaks` with a ``false_alarm`` of 0.001, so that maxima of
+    noise are neither found reflectors nor spurious peaks. Their number is limited to that of the reflectors plus 100.
 
     Parameters
     ----------
@@ -151,7 +153,7 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     # A reflector that does not count may still be the strongest in the image, or leak into it.
     above_db = float(np.max(levels_db, where=in_range, initial=strongest_db)) - strongest_db if counted else 0.0
     floor_db = max(_MIN_DB, min_level_db - above_db - _SLACK_DB)
-    peaks = peaks_of_grid(image, top=len(reflectors) + _MAX_FALSE, min_level_db=floor_db)
+    peaks = peaks_of_grid(image, top=len(reflectors) + _MAX_FALSE, min_level_db=floor_db, false_alarm=_FALSE_ALARM)
     pairs = _assign(image, counted, peaks, lobe)
     # Levels of peaks are relative to the strongest peak, those of reflectors to the strongest reflector. A matched pair
     # determines the offset between the two references.

@@ -186,7 +186,7 @@ def test_compare_of_one_microphone_ignores_direction():
 def test_compare_of_empty_images_and_empty_truth(noise):
     comparison = compare(image_of([], noise=noise, range_m=(0.8, 3.2)), [])
     assert counts(comparison)[:2] == (0, 0)
-    assert len(comparison.spurious) == (100 if noise else 0)  # the list of ghosts in noise is limited
+    assert len(comparison.spurious) <= (1 if noise else 0)  # Maxima of noise are no peaks; its tail is not Rayleigh's.
     assert counts(compare(image_of([]), [MIDDLE])) == (0, 1, 0, 0)
 
 
