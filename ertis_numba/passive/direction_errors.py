@@ -19,6 +19,8 @@ _LEAST: Final = 1e-30
 _FLAT: Final = 1e-9  # Information relative to the largest, below which a direction is not resolved.
 _ROUNDING: Final = 3e-7  # of powers in single precision
 _SIGNIFICANT: Final = 5.0  # Power beyond noise relative to its standard deviation that shows several sources.
+_AXIS_ERROR_RAD: Final = 0.05  # Error of the direction in which sources lie that are not separated.
+_APART: Final = 0.1  # Changes of waves relative to their size from which on this error is at its largest.
 _OF_WIDTH: Final = 0.3  # Uncertain share of the power that the width of a bin causes.
 
 
@@ -60,18 +62,22 @@ def covariance_of(likelihood: BandLikelihood, places: Floats, k: int, band: Hear
     every = np.maximum(likelihood.separated(places, band.omegas)[0], 0)
     of_blocks = beside.waves(places, band.omegas, order=1) * (band.width[:, None] * np.sqrt(every))[:, None]
     across = changes.conj().transpose(0, 2, 1) @ beside.outside(of_blocks)
+    # Noise in bins without sound of the source shows nothing of other sources.
+    weights = band.weights * powers / (powers + noise)
     of_width, of_others = (
-        np.tensordot(band.weights, (each @ each.conj().transpose(0, 2, 1)).real, 1)
+        np.tensordot(weights, (each @ each.conj().transpose(0, 2, 1)).real, 1)
         for each in (across, np.delete(across, k, axis=2))
     )
-    of_noise = np.tensordot(band.weights * noise, metrics, 1)
-    excess = np.tensordot(band.weights, beside.powers_of(changes, changes), 1) - of_noise - of_width
+    of_noise = np.tensordot(weights * noise, metrics, 1)
+    excess = np.tensordot(weights, beside.powers_of(changes, changes), 1) - of_noise - of_width
     limit = _SIGNIFICANT / math.sqrt(samples) * of_noise + _OF_WIDTH * of_width
     n = 1 if level else 2
     out = _inverse(scale * metric[:n, :n])
-    out[:n, :n] += _of_excess(excess, limit, metric, float(band.weights @ powers))[:n, :n]
+    spread = _of_excess(excess, limit, metric, float(weights @ powers))
+    apart = min(1.0, float(np.trace(metric @ spread)) / (_APART * float(band.weights @ size)))
+    out[:n, :n] += (spread + apart * _AXIS_ERROR_RAD**2 * np.trace(spread) * np.eye(2))[:n, :n]
     # Blocks of distant microphones hear different sound of other sources, which looks like noise.
-    out[:n, :n] += _of_excess(of_others, 0 * limit, metric, scale * float(band.weights @ noise))[:n, :n]
+    out[:n, :n] += _of_excess(of_others, 0 * limit, metric, scale * float(weights @ noise))[:n, :n]
     return out
 
 
