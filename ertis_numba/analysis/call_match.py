@@ -35,6 +35,7 @@ __all__ = ["SILENT", "CallMatch", "call_match", "first_call_match"]
 _WRONG: Final = "another call was emitted, and ranges in the image are wrong"
 _MIN_RATIO: Final = 1.3
 """Ratio of the peak powers of another sweep and the call, above which the call does not match."""
+_MIN_CLEAR_RATIO: Final = 1.7  # The same, up to which two echoes of the call close together may explain it.
 _MAX_DOPPLER: Final = 0.03  # Change of the slope of linear sweeps by motion at 2.5 m/s.
 _BEYOND: Final = 1.3  # Largest range errors of calls of another kind, relative to the tolerance of the start.
 _MIN_CREST: Final = 12.0  # Peak to mean power around the call's own strongest peak; higher values indicate the call.
@@ -193,6 +194,9 @@ def _compared(sound: SoundSpectra, found: FoundSweep, call: Call) -> CallMatch:
     ratio = float(np.median(best.max(axis=1) / np.maximum(own.max(axis=1), 1e-30)))
     loss_db = max(0.0, 10 * math.log10(ratio))
     if sweep.is_tone or (ratio > _MIN_RATIO and not _differs_by_motion(found.curve, curve_of(call))):
+        if ratio < _MIN_CLEAR_RATIO and not sweep.is_tone:
+            note = f"echoes look like {sweep}, or like two echoes of the call close together; if they are not, {_WRONG}"
+            return CallMatch("unknown", loss_db, call=call, note=note)
         return CallMatch("differs", loss_db, sweep, call)
     own_curve = curve_of(call)
     if own_curve is None:

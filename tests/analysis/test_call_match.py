@@ -169,6 +169,14 @@ def test_call_match_accepts_many_echoes_of_the_call(seed):
     assert call_match(heard(CALL, echoes=echoes, noise=0.1, seed=seed)).verdict == "matches"
 
 
+@pytest.mark.parametrize(("apart_s", "amplitude"), [(48e-6, 1.0), (48e-6, -1.0), (66e-6, -1.0)])
+def test_call_match_does_not_take_two_echoes_close_together_for_another_call(apart_s, amplitude):
+    """Equal echoes from one direction cancel parts of the band in all microphones."""
+    found = call_match(heard(CALL, echoes=((6e-3, 1.0), (6e-3 + apart_s, amplitude)), noise=0.005))
+    assert found.verdict == "unknown"
+    assert "or like two echoes of the call close together; if they are not, another call was emitted" in found.warning
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_call_match_accepts_random_settings_and_scenes(seed):
     measurement, _ = budgets.measurement_of(seed)
