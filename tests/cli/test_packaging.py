@@ -70,7 +70,7 @@ def wheel(tmp_path_factory):
 def test_container_contains_every_package_and_its_stages_are_extras():
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
-    copied = {line[1:] for line in (ROOT / ".containerignore").read_text().split() if line.startswith("!")}
+    copied = {line[1:] for line in (ROOT / ".dockerignore").read_text().split() if line.startswith("!")}
     folders = {line.partition("=")[2].split("/")[0].strip() for line in config["options"]["package_dir"].split("\n")}
     assert (folders - {""}) | {"setup.cfg", "pyproject.toml", "README.md", "LICENSE", "NOTICE", "ertis_numba"} <= copied
     stages = re.findall(
