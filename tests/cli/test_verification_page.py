@@ -22,8 +22,9 @@ def test_results_are_those_of_the_linked_page(row):
         return
     (target,) = re.findall(r"\]\((.*?)\)", link)
     text = (PAGE.parent / target).resolve().read_text("utf-8").replace("−", "-").replace(" %", "%")
-    for number in re.findall(r"-?\d[\d,.]*%?", result.replace("−", "-").replace(" %", "%")):
-        assert number.rstrip(",.") in text
+    numbers = re.findall(r"-?\d[\d,.]*%?", result.replace("−", "-").replace(" %", "%"))
+    whole = [rf"(?<![\d,.-]){re.escape(number.rstrip(',.'))}(?!\d|[,.]\d)" for number in numbers]
+    assert any(all(re.search(each, paragraph) for each in whole) for paragraph in text.split("\n\n"))
 
 
 def test_commands_exist():
