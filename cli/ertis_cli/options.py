@@ -68,9 +68,7 @@ __all__ = [
     "note_doubts",
     "note_layout",
     "note_missing_points",
-    "note_noise",
     "note_of",
-    "note_open_edges",
     "note_unknown_angles",
     "note_unknown_bearings",
     "note_unknown_places",
@@ -453,13 +451,6 @@ def note_unknown_places(sensor: str, settings: "Settings", *, quiet: bool = Fals
         note(f"sensor {sensor} {text}", quiet=quiet)
 
 
-def note_noise(sensor: str, count: int, *, quiet: bool = False) -> None:
-    """Print a note on images whose strongest maximum is noise from its direction, if there are any."""
-    from ertis_numba.analysis.peak_notes import noise_note
-
-    note_of(sensor, noise_note(count), quiet=quiet)
-
-
 def note_unknown_bearings(sensor: str, settings: "Settings") -> None:
     """Print a note on angles that bearings cannot show, and a warning if the array needs too fine a search."""
     from ertis_numba.geometry import direction_grid
@@ -485,15 +476,6 @@ def note_doubts(sensor: str, bearings: "Iterable[Bearing]") -> bool:
             "remains, and sound does not"
         )
     return bool(doubts)
-
-
-def note_open_edges(
-    sensor: str, grid: "DegreesFromRadians", grid_errors: "Iterable[float]", *, quiet: bool = False
-) -> None:
-    """Print a note on listed directions whose sources may lie beyond the edges of the grid, if there are any."""
-    from ertis_numba.analysis.peak_notes import open_edge_note
-
-    note_of(sensor, open_edge_note(grid, grid_errors), quiet=quiet)
 
 
 def say(text: str, *, quiet: bool) -> None:

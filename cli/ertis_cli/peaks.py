@@ -288,7 +288,7 @@ def _found(
     path: Path, sensor: str, find: "Callable[[Energyscape], list[Peak]]", measurement: int | None
 ) -> list[dict[str, Any]]:
     """Return a row for each peak of a sensor."""
-    from ertis_numba.analysis.peak_notes import left_out_note, unconfirmed_note
+    from ertis_numba.analysis.peak_notes import left_out_note, noise_note, open_edge_note, unconfirmed_note
     from ertis_numba.storage import open_energyscapes
 
     with open_energyscapes(path, sensor=sensor) as images:
@@ -298,11 +298,11 @@ def _found(
         found = [(index, peak) for index, peaks in by_place.items() for peak in peaks]
         n_left_out = sum(_n_left_out(images[index], peaks, find) for index, peaks in by_place.items())
         options.note_of(sensor, left_out_note(n_left_out))
-        options.note_noise(sensor, sum(_is_noisy(images[index], find) for index in places))
+        options.note_of(sensor, noise_note(sum(_is_noisy(images[index], find) for index in places)))
         clouds = [images[index].points for index in places] if images.has_points else []
         n_unconfirmed = sum(int((~each.is_certain).sum()) for each in clouds if each is not None)
         options.note_of(sensor, unconfirmed_note(n_unconfirmed))
-        options.note_open_edges(sensor, images, (peak.grid_error_deg for _, peak in found))
+        options.note_of(sensor, open_edge_note(images, (peak.grid_error_deg for _, peak in found)))
         return [{"sensor": sensor, "measurement": index, **_rounded(peak)} for index, peak in found]
 
 

@@ -287,12 +287,13 @@ def _drawn(kind: str, image: "Energyscape", top: int, look: dict[str, Any], *, q
     """Draw an image with rings around its strongest reflectors, if ``top`` is above 0."""
     from ertis_numba import figures
     from ertis_numba.analysis.detect import find_peaks, left_out_in_noise
+    from ertis_numba.analysis.peak_notes import noise_note, open_edge_note
 
     peaks = find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else None
     is_noisy = bool(top) and left_out_in_noise(image, false_alarm=options.FALSE_ALARM)
-    options.note_noise(image.stamp.sensor, int(is_noisy), quiet=quiet)
+    options.note_of(image.stamp.sensor, noise_note(int(is_noisy)), quiet=quiet)
     errors_deg = (peak.grid_error_deg for peak in peaks or ())
-    options.note_open_edges(image.stamp.sensor, image, errors_deg, quiet=quiet)
+    options.note_of(image.stamp.sensor, open_edge_note(image, errors_deg), quiet=quiet)
     draw: dict[str, Callable[..., Figure]]
     draw = {"image": figures.plot, "polar": figures.polar, "projection": figures.projection, "slices": figures.slices}
     return draw[kind](image, peaks=peaks, **look)

@@ -53,8 +53,8 @@ class ArrayAxes:
     def apart_rad(self, first: Floats, second: Floats) -> Floats:
         """Return angles (n,) between unit vectors (n, axis), or between their cones around a line of microphones."""
         if self._sizes_m[1] < _LINE * self._sizes_m[2]:
-            ends = (np.arcsin(np.clip(each @ self.longest, -1.0, 1.0)) for each in (first, second))
-            return np.asarray(np.abs(next(ends) - next(ends)))
+            one, other = (np.arcsin(np.clip(each @ self.longest, -1.0, 1.0)) for each in (first, second))
+            return np.asarray(np.abs(one - other))
         return np.asarray(2 * np.arcsin(np.minimum(np.linalg.norm(first - second, axis=1) / 2, 1.0)))
 
     @property

@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.detect import observed, peaks_of_grid
+from ertis_numba.analysis.points import FALSE_ALARM
 from ertis_numba.base import checks
 from ertis_numba.frames import Energyscape, Peak, Reflector
 from ertis_numba.geometry import array_weights, microphones, observable_angles, unit_vectors
@@ -24,7 +25,6 @@ _GATE_HALF_LOBES = 3.0  # Maximum angle between them: one and a half main lobes.
 _HALF_AMPLITUDE = math.sqrt(2 * math.log(2))  # Argument x for which exp(-x² / 2) is one half.
 _SLACK_DB = 3.0  # Tolerance of a level in the image relative to the true level.
 _MAX_FALSE = 100  # More than a hundred spurious peaks add no information.
-_FALSE_ALARM = 1e-3  # Probability of a peak of noise alone in an image, as of 'ertis peaks'.
 _MIN_DB = -1000.0
 
 
@@ -153,7 +153,7 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     # A reflector that does not count may still be the strongest in the image, or leak into it.
     above_db = float(np.max(levels_db, where=in_range, initial=strongest_db)) - strongest_db if counted else 0.0
     floor_db = max(_MIN_DB, min_level_db - above_db - _SLACK_DB)
-    peaks = peaks_of_grid(image, top=len(reflectors) + _MAX_FALSE, min_level_db=floor_db, false_alarm=_FALSE_ALARM)
+    peaks = peaks_of_grid(image, top=len(reflectors) + _MAX_FALSE, min_level_db=floor_db, false_alarm=FALSE_ALARM)
     pairs = _assign(image, counted, peaks, lobe)
     # Levels of peaks are relative to the strongest peak, those of reflectors to the strongest reflector. A matched pair
     # determines the offset between the two references.

@@ -38,8 +38,7 @@ def draw(canvas: Canvas, cloud: PointCloud) -> Figure:
 
     def finish(axes: Axes) -> None:
         """Set limits with one scale for both axes, around the points and the sensor."""
-        low, high = (edge([*left_m, 0.0]) for edge in (min, max)), (edge([*ahead_m, 0.0]) for edge in (min, max))
-        (right, left), (back, front) = tuple(low), tuple(high)
+        (right, left), (back, front) = ((min(*each, 0.0), max(*each, 0.0)) for each in (left_m, ahead_m))
         scale = _SPARE * max((left - right) / axes.bbox.width, (front - back) / axes.bbox.height) or 1e-3
         across, ahead = (left + right) / 2, (front + back) / 2
         axes.set_xlim(across + scale * axes.bbox.width / 2, across - scale * axes.bbox.width / 2)
