@@ -1,4 +1,4 @@
-"""Pictures of the README and of the pages on beamformers and plots, drawn by `make pictures`.
+"""Pictures of the README and of the documentation, drawn by `make pictures`.
 
 The real measurement comes with the package rtisdev; its code is not imported.
 """

@@ -2,8 +2,8 @@
 
 Start it with::
 
-ertis serve &
-ros2 launch ertis_ros platform.launch.py address:=tcp://127.0.0.1:5602 rviz:=true
+    ertis serve &
+    ros2 launch ertis_ros platform.launch.py address:=tcp://127.0.0.1:5602 rviz:=true
 """
 
 from pathlib import Path

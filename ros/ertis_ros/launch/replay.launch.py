@@ -2,7 +2,7 @@
 
 Start it with::
 
-ros2 launch ertis_ros replay.launch.py file:=REC.h5 speed:=0.5
+    ros2 launch ertis_ros replay.launch.py file:=REC.h5 speed:=0.5
 """
 
 from launch import LaunchDescription

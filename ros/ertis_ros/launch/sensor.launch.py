@@ -2,7 +2,7 @@
 
 Start it with::
 
-ros2 launch ertis_ros sensor.launch.py ports:="/dev/ttyACM0 /dev/ttyACM1" preset:=short_25_50
+    ros2 launch ertis_ros sensor.launch.py ports:="/dev/ttyACM0 /dev/ttyACM1" preset:=short_25_50
 """
 
 from launch import LaunchDescription
