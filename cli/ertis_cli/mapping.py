@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
     from ertis_cli._pulses import StampedIndex
     from ertis_numba.frames import OccupancyMap, Trajectory
+    from ertis_numba.mapping import Mapper
     from ertis_numba.storage import RecordingReader
 
 __all__ = ["mapping"]
@@ -138,11 +139,7 @@ def mapping(
                 mapper.add(images.values(), trajectory)
                 truth.add(images, {name: place.index for name, place in group.items()})
     occupancy = mapper.map
-    if contradiction := mapper.emitter_warning():
-        options.warn(contradiction)
-    _pulses.note_empty(mapper.n_empty, len(located), quiet=quiet)
-    if mapper.n_empty < len(located) and not contradiction:
-        _pulses.note_without_own_echo(mapper.without_own_echo, len(located), quiet=quiet)
+    contradiction = _note_echoes(mapper, len(located), quiet=quiet)
     if height_m is not None and not mapper.n_points and mapper.n_empty < len(located):
         _report_heights(occupancy, height_m, quiet=quiet)
     _pulses.note_truth(truth, quiet=quiet)
@@ -159,14 +156,19 @@ def mapping(
         "notes": list(trajectory.notes),
         "warnings": [] if contradiction is None else [contradiction],
     }
-    size = " × ".join(f"{side_m:.2f}" for side_m in report["size_m"])
-    options.say(
-        f"{target}: {options.counted(len(located), 'pulse')}, {size} m, {report['occupied']} cells occupied, "
-        f"{report['free']} free",
-        quiet=quiet,
-    )
+    options.say(_summary(target, len(located), report), quiet=quiet)
     if as_json:
         options.print_json(report)
+
+
+def _note_echoes(mapper: "Mapper", n_pulses: int, *, quiet: bool) -> str | None:
+    """Report pulses and sensors without echoes, and return the warning of wrong emitters, or None."""
+    if contradiction := mapper.emitter_warning():
+        options.warn(contradiction)
+    _pulses.note_empty(mapper.n_empty, n_pulses, quiet=quiet)
+    if mapper.n_empty < n_pulses and not contradiction:
+        _pulses.note_without_own_echo(mapper.without_own_echo, n_pulses, quiet=quiet)
+    return contradiction
 
 
 def _report_heights(occupancy: "OccupancyMap", height_m: tuple[float, float], *, quiet: bool) -> None:
@@ -243,6 +245,12 @@ def _note_gaps(groups: "Sequence[dict[str, StampedIndex]]", trajectory: "Traject
     if n_in_gaps:
         pulses = f"{n_in_gaps} of {options.counted(len(groups), 'pulse')}"
         options.note(f"{pulses} between poses more than a second apart, which are interpolated", quiet=quiet)
+
+
+def _summary(target: Path, n_pulses: int, report: dict[str, Any]) -> str:
+    size = " × ".join(f"{side_m:.2f}" for side_m in report["size_m"])
+    cells = f"{report['occupied']} cells occupied, {report['free']} free"
+    return f"{target}: {options.counted(n_pulses, 'pulse')}, {size} m, {cells}"
 
 
 def _report(

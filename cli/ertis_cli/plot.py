@@ -2,7 +2,7 @@
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import click
 
@@ -159,9 +159,9 @@ def plot(
     from ertis_numba import figures
     from ertis_numba.base import checks
     from ertis_numba.base.errors import DataError
-    from ertis_numba.storage import atomic_write, check_target, read_map
+    from ertis_numba.storage import atomic_write, check_target
 
-    given: dict[str, object] = {
+    given: dict[str, Any] = {
         "sensor": sensor,
         "measurement": measurement,
         "peaks": top,
@@ -194,54 +194,63 @@ def plot(
         "columns": columns,
         "font": font,
     }
-    azimuth_deg, elevation_deg = steer or (0.0, 0.0)
-    report: dict[str, object] = {"output": str(target), "kind": kind}
-    if kind == "array":
-        figure = figures.array(
-            _settings(path, sensor),
-            frequencies_hz=frequencies or None,
-            azimuth_deg=azimuth_deg,
-            elevation_deg=elevation_deg,
-            **look,
-        )
-        reported = f"array of {path}"
-    elif kind == "calibration":
-        made, settings = _calibrated(path, sensor)
-        figure = figures.calibration(made, settings, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, **look)
-        reported = f"calibration with {path}"
-    elif kind == "map":
-        figure, reported = _map(read_map(path), poses, mounting, look), f"map of {path}"
-    else:
-        row, index = _acoustic_plots.row_name(path), measurement or 0
-        if kind in _OF_RECORDINGS:
-            heard = _measurement(path, sensor, index)
-            draw = figures.signals if kind == "signals" else figures.matched_filter
-            figure, name = draw(heard, microphone=microphone, **look), heard.stamp.sensor
-        elif kind in _OF_SOUND:
-            figure, name = _acoustic_plots.draw(
-                kind,
-                path,
-                sensor,
-                index,
-                steer=steer,
-                band_hz=band_hz,
-                photo=photo,
-                photo_fov_deg=photo_fov_deg,
-                quiet=quiet,
-                look=look,
-            )
-        else:
-            image = _image(path, sensor, index, quiet=quiet)
-            places = {"height_m": height, "left_m": left, "side_lobes": side_lobes}
-            look |= {name: value for name, value in places.items() if value is not None}
-            figure, name = _drawn(kind, image, 5 if top is None else top, look, quiet=quiet), image.stamp.sensor
-        report |= {"sensor": name, row: index}
-        reported = f"{row} {index} of {path}"
+    made = _plot_of_file(kind, path, given, look, quiet=quiet)
     with atomic_write(target, overwrite=force) as part:
-        figures.save(figure, part, format=target.suffix.lower().lstrip("."))
-    options.say(f"{target}: {reported}", quiet=quiet)
+        figures.save(made.figure, part, format=target.suffix.lower().lstrip("."))
+    options.say(f"{target}: {made.content}", quiet=quiet)
     if as_json:
-        options.print_json(report)
+        options.print_json({"output": str(target), "kind": kind, **made.entries})
+
+
+class _Plot(NamedTuple):
+    """Figure, the text that names its content, and entries of the JSON report."""
+
+    figure: "Figure"
+    content: str
+    entries: dict[str, object]
+
+
+def _plot_of_file(kind: str, path: Path, given: "Mapping[str, Any]", look: dict[str, Any], *, quiet: bool) -> _Plot:
+    """Draw a plot of any kind with the given options."""
+    from ertis_numba import figures
+    from ertis_numba.storage import read_map
+
+    azimuth_deg, elevation_deg = given["steer"] or (0.0, 0.0)
+    towards: dict[str, Any] = {"azimuth_deg": azimuth_deg, "elevation_deg": elevation_deg}
+    if kind == "array":
+        settings = _settings(path, given["sensor"])
+        figure = figures.array(settings, frequencies_hz=given["frequency"], **towards, **look)
+        return _Plot(figure, f"array of {path}", {})
+    if kind == "calibration":
+        made, settings = _calibrated(path, given["sensor"])
+        return _Plot(figures.calibration(made, settings, **towards, **look), f"calibration with {path}", {})
+    if kind == "map":
+        return _Plot(_map(read_map(path), given["poses"], given["mounting"], look), f"map of {path}", {})
+    return _plot_of_measurement(kind, path, given, look, quiet=quiet)
+
+
+def _plot_of_measurement(
+    kind: str, path: Path, given: "Mapping[str, Any]", look: dict[str, Any], *, quiet: bool
+) -> _Plot:
+    """Draw the signals, the sound or the image of one measurement."""
+    from ertis_numba import figures
+
+    sensor, row, index = given["sensor"], _acoustic_plots.row_name(path), given["measurement"] or 0
+    if kind in _OF_RECORDINGS:
+        heard = _measurement(path, sensor, index)
+        draw = figures.signals if kind == "signals" else figures.matched_filter
+        figure, name = draw(heard, microphone=given["microphone"], **look), heard.stamp.sensor
+    elif kind in _OF_SOUND:
+        chosen = {"steer": given["steer"], "band_hz": given["band"]}
+        chosen |= {"photo": given["photo"], "photo_fov_deg": given["photo-fov"]}
+        figure, name = _acoustic_plots.draw(kind, path, sensor, index, **chosen, quiet=quiet, look=look)
+    else:
+        image = _image(path, sensor, index, quiet=quiet)
+        places = {"height_m": given["height"], "left_m": given["left"], "side_lobes": given["side-lobes"]}
+        look = look | {name: value for name, value in places.items() if value is not None}
+        top = 5 if given["peaks"] is None else given["peaks"]
+        figure, name = _drawn(kind, image, top, look, quiet=quiet), image.stamp.sensor
+    return _Plot(figure, f"{row} {index} of {path}", {"sensor": name, row: index})
 
 
 def _default_kind(path: Path, sensor: str | None, index: int, kind: str) -> str:

@@ -118,21 +118,7 @@ def simulate(
             )
         n_reflectors = max(log.n_own_targets for log in logs.values())
     options.say(_summary(target, scene, n_sensors=len(names), n_reflectors=n_reflectors), quiet=quiet)
-    if plan.left_out:
-        options.say(
-            f"left out: {', '.join(plan.left_out)}; --explain gives the reasons, --tolerance-db 0 keeps all effects",
-            quiet=quiet,
-        )
-    for simulator in simulators:
-        followed, by = (_FOLLOWED, "modulators") if simulator.sensor.recording.is_pdm else (1.0, "converters")
-        if simulator.loudest > followed:
-            options.note(
-                f"signals of {simulator.sensor.name} reach {simulator.loudest:.2g} of full scale, but {by} "
-                f"follow only up to {followed:g}; lower emitter.level_db or increase distances",
-                quiet=quiet,
-            )
-    for note in plan.notes:
-        options.note(note, quiet=quiet)
+    _print_notes(plan, simulators, quiet=quiet)
     effects = _effects(plan, simulators)
     if as_json:
         options.print_json(_report(target, scene, plan, firsts) | ({"effects": effects} if explain else {}))
@@ -184,6 +170,25 @@ def _poses(scene: "Scene") -> "Trajectory | None":
     import numpy as np
 
     return None if scene.platform is None else scene.platform.trajectory(np.arange(scene.count + 1) / scene.rate_hz)
+
+
+def _print_notes(plan: "EffectPlan", simulators: "Sequence[Simulator]", *, quiet: bool) -> None:
+    """Report the effects that are left out, signals beyond full scale, and the notes of the plan."""
+    if plan.left_out:
+        options.say(
+            f"left out: {', '.join(plan.left_out)}; --explain gives the reasons, --tolerance-db 0 keeps all effects",
+            quiet=quiet,
+        )
+    for simulator in simulators:
+        followed, by = (_FOLLOWED, "modulators") if simulator.sensor.recording.is_pdm else (1.0, "converters")
+        if simulator.loudest > followed:
+            options.note(
+                f"signals of {simulator.sensor.name} reach {simulator.loudest:.2g} of full scale, but {by} "
+                f"follow only up to {followed:g}; lower emitter.level_db or increase distances",
+                quiet=quiet,
+            )
+    for note in plan.notes:
+        options.note(note, quiet=quiet)
 
 
 def _effects(plan: "EffectPlan", simulators: "Sequence[Simulator]") -> list[dict[str, Any]]:
