@@ -120,8 +120,7 @@ def _write_fused(
         for text in clocks.warnings():
             options.warn(text)
         truth = PlacedTruth(readers, mountings)
-        incomplete = empty = 0
-        unheard, unshown = Counter[str](), Counter[str]()
+        counts = _FusedCounts()
         writer = stack.enter_context(
             EnergyscapeWriter(target, overwrite=force, mounting={PLATFORM: ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))})
         )
@@ -131,25 +130,14 @@ def _write_fused(
                 fused = fuser(images.values())
                 truth.add(images, {name: place.index for name, place in group.items()})
                 missing = [name for name in fused.missing if name in by_name]
-                incomplete += bool(missing)
                 if missing:
                     options.note(f"pulse {number} has no image of {', '.join(missing)}", quiet=quiet)
-                empty += fused.is_empty
-                unheard.update(fused.unheard)
-                unshown.update(fused.without_own_echo)
+                counts.add(fused, is_complete=not missing)
                 writer.write(_numbered(fused, number))
         _pulses.note_truth(truth, quiet=quiet)
         if (placed := truth.truth()) is not None:
             writer.note_truth(PLATFORM, placed)
-    _pulses.note_empty(empty, len(groups), quiet=quiet)
-    contradiction = fuser.emitter_warning()  # With wrong emitters, echoes seem to be missing.
-    every = [_unheard(name, count, len(groups)) for name, count in unheard.items()]
-    warnings = [contradiction] if contradiction else every
-    for text in warnings:
-        options.warn(text)
-    if empty < len(groups) and not contradiction:
-        others = {name: count for name, count in unshown.items() if name not in unheard}
-        _pulses.note_without_own_echo(others, len(groups), quiet=quiet)
+    warnings = _warn_of_echoes(counts, fuser.emitter_warning(), len(groups), quiet=quiet)
     pulses = options.counted(len(groups), "pulse")
     options.say(f"{target}: {pulses} of {', '.join(by_name)}, fused", quiet=quiet)
     if as_json:
@@ -157,15 +145,43 @@ def _write_fused(
             "output": str(target),
             "sensors": list(by_name),
             "pulses": len(groups),
-            "incomplete": incomplete,
-            "empty": empty,
+            "incomplete": counts.incomplete,
+            "empty": counts.empty,
             "left_out": active.n_passive,
-            "unheard": dict(unheard),
-            "without_own_echo": dict(unshown),
+            "unheard": dict(counts.unheard),
+            "without_own_echo": dict(counts.unshown),
             "simulated": placed is not None,
         }
         warnings = [*clocks.warnings(), *pipelines.warnings, *warnings]
         options.print_json(report | {"direct_sound": _direct_sound(clocks), "warnings": warnings})
+
+
+class _FusedCounts:
+    """Counts of incomplete and empty images, and of the pulses in which the echoes of each sensor are missing."""
+
+    def __init__(self) -> None:
+        self.incomplete = self.empty = 0
+        self.unheard, self.unshown = Counter[str](), Counter[str]()
+
+    def add(self, fused: "Fused", *, is_complete: bool) -> None:
+        """Count the fused image of a pulse."""
+        self.incomplete += not is_complete
+        self.empty += fused.is_empty
+        self.unheard.update(fused.unheard)
+        self.unshown.update(fused.without_own_echo)
+
+
+def _warn_of_echoes(counts: _FusedCounts, contradiction: str | None, n_pulses: int, *, quiet: bool) -> list[str]:
+    """Print and return warnings of missing echoes; with wrong emitters, echoes only seem to be missing."""
+    _pulses.note_empty(counts.empty, n_pulses, quiet=quiet)
+    every = [_unheard(name, count, n_pulses) for name, count in counts.unheard.items()]
+    warnings = [contradiction] if contradiction else every
+    for text in warnings:
+        options.warn(text)
+    if counts.empty < n_pulses and not contradiction:
+        others = {name: count for name, count in counts.unshown.items() if name not in counts.unheard}
+        _pulses.note_without_own_echo(others, n_pulses, quiet=quiet)
+    return warnings
 
 
 def _clock_check(

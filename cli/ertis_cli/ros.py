@@ -11,12 +11,12 @@ import click
 from click.core import ParameterSource
 
 from ertis_cli import _mountings, _network, _ros_sources, _watchdog, options
-from ertis_cli._naming import with_options
 from ertis_cli._recording_settings import recording_settings, settings_from
+from ertis_cli._ros_report import RosReport
 from ertis_cli._stop_signals import stopped_by_signals
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from ertis_numba.ros import RosPublisher
     from ertis_numba.ros.publishing_settings import PublishingSettings, WatchedSettings
@@ -196,25 +196,24 @@ def ros(
     of_files = {"--use-sim-time": sim_time, "--loop": loop, "--rate": rate != 1.0}
     of_ports = {"--trigger": trigger, "--trigger-rate": trigger_rate_hz}
     of_ports |= {f"--{name.removesuffix('_file')}": value for name, value in given_settings.items()}
-    for wanted, options_of in (("file", of_files), ("port", of_ports)):
-        for name, value in options_of.items():
-            if kind != wanted and value not in {None, False}:
-                raise click.UsageError(f"{name} is for {wanted}s; remove it with {_KINDS[kind]}")
-    if kind == "port" and sensors:
-        raise click.UsageError(
-            "--sensor selects sensors of a file or an address; name the ports of the sensors instead"
-        )
+    _require_fitting(kind, sensors, {"file": of_files, "port": of_ports})
     _network.require_duration(duration)
-    settings = settings_from(**given_settings) if kind == "port" else None
+    chosen = topics or ("points", "scan")
+    own: dict[str, Any]  # The options of this kind of source.
+    if kind == "port":
+        own = {"settings": settings_from(**given_settings), "trigger": trigger or "command", "device": device}
+        own |= {"rate_hz": trigger_rate_hz or _TRIGGER_RATE_HZ, "quiet": quiet}
+    elif kind == "address":
+        own = {"sensors": sensors, "images": odometry or set(chosen) != {"points"}, "keys": (key, server_key)}
+    else:
+        own = {"sensors": sensors, "device": device, "loop": loop, "sim_time": sim_time}
     watched, publishing = _publishing(
         control, min_level_db=min_level, floor_dbfs=floor_dbfs, max_rate_hz=dict(max_rates), speed=rate
     )
     from ertis_numba.ros import Participant, RosPublisher
 
-    chosen = topics or ("points", "scan")
     end_s = math.inf if duration is None else time.monotonic() + duration
     given = _mountings.mountings(mounting, sensors or None) or {}
-    images = odometry or set(chosen) != {"points"}
     notes: deque[str] = deque()
     with (
         stopped_by_signals() as signals,
@@ -230,7 +229,7 @@ def ros(
             on_note=notes.append,
         ) as publisher,
     ):
-        report = _RosReport(publisher, notes, quiet=quiet, as_json=as_json)
+        report = RosReport(publisher, notes, quiet=quiet, as_json=as_json)
 
         def is_over() -> bool:
             _watchdog.beat()
@@ -239,42 +238,40 @@ def ros(
                 watched.poll(publisher, report.note)
             return bool(signals.came) or time.monotonic() >= end_s
 
-        common: dict[str, Any] = {
-            "sensors": sensors,
+        own |= {
             "is_over": is_over,
             "on_ready": lambda: report.start(source, participant),
             "on_published": report.published,
             "signals": signals,
         }
-        if settings is not None:
-            _ros_sources.publish_ports(
-                sources,
-                publisher,
-                settings=settings,
-                trigger=trigger or "command",
-                rate_hz=trigger_rate_hz or _TRIGGER_RATE_HZ,
-                device=device,
-                quiet=quiet,
-                on_note=report.note,
-                **{name: value for name, value in common.items() if name != "sensors"},
-            )
-        elif kind == "address":
-            keys = _network.client_keys(key, server_key)
-            _ros_sources.publish_node(source, publisher, images=images, keys=keys, on_note=report.note, **common)
-        else:
-            _ros_sources.publish_file(
-                Path(source),
-                publisher,
-                device=device,
-                loop=loop,
-                sim_time=sim_time,
-                on_passive=report.passive,
-                **common,
-            )
+        _publish(kind, sources, publisher, report, **own)
         publisher.close()
         report.end()
         if signals.came and kind == "file" and not loop:
             sys.exit(128 + signals.came[0])
+
+
+def _publish(kind: str, sources: tuple[str, ...], publisher: "RosPublisher", report: RosReport, **own: Any) -> None:
+    """Publish from sensors at ports, from a central node or from a file, with the options of that source."""
+    if kind == "port":
+        _ros_sources.publish_ports(sources, publisher, on_note=report.note, **own)
+    elif kind == "address":
+        keys = _network.client_keys(*own.pop("keys"))
+        _ros_sources.publish_node(sources[0], publisher, keys=keys, on_note=report.note, **own)
+    else:
+        _ros_sources.publish_file(Path(sources[0]), publisher, on_passive=report.passive, **own)
+
+
+def _require_fitting(kind: str, sensors: tuple[str, ...], given: "Mapping[str, Mapping[str, object]]") -> None:
+    """Raise an error for given options of another kind of source."""
+    for wanted, options_of in given.items():
+        for name, value in options_of.items():
+            if kind != wanted and value not in {None, False}:
+                raise click.UsageError(f"{name} is for {wanted}s; remove it with {_KINDS[kind]}")
+    if kind == "port" and sensors:
+        raise click.UsageError(
+            "--sensor selects sensors of a file or an address; name the ports of the sensors instead"
+        )
 
 
 class _Control:
@@ -327,78 +324,3 @@ def _kind(sources: tuple[str, ...]) -> str:
     if kind == "port" and any(Path(each).suffix == ".h5" for each in sources):
         raise click.UsageError(f"file {sources[0]} does not exist; choose an existing file, an address, or ports")
     return kind
-
-
-class _RosReport:
-    """Lines about the progress of the command."""
-
-    def __init__(self, publisher: Any, notes: deque[str], *, quiet: bool, as_json: bool) -> None:
-        self._publisher, self._notes, self._quiet, self._as_json = publisher, notes, quiet, as_json
-        self._listed: set[str] = set()
-        self._n_passive = 0
-
-    def start(self, source: str, participant: Any) -> None:
-        """Report the domain and the interface."""
-        text = f"publishing {source} in domain {participant.domain} on interface {participant.interface}"
-        options.say(f"{text}; Ctrl-C ends", quiet=self._quiet)
-        if self._as_json:
-            options.print_json(
-                {
-                    "event": "publishing",
-                    "source": source,
-                    "domain": participant.domain,
-                    "interface": participant.interface,
-                }
-            )
-
-    def note(self, text: str) -> None:
-        """Report an event of the connection."""
-        text = with_options(text)
-        options.say(text, quiet=self._quiet)
-        if self._as_json:
-            options.print_json({"event": "note", "text": text})
-
-    def passive(self, count: int) -> None:
-        """Report that measurements of a file without a call are left out."""
-        self._n_passive = count
-        self.note(
-            f"note: {options.counted(count, 'measurement')} without a call left out; 'ertis acoustic' makes maps "
-            "of their sound"
-        )
-
-    def show_notes(self) -> None:
-        """Report the notes of other threads."""
-        while self._notes:
-            self.note(self._notes.popleft())
-
-    def published(self) -> None:
-        """Report new topics."""
-        for name, topic in self._publisher.topics.items():
-            if name not in self._listed:
-                self._listed.add(name)
-                options.say(f"  {name}  {topic.message}", quiet=self._quiet)
-                if self._as_json:
-                    options.print_json({"event": "topic", "topic": name, "message": topic.message})
-
-    def end(self) -> None:
-        """Report the counts."""
-        self.show_notes()
-        dropped, left_out, skipped = self._publisher.dropped, self._publisher.left_out, self._publisher.skipped
-        n_published = self._publisher.published
-        text = f"{options.counted(n_published, 'measurement')} published"
-        text += f", {options.counted(dropped, 'message')} dropped for slow subscribers" if dropped else ""
-        text += f", {options.counted(left_out, 'message')} left out by rates or pauses" if left_out else ""
-        text += f", {options.counted(skipped, 'pulse')} without odometry, which was too slow" if skipped else ""
-        options.say(text, quiet=self._quiet)
-        if self._as_json:
-            counts = {name: topic.published for name, topic in self._publisher.topics.items()}
-            options.print_json(
-                {
-                    "event": "end",
-                    "measurements": n_published,
-                    "messages": counts,
-                    "dropped": dropped,
-                    "left_out": left_out + self._n_passive,
-                    "skipped": skipped,
-                }
-            )

@@ -177,16 +177,7 @@ def view(
     is_known = live or acoustic_maps is not None
     _require_use(kind, (_MAPS if acoustic_maps else _IMAGES,) if is_known else (_IMAGES, _MAPS))
     _network.require_duration(duration)
-    if html is not None:
-        from ertis_numba.base import checks
-        from ertis_numba.storage import check_target
-
-        check_target(html, overwrite=force, sources=[] if live else [Path(location)])
-        checks.file_ending("page", html, _PAGES)
-    if not live:
-        from ertis_numba.storage import file_kind
-
-        file_kind(Path(location))  # The viewer loads kernels, so other files are refused before.
+    _require_files(None if live else Path(location), html, overwrite=force)
     from ertis_numba.viewer import Choices, Viewer
 
     choices = Choices(
@@ -251,6 +242,18 @@ def _is_address(location: str) -> bool:
             f"{location!r} is not a file; for the address of a central node, use tcp://{host_port[2]}"
         )
     return live
+
+
+def _require_files(source: Path | None, html: Path | None, *, overwrite: bool) -> None:
+    """Raise an error for a page that cannot be written, or for a file that cannot be shown."""
+    from ertis_numba.base import checks
+    from ertis_numba.storage import check_target, file_kind
+
+    if html is not None:
+        check_target(html, overwrite=overwrite, sources=[] if source is None else [source])
+        checks.file_ending("page", html, _PAGES)
+    if source is not None:
+        file_kind(source)  # The viewer loads kernels, so other files are refused before.
 
 
 def _require_use(kind: str, contents: tuple[str, ...]) -> None:
