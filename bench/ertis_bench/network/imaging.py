@@ -73,11 +73,7 @@ def processing(
         )
         sender.wait_for("begun")
         load = ProcessorTime(serve.processes() | {"sensor nodes": [sender.pid], "application": [receiver.pid]})
-        n_before = len(read_received(images).numbers)
-        end_s = time.monotonic() + duration_s - 1.0
-        while time.monotonic() < end_s:
-            serve.look(timeout_s=1.0)
-        n_images = len(read_received(images).numbers) - n_before
+        n_images = _images_within(duration_s - 1.0, serve, images)
         cpu_percent, cpu_ms = load.percent(), load.rows(n_images)
         sender.wait_for("sent", timeout_s=duration_s + 60.0)
         sent = read_diaries([warm, diary])
@@ -90,7 +86,6 @@ def processing(
         status = serve.latest
         serve.node.stop()
     measured = read_diaries([diary]).offered
-    times_ms = [time_ms for key, time_ms in received.times_ms.items() if key in measured]
     choice = "" if status is None or status.processing is None else status.processing.choice
     return found | {
         "part": part,
@@ -99,14 +94,25 @@ def processing(
         "rate_hz": rate_hz,
         "goal": goal,
         "choice": choice,
-        "p50_ms": percentile(times_ms, 0.5),
-        "p90_ms": percentile(times_ms, 0.9),
-        "p99_ms": percentile(times_ms, 0.99),
-        "slowest_ms": percentile(times_ms, 1.0),
+        **_latencies([time_ms for key, time_ms in received.times_ms.items() if key in measured]),
         "cpu_percent": cpu_percent,
         "cpu_ms": cpu_ms,
         "cpu_total_ms": sum(time_ms for *_, time_ms in cpu_ms),
     }
+
+
+def _images_within(duration_s: float, serve: Serve, images: Path) -> int:
+    """Return the number of images that an application receives within a time."""
+    n_before = len(read_received(images).numbers)
+    end_s = time.monotonic() + duration_s
+    while time.monotonic() < end_s:
+        serve.look(timeout_s=1.0)
+    return len(read_received(images).numbers) - n_before
+
+
+def _latencies(times_ms: list[float]) -> Found:
+    shares = {"p50_ms": 0.5, "p90_ms": 0.9, "p99_ms": 0.99, "slowest_ms": 1.0}
+    return {name: percentile(times_ms, share) for name, share in shares.items()}
 
 
 def _since(begun: Found, found: Found) -> Found:

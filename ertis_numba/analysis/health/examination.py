@@ -5,7 +5,7 @@ import math
 import statistics
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,23 +91,7 @@ def health(measurement: Measurement) -> Health:
         return Health(
             channels=tuple(ChannelHealth(channel=int(i)) for i in enabled), unknown=(too_short,), has_call=has_call
         )
-    signal_of: Callable[[int], NDArray[np.float32]]
-    whole: Callable[[int], NDArray[np.float32]]
-    columns: Callable[[int], NDArray[Any]]
-    if settings.recording.is_pdm:
-        octets = _bits.octets_of(words)
-        signal_of = whole = functools.partial(_bits.signal_of, octets)
-        columns = functools.partial(_bits.bits_of, octets)
-        reported, half_scale = by_bits(octets, enabled), 0.5
-    else:
-        full, is_float = settings.recording.full_scale, settings.recording.encoding == "float32"
-        reported = [by_numbers(i, scaled(words, full, i), is_float=is_float) for i in enabled.tolist()]
-        if is_float:  # The unit of float samples may be the pascal.
-            full = max(full, *(float(np.abs(words[:, i]).max()) for i in enabled))
-        signal_of = functools.partial(scaled, words, full)
-        # Times since the start of the record include the silence before its first sound.
-        whole = functools.partial(scaled, record[:MAX_SAMPLES], full)
-        columns, half_scale = functools.partial(_column, words), full
+    reported, signal_of, whole, columns, half_scale = _recorded_channels(words, record[:MAX_SAMPLES], settings, enabled)
     found = {item.channel: item for item in reported}
     moving = [item for item in reported if not any(name.startswith("stuck") for name in item.faults)]
     band_hz = (
@@ -147,6 +131,33 @@ def health(measurement: Measurement) -> Health:
     gain = (call.high_frequency_hz - call.low_frequency_hz) * duration_s * len(noise)
     dynamic_range_db = 10 * math.log10(gain / 2) - noise_dbfs
     return replace(report, noise_dbfs=noise_dbfs, dynamic_range_db=dynamic_range_db)
+
+
+class _RecordedChannels(NamedTuple):
+    """Channels of a record; ``signal_of`` starts at the first sound, and ``whole`` at the start of the record."""
+
+    reported: list[ChannelHealth]
+    signal_of: Callable[[int], NDArray[np.float32]]
+    whole: Callable[[int], NDArray[np.float32]]
+    columns: Callable[[int], NDArray[Any]]
+    half_scale: float
+
+
+def _recorded_channels(
+    words: NDArray[Any], record: NDArray[Any], settings: Settings, enabled: NDArray[np.intp]
+) -> _RecordedChannels:
+    """Return the channels of a record of bits or of PCM samples, of which ``words`` is the part with sound."""
+    if settings.recording.is_pdm:
+        octets = _bits.octets_of(words)
+        signal_of, columns = functools.partial(_bits.signal_of, octets), functools.partial(_bits.bits_of, octets)
+        return _RecordedChannels(by_bits(octets, enabled), signal_of, signal_of, columns, 0.5)
+    full, is_float = settings.recording.full_scale, settings.recording.encoding == "float32"
+    reported = [by_numbers(i, scaled(words, full, i), is_float=is_float) for i in enabled.tolist()]
+    if is_float:  # The unit of float samples may be the pascal.
+        full = max(full, *(float(np.abs(words[:, i]).max()) for i in enabled))
+    # Times since the start of the record include the silence before its first sound.
+    signal_of, whole = functools.partial(scaled, words, full), functools.partial(scaled, record, full)
+    return _RecordedChannels(reported, signal_of, whole, functools.partial(_column, words), full)
 
 
 def _of_call(
