@@ -72,13 +72,8 @@ def listen_pulses(
             ended.callback(at_end, subscriber)
             while received != n and not signals.came and time.monotonic() < end_s:
                 arrival = subscriber.receive(_POLL_INTERVAL_S)
-                if subscriber.connected:
-                    heard.subscribed(address, tuple(sensors), (product,))
-                    heard.silent(address, (product,), subscriber.counts.received)
-                else:
-                    heard.unanswered(address, time.monotonic() - begun_s)
-                while notes:
-                    heard.note(notes.popleft())
+                heard.connection(subscriber, address, tuple(sensors), (product,), time.monotonic() - begun_s)
+                heard.show_notes(notes)
                 if arrival is not None:
                     received += 1
                     show(arrival)

@@ -3,9 +3,10 @@
 import functools
 import time
 import zlib
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import click
 
@@ -32,6 +33,13 @@ _STAMP = (
 _ROW = "{sensor:12}  {sequence:8d}  {age:>8}  {made_in:>8}  {dropped:7d}  {text}"
 
 
+class _Connected(Protocol):
+    counts: Any
+
+    @property
+    def connected(self) -> bool: ...
+
+
 class ProductTable:
     """Printer of received products: one line per product, or one JSON object per event."""
 
@@ -47,6 +55,16 @@ class ProductTable:
         """Print the column headings."""
         if not self._as_json:
             click.echo(_HEAD)
+
+    def connection(
+        self, subscriber: _Connected, address: str, sensors: tuple[str, ...], products: tuple[str, ...], since_s: float
+    ) -> None:
+        """Report once that a publisher answers, that it does not answer, or that it sends nothing."""
+        if subscriber.connected:
+            self.subscribed(address, sensors, products)
+            self.silent(address, products, subscriber.counts.received)
+        else:
+            self.unanswered(address, since_s)
 
     def subscribed(self, address: str, sensors: tuple[str, ...], products: tuple[str, ...]) -> None:
         """Report once that a publisher answers, and note the requested sensors for `silent`."""
@@ -106,6 +124,11 @@ class ProductTable:
         if self._as_json:
             options.print_json({"event": "note", "text": text})
         options.say(text, quiet=self._quiet)
+
+    def show_notes(self, notes: deque[str]) -> None:
+        """Report the events of the connection that other threads have noted."""
+        while notes:
+            self.note(notes.popleft())
 
     def product(self, arrival: "Arrival", counts: "SubscriberCounts") -> None:
         """Print a received product."""

@@ -38,6 +38,11 @@ class Watch:
         self._session: CaptureSession | None = None
         self._checks: dict[str, BitCheck] = {}
 
+    @property
+    def callbacks(self) -> dict[str, Any]:
+        """Callbacks with which a session reports its events."""
+        return {"on_stored": self.stored, "on_note": self.note, "on_back": self.back, "on_tick": self.tick}
+
     def run(
         self, session: "CaptureSession", sink: "MeasurementSink", checks: "dict[str, BitCheck]", *, where: str
     ) -> Exception | None:

@@ -187,8 +187,7 @@ def capture(
     is_fixed = fixed_settings or listen_only
     send = None
     if address is not None:
-        limits = (spool_mb, ring_mb)
-        send = Sending(address, settings, spool=spool, limits_mb=limits, is_fixed=is_fixed, **reported)
+        send = Sending(address, settings, spool=spool, limits_mb=(spool_mb, ring_mb), is_fixed=is_fixed, **reported)
     watch = Watch(**reported) if send is None else send.watch
     with stopped_by_signals() as signals, ExitStack() as stack:
         made = stack.enter_context(withdrawn(spool))
@@ -209,10 +208,7 @@ def capture(
             duration_s=duration,
             patience_s=patience,
             mounting=_mountings.mountings(mounting, sonars),
-            on_stored=watch.stored,
-            on_note=watch.note,
-            on_back=watch.back,
-            on_tick=watch.tick,
+            **watch.callbacks,
             configure=None if is_fixed else sensors.configure,
         )
         sensors.configure_all(settings, signals)
@@ -226,9 +222,14 @@ def capture(
         asked_to_end = list(signals.came)
     sent, n_lost = (None, 0) if send is None else (send.report, send.n_lost)
     report(address or target, session, watch.took, more=sent, n_lost=n_lost, **reported)
+    _end(failure, asked_to_end, is_limited=n is not None or duration is not None)
+
+
+def _end(failure: Exception | None, asked_to_end: "Sequence[int]", *, is_limited: bool) -> None:
+    """Raise the error that ended a capture, or exit with the status of a signal before the requested end."""
     if failure is not None:
         raise failure
-    if asked_to_end and (n is not None or duration is not None):
+    if asked_to_end and is_limited:
         sys.exit(128 + asked_to_end[0])
 
 

@@ -146,13 +146,8 @@ def emulate(
     with ExitStack() as stack:
         stack.enter_context(broken_off_by_signals())
         names = _names(path, sensor, is_scene=is_scene)
-        if link is not None and len(names) > 1:
-            raise click.UsageError(
-                f"--link is for one device, but {path.name} has {len(names)} sensors; choose one with --sensor",
-                ctx=click.get_current_context(),
-            )
-        if link is not None and not link.parent.is_dir():
-            raise ArgumentError(f"link {link}: folder {link.parent} does not exist; create it or choose another")
+        if link is not None:
+            _require_link(link, path, names)
         links = {name: link or emulated_folder() / name for name in names}
         for each in links.values():  # refuse a taken link before rendering
             HeldLink(each).release()
@@ -203,6 +198,19 @@ def _require_log(path: Path | None) -> None:
                 raise ArgumentError(
                     f"log {path} exists, and is no log of 'ertis sensors emulate'; choose another file (--log)"
                 )
+
+
+def _require_link(link: Path, path: Path, names: "Sequence[str]") -> None:
+    """Raise an error for a link to several devices, or in a folder that does not exist."""
+    from ertis_numba.base.errors import ArgumentError
+
+    if len(names) > 1:
+        raise click.UsageError(
+            f"--link is for one device, but {path.name} has {len(names)} sensors; choose one with --sensor",
+            ctx=click.get_current_context(),
+        )
+    if not link.parent.is_dir():
+        raise ArgumentError(f"link {link}: folder {link.parent} does not exist; create it or choose another")
 
 
 def _names(path: Path, sensor: str | None, *, is_scene: bool) -> list[str]:

@@ -11,7 +11,7 @@ from ertis_cli import _export_drive, _export_poses, _export_sound, _mountings, o
 from ertis_numba.interop.export_formats import EXPORT_FORMATS, TOPICS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from ertis_numba.frames import Beams, Energyscape, Measurement, MicrophoneSignals
     from ertis_numba.storage import EnergyscapeReader, RecordingReader
@@ -152,11 +152,7 @@ def export(
             **chosen,
         )
     if known is not None:
-        for reader in () if content == "drive" else readers:
-            options.note_unknown_places(reader.sensor, reader.settings, quiet=quiet)
-        unknown = [reader.sensor for reader in readers if reader.sensor not in known]
-        remedy = "the export uses the frame of the sensor; add --mounting FILE for the frame of the platform"
-        _mountings.note_unknown(unknown, remedy, quiet=quiet)
+        _note_places(readers, known, content, quiet=quiet)
     if content == "topics" and sum(len(sensor_names(path)) for path in paths) > 1 and "scan" in (topics or TOPICS):
         options.note(
             "scans of single sensors contain echoes of the other sensors' calls; for /fused/scan, export the file that "
@@ -207,6 +203,21 @@ def _known(
         for each in readers
         if each.translation_m is not None and each.rotation_xyzw is not None
     }
+
+
+def _note_places(
+    readers: "Sequence[RecordingReader | EnergyscapeReader]",
+    known: "Mapping[str, _mountings.Mounting]",
+    content: str,
+    *,
+    quiet: bool,
+) -> None:
+    """Report microphones and sensors whose place on the platform is unknown."""
+    for reader in () if content == "drive" else readers:
+        options.note_unknown_places(reader.sensor, reader.settings, quiet=quiet)
+    unknown = [reader.sensor for reader in readers if reader.sensor not in known]
+    remedy = "the export uses the frame of the sensor; add --mounting FILE for the frame of the platform"
+    _mountings.note_unknown(unknown, remedy, quiet=quiet)
 
 
 class _Items:

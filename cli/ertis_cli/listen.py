@@ -156,13 +156,8 @@ def listen(
             ended.callback(lambda: heard.end(subscriber.counts, written, time.monotonic() - begun_s))
             while subscriber.counts.received != n and not signals.came and time.monotonic() < end_s and failure is None:
                 item = subscriber.receive(_POLL_INTERVAL_S)
-                if subscriber.connected:
-                    heard.subscribed(address, sensors, products)
-                    heard.silent(address, products, subscriber.counts.received)
-                else:
-                    heard.unanswered(address, time.monotonic() - begun_s)
-                while notes:
-                    heard.note(notes.popleft())
+                heard.connection(subscriber, address, sensors, products, time.monotonic() - begun_s)
+                heard.show_notes(notes)
                 if item is not None and subscriber.latest is not None:
                     failure = _saved(save, subscriber.latest)
                     heard.product(subscriber.latest, subscriber.counts)

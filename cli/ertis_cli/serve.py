@@ -118,21 +118,15 @@ def serve(
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH, at_port
     from ertis_numba.network.central_node import CentralNode
     from ertis_numba.network.processing import ImageProcessing, ProcessingOptions
-    from ertis_numba.settings import Settings, preset_tables
+    from ertis_numba.settings import Settings
 
     _network.require_duration(duration)
     _network.require_address("--listen", listen)
     _network.require_address("--publish", publish)
     served = _network.metrics(metrics, lambda: node.latest)
     publish = life.addresses.get("publish") or publish or DEFAULT_PUBLISH
-    changes = {
-        "directions": directions,
-        "range_m": range_m,
-        "method": method,
-        **other,
-        **(beamformer or {}),
-    }
-    chosen = {} if preset is None else preset_tables(preset, "processing")["processing"]
+    given = {"directions": directions, "range_m": range_m, "method": method, **other, **(beamformer or {})}
+    changes = _processing(preset, given)
     keys = _network.server_keys(key, allow)
     with withdrawn(folder, quarantine) as made:
         if quarantine is not None:
@@ -141,7 +135,7 @@ def serve(
             ProcessingOptions(
                 publish=publish,
                 keys=keys,
-                processing=chosen | {option: value for option, value in changes.items() if value is not None},
+                processing=changes,
                 max_error_db=max_error_db,
                 without=without,
                 plan=plan,
@@ -176,6 +170,14 @@ def serve(
         _central_watch.run(node, watch, made=made, metrics=served, duration_s=life.remaining_s(duration))
     _central_watch.report(node.latest, watch, event="served")
     _warn_of_unknown(without, node.latest.sensors)
+
+
+def _processing(preset: str | None, given: dict[str, Any]) -> dict[str, Any]:
+    """Return the processing settings of a preset, or none, which given options override."""
+    from ertis_numba.settings import preset_tables
+
+    chosen = {} if preset is None else preset_tables(preset, "processing")["processing"]
+    return chosen | {option: value for option, value in given.items() if value is not None}
 
 
 def _warn_of_unknown(without: "ExcludedChannels", sensors: "Collection[str]") -> None:
