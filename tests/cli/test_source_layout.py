@@ -40,3 +40,19 @@ def test_files_of_the_reading_order_exist():
     folders = (ROOT, *(ROOT / "ertis_numba").iterdir(), ROOT / "ertis_numba", ROOT / "ertis_numba" / "kernels")
     for name in re.findall(r"`([\w/]+\.py)`", text):
         assert any((folder / name).is_file() for folder in folders), name
+
+
+def function_lengths(path):
+    """Yield the place and the number of lines of each function body, without its docstring."""
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            body = node.body[ast.get_docstring(node) is not None :]
+            n_lines = body[-1].end_lineno - body[0].lineno + 1 if body else 0
+            yield f"{path.relative_to(ROOT)}:{node.lineno} {node.name}", n_lines
+
+
+def test_no_function_body_exceeds_sixty_lines():
+    paths = [path for folder in ("ertis_numba", "cli", "bench") for path in (ROOT / folder).rglob("*.py")]
+    lengths = dict(found for path in paths for found in function_lengths(path))
+    assert len(lengths) > 5000
+    assert {place: n_lines for place, n_lines in lengths.items() if n_lines > 60} == {}
