@@ -195,7 +195,8 @@ def _compared(sound: SoundSpectra, found: FoundSweep, call: Call) -> CallMatch:
     loss_db = max(0.0, 10 * math.log10(ratio))
     if sweep.is_tone or (ratio > _MIN_RATIO and not _differs_by_motion(found.curve, curve_of(call))):
         if ratio < _MIN_CLEAR_RATIO and not sweep.is_tone:
-            note = f"echoes look like {sweep}, or like two echoes of the call close together; if they are not, {_WRONG}"
+            either = f"echoes look like {sweep}, or like two close echoes of the call"
+            note = f"{either}; if they are not two echoes, {_WRONG}"
             return CallMatch("unknown", loss_db, call=call, note=note)
         return CallMatch("differs", loss_db, sweep, call)
     own_curve = curve_of(call)

@@ -174,7 +174,7 @@ def test_call_match_does_not_take_two_echoes_close_together_for_another_call(apa
     """Equal echoes from one direction cancel parts of the band in all microphones."""
     found = call_match(heard(CALL, echoes=((6e-3, 1.0), (6e-3 + apart_s, amplitude)), noise=0.005))
     assert found.verdict == "unknown"
-    assert "or like two echoes of the call close together; if they are not, another call was emitted" in found.warning
+    assert "or like two close echoes of the call; if they are not two echoes, another call was emitted" in found.warning
 
 
 @pytest.mark.parametrize("seed", range(5))
