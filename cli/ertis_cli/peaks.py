@@ -288,42 +288,22 @@ def _found(
     path: Path, sensor: str, find: "Callable[[Energyscape], list[Peak]]", measurement: int | None
 ) -> list[dict[str, Any]]:
     """Return a row for each peak of a sensor."""
-    from ertis_numba.analysis.peak_notes import left_out_note, noise_note, open_edge_note, unconfirmed_note
+    from ertis_numba.analysis.detect import find_peaks
+    from ertis_numba.analysis.peak_notes import list_notes, open_edge_note
     from ertis_numba.storage import open_energyscapes
 
     with open_energyscapes(path, sensor=sensor) as images:
         options.warn_of_spacing(sensor, images.settings, images)
-        places = options.places(measurement, len(images))
-        by_place = {index: find(images[index]) for index in places}
+        by_place = {index: find(images[index]) for index in options.places(measurement, len(images))}
         found = [(index, peak) for index, peaks in by_place.items() for peak in peaks]
-        n_left_out = sum(_n_left_out(images[index], peaks, find) for index, peaks in by_place.items())
-        options.note_of(sensor, left_out_note(n_left_out))
-        options.note_of(sensor, noise_note(sum(_is_noisy(images[index], find) for index in places)))
-        clouds = [images[index].points for index in places] if images.has_points else []
-        n_unconfirmed = sum(int((~each.is_certain).sum()) for each in clouds if each is not None)
-        options.note_of(sensor, unconfirmed_note(n_unconfirmed))
-        options.note_of(sensor, open_edge_note(images, (peak.grid_error_deg for _, peak in found)))
+        if isinstance(find, partial) and find.func is find_peaks:
+            limits = {name: find.keywords[name] for name in ("min_level_db", "false_alarm")}
+            notes = list_notes(((images[index], peaks) for index, peaks in by_place.items()), **limits)
+        else:
+            notes = [open_edge_note(images, (peak.grid_error_deg for _, peak in found)) or ""]
+        for note in notes:
+            options.note_of(sensor, note)
         return [{"sensor": sensor, "measurement": index, **_rounded(peak)} for index, peak in found]
-
-
-def _n_left_out(image: "Energyscape", peaks: "list[Peak]", find: "Callable[[Energyscape], list[Peak]]") -> int:
-    """Return the number of maxima near the first and last range that the finder of `find_peaks` left out."""
-    from ertis_numba.analysis.detect import find_peaks, left_out_at_edges
-
-    if not isinstance(find, partial) or find.func is not find_peaks:
-        return 0
-    limits = {name: find.keywords[name] for name in ("min_level_db", "false_alarm")}
-    return left_out_at_edges(image, peaks, **limits)
-
-
-def _is_noisy(image: "Energyscape", find: "Callable[[Energyscape], list[Peak]]") -> bool:
-    """Return True if the finder of `find_peaks` left out the strongest maximum as noise from its direction."""
-    from ertis_numba.analysis.detect import find_peaks, left_out_in_noise
-
-    if not isinstance(find, partial) or find.func is not find_peaks or find.keywords["false_alarm"] is None:
-        return False
-    limits = {name: find.keywords[name] for name in ("min_level_db", "false_alarm")}
-    return left_out_in_noise(image, **limits)
 
 
 def _compared(place: dict[str, Any], comparison: "Comparison") -> Iterator[dict[str, Any]]:

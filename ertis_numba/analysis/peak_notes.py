@@ -1,15 +1,36 @@
 """Notes on omissions and unknown values in lists of reflectors."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
+from ertis_numba.analysis.detect import left_out_at_edges, left_out_in_noise
 from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.base.units import counted
+from ertis_numba.frames import Energyscape, Peak
 
-__all__ = ["left_out_note", "noise_note", "open_edge_note", "unconfirmed_note"]
+__all__ = ["list_notes", "noise_note", "open_edge_note", "unconfirmed_note"]
 
 
-def left_out_note(count: int) -> str | None:
+def list_notes(
+    found: Iterable[tuple[Energyscape, Sequence[Peak]]], *, min_level_db: float = -30.0, false_alarm: float | None
+) -> list[str]:
+    """Return notes on images of one sensor and their lists by `find_peaks`, with the arguments of this function."""
+    n_left_out = n_noisy = n_unconfirmed = 0
+    open_edges = None
+    errors_deg: list[float] = []
+    for image, peaks in found:
+        n_left_out += left_out_at_edges(image, peaks, min_level_db=min_level_db, false_alarm=false_alarm)
+        if false_alarm is not None:
+            n_noisy += left_out_in_noise(image, min_level_db=min_level_db, false_alarm=false_alarm)
+        if image.points is not None:
+            n_unconfirmed += int((~image.points.is_certain).sum())
+        errors_deg += (peak.grid_error_deg for peak in peaks)
+        open_edges = open_edge_note(image, errors_deg)
+    notes = (_left_out_note(n_left_out), noise_note(n_noisy), unconfirmed_note(n_unconfirmed), open_edges)
+    return [each for each in notes if each is not None]
+
+
+def _left_out_note(count: int) -> str | None:
     """Return a note on maxima that were left out near the ends of the range axis; None if there are none."""
     if not count:
         return None

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from ertis_numba.analysis.detect import find_peaks, left_out_at_edges, left_out_in_noise
+from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.analysis.direction_spacing import spacing_warning
-from ertis_numba.analysis.peak_notes import left_out_note, noise_note, open_edge_note, unconfirmed_note
+from ertis_numba.analysis.peak_notes import list_notes, unconfirmed_note
 from ertis_numba.analysis.points import FALSE_ALARM
 from ertis_numba.base.errors import ErtisError
 from ertis_numba.base.html_parts import escaped, table
@@ -76,13 +76,10 @@ def _notes_of_image(image: Energyscape, found: Sequence[Peak]) -> Iterator[str |
     array = image.settings.array
     if image.points is not None:
         yield _of_sensor(image.stamp, observable_angles(array).note)
-        yield unconfirmed_note(int((~image.points.is_certain).sum()))
-        return
-    yield _of_sensor(image.stamp, direction_note(array, image))
-    yield spacing_warning(image.settings, image)
-    yield left_out_note(left_out_at_edges(image, found, false_alarm=FALSE_ALARM))
-    yield noise_note(int(left_out_in_noise(image, false_alarm=FALSE_ALARM)))
-    yield open_edge_note(image, (peak.grid_error_deg for peak in found))
+    else:
+        yield _of_sensor(image.stamp, direction_note(array, image))
+        yield spacing_warning(image.settings, image)
+    yield from list_notes([(image, found)], false_alarm=FALSE_ALARM)
 
 
 def _peak_rows(found: Sequence[Peak]) -> str:

@@ -8,6 +8,7 @@ import pytest
 
 import ertis_numba as ertis
 from ertis_numba.analysis.detect import find_peaks, left_out_in_noise
+from ertis_numba.analysis.peak_notes import list_notes
 from ertis_numba.settings import Recording
 from tests.echo_draws import AMPLITUDE, Case, Draws, unit
 
@@ -59,6 +60,8 @@ def test_sound_from_one_direction_is_no_reflector(draws, name, kind):
         assert find_peaks(image)
         n_false += bool(find_peaks(image, false_alarm=FALSE_ALARM))
         assert n_false or left_out_in_noise(image, false_alarm=FALSE_ALARM)
+        notes = list_notes([(image, [])], false_alarm=FALSE_ALARM)
+        assert n_false or any("the strongest maximum of 1 image left out" in each for each in notes)
     assert n_false <= (kind == "a click")  # About 1 of 40 clicks has a single high maximum.
 
 

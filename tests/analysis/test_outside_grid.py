@@ -8,6 +8,7 @@ import pytest
 import ertis_numba as ertis
 from ertis_numba.analysis.detect import peaks_of_grid
 from ertis_numba.analysis.outside_grid import OutsidePatterns
+from ertis_numba.analysis.peak_notes import list_notes
 from ertis_numba.analysis.points import PointExtractor
 from ertis_numba.frames import AcousticMap, Energyscape
 from ertis_numba.geometry import Grid, direction_grid, unit_vectors
@@ -105,6 +106,8 @@ def test_reflectors_beyond_the_limits_have_an_unknown_direction(place):
         assert all(math.isinf(peak.grid_error_deg) for peak in peaks)
         assert len(across_rad)
         assert (across_rad > 0.5).all()
+        (note,) = (each for each in list_notes([(image, peaks)], false_alarm=None) if "beyond the edges" in each)
+        assert note.startswith(f"{len(peaks)} listed direction")
 
 
 def test_grids_of_all_distinguishable_directions_have_no_outside():
