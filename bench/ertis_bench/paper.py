@@ -16,7 +16,7 @@ from ertis_numba.chain.interpolation_fit import one_thread
 from ertis_numba.frames import Energyscape, Measurement
 from ertis_numba.pipeline import Pipeline
 
-__all__ = ["BACKENDS", "DIRECTIONS", "PUBLISHED_MS", "RESTRICTED", "run"]
+__all__ = ["BACKENDS", "DIRECTIONS", "FASTEST", "PUBLISHED_MS", "RESTRICTED", "run"]
 
 DIRECTIONS = (90, 1850, 3000)
 RANGE_M = (0.5, 5.0)
@@ -32,12 +32,15 @@ BACKENDS = {
 RESTRICTED = ("AVX2",)
 """Older instruction sets on which the backend ``cpu`` is measured as well, if this machine has a newer one."""
 
+FASTEST = "GPU GTX 1080 Ti"
+"""Fastest machine of the paper."""
+
 PUBLISHED_MS = {
     "CPU i7-7567U": ((132.53, 4.89), (976.33, 14.54), (1541.41, 20.30)),
     "CPU i9-7960X": ((167.13, 16.88), (1087.04, 109.72), (1653.45, 167.03)),
     "GPU Jetson TX2": ((68.40, 13.40), (585.24, 61.02), (911.47, 91.97)),
     "GPU GTX 1050": ((23.03, 2.38), (202.37, 20.85), (323.83, 33.18)),
-    "GPU GTX 1080 Ti": ((5.93, 0.66), (51.58, 6.38), (77.02, 7.81)),
+    FASTEST: ((5.93, 0.66), (51.58, 6.38), (77.02, 7.81)),
 }
 """Mean and standard deviation of 100 measurements in ms, at 90, 1850 and 3000 directions (Jansen et al., 2019)."""
 

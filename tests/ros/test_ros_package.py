@@ -156,6 +156,8 @@ def test_values_become_options_and_settings(parameters):
 def test_options_are_those_of_the_command(parameters):
     from ertis_cli.ros import ros  # noqa: PLC0415  beside the other imports of ROS
 
+    (topics,) = (each for each in ros.params if "--topic" in each.opts)
+    assert tuple(topics.type.choices) == parameters.TOPICS
     options = {name for each in ros.params for name in each.opts}
     given = {
         name: [name] if isinstance(each.default, list) else each.default for name, each in parameters.FIXED.items()

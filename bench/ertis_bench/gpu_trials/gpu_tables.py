@@ -5,12 +5,11 @@ from typing import Any
 
 from ertis_bench.gpu_trials import rival_mach
 from ertis_bench.markdown import table
-from ertis_bench.paper import DIRECTIONS, PUBLISHED_MS
+from ertis_bench.paper import DIRECTIONS, FASTEST, PUBLISHED_MS
 
 __all__ = ["gpu"]
 
 _UNMEASURED = "not measured"
-_PUBLISHED = "GPU GTX 1080 Ti"
 _WITHOUT = ", without CUDA graphs"
 _SINGLE = {"one at a time, words to image": "graphs", f"one at a time, words to image{_WITHOUT}": "plain"}
 _STREAMS = {
@@ -19,7 +18,7 @@ _STREAMS = {
     for without, how in (("", "graphs"), (_WITHOUT, "plain"))
 }
 _BATCH = f"theirs_per_frame_of_{rival_mach.FRAMES}_ms"
-_PAPER = f"the paper's {_PUBLISHED.removeprefix('GPU ')}"
+_PAPER = f"the paper's {FASTEST.removeprefix('GPU ')}"
 
 
 def gpu(report: dict[str, Any]) -> str:
@@ -45,7 +44,7 @@ def _lines(report: dict[str, Any]) -> dict[str, list[str]]:
         _PAPER: [],
         "paper's time / shortest single time": [],
     }
-    for directions, published in zip(DIRECTIONS, PUBLISHED_MS[_PUBLISHED], strict=True):
+    for directions, published in zip(DIRECTIONS, PUBLISHED_MS[FASTEST], strict=True):
         row = rows.get(str(directions))
         cells = [_UNMEASURED] * 7 if row is None else list(_cells(row))
         faster = "–" if row is None else f"{row['times_faster_than_published']:.0f}×"

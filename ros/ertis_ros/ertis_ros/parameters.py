@@ -8,7 +8,7 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 
 from ertis_numba.ros import PublishingSettings
 
-__all__ = ["FIXED", "LIVE", "Declared", "options_of", "settings_of"]
+__all__ = ["FIXED", "LIVE", "TOPICS", "Declared", "options_of", "settings_of"]
 
 TOPICS = ("points", "scan", "image", "sonar_image")
 _MAX_DB = 1000.0
