@@ -118,7 +118,7 @@ class _Subject:
         say(f"{name}: computing the exact image")
         exact = verification.exact_image(Pipeline(settings, predict=False).process(measurement), measurement)
         self._exact = exact.amplitude
-        self._wanted: Sequence[Peak] = find_peaks(exact, top=verification.PEAKS)
+        self._wanted: Sequence[Peak] = find_peaks(exact, top=verification.PEAKS, false_alarm=None)
         self._signal_model = signal_model_of(measurement, settings, kernel_set, threads=self._threads)
 
     def rows(self, count: int) -> list[dict[str, Any]]:

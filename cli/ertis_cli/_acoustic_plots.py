@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
+from ertis_numba.base.constants import FALSE_ALARM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -165,7 +166,7 @@ def _map(path: Path, sensor: str | None, index: int, *, quiet: bool) -> "tuple[A
     with options.note_when_slow(options.PREPARING, quiet=quiet):
         from ertis_numba.passive import AcousticCamera
 
-        with AcousticCamera(heard.settings, check=False, false_alarm=options.FALSE_ALARM) as camera:
+        with AcousticCamera(heard.settings, check=False, false_alarm=FALSE_ALARM) as camera:
             return camera.process(heard), camera.band_note
 
 

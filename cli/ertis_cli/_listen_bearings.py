@@ -8,6 +8,7 @@ import click
 
 from ertis_cli import options
 from ertis_cli._listen_pulses import listen_pulses
+from ertis_numba.base.constants import FALSE_ALARM
 
 if TYPE_CHECKING:
     from ertis_numba.frames import AcousticMap, Bearing
@@ -42,7 +43,7 @@ def listen_bearings(
         changes = {} if average is None else {"passive.averages": average}
         subscribers.append(
             AcousticMapSubscriber(
-                address, sensors=sensors or None, changes=changes, false_alarm=1e-3, keys=keys, on_note=on_note
+                address, sensors=sensors or None, changes=changes, false_alarm=FALSE_ALARM, keys=keys, on_note=on_note
             )
         )
         return subscribers[0]

@@ -43,7 +43,6 @@ __all__ = [
     "DIRECTION",
     "ELEVATION",
     "ERROR_BUDGET",
-    "FALSE_ALARM",
     "FILE",
     "FOLDER",
     "INTERVAL",
@@ -109,8 +108,6 @@ def _excluded_channels(
     return ExcludedChannels(channels.pop("", ()), channels)
 
 
-FALSE_ALARM = 1e-3
-"""Probability that noise alone causes a reflector in one image."""
 PREPARING = "preparing ..."
 """Message for a slow start."""
 COMPILING = "a first run compiles kernels, which takes longer ..."

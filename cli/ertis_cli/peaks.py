@@ -11,6 +11,7 @@ import click
 
 from ertis_cli import _tables, options
 from ertis_cli._config import typed
+from ertis_numba.base.constants import FALSE_ALARM
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison, Match
@@ -280,7 +281,7 @@ def _finder(
         find_peaks,
         top=top,
         min_level_db=_MIN_LEVEL_DB if min_level is None else min_level,
-        false_alarm=None if everything else options.FALSE_ALARM,
+        false_alarm=None if everything else FALSE_ALARM,
     )
 
 

@@ -8,6 +8,7 @@ import click
 
 from ertis_cli import _acoustic_plots, _mountings, options
 from ertis_cli._config import typed
+from ertis_numba.base.constants import FALSE_ALARM
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -298,9 +299,9 @@ def _drawn(kind: str, image: "Energyscape", top: int, look: dict[str, Any], *, q
     from ertis_numba.analysis.detect import find_peaks, left_out_in_noise
     from ertis_numba.analysis.peak_notes import noise_note, open_edge_note
 
-    peaks = find_peaks(image, top=top, false_alarm=options.FALSE_ALARM) if top else None
-    is_noisy = bool(top) and left_out_in_noise(image, false_alarm=options.FALSE_ALARM)
-    options.note_of(image.stamp.sensor, noise_note(int(is_noisy)), quiet=quiet)
+    peaks = find_peaks(image, top=top, false_alarm=FALSE_ALARM) if top else None
+    n_noisy = left_out_in_noise(image, peaks, false_alarm=FALSE_ALARM) if peaks is not None else 0
+    options.note_of(image.stamp.sensor, noise_note(n_noisy), quiet=quiet)
     errors_deg = (peak.grid_error_deg for peak in peaks or ())
     options.note_of(image.stamp.sensor, open_edge_note(image, errors_deg), quiet=quiet)
     draw: dict[str, Callable[..., Figure]]

@@ -233,4 +233,4 @@ def cfar_peaks(
     """
     stands_out = cfar(image, false_alarm=false_alarm, method=method)
     stands_out &= clean(image, within_db=within_db).amplitude > 0
-    return find_peaks(image, top=top, min_level_db=min_level_db, where=stands_out)
+    return find_peaks(image, top=top, min_level_db=min_level_db, where=stands_out, false_alarm=None)

@@ -10,8 +10,8 @@ import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.detect import observed, peaks_of_grid
-from ertis_numba.analysis.points import FALSE_ALARM
 from ertis_numba.base import checks
+from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.frames import Energyscape, Peak, Reflector
 from ertis_numba.geometry import array_weights, microphones, observable_angles, unit_vectors
 from ertis_numba.geometry.air import sound_speed_m_s

@@ -1,7 +1,7 @@
 """Detection of reflectors in images."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.side_lobes import EdgeFloor, SideLobes
 from ertis_numba.analysis.uncertainty import PositionUncertainty
 from ertis_numba.base import checks
+from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Energyscape, Peak, PointCloud
 from ertis_numba.geometry import ObservableAngles, observable_angles, unit_vectors
@@ -24,6 +25,7 @@ __all__ = ["find_peaks", "left_out_at_edges", "left_out_in_noise", "neighbours_o
 
 _SAME_DIGITS = 9  # Decimals in which the unit vectors of equal directions agree.
 _BESIDE = 8  # Number of further maxima that are examined as disturbances.
+_COUNTED = 400  # Number of maxima that are examined as possible noise.
 _NEIGHBOURS = 8  # Number of directions around each direction of a dense grid.
 
 
@@ -33,7 +35,7 @@ def find_peaks(
     top: int | None = 10,
     min_level_db: float = -30.0,
     where: NDArray[np.bool_] | None = None,
-    false_alarm: float | None = None,
+    false_alarm: float | None = FALSE_ALARM,
 ) -> list[Peak]:
     """Return the reflectors of an image, strongest first.
 
@@ -59,10 +61,10 @@ def find_peaks(
     where : (direction, range) bool, optional
         True for bins that may be the maximum of a reflector; all bins by default.
     false_alarm : float, optional
-        Probability that noise alone yields a reflector anywhere in the image. Weaker maxima are discarded: see
-        `ertis_numba.analysis.noise.threshold_of`. So are those that a hiss, a tone or a click from their direction
-        explains: see `ertis_numba.analysis.directional_noise.stands_out`. Cleaned images keep all maxima. By default,
-        maxima of noise count as reflectors.
+        Probability that noise alone yields a reflector anywhere in the image; 0.001 by default. Weaker maxima are
+        discarded: see `ertis_numba.analysis.noise.threshold_of`. So are those that a hiss, a tone or a click from their
+        direction explains: see `ertis_numba.analysis.directional_noise.stands_out`. Cleaned images keep all maxima.
+        None also lists the maxima that noise alone may cause.
 
     Returns
     -------
@@ -113,7 +115,7 @@ def peaks_of_grid(
     top: int | None = 10,
     min_level_db: float = -30.0,
     where: NDArray[np.bool_] | None = None,
-    false_alarm: float | None = None,
+    false_alarm: float | None = FALSE_ALARM,
 ) -> list[Peak]:
     """Return the result of `find_peaks` with directions of the grid instead of angles that the array cannot observe."""
     checks.instance("image", image, Energyscape, "Pipeline.process returns")
@@ -210,24 +212,44 @@ def left_out_at_edges(
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
     is_left = levels < edges[places[:, 1]]
     side_lobes = SideLobes(image, directions, places[is_left])
-    for peak in peaks:
-        azimuth_rad, elevation_rad = np.nan_to_num(np.radians([[peak.azimuth_deg], [peak.elevation_deg]]))
-        side_lobes.add(unit_vectors(azimuth_rad, elevation_rad)[0], peak.range_m, 10 ** (peak.level_dbfs / 20))
+    _add(side_lobes, peaks)
     doubtful = zip(places[is_left], levels[is_left], strict=True)
     return sum(not side_lobes.explain(directions[place[0]], int(place[1]), level) for place, level in doubtful)
 
 
-def left_out_in_noise(image: Energyscape, *, min_level_db: float = -30.0, false_alarm: float) -> bool:
-    """Return True if `find_peaks` left out the strongest maximum as possible noise from its direction."""
+def left_out_in_noise(
+    image: Energyscape, peaks: Sequence[Peak], *, min_level_db: float = -30.0, false_alarm: float
+) -> int:
+    """Return the number of maxima that `find_peaks` left out as possible noise from their direction.
+
+    ``peaks`` are those of `find_peaks` with the same arguments; their side lobes and those of the maxima do not count.
+    """
     if image.points is not None:
-        return False
-    neighbours = neighbours_of(unit_vectors(image.azimuth_rad, image.elevation_rad))
-    floor = np.full(len(image.range_m), _floor(image, min_level_db, false_alarm))
-    row, column = _local_maxima(image.amplitude, neighbours, floor, None).T
-    if not len(row):
-        return False
-    strongest = np.argmax(image.amplitude[row, column], keepdims=True)
-    return not stands_out(image, row[strongest], column[strongest], false_alarm, pulse_steps(image)).all()
+        return 0
+    directions = unit_vectors(image.azimuth_rad, image.elevation_rad)
+    floor = np.maximum(
+        _floor(image, min_level_db, false_alarm), EdgeFloor(directions, PointSpread(image.settings))(image)
+    )
+    places = _local_maxima(image.amplitude, neighbours_of(directions), floor, None)
+    places = places[~stands_out(image, places[:, 0], places[:, 1], false_alarm, pulse_steps(image))]
+    levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
+    places, levels = (each[np.argsort(-levels, kind="stable")[:_COUNTED]] for each in (places, levels))
+    side_lobes = SideLobes(image, directions, places)
+    _add(side_lobes, peaks)
+    count = 0
+    for place, level in zip(places, levels, strict=True):
+        direction = directions[place[0]]
+        if not side_lobes.explain(direction, int(place[1]), level):
+            side_lobes.add(direction, float(image.range_m[place[1]]), float(level))
+            count += 1
+    return count
+
+
+def _add(side_lobes: SideLobes, peaks: Iterable[Peak]) -> None:
+    """Add listed reflectors to those whose side lobes are predicted."""
+    for peak in peaks:
+        azimuth_rad, elevation_rad = np.nan_to_num(np.radians([[peak.azimuth_deg], [peak.elevation_deg]]))
+        side_lobes.add(unit_vectors(azimuth_rad, elevation_rad)[0], peak.range_m, 10 ** (peak.level_dbfs / 20))
 
 
 def _floor(image: Energyscape, min_level_db: float, false_alarm: float | None) -> float:

@@ -21,7 +21,7 @@ def list_notes(
     for image, peaks in found:
         n_left_out += left_out_at_edges(image, peaks, min_level_db=min_level_db, false_alarm=false_alarm)
         if false_alarm is not None:
-            n_noisy += left_out_in_noise(image, min_level_db=min_level_db, false_alarm=false_alarm)
+            n_noisy += left_out_in_noise(image, peaks, min_level_db=min_level_db, false_alarm=false_alarm)
         if image.points is not None:
             n_unconfirmed += int((~image.points.is_certain).sum())
         errors_deg += (peak.grid_error_deg for peak in peaks)
@@ -43,12 +43,14 @@ def _left_out_note(count: int) -> str | None:
 
 
 def noise_note(count: int) -> str | None:
-    """Return a note on images whose strongest maximum is noise from its direction; None if there are none."""
+    """Return a note on maxima that noise from their direction may have caused; None if there are none."""
     if not count:
         return None
+    maxima = "1 maximum" if count == 1 else f"{count} maxima"
     return (
-        f"the strongest maximum of {counted(count, 'image')} left out because a hiss, a tone or a click from its "
-        "direction may have caused it; 'ertis peaks --all' lists it"
+        f"{maxima} left out because a hiss, a tone or a click from {'its' if count == 1 else 'their'} direction may "
+        f"have caused {'it' if count == 1 else 'them'}; in dense scenes, reflectors beside stronger ones may be among "
+        "these; 'ertis peaks --all' lists them"
     )
 
 

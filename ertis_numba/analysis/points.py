@@ -15,19 +15,17 @@ from ertis_numba.analysis.point_spread import PointSpread
 from ertis_numba.analysis.side_lobes import EdgeFloor, side_lobe_floor
 from ertis_numba.analysis.uncertainty import PositionUncertainty
 from ertis_numba.base import checks
+from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.geometry import Grid, direction_grid, observable_angles, unit_vectors
 from ertis_numba.settings import Settings
 
-__all__ = ["FALSE_ALARM", "MIN_LEVEL_DB", "TOP", "EchoPointExtractor", "PointExtractor"]
+__all__ = ["MIN_LEVEL_DB", "TOP", "EchoPointExtractor", "PointExtractor"]
 
 TOP: Final = 256
 """Default of the largest number of points per image."""
 MIN_LEVEL_DB: Final = -20.0
 """Default of the lowest level of points, relative to the strongest of the image."""
-
-FALSE_ALARM: Final = 1e-3
-"""Default of the probability that noise alone yields a point of an image."""
 
 _BINS_OF_POINT = 64
 """Maximum number of bins to examine per point; in noise, a third of the image would be candidates otherwise."""

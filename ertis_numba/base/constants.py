@@ -4,6 +4,7 @@ from typing import Final
 
 __all__ = [
     "ERTIS_PDM_RATE_HZ",
+    "FALSE_ALARM",
     "MAX_MICROPHONES",
     "MAX_NAME_LENGTH",
     "SHAPED_NOISE_SHARE",
@@ -23,6 +24,9 @@ ERTIS_PDM_RATE_HZ: Final = 4_500_000.0  # eRTIS in ultrasonic mode
 SHAPED_NOISE_SHARE: Final = 130e3 / 4.5e6
 """Frequency above which the shaped quantisation noise of one-bit microphones dominates, relative to their clock."""
 SYNC_STEP_S: Final = 400e-9  # delay between neighbours in the SYNC chain; Jansen et al., 2019
+
+FALSE_ALARM: Final = 1e-3
+"""Probability that noise alone yields a reflector in an image, or a bearing in a map, by default."""
 
 MAX_MICROPHONES: Final = 1024
 MAX_NAME_LENGTH: Final = (

@@ -6,12 +6,13 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from ertis_numba.analysis.health import health
 from ertis_numba.analysis.layout_match import LayoutMatch
+from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.base.errors import DataError
 from ertis_numba.campaign.sensor_processing import describe_faults, require_same_air
 from ertis_numba.campaign.tasks import CampaignOptions
@@ -25,7 +26,6 @@ from ertis_numba.storage import AcousticMapWriter, RecordingReader, open_recordi
 __all__ = ["MapJob", "check_maps", "prepare_maps"]
 
 _Warn = Callable[[str], None]
-_FALSE_ALARM: Final = 1e-3  # Probability that noise alone yields a bearing in a map.
 
 
 class MapJob:
@@ -170,7 +170,7 @@ def prepare_maps(
                     options.device,
                     options.threads,
                     check=False,
-                    false_alarm=_FALSE_ALARM,
+                    false_alarm=FALSE_ALARM,
                 )
             )
             for recording in recordings

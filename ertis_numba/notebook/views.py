@@ -10,7 +10,7 @@ import numpy as np
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.analysis.direction_spacing import spacing_warning
 from ertis_numba.analysis.peak_notes import list_notes, unconfirmed_note
-from ertis_numba.analysis.points import FALSE_ALARM
+from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.base.errors import ErtisError
 from ertis_numba.base.html_parts import escaped, table
 from ertis_numba.base.units import counted

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.base import checks
+from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.chain.interpolation_fit import one_thread
 from ertis_numba.frames import Bearing, known_levels
 from ertis_numba.geometry import direction_grid, direction_note, microphones, spacing_rad, unit_vectors
@@ -80,7 +81,7 @@ class BearingFinder:
     """
 
     def __init__(
-        self, camera: AcousticCamera, *, false_alarm: float = 1e-3, top: int = 8, min_level_db: float = -20.0
+        self, camera: AcousticCamera, *, false_alarm: float = FALSE_ALARM, top: int = 8, min_level_db: float = -20.0
     ) -> None:
         checks.instance("camera", camera, AcousticCamera, "AcousticCamera(settings) makes")
         checks.between("false_alarm", false_alarm, 1e-9, 0.5)
@@ -135,7 +136,7 @@ class BearingFinder:
 
 
 def find_bearings(
-    camera: AcousticCamera, *, false_alarm: float = 1e-3, top: int = 8, min_level_db: float = -20.0
+    camera: AcousticCamera, *, false_alarm: float = FALSE_ALARM, top: int = 8, min_level_db: float = -20.0
 ) -> list[Bearing]:
     """Return the bearings of sources in the sound that an acoustic camera has heard, band by band, loudest first.
 

@@ -7,6 +7,7 @@ from typing import Final, TypedDict
 import numpy as np
 
 from ertis_numba.analysis.noise import threshold_of
+from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.base.errors import DataError
 from ertis_numba.base.forks import ForkSafeLock
 from ertis_numba.chain.plan_model import TABLE_BYTES
@@ -41,7 +42,6 @@ MAX_MEMORY_BYTES: Final = 2**28
 
 _MAX_DIRECTIONS: Final = 64
 _SPREAD_DB: Final = 0.25  # Smaller effects of the number of image points are within the uncertainty.
-_FALSE_ALARM: Final = 1e-3
 _FAINTER_RATIO: Final = 0.1
 _ROWS: Final = 16
 
@@ -153,7 +153,7 @@ def predict(planner: Planner, image: Energyscape | None = None) -> Prediction:
     )
     if image is None or not found.warning:
         return found
-    return replace(found, has_echoes=bool(image.amplitude.max(initial=0.0) > threshold_of(image, _FALSE_ALARM)))
+    return replace(found, has_echoes=bool(image.amplitude.max(initial=0.0) > threshold_of(image, FALSE_ALARM)))
 
 
 def memory_bytes(image: Energyscape) -> int:

@@ -95,7 +95,7 @@ class Trials:
         image = Energyscape(
             amplitudes.astype(np.float32), grid.azimuth_rad, grid.elevation_rad, self._chain.range_m, self._settings
         )
-        (peak,) = find_peaks(image, top=1)
+        (peak,) = find_peaks(image, top=1, false_alarm=None)
         found = unit_vectors(np.array([peak.azimuth_rad]), np.array([peak.elevation_rad]))[0]
         across_rad = float(found @ self._min_resolved(azimuth_rad, elevation_rad))
         level_db = peak.level_dbfs - 20 * math.log10(_AMPLITUDE)
