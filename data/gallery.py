@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ertis_cli.options import FALSE_ALARM
+from ertis_numba.base.constants import FALSE_ALARM
 from matplotlib.figure import Figure
 from PIL import Image
 

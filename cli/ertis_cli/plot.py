@@ -300,7 +300,7 @@ def _drawn(kind: str, image: "Energyscape", top: int, look: dict[str, Any], *, q
     from ertis_numba.analysis.peak_notes import noise_note, open_edge_note
 
     peaks = find_peaks(image, top=top, false_alarm=FALSE_ALARM) if top else None
-    n_noisy = left_out_in_noise(image, peaks, false_alarm=FALSE_ALARM) if peaks is not None else 0
+    n_noisy = left_out_in_noise(image, false_alarm=FALSE_ALARM) if top else 0
     options.note_of(image.stamp.sensor, noise_note(n_noisy), quiet=quiet)
     errors_deg = (peak.grid_error_deg for peak in peaks or ())
     options.note_of(image.stamp.sensor, open_edge_note(image, errors_deg), quiet=quiet)

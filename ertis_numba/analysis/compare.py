@@ -4,12 +4,14 @@ import functools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.detect import observed, peaks_of_grid
+from ertis_numba.analysis.noise import threshold_of
 from ertis_numba.base import checks
 from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.frames import Energyscape, Peak, Reflector
@@ -104,8 +106,9 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
 
     Peaks and visible reflectors are assigned one to one. The assignment first maximises the number of pairs within
     0.1 m and one and a half main lobes, then minimises the sum of squared distances. SciPy solves this assignment
-    problem after D. F. Crouse, 2016. Peaks are those of `find_peaks` with a ``false_alarm`` of 0.001, so that maxima of
-    noise are neither found reflectors nor spurious peaks. Their number is limited to that of the reflectors plus 100.
+    problem after D. F. Crouse, 2016. Found reflectors exceed the noise of the image
+    (`ertis_numba.analysis.noise.threshold_of`, probability 0.001). Spurious peaks are those of `find_peaks`. The number
+    of peaks is limited to that of the reflectors plus 100.
 
     Parameters
     ----------
@@ -153,7 +156,11 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
     # A reflector that does not count may still be the strongest in the image, or leak into it.
     above_db = float(np.max(levels_db, where=in_range, initial=strongest_db)) - strongest_db if counted else 0.0
     floor_db = max(_MIN_DB, min_level_db - above_db - _SLACK_DB)
-    peaks = peaks_of_grid(image, top=len(reflectors) + _MAX_FALSE, min_level_db=floor_db, false_alarm=FALSE_ALARM)
+    # Only spurious peaks must be listed: the truth tells reflectors beside stronger ones from noise of their direction.
+    limits: dict[str, Any] = {"top": len(reflectors) + _MAX_FALSE, "min_level_db": floor_db}
+    where = image.amplitude >= threshold_of(image, FALSE_ALARM) if image.points is None else None
+    peaks = peaks_of_grid(image, where=where, false_alarm=None, **limits)
+    listed = {_place(peak) for peak in peaks_of_grid(image, false_alarm=FALSE_ALARM, **limits)}
     pairs = _assign(image, counted, peaks, lobe)
     # Levels of peaks are relative to the strongest peak, those of reflectors to the strongest reflector. A matched pair
     # determines the offset between the two references.
@@ -161,6 +168,7 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
 
     min_db = min_level_db + (strongest_db if counted else 0.0) - step_db
     left = [peak for peak in peaks if peak.level_db >= min_db and not any(peak is taken for _, taken in pairs)]
+    left = [peak for peak in left if _place(peak) in listed]
     is_due = _explained(image, reflectors, left, lobe, in_view=in_view, counts=counts, step_db=step_db)
     return Comparison(
         matched=tuple(_match(image, reflector, peak, step_db) for reflector, peak in pairs),
@@ -168,6 +176,11 @@ def compare(image: Energyscape, reflectors: Sequence[Reflector], *, min_level_db
         spurious=tuple(observed(image, [peak for peak, due in zip(left, is_due, strict=True) if not due])),
         explained=tuple(observed(image, [peak for peak, due in zip(left, is_due, strict=True) if due])),
     )
+
+
+def _place(peak: Peak) -> tuple[float, float, float]:
+    """Return the place of a peak, which is the same in all lists of an image."""
+    return peak.azimuth_deg, peak.elevation_deg, peak.range_m
 
 
 def visible(image: Energyscape, reflectors: Sequence[Reflector]) -> NDArray[np.bool_]:

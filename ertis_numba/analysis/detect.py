@@ -26,6 +26,7 @@ __all__ = ["find_peaks", "left_out_at_edges", "left_out_in_noise", "neighbours_o
 _SAME_DIGITS = 9  # Decimals in which the unit vectors of equal directions agree.
 _BESIDE = 8  # Number of further maxima that are examined as disturbances.
 _COUNTED = 400  # Number of maxima that are examined as possible noise.
+_EXPLAINING = 50  # Number of listed reflectors whose side lobes may be among them.
 _NEIGHBOURS = 8  # Number of directions around each direction of a dense grid.
 
 
@@ -217,12 +218,10 @@ def left_out_at_edges(
     return sum(not side_lobes.explain(directions[place[0]], int(place[1]), level) for place, level in doubtful)
 
 
-def left_out_in_noise(
-    image: Energyscape, peaks: Sequence[Peak], *, min_level_db: float = -30.0, false_alarm: float
-) -> int:
+def left_out_in_noise(image: Energyscape, *, min_level_db: float = -30.0, false_alarm: float) -> int:
     """Return the number of maxima that `find_peaks` left out as possible noise from their direction.
 
-    ``peaks`` are those of `find_peaks` with the same arguments; their side lobes and those of the maxima do not count.
+    Side lobes of listed reflectors and of these maxima do not count.
     """
     if image.points is not None:
         return 0
@@ -233,10 +232,12 @@ def left_out_in_noise(
     places = _local_maxima(image.amplitude, neighbours_of(directions), floor, None)
     places = places[~stands_out(image, places[:, 0], places[:, 1], false_alarm, pulse_steps(image))]
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
-    places, levels = (each[np.argsort(-levels, kind="stable")[:_COUNTED]] for each in (places, levels))
-    side_lobes = SideLobes(image, directions, places)
-    _add(side_lobes, peaks)
-    count = 0
+    order = np.argsort(-levels, kind="stable")[:_COUNTED]
+    places, levels = places[order], levels[order]
+    if not len(places):
+        return 0
+    side_lobes, count = SideLobes(image, directions, places), 0
+    _add(side_lobes, peaks_of_grid(image, top=_EXPLAINING, min_level_db=min_level_db, false_alarm=false_alarm))
     for place, level in zip(places, levels, strict=True):
         direction = directions[place[0]]
         if not side_lobes.explain(direction, int(place[1]), level):

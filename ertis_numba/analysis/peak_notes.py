@@ -21,7 +21,7 @@ def list_notes(
     for image, peaks in found:
         n_left_out += left_out_at_edges(image, peaks, min_level_db=min_level_db, false_alarm=false_alarm)
         if false_alarm is not None:
-            n_noisy += left_out_in_noise(image, peaks, min_level_db=min_level_db, false_alarm=false_alarm)
+            n_noisy += left_out_in_noise(image, min_level_db=min_level_db, false_alarm=false_alarm)
         if image.points is not None:
             n_unconfirmed += int((~image.points.is_certain).sum())
         errors_deg += (peak.grid_error_deg for peak in peaks)
