@@ -11,12 +11,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ertis_numba.base.constants import FALSE_ALARM
 from matplotlib.figure import Figure
 from PIL import Image
 
 import ertis_numba as ertis
 from ertis_numba.analysis.compare import errors_of
+from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.simulation import Scene
 from ertis_numba.simulation.effect_plan import EffectPlan, make_plan
 

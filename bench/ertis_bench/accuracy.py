@@ -1,7 +1,7 @@
 """Error versus time of many plans, with the plans on the Pareto front."""
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from ertis_numba import kernels
 from ertis_numba.analysis.detect import find_peaks
 from ertis_numba.chain.planner import Planner
 from ertis_numba.chain.signal_model import signal_model_of
-from ertis_numba.frames import Measurement, Peak
+from ertis_numba.frames import Measurement
 from ertis_numba.kernels import KernelSet
 from ertis_numba.pipeline import Pipeline, verification
 from ertis_numba.settings import ERROR_PRESETS_DB, Settings
@@ -118,7 +118,6 @@ class _Subject:
         say(f"{name}: computing the exact image")
         exact = verification.exact_image(Pipeline(settings, predict=False).process(measurement), measurement)
         self._exact = exact.amplitude
-        self._wanted: Sequence[Peak] = find_peaks(exact, top=verification.PEAKS, false_alarm=None)
         self._signal_model = signal_model_of(measurement, settings, kernel_set, threads=self._threads)
 
     def rows(self, count: int) -> list[dict[str, Any]]:
@@ -156,7 +155,9 @@ class _Subject:
 
     def _row(self, name: str, pipeline: Pipeline) -> dict[str, Any]:
         image = pipeline.process(self._measurement)
-        peaks = verification.peak_errors(image, self._wanted)
+        # The fits of peaks use the settings of an image, so both images have the same.
+        wanted = find_peaks(image.replace(amplitude=self._exact), top=verification.PEAKS, false_alarm=None)
+        peaks = verification.peak_errors(image, wanted)
         return {
             "subject": self._name,
             "plan": name,

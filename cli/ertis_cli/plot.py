@@ -296,14 +296,12 @@ def _calibrated(path: Path, sensor: str | None) -> "tuple[Calibration, Settings]
 def _drawn(kind: str, image: "Energyscape", top: int, look: dict[str, Any], *, quiet: bool) -> "Figure":
     """Draw an image with rings around its strongest reflectors, if ``top`` is above 0."""
     from ertis_numba import figures
-    from ertis_numba.analysis.detect import find_peaks, left_out_in_noise
-    from ertis_numba.analysis.peak_notes import noise_note, open_edge_note
+    from ertis_numba.analysis.detect import find_peaks
+    from ertis_numba.analysis.peak_notes import list_notes
 
-    peaks = find_peaks(image, top=top, false_alarm=FALSE_ALARM) if top else None
-    n_noisy = left_out_in_noise(image, false_alarm=FALSE_ALARM) if top else 0
-    options.note_of(image.stamp.sensor, noise_note(n_noisy), quiet=quiet)
-    errors_deg = (peak.grid_error_deg for peak in peaks or ())
-    options.note_of(image.stamp.sensor, open_edge_note(image, errors_deg), quiet=quiet)
+    peaks = find_peaks(image, top=top) if top else None
+    for note in list_notes([(image, peaks)], false_alarm=FALSE_ALARM) if peaks is not None else ():
+        options.note_of(image.stamp.sensor, note, quiet=quiet)
     draw: dict[str, Callable[..., Figure]]
     draw = {"image": figures.plot, "polar": figures.polar, "projection": figures.projection, "slices": figures.slices}
     return draw[kind](image, peaks=peaks, **look)

@@ -217,7 +217,7 @@ def test_echo_at_range_zero_has_an_uncertain_direction():
     pipeline = Pipeline(settings, predict=False)
     image = pipeline.process(Measurement(words_for(pipeline, "noise", 23), settings))
     assert image.range_m.tolist() == [0.0]
-    found = find_peaks(image)
+    found = find_peaks(image, false_alarm=None)
     assert len(found) >= 1
     assert min(peak.angle_sd_deg for peak in found) > 5  # degrees: echoes of noise
     assert min(peak.range_sd_m for peak in found) > 0
@@ -248,5 +248,5 @@ def test_peaks_are_found_if_the_sample_rate_cuts_the_band_edge():
     made = Settings(call=call, recording=Recording(n_samples=20_000), processing=processing)
     assert made.signal_rate_hz < 2 * (call.high_frequency_hz + 5_000)
     pipeline = Pipeline(made, predict=False)
-    [peak] = find_peaks(pipeline.process(Measurement(words_for(pipeline, "noise", 1), made)), top=1)
+    [peak] = find_peaks(pipeline.process(Measurement(words_for(pipeline, "noise", 1), made)), top=1, false_alarm=None)
     assert 0.2 < peak.range_m < 0.5

@@ -41,10 +41,11 @@ def measure(image: Energyscape, measurement: Measurement) -> Measured:
     if share < 1:
         return _measured_in_part(image, exact, share=share)
     wanted = _whole(image, exact)
+    replaced = image.replace(amplitude=wanted.astype(np.float32))
     return Measured(
         error_db=error_db(image.amplitude, wanted),
         n_directions=len(wanted),
-        peaks=peak_errors(image, peaks_of_grid(image.replace(amplitude=wanted.astype(np.float32)), top=PEAKS)),
+        peaks=peak_errors(image, peaks_of_grid(replaced, top=PEAKS, false_alarm=None)),
     )
 
 

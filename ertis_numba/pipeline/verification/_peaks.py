@@ -32,7 +32,7 @@ class PeakErrors:
 def peak_errors(image: Energyscape, wanted: Sequence[Peak]) -> PeakErrors:
     """Return the errors of an image at the strongest reflectors of the exact image."""
     # Reflectors of nearly the same level may change order. Twice the number ensures that the last are included.
-    found = peaks_of_grid(image, top=2 * PEAKS, min_level_db=-1000.0)
+    found = peaks_of_grid(image, top=2 * PEAKS, min_level_db=-1000.0, false_alarm=None)
     errors = [error for peak in wanted if (error := _nearest(peak, found)) is not None]
     level_db, range_m, angle_deg = np.max(np.abs(errors), axis=0).tolist() if errors else (None, None, None)
     return PeakErrors(
