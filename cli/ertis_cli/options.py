@@ -468,9 +468,9 @@ def note_doubts(sensor: str, bearings: "Iterable[Bearing]") -> bool:
         )
     if "interference" in doubts:
         note(
-            f"sensor {sensor}: a source marked as possible interference is a tone, and with so few microphones, a "
-            "tone of the electronics with random phases would look the same; cover the microphones: interference "
-            "remains, and sound does not"
+            f"sensor {sensor}: a source marked as possible interference fits its direction no better than electrical "
+            "interference with random phases may by chance; cover the microphones: interference remains, and sound "
+            "does not"
         )
     return bool(doubts)
 

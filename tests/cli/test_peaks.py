@@ -5,8 +5,10 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from ertis_cli import options
 from ertis_cli.main import cli
 
+import ertis_numba as ertis
 from ertis_numba.analysis.cfar import cfar_peaks
 from ertis_numba.storage import open_energyscapes, write_energyscapes
 from tests.files import image
@@ -62,3 +64,23 @@ def test_cfar_options_change_the_peaks(images):
 )
 def test_peaks_refuses_invalid_input(images, options, code, match):
     assert match in run("peaks", images, *options.split(), code=code).stderr
+
+
+def test_note_on_interference_holds_for_any_array_and_sound(capsys):
+    """Errors of the array mark broadband sources of 32 microphones, too."""
+    bearing = ertis.Bearing(
+        azimuth_deg=10.0,
+        elevation_deg=0.0,
+        sideways_deg=0.1,
+        upwards_deg=0.1,
+        correlation=0.0,
+        band_hz=(38e3, 42e3),
+        level_dbfs=-40.0,
+        snr_db=10.0,
+        may_be_interference=True,
+    )
+    assert options.note_doubts("s", [bearing])
+    text = capsys.readouterr().err
+    assert "random phases" in text
+    assert "tone" not in text
+    assert "few microphones" not in text
