@@ -13,7 +13,7 @@ from ertis_numba.chain.stream_recipe import uses_streams
 from ertis_numba.chain.wavefronts import plane_wave_error_db
 from ertis_numba.frames import Measurement
 from ertis_numba.pipeline import Pipeline, verification
-from ertis_numba.pipeline.prediction import planner_of
+from ertis_numba.pipeline.prediction import planner_of, relative_to_exact_db
 from ertis_numba.settings import Settings
 
 __all__ = ["examine"]
@@ -101,11 +101,16 @@ def _verified(pipeline: Pipeline, first: Measurement, planners: dict[str, Planne
         "sequence": first.stamp.sequence,
         "directions": measured.n_directions,
         "error_db": round(measured.error_db, 2),
-        "predicted_db": round(planners["signal_model"].error_db(accuracy), 2),
+        "predicted_db": round(_predicted_db(pipeline, planners["signal_model"]), 2),
         "safe_db": round(planners["safe"].error_db(accuracy), 2),
         "max_error_db": accuracy.max_error_db,
         "peaks": measured.peaks and {name: _rounded(value) for name, value in asdict(measured.peaks).items()},
     }
+
+
+def _predicted_db(pipeline: Pipeline, planner: Planner) -> float:
+    error_db = planner.error_db(pipeline.settings.accuracy)
+    return error_db if pipeline.settings.processing.is_adaptive else relative_to_exact_db(error_db)
 
 
 def _require_budget(sensor: str, error_db: float, settings: Settings) -> None:

@@ -27,6 +27,7 @@ __all__ = [
     "memory_bytes",
     "planner_of",
     "predict",
+    "relative_to_exact_db",
 ]
 
 UNCERTAINTY_DB: Final = 1.0
@@ -42,6 +43,7 @@ MAX_MEMORY_BYTES: Final = 2**28
 
 _MAX_DIRECTIONS: Final = 64
 _SPREAD_DB: Final = 0.25  # Smaller effects of the number of image points are within the uncertainty.
+_MAX_SHARE: Final = 0.999  # Largest share of the error in the power of an image.
 _FAINTER_RATIO: Final = 0.1
 _ROWS: Final = 16
 
@@ -87,10 +89,13 @@ class Prediction:
         """Warning in one line; empty if the budget is kept."""
         if self.predicted_error_db + self.uncertainty_db <= self.max_error_db:
             return ""
+        highest_db = self.predicted_error_db + self.uncertainty_db
+        if not self.has_echoes and highest_db >= 0:
+            return "no echo was heard above the noise; most of the image is the error of the plan, not this noise"
         if not self.has_echoes:
             return (
                 f"no echo was heard above the noise; the image shows this noise with an error of up to "
-                f"{self.predicted_error_db + self.uncertainty_db:.1f} dB relative to it"
+                f"{highest_db:.1f} dB relative to it"
             )
         scope = ""
         if self.budget_applies_to == "beams":
@@ -143,9 +148,15 @@ def predict(planner: Planner, image: Energyscape | None = None) -> Prediction:
         # The mean power of few independent errors differs from its expectation, by up to three standard deviations.
         spread_db = 10 * math.log10(1 + 3 / math.sqrt(planner.n_independent))
         uncertainty_db = UNCERTAINTY_DB + (round(spread_db, 1) if spread_db > _SPREAD_DB else 0.0)
+    predicted_db = planner.error_db(settings.accuracy)
+    if image is not None and not processing.is_adaptive:
+        # The power of the image contains that of its error, which matters for errors above -15 dB.
+        highest_db = relative_to_exact_db(predicted_db + uncertainty_db)
+        predicted_db = relative_to_exact_db(predicted_db)
+        uncertainty_db = round(highest_db - predicted_db, 1)
     weighted = "" if processing.weighting == "none" else f" with {processing.weighting}"
     found = Prediction(
-        predicted_error_db=round(planner.error_db(settings.accuracy), 2),
+        predicted_error_db=round(predicted_db, 2),
         max_error_db=settings.accuracy.max_error_db,
         uncertainty_db=uncertainty_db,
         budget_applies_to=planner.budget_scope(settings.accuracy),
@@ -154,6 +165,12 @@ def predict(planner: Planner, image: Energyscape | None = None) -> Prediction:
     if image is None or not found.warning:
         return found
     return replace(found, has_echoes=bool(image.amplitude.max(initial=0.0) > threshold_of(image, FALSE_ALARM)))
+
+
+def relative_to_exact_db(error_db: float) -> float:
+    """Return an error relative to an image without it, from that relative to the image with it."""
+    share = min(10 ** (error_db / 10), _MAX_SHARE)
+    return 10 * math.log10(share / (1 - share)) if share > 0 else error_db
 
 
 def memory_bytes(image: Energyscape) -> int:
