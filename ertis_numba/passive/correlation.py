@@ -19,6 +19,8 @@ _SMOOTH: Final = 20.0  # Error relative to the misfit, if this changes its sign 
 _ROUGH: Final = 0.3  # … and otherwise.
 _MERGED: Final = 0.06  # Largest error by an echo that the band does not resolve, in periods of its width.
 _AMBIGUOUS: Final = 0.7  # Correlation relative to the largest one, from which a misfit leaves no choice.
+_TONE_BINS: Final = 3  # Largest distance of the bins of a tone under a Hann window …
+_TONE_WIDTH: Final = 2.5  # … and their equivalent number, which is 2.0 to 2.2.
 _TINY: Final = 1e-30
 
 
@@ -32,6 +34,13 @@ class Bins(NamedTuple):
     coherence: NDArray[np.float64]
     evidence: NDArray[np.float64]
     is_coherent: bool
+
+    @property
+    def is_tone(self) -> bool:
+        """True if the frequencies in use hold no more than one tone does under the window: no period is evident."""
+        used = np.flatnonzero(self.weights)
+        power = np.abs(self.cross[used])
+        return bool(np.ptp(used) <= _TONE_BINS and power.sum() ** 2 < _TONE_WIDTH * (power**2).sum())
 
 
 class Correlation:
@@ -134,7 +143,7 @@ class Correlation:
         variance = float((self._omega**2 * noise).sum()) / curvature**2
         lead = float(turned.real.sum()) - values
         misfit_s = self._misfit_s(turned, noise)
-        ambiguous = (values > _AMBIGUOUS * float(turned.real.sum())) & (misfit_s > 0)
+        ambiguous = (values > _AMBIGUOUS * float(turned.real.sum())) & (misfit_s > 0 or self._bins.is_tone)
         near = (lead**2 < _CERTAIN * noise.sum()) | ambiguous
         apart_s, odds = [0.0], [1.0]
         for other_s, unclear in zip(others_s[near].tolist(), ambiguous[near].tolist(), strict=True):

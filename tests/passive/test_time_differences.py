@@ -131,6 +131,21 @@ def test_narrow_band_far_above_the_noise_has_no_uncertainty_of_periods():
         assert found.uncertainty_s < 0.2e-6
 
 
+@pytest.mark.parametrize("weighting", ["phat", "scot", "none"])
+@pytest.mark.parametrize("frequency_hz", [25e3, 33.3e3, 40e3, 40.123e3])
+def test_tone_has_an_uncertainty_of_periods(frequency_hz, weighting):
+    """The phase of a steady tone does not tell its periods apart, however loud it is."""
+    time_s = np.arange(20_000) / RATE_HZ
+    for seed in range(5):
+        random = np.random.default_rng(seed)
+        delay_s = random.uniform(-100e-6, 100e-6)
+        rows = np.sin(2 * np.pi * frequency_hz * (time_s - np.array([[0.0], [delay_s]])))
+        rows += 10.0 ** random.uniform(-3, -1) * random.standard_normal(rows.shape)
+        (found,) = time_differences(rows.astype(np.float32), rate_hz=RATE_HZ, weighting=weighting, max_delay_s=150e-6)
+        assert abs(found.delay_s - delay_s) < 3 * found.uncertainty_s
+        assert 1 / frequency_hz < found.uncertainty_s < 150e-6
+
+
 @pytest.mark.parametrize("apart", [0.5, 1.0, 2.0, 4.0])
 @pytest.mark.parametrize("snr_db", [10, 40])
 def test_uncertainty_covers_the_shift_by_an_echo(apart, snr_db):
