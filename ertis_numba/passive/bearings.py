@@ -37,7 +37,8 @@ class BearingFinder:
     explains the loudest one: see `exceedance`. Side lobes of a source therefore yield no bearings. After each new
     source, the directions of all sources of its band are corrected. The noise is a mixture of white noise of the
     microphones and of diffuse sound, whose shares are estimated in each band. Electrical crosstalk that is equal in all
-    channels looks like sound straight ahead of a flat array: see `Bearing.may_be_crosstalk`.
+    channels looks like sound straight ahead of a flat array: see `Bearing.may_be_crosstalk`. Without passive.focus_m,
+    waves are plane, and the uncertainty contains the error of this for sources from 1 m on; nearer ones need it.
 
     Parameters
     ----------

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ertis_numba.passive.detection_law import independent_samples
 from ertis_numba.passive.heard_band import HeardBand
 from ertis_numba.passive.likelihood import BandLikelihood
-from ertis_numba.passive.model_errors import beside_others
+from ertis_numba.passive.model_errors import beside_others, inverse_ranges
 
 __all__ = ["covariance_of", "powers_in_noise"]
 
@@ -21,6 +21,7 @@ _ROUNDING: Final = 3e-7  # of powers in single precision
 _SIGNIFICANT: Final = 5.0  # Power beyond noise relative to its standard deviation that shows several sources.
 _AXIS_ERROR_RAD: Final = 0.05  # Error of the direction in which sources lie that are not separated.
 _APART: Final = 0.1  # Changes of waves relative to their size from which on this error is at its largest.
+_TURN_ERROR: Final = 0.25  # Error of the turn by a finite range, relative to it.
 _OF_WIDTH: Final = 0.3  # Uncertain share of the power that the width of a bin causes.
 
 
@@ -76,9 +77,31 @@ def covariance_of(likelihood: BandLikelihood, places: Floats, k: int, band: Hear
     spread = _of_excess(excess, limit, metric, float(weights @ powers))
     apart = min(1.0, float(np.trace(metric @ spread)) / (_APART * float(band.weights @ size)))
     out[:n, :n] += (spread + apart * _AXIS_ERROR_RAD**2 * np.trace(spread) * np.eye(2))[:n, :n]
+    out[:n, :n] += _of_range(beside, place, powers, noise, metric[:n, :n], gains / gains.sum(), changes[..., :n], band)
     # Blocks of distant microphones hear different sound of other sources, which looks like noise.
     out[:n, :n] += _of_excess(of_others, 0 * limit, metric, scale * float(weights @ noise))[:n, :n]
     return out
+
+
+def _of_range(
+    beside: BandLikelihood,
+    place: Floats,
+    powers: Floats,
+    noise: Floats,
+    metric: Floats,
+    weights: Floats,
+    changes: NDArray[np.complex128],
+    band: HeardBand,
+) -> Floats:
+    """Return the covariance of the turn of the direction by a range that is not infinite."""
+    whole, curvature = (beside.waves(place[None], order=1, curved=True, part=part) for part in (0, 1))
+    wave, _, size = beside.slopes(place)
+    curvature = (
+        curvature - wave * (wave.conj() * beside.outside(curvature)).sum(axis=1, keepdims=True) / size[:, None, None]
+    )
+    turn = np.linalg.pinv(metric) @ (weights @ (changes.conj().transpose(0, 2, 1) @ whole).real[..., 0])
+    spread = np.outer(turn, turn) + _TURN_ERROR**2 * (turn @ turn) * np.eye(len(turn))
+    return np.asarray(spread * inverse_ranges(beside, noise, powers[:, None], curvature, band)[0] ** 2)
 
 
 def _of_excess(excess: Floats, limit: Floats, metric: Floats, power: float) -> Floats:

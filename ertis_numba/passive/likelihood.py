@@ -51,9 +51,9 @@ class BandLikelihood:
     power outside of them (I. Ziskind and M. Wax, Maximum likelihood localization of multiple sources by alternating
     projection, 1988). ``whitening`` (bin, mode, mic) is that of the matrix (bin, mic, mic), None for microphones; the
     weights (bin,) have a sum of 1; ``delays`` returns those from unit vectors, (direction, mic); ``others`` are
-    (source, axis), with frequencies (bin, source), and numbers of derivatives of their waves by frequency that belong
-    to them, none by default. As attributes, the matrix is (bin, mode, mode), and its trace and number of dimensions
-    outside of the others are ``power`` (bin,) and ``dimensions``.
+    (source, axis), with frequencies (bin, source), and numbers of derivatives of their waves, by frequency and by
+    1/range, that belong to them, none by default. As attributes, the matrix is (bin, mode, mode), and its trace and
+    number of dimensions outside of the others are ``power`` (bin,) and ``dimensions``.
     """
 
     def __init__(
@@ -65,21 +65,24 @@ class BandLikelihood:
         delays: Delays,
         others: Floats = _NONE,
         others_omega: Floats | None = None,
-        others_orders: tuple[int, ...] = (),
+        others_orders: tuple[tuple[int, int], ...] = (),
+        curvatures: Delays | None = None,
     ) -> None:
-        self._whitening, self.omega, self._delays = whitening, omega, delays
+        self._whitening, self.omega, self._delays, self._curvatures = whitening, omega, delays, curvatures
         self.is_whitened = whitening is not None
         self.weights = weights
         self.matrix, self.others_orders = matrix, others_orders
-        self.dimensions = matrix.shape[1] - len(others) - sum(others_orders)
+        self.dimensions = matrix.shape[1] - len(others) - sum(map(sum, others_orders))
         power = np.trace(matrix, axis1=1, axis2=2).real
         self._basis = None
         if len(others):
             waves = [self.waves(others, others_omega)]
-            for order in range(1, max(others_orders, default=0) + 1):
-                changed = np.flatnonzero(np.array(others_orders) >= order)
-                omegas = None if others_omega is None else others_omega[:, changed]
-                waves.append(self.waves(others[changed], omegas, order=order))
+            orders = np.array(others_orders, np.intp).reshape(-1, 2)
+            for curved in (False, True):
+                for order in range(1, orders[:, int(curved)].max(initial=0) + 1):
+                    changed = np.flatnonzero(orders[:, int(curved)] >= order)
+                    omegas = None if others_omega is None else others_omega[:, changed]
+                    waves.append(self.waves(others[changed], omegas, order=order, curved=curved))
             self._basis, _ = np.linalg.qr(np.concatenate(waves, axis=2))
             power = power - (self._basis.conj() * (matrix @ self._basis)).sum(axis=(1, 2)).real
         self.power = np.maximum(power, _LEAST)
@@ -108,13 +111,12 @@ class BandLikelihood:
         others: Floats,
         others_omega: Floats | None = None,
         omega: Floats | None = None,
-        others_orders: tuple[int, ...] = (),
+        others_orders: tuple[tuple[int, int], ...] = (),
     ) -> Self:
         """Return the likelihood given others (source, axis); frequencies are its own by default."""
         omega = self.omega if omega is None else omega
-        return type(self)(
-            self.matrix, self._whitening, omega, self.weights, self._delays, others, others_omega, others_orders
-        )
+        orders = others, others_omega, others_orders
+        return type(self)(self.matrix, self._whitening, omega, self.weights, self._delays, *orders, self._curvatures)
 
     def unwhitened(self, matrices: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the matrices whose powers for a wave are those of given matrices for the whitened wave."""
@@ -122,9 +124,21 @@ class BandLikelihood:
             return matrices
         return np.asarray(self._whitening.transpose(0, 2, 1) @ matrices @ self._whitening)
 
-    def waves(self, directions: Floats, omega: Floats | None = None, *, order: int = 0) -> NDArray[np.complex128]:
-        """Return whitened waves, or derivatives by angular frequency: (bin, mode, direction)."""
-        waves = self.unwhitened_waves(directions, omega, order=order)
+    def waves(
+        self, directions: Floats, omega: Floats | None = None, *, order: int = 0, curved: bool = False, part: int = 1
+    ) -> NDArray[np.complex128]:
+        """Return whitened waves, or derivatives by angular frequency or 1/range: (bin, mode, direction).
+
+        Those by 1/range are a part of `WaveDelays.curvatures`.
+        """
+        waves = self.unwhitened_waves(directions, omega, order=0 if curved else order)
+        if curved:
+            curvatures = (
+                np.zeros_like(self._delays(directions))
+                if self._curvatures is None
+                else self._curvatures(directions)[part]
+            )
+            waves *= (-1j * (self.omega[:, None] if omega is None else omega)[:, None] * curvatures.T) ** order
         if self._whitening is None:
             return waves
         return (self._whitening @ waves.view(np.float64)).view(np.complex128)  # Weights are real.

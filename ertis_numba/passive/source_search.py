@@ -11,10 +11,11 @@ from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.detection_law import LAGS, chance_of_phases, exceedance, independent_samples
 from ertis_numba.passive.direction_errors import covariance_of, powers_in_noise
 from ertis_numba.passive.heard_band import HeardBand
-from ertis_numba.passive.likelihood import BandLikelihood, Delays, moved
+from ertis_numba.passive.likelihood import BandLikelihood, moved
 from ertis_numba.passive.model_errors import beside_others, beside_sources
 from ertis_numba.passive.noise_model import NoiseFluctuations, NoiseModel
 from ertis_numba.passive.scan_extent import ScanExtent, ScanMesh
+from ertis_numba.passive.wave_delays import WaveDelays
 
 __all__ = ["BandSearch", "FoundSource", "Scan"]
 
@@ -71,7 +72,7 @@ class BandSearch:
         frequency_hz: Floats,
         shares: Floats,
         noise: NoiseModel,
-        delays: Delays,
+        delays: WaveDelays,
         steer: Callable[[NDArray[np.complex64]], NDArray[np.float32]],
     ) -> None:
         self._scan, self._noise, self._delays, self._steer = scan, noise, delays, steer
@@ -187,7 +188,9 @@ class BandSearch:
         extent, similarity = self._of_noise(diffuse)
         of_white = independent_samples(band.weights, band.n_blocks, similarity)
         omegas = np.append(band.omegas[:, : len(places)], rest.omega[:, None], axis=1)
-        beside = whole.beside(np.concatenate([places, place[None]]), omegas, others_orders=(*rest.others_orders, 0))
+        beside = whole.beside(
+            np.concatenate([places, place[None]]), omegas, others_orders=(*rest.others_orders, (0, 0))
+        )
         outside = beside.projection
         if self._scan.level:  # The source may be above or below.
             loudest = np.linalg.eigh(beside.rest)[1][:, :, -1:]
@@ -214,13 +217,15 @@ class BandSearch:
     def _likelihood(self, band: HeardBand, places: Floats) -> tuple[BandLikelihood, float]:
         """Return the likelihood of sources in noise, and the diffuse share of the noise."""
         matrix = band.matrix
-        plain = BandLikelihood(matrix, None, band.omega, band.weights, self._delays)
+        plain = BandLikelihood(matrix, None, band.omega, band.weights, self._delays, curvatures=self._delays.curvatures)
         share = self._noise.diffuse_share(matrix, band.weights, _of_sources(plain, places, band.omegas))
         if not share:
             return plain, share
         whitening = self._noise.whitening(share)
         white = whitening @ matrix @ whitening.transpose(0, 2, 1)
-        return BandLikelihood(white, whitening, band.omega, band.weights, self._delays), share
+        return BandLikelihood(
+            white, whitening, band.omega, band.weights, self._delays, curvatures=self._delays.curvatures
+        ), share
 
     def _corrected(self, likelihood: BandLikelihood, places: Floats, band: HeardBand) -> Floats:
         """Return the directions of sources that are most likely together."""
@@ -271,7 +276,9 @@ class BandSearch:
         The fit is that of its loudest bin. Sound beside louder sources, which are certain, and outside of the direction
         is a misfit: it may belong to these phases, unless noise explains it. So is what noise may hide.
         """
-        plain = BandLikelihood(band.matrix, None, band.omega, band.weights, self._delays)
+        plain = BandLikelihood(
+            band.matrix, None, band.omega, band.weights, self._delays, curvatures=self._delays.curvatures
+        )
         beside, n_mics = beside_others(plain, places, k, band), band.matrix.shape[1]
         powers = np.maximum(band.shares * band.level * powers_in_noise(beside, places[k], band.width)[0], 0)
         if not powers.any():

@@ -31,8 +31,8 @@ def direction_of(azimuth_deg, elevation_deg):
     return unit_vectors(np.radians([azimuth_deg]), np.radians([elevation_deg]))[0]
 
 
-def heard(settings, sources, noise, random):
-    """Return a measurement of plane waves, and of white noise of each microphone.
+def heard(settings, sources, noise, random, range_m=None):
+    """Return a measurement of plane waves, or waves from points, and of white noise of each microphone.
 
     A source has a direction, a root mean square within its band, and the band: a tone if both edges are equal.
     """
@@ -43,6 +43,9 @@ def heard(settings, sources, noise, random):
     out = noise * random.standard_normal((len(places_m), N_SAMPLES))
     for direction, rms, (low_hz, high_hz) in sources:
         delay_s = -(places_m @ direction)[:, None] / speed_m_s
+        if range_m is not None:
+            away_m = np.linalg.norm(range_m * direction - places_m, axis=1)
+            delay_s = (away_m[:, None] - range_m) / speed_m_s
         if low_hz == high_hz:
             phase = random.uniform(0, 2 * np.pi)
             out += np.sqrt(2) * rms * np.cos(2 * np.pi * low_hz * (time_s - delay_s) + phase)
@@ -207,3 +210,23 @@ def test_crosstalk_of_an_array_that_is_not_flat_is_marked():
         camera.reset()
         camera.add(heard(settings, [(direction_of(0, 0), 1.0, WIDE)], 1.0, np.random.default_rng(15)))
         assert [bearing.may_be_crosstalk for bearing in finder.find()] == [False]
+
+
+@pytest.mark.parametrize("range_m", [1.0, 3.0])
+def test_sources_at_a_finite_range_have_the_stated_errors(range_m):
+    """Without passive.focus_m, waves from points differ from plane ones by more than the noise."""
+    settings, found = settings_of((38e3, 42e3), (56e3, 77e3)), []
+    with AcousticCamera(settings, "cpu", 1) as camera:
+        finder = BearingFinder(camera)
+        for seed in range(6):
+            random = np.random.default_rng([29, seed])
+            direction = direction_of(random.uniform(-60, 60), random.uniform(-50, 50))
+            camera.reset()
+            camera.add(heard(settings, [(direction, 1.0, WIDE)], 1e-3, random, range_m))
+            bearings = finder.find()
+            assert [each.band_hz for each in bearings] == [(38e3, 42e3), (56e3, 77e3)]
+            found += [squares(each, direction) for each in bearings]
+            # Errors are not much smaller than stated, either.
+            assert all(np.hypot(each.sideways_deg, each.upwards_deg) < 0.15 / range_m for each in bearings)
+    assert 0.2 < np.mean(found) / 2 < 1.5
+    assert np.max(found) < 4**2
