@@ -64,8 +64,8 @@ def find_peaks(
     false_alarm : float, optional
         Probability that noise alone yields a reflector anywhere in the image; 0.001 by default. Weaker maxima are
         discarded: see `ertis_numba.analysis.noise.threshold_of`. So are those that a hiss, a tone or a click from their
-        direction explains: see `ertis_numba.analysis.directional_noise.stands_out`. Cleaned images keep all maxima.
-        None also lists the maxima that noise alone may cause.
+        direction explains, see `ertis_numba.analysis.directional_noise.stands_out`, and side lobes that noise may have
+        raised. Cleaned images keep all maxima. None also lists the maxima that noise alone may cause.
 
     Returns
     -------
@@ -143,7 +143,7 @@ def peaks_of_grid(
         places = places[stands_out(image, places[:, 0], places[:, 1], false_alarm, pulse_steps(image))]
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
     order = np.argsort(-levels, kind="stable")
-    side_lobes = SideLobes(image, directions, places[order])
+    side_lobes = SideLobes(image, directions, places[order], noise=threshold_of(image, false_alarm))
     interpolate = PeakInterpolator(image.settings, directions, neighbours, only=places[:, 0])
     found: list[tuple[NDArray[np.float64], float, float]] = []
     errors_rad: list[float] = []
@@ -212,7 +212,7 @@ def left_out_at_edges(
     places = _local_maxima(image.amplitude, neighbours_of(directions), np.full(len(edges), floor), edges[None] > 0)
     levels = image.amplitude[places[:, 0], places[:, 1]].astype(np.float64)
     is_left = levels < edges[places[:, 1]]
-    side_lobes = SideLobes(image, directions, places[is_left])
+    side_lobes = SideLobes(image, directions, places[is_left], noise=threshold_of(image, false_alarm))
     _add(side_lobes, peaks)
     doubtful = zip(places[is_left], levels[is_left], strict=True)
     return sum(not side_lobes.explain(directions[place[0]], int(place[1]), level) for place, level in doubtful)
@@ -236,7 +236,7 @@ def left_out_in_noise(image: Energyscape, *, min_level_db: float = -30.0, false_
     places, levels = places[order], levels[order]
     if not len(places):
         return 0
-    side_lobes, count = SideLobes(image, directions, places), 0
+    side_lobes, count = SideLobes(image, directions, places, noise=threshold_of(image, false_alarm)), 0
     _add(side_lobes, peaks_of_grid(image, top=_EXPLAINING, min_level_db=min_level_db, false_alarm=false_alarm))
     for place, level in zip(places, levels, strict=True):
         direction = directions[place[0]]
@@ -257,7 +257,7 @@ def _floor(image: Energyscape, min_level_db: float, false_alarm: float | None) -
     """Return the amplitude that reflectors must have."""
     highest = checks.finite("the maximum of the image", float(np.max(image.amplitude, initial=0.0)))
     floor = highest * 10 ** (min_level_db / 20)
-    return floor if false_alarm is None else max(floor, threshold_of(image, false_alarm))
+    return max(floor, threshold_of(image, false_alarm))
 
 
 def _fused_peaks(cloud: PointCloud, *, is_planar: bool) -> list[Peak]:

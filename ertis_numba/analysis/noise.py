@@ -131,13 +131,15 @@ def _medians_of_blocks(amplitude: NDArray[np.float32], n_blocks: int) -> NDArray
     )
 
 
-def threshold_of(image: Energyscape, false_alarm: float) -> float:
-    """Return the amplitude that noise reaches anywhere in an image with a probability; 0 if noise is unknown.
+def threshold_of(image: Energyscape, false_alarm: float | None) -> float:
+    """Return the amplitude that noise reaches anywhere in an image with a probability; 0 if either is unknown.
 
     A bin of noise with root mean square s exceeds t with the probability ``exp(-t²/s²)``. The function treats all bins
     as independent, so the threshold is slightly too high. For one-bit microphones, it is at least -140 dB of full
     scale, because bits that never change leave only rounding errors. ``false_alarm`` is 1e-12 to 1.
     """
+    if false_alarm is None:
+        return 0.0
     checks.between("false_alarm", false_alarm, 1e-12, 1.0)
     smallest = _ROUNDING if image.settings.recording.is_pdm else 0.0
     return max(smallest, noise_of(image) * math.sqrt(math.log(max(1, image.amplitude.size) / false_alarm)))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.analysis.detect import neighbours_of
 from ertis_numba.analysis.directional_noise import pulse_steps, stands_out
-from ertis_numba.analysis.noise import noise_of
+from ertis_numba.analysis.noise import noise_of, threshold_of
 from ertis_numba.analysis.outside_echo import has_outside, outside_of
 from ertis_numba.analysis.peak_interpolation import PeakInterpolator, Tops, listed
 from ertis_numba.analysis.point_spread import PointSpread
@@ -35,8 +35,8 @@ _THINNED = 16  # One of so many ranges serves to estimate the distribution of am
 class PointExtractor:
     """Extractor of the local maxima of images as points, with tables computed once for a grid.
 
-    A point is a local maximum over directions and ranges that exceeds the possible side lobes of the strongest
-    reflector at about the same range, and that noise from its direction does not explain: see
+    A point is a local maximum over directions and ranges that exceeds the possible side lobes, raised by noise, of the
+    strongest reflector at about the same range, and that noise from its direction does not explain: see
     `ertis_numba.analysis.directional_noise.stands_out`. Position and amplitude are interpolated as in
     `ertis_numba.find_peaks`. The latter is slower and predicts side lobes from the array. It finds weak reflectors
     beside strong ones at the same range, which this class discards.
@@ -154,8 +154,8 @@ class PointExtractor:
         profile = amplitude.max(axis=0)
         if not self._has_directions or n_ranges < 3 or not profile.max() > 0:
             return none, none
-        floor = np.maximum(side_lobe_floor(profile, image.range_m), profile.max() * np.float32(self._smallest))
-        floor = np.maximum(floor, self._edges(image))
+        lobes = side_lobe_floor(profile, image.range_m, threshold_of(image, self._false_alarm))
+        floor = np.maximum(np.maximum(lobes, profile.max() * np.float32(self._smallest)), self._edges(image))
         floor[[0, -1]] = np.inf
         # This pass over the whole image and that of the profile dominate the time. Few bins remain.
         above = amplitude >= floor

@@ -54,9 +54,15 @@ class SideLobes:
     the prediction at the same range, and at most the mean of all side lobes that extend to this range. Echoes that
     interfere deviate as well. The prediction is therefore first compared with the reflector that fits best: if the
     pattern around it matches, the array is as designed, and σ is 0.
+
+    Noise adds to side lobes. ``noise`` is the amplitude that it alone reaches with the probability of a false alarm, as
+    `ertis_numba.analysis.noise.threshold_of` returns it. A maximum must exceed the limit by this amplitude, too.
     """
 
-    def __init__(self, image: Energyscape, directions: NDArray[np.float64], candidates: NDArray[np.int64]) -> None:
+    def __init__(
+        self, image: Energyscape, directions: NDArray[np.float64], candidates: NDArray[np.int64], *, noise: float = 0.0
+    ) -> None:
+        self._noise = noise
         self._image, self._spread = image, PointSpread(image.settings)
         count = len(directions)
         self._samples = np.unique(np.linspace(0, count - 1, min(count, _N_DIRECTIONS)).astype(np.int64))
@@ -91,6 +97,7 @@ class SideLobes:
         offsets_m = range_m - ranges_m
         places = np.broadcast_to(direction, sources.shape), np.full(len(near), range_m)
         predicted = float(amplitudes @ self._spread.of_echo(*places, sources, ranges_m, is_focused=self._is_focused))
+        level -= self._noise
         if level <= _MARGIN * predicted:
             return True
         # Echoes of real surfaces are longer than the pulse.
@@ -212,15 +219,20 @@ def _upper_quartile(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(low + np.float32(place - before) * (high - low))
 
 
-def side_lobe_floor(highest: NDArray[np.float32], range_m: NDArray[np.float64]) -> NDArray[np.float32]:
+def side_lobe_floor(
+    highest: NDArray[np.float32], range_m: NDArray[np.float64], noise: float = 0.0
+) -> NDArray[np.float32]:
     """Return the amplitude (range,) below which side lobes are expected, coarser than `SideLobes`, but fast.
 
     The limit lies `SIDE_LOBE_DB` below the strongest amplitude of all ranges within a pulse length. ``highest``
-    (range,) are the maxima over all directions at evenly spaced ranges.
+    (range,) are the maxima over all directions at evenly spaced ranges. ``noise`` is the amplitude that noise alone
+    hardly reaches. It adds to side lobes, in power, because few of them are near the limit. The strongest amplitude
+    itself is no side lobe.
     """
     reach = max(1, round(PULSE_M / float(range_m[1] - range_m[0])))
     around = scipy.ndimage.maximum_filter1d(highest, 2 * reach + 1, mode="nearest")
-    return np.asarray(around * np.float32(10 ** (-SIDE_LOBE_DB / 20)))
+    floor = np.hypot(around * np.float32(10 ** (-SIDE_LOBE_DB / 20)), np.float32(noise))
+    return np.asarray(np.minimum(floor, around))
 
 
 def without_side_lobes(image: Energyscape) -> Energyscape:
