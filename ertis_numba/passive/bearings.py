@@ -27,6 +27,7 @@ __all__ = ["BearingFinder", "find_bearings"]
 _REACH: Final = 1.5  # Largest distance from a direction of the grid to a maximum, in spacings of the grid.
 _MAX_SPACING_RAD: Final = 0.5
 _LEAST: Final = 1e-30
+_DEAD: Final = 1e-4  # Power relative to the median of the channels, below which a channel hears nothing.
 
 
 class BearingFinder:
@@ -38,7 +39,8 @@ class BearingFinder:
     source, the directions of all sources of its band are corrected. The noise is a mixture of white noise of the
     microphones and of diffuse sound, whose shares are estimated in each band. Electrical crosstalk that is equal in all
     channels looks like sound straight ahead of a flat array: see `Bearing.may_be_crosstalk`. Without passive.focus_m,
-    waves are plane, and the uncertainty contains the error of this for sources from 1 m on; nearer ones need it.
+    waves are plane, and the uncertainty contains the error of this for sources from 1 m on; nearer ones need it. If a
+    channel hears nothing, 40 dB below the median of all, uncertainties are infinite: put it in array.disabled.
 
     Parameters
     ----------
@@ -131,6 +133,10 @@ class BearingFinder:
                 sources = search(
                     spectrum.of_bins(bins), false_alarm=self._false_alarm, top=self._top, least=self._least
                 )
+            heard = np.einsum("bmm->m", spectrum.matrix[bins].real)
+            if heard.min() < _DEAD * np.median(heard):
+                unknown = np.diag([math.inf, math.inf])
+                sources = [source._replace(covariance_rad2=unknown) for source in sources]
             sources.sort(key=lambda source: -source.power)
             out += [_bearing(source, band_hz, self._camera.settings) for source in sources]
         return out

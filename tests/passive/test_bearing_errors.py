@@ -230,3 +230,15 @@ def test_sources_at_a_finite_range_have_the_stated_errors(range_m):
             assert all(np.hypot(each.sideways_deg, each.upwards_deg) < 0.15 / range_m for each in bearings)
     assert 0.2 < np.mean(found) / 2 < 1.5
     assert np.max(found) < 4**2
+
+
+def test_dead_channels_leave_no_certain_bearings():
+    settings, direction = settings_of((38e3, 42e3)), direction_of(30, 10)
+    measurement = heard(settings, [(direction, 1.0, WIDE)], 0.1, np.random.default_rng(31))
+    samples = measurement.data.copy()
+    samples[:, [3, 11, 20]] = 0
+    with AcousticCamera(settings, "cpu", 1) as camera:
+        camera.add(ertis.Measurement(samples, settings, measurement.stamp))
+        bearings = BearingFinder(camera).find()
+    assert bearings
+    assert all(np.isinf([each.sideways_deg, each.upwards_deg]).all() for each in bearings)
