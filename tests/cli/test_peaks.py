@@ -1,6 +1,7 @@
 """``ertis peaks`` with either detector."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -84,3 +85,18 @@ def test_note_on_interference_holds_for_any_array_and_sound(capsys):
     assert "random phases" in text
     assert "tone" not in text
     assert "few microphones" not in text
+
+
+def test_unknown_directions_of_sources_have_a_note(capsys):
+    unknown = ertis.Bearing(
+        azimuth_deg=math.nan,
+        elevation_deg=math.nan,
+        sideways_deg=math.inf,
+        upwards_deg=math.inf,
+        correlation=0.0,
+        band_hz=(38e3, 42e3),
+        level_dbfs=-40.0,
+        snr_db=10.0,
+    )
+    assert options.note_doubts("s", [unknown])
+    assert "the direction of 1 source is unknown" in capsys.readouterr().err
