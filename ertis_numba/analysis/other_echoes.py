@@ -56,6 +56,8 @@ def unlisted_echoes(spread: PointSpread, image: Energyscape, tops: Tops, noise: 
     across = _leak(spread, image, tops, is_across=True) * tops.amplitude
     for point, range_m in enumerate(tops.range_m):
         first, last = np.searchsorted(image.range_m, [range_m - reach_m, range_m + reach_m])
+        if first == last:  # The ranges are farther apart than a pulse is long.
+            continue
         nearest = int(np.argmax(directions @ tops.direction[point]))
         row = image.amplitude[nearest, first:last].astype(np.float64)
         offset_m = image.range_m[first:last] - range_m

@@ -25,6 +25,7 @@ At 2.5 times this offset, it is 40 dB down.
 
 _STEPS_PER_WAVE = 512  # Table steps per wavelength at the band's edge: linear interpolation has an error of 5e-6.
 _SKIRTS = (0.05, 0.01)  # Amplitudes at the ends of a pulse and of its skirt.
+_MOST_TILT = 0.9  # Largest change of amplitude by a tilt, from the carrier to an edge of the band.
 
 
 class PointSpread:
@@ -128,7 +129,8 @@ class PointSpread:
         loss = 2 * np.outer(range_m, _absorption_1_m(air or self._air, frequency_hz))
         change = np.exp((loss @ shares)[:, None] - loss + self._path_m * _absorption_1_m(Air(), frequency_hz))
         slope_s = change @ (shares * (offset_hz - mean_hz)) / float(shares @ (offset_hz - mean_hz) ** 2 or 1.0)
-        tilt_s = slope_s / (change @ shares - slope_s * mean_hz)
+        limit_s = _MOST_TILT / float(np.abs(offset_hz).max(initial=1e-30))  # Far away, lines would end below zero.
+        tilt_s = np.clip(slope_s / (change @ shares - slope_s * mean_hz), -limit_s, limit_s)
         return tilt_s, 1 + tilt_s * mean_hz
 
     def beams(self, directions: Floats, deviation: Deviation | None) -> kernels.BeamErrors:

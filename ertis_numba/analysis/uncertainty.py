@@ -26,6 +26,7 @@ _SEEN = 0.45  # Misfit that other points cause, relative to their amplitude at t
 # Bias of the range in widths of the pulse, relative to the error of the plan: it is alike in all bins. Measured.
 _BIAS, _BIAS_OF_ONE_TAP, _BIAS_OF_FOUR_BEAM_TAPS = 2.0, 1.0, 9.0
 _HALF = math.sqrt(0.5)  # Half of the power of a disturbance changes the amplitude, half the phase.
+_UNSEEN = 3e-4  # Relative amplitude of side lobes of the call of other echoes, which no image shows.
 _FLAT = 1e-12  # Relative variance of an array below which its extent counts as zero.
 _UNIFORM = 0.34  # A uniform distribution has 68 % of its values within this share of its width around the middle.
 
@@ -82,6 +83,9 @@ class PositionUncertainty:
         self._plan = 0.0 if noise_only else plan_error(settings)
         bias = _BIAS_OF_ONE_TAP if settings.accuracy.delay_taps == 1 else _BIAS
         self._bias = self._plan * (_BIAS_OF_FOUR_BEAM_TAPS if settings.accuracy.beam_taps == 4 else bias)
+        recording = settings.recording
+        clock_s = 1 / recording.sample_rate_hz if recording.is_pdm else 0.0  # Bits tell no time within it.
+        self._clock_m = _UNIFORM * clock_s * sound_speed_m_s(settings.air) / 2
         self._covariance_m2 = _effective_covariance_m2(positions_m, array_weights(settings))
 
     def __call__(self, image: Energyscape, tops: Tops, *, noise: float) -> Uncertainty:
@@ -100,7 +104,7 @@ class PositionUncertainty:
         if not self._noise_only:
             is_fitted = np.isfinite(tops.across_sd_rad)
             range_m = np.where(is_fitted, tops.range_sd_m, range_m)
-            range_m = np.hypot(range_m, self._bias * pulse_m)
+            range_m = np.hypot(np.hypot(range_m, self._bias * pulse_m), self._clock_m)
             level = np.hypot(np.where(is_fitted, tops.level_sd, level), self._plan)
             across_rad = np.where(is_fitted & (reach_m > 0), tops.across_sd_rad, across_rad)
             others = listed_echoes(self._spread, image, tops, noise)
@@ -108,6 +112,8 @@ class PositionUncertainty:
             others = np.hypot(others, unlisted_echoes(self._spread, image, tops, noise))
             range_m = np.hypot(range_m, pulse_m * np.hypot(_HALF * others, _CLOSE_M * np.sqrt(unseen)))
             wrong = np.maximum(np.hypot(_HALF * others, _CLOSE_RAD * np.sqrt(unseen)), _FLAT)
+            if len(tops.range_m) > 1:
+                wrong = np.hypot(wrong, _UNSEEN)
             across_rad = np.hypot(across_rad, lobe_rad * wrong)
             level = np.hypot(level, np.hypot(_HALF * others, np.minimum(_CLOSE_NP * np.sqrt(unseen), _MOST_NP)))
         return Uncertainty(range_m, np.hypot(across_rad, _UNIFORM * tops.width_rad), level)

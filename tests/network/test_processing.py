@@ -339,7 +339,7 @@ def test_missed_error_budget_is_logged_once_per_sensor(cpu_loop, changes):
     loop.until(lambda: any(event == "error_budget" for event, _ in loop.lines))
     found = [fields for event, fields in loop.lines if event == "error_budget"]
     assert [fields["sensor"] for fields in found] == ["quiet"]
-    assert found[0]["text"].startswith("no echo was heard above the noise; the image shows this noise with an error")
+    assert found[0]["text"].startswith("no echo was heard above the noise; most of the image is the error of the plan")
 
 
 def test_sound_is_checked_ever_more_rarely(cpu_loop):

@@ -49,7 +49,7 @@ def _nearest(peak: Peak, found: Sequence[Peak]) -> tuple[float, float, float] | 
     errors = (
         (other.level_db - peak.level_db, other.range_m - peak.range_m, _angle_deg(peak, other)) for other in found
     )
-    near = [error for error in errors if abs(error[1]) <= _NEAR_M and error[2] <= _NEAR_DEG]
+    near = [error for error in errors if abs(error[1]) <= _NEAR_M and error[2] <= max(_NEAR_DEG, peak.angle_sd_deg)]
     return min(near, key=lambda error: (error[1] / _NEAR_M) ** 2 + (error[2] / _NEAR_DEG) ** 2, default=None)
 
 
