@@ -84,8 +84,7 @@ class PositionUncertainty:
         bias = _BIAS_OF_ONE_TAP if settings.accuracy.delay_taps == 1 else _BIAS
         self._bias = self._plan * (_BIAS_OF_FOUR_BEAM_TAPS if settings.accuracy.beam_taps == 4 else bias)
         recording = settings.recording
-        clock_s = 1 / recording.sample_rate_hz if recording.is_pdm else 0.0  # Bits tell no time within it.
-        self._clock_m = _UNIFORM * clock_s * sound_speed_m_s(settings.air) / 2
+        self._clock_s = 1 / recording.sample_rate_hz if recording.is_pdm else 0.0  # Bits tell no time within it.
         self._covariance_m2 = _effective_covariance_m2(positions_m, array_weights(settings))
 
     def __call__(self, image: Energyscape, tops: Tops, *, noise: float) -> Uncertainty:
@@ -104,7 +103,8 @@ class PositionUncertainty:
         if not self._noise_only:
             is_fitted = np.isfinite(tops.across_sd_rad)
             range_m = np.where(is_fitted, tops.range_sd_m, range_m)
-            range_m = np.hypot(np.hypot(range_m, self._bias * pulse_m), self._clock_m)
+            clock_m = _UNIFORM * self._clock_s * speed_m_s / 2
+            range_m = np.hypot(np.hypot(range_m, self._bias * pulse_m), clock_m)
             level = np.hypot(np.where(is_fitted, tops.level_sd, level), self._plan)
             across_rad = np.where(is_fitted & (reach_m > 0), tops.across_sd_rad, across_rad)
             others = listed_echoes(self._spread, image, tops, noise)

@@ -75,7 +75,7 @@ def count_matches(found, wanted):
         any(
             abs(peak["azimuth_deg"] - other.azimuth_deg) < 1.5
             and abs(peak["range_m"] - other.range_m) < 0.01
-            and abs(peak["level_db"] - other.level_db) < 1
+            and abs(peak["level_dbfs"] - other.level_dbfs) < 1
             for peak in found
         )
         for other in wanted
