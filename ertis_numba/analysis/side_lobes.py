@@ -226,8 +226,8 @@ def side_lobe_floor(
 
     The limit lies `SIDE_LOBE_DB` below the strongest amplitude of all ranges within a pulse length. ``highest``
     (range,) are the maxima over all directions at evenly spaced ranges. ``noise`` is the amplitude that noise alone
-    hardly reaches. It adds to side lobes, in power, because few of them are near the limit. The strongest amplitude
-    itself is no side lobe.
+    hardly reaches; its power adds to that of side lobes, because few side lobes are near the limit. The strongest
+    amplitude itself is no side lobe.
     """
     reach = max(1, round(PULSE_M / float(range_m[1] - range_m[0])))
     around = scipy.ndimage.maximum_filter1d(highest, 2 * reach + 1, mode="nearest")

@@ -1,4 +1,4 @@
-"""What works on a machine without Numba and llvmlite, in processes that cannot import them."""
+"""Functions that work without Numba and llvmlite, tried in processes that cannot import either."""
 
 import configparser
 import json
