@@ -46,11 +46,14 @@ def noise_note(count: int) -> str | None:
     """Return a note on maxima that noise from their direction may have caused; None if there are none."""
     if not count:
         return None
-    maxima = "1 maximum" if count == 1 else f"{count} maxima"
+    if count == 1:
+        return (
+            "1 maximum left out because a hiss, a tone or a click from its direction may have caused it; in dense "
+            "scenes, it may be a reflector beside stronger ones; 'ertis peaks --all' lists it"
+        )
     return (
-        f"{maxima} left out because a hiss, a tone or a click from {'its' if count == 1 else 'their'} direction may "
-        f"have caused {'it' if count == 1 else 'them'}; in dense scenes, reflectors beside stronger ones may be among "
-        "these; 'ertis peaks --all' lists them"
+        f"{count} maxima left out because a hiss, a tone or a click from their directions may have caused them; in "
+        "dense scenes, they may be reflectors beside stronger ones; 'ertis peaks --all' lists them"
     )
 
 
