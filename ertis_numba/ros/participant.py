@@ -153,7 +153,9 @@ class Topic:
     @property
     def n_subscribers(self) -> int:
         """Number of subscribers that are present and compatible."""
-        return len(self._writer.get_matched_subscriptions())
+        while True:
+            with suppress(IndexError):  # Cyclone DDS 11.0 raises it if a subscriber appears between its two calls.
+                return len(self._writer.get_matched_subscriptions())
 
     def publish(self, message: dict[str, Any]) -> bool:
         """Publish a message, a dict of its fields; return False if it was dropped."""
