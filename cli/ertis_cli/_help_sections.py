@@ -17,10 +17,10 @@ _SECTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     "Settings (default: those of the recording)": (
         *("settings", "method", "beamformer", "weighting"),
-        *("clean-within", "clean-above-mean", "array-weights", "wavefront", "last-stage", "bands", "average", "focus"),
+        *("clean", "array-weights", "wavefront", "last-stage", "bands", "average", "focus"),
     ),
     "Accuracy": ("max-error", "plan", "explain", "verify"),
-    "Computation": ("device", "threads", "batch", "workers", "scheduler"),
+    "Computation": ("device", "threads", "workers"),
 }
 """Long names of options by the heading above them."""
 _TITLES: Final = {name: title for title, names in _SECTIONS.items() for name in names}

@@ -1,5 +1,7 @@
 """Types of option values: intervals, directions, channels, error budgets and paths."""
 
+import math
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -7,11 +9,12 @@ from typing import Any
 import click
 
 from ertis_numba.base.constants import MAX_MICROPHONES
-from ertis_numba.settings.beamformers import BEAMFORMERS
+from ertis_numba.settings.beamformers import BEAMFORMERS, BeamformerOption
 
 __all__ = [
     "BEAMFORMER",
     "CHANNELS",
+    "CLEANING",
     "DIRECTION",
     "ELEVATION",
     "ERROR_BUDGET",
@@ -20,12 +23,36 @@ __all__ = [
     "INTERVAL",
     "NAMES",
     "TEXT_PATH",
+    "WORKERS",
 ]
 
 _MAX_DEG = 90.0  # limit of azimuth and elevation in front of an array
 
 
-class _Beamformer(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+class _Assignments(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
+    """Numbers as ``KEY=X,...``, by the names of their fields."""
+
+    def numbers(self, text: str, known: Mapping[str, BeamformerOption], usage: str) -> dict[str, float]:
+        """Return the numbers of a text by name; ``known`` has the key of each, and ``usage`` completes errors."""
+        found: dict[str, float] = {}
+        for each in text.split(","):
+            key, _, number = each.partition("=")
+            if key not in known:
+                self.fail(f"{each!r} is not an option of {usage}")
+            name, low, high = known[key].name, known[key].low, known[key].high
+            if name in found:
+                self.fail(f"{key} appears twice; state it once")
+            kind: Any = click.IntRange(low, int(high)) if isinstance(low, int) else click.FloatRange(low, high)
+            try:
+                found[name] = kind.convert(number, None, None)
+            except click.BadParameter as error:
+                self.fail(f"{each!r}: {error.message}")
+            if not math.isfinite(found[name]):
+                self.fail(f"{each!r}: use a finite number")
+        return found
+
+
+class _Beamformer(_Assignments):
     """Beamformer with its options, as fields of `Processing`."""
 
     name = "NAME[:OPTION=X,...]"
@@ -36,21 +63,37 @@ class _Beamformer(click.ParamType):  # type: ignore[type-arg]  # generic since c
         if name not in declared:
             self.fail(f"{name!r} is not a beamformer; choose one of {', '.join(declared)}", param, ctx)
         known = {option.name.removeprefix(f"{name}_"): option for option in declared[name]}
-        found: dict[str, Any] = {"beamformer": name}
-        for each in text.split(",") if colon else ():
-            key, _, number = each.partition("=")
-            if key not in known:
-                usage = f"use {name}:{', '.join(f'{other}=X' for other in known)}" if known else f"use {name} alone"
-                self.fail(f"{each!r} is not an option of {name}; {usage}", param, ctx)
-            if known[key].name in found:
-                self.fail(f"{key} appears twice; state it once", param, ctx)
-            low, high = known[key].low, known[key].high
-            kind: Any = click.IntRange(low, int(high)) if isinstance(low, int) else click.FloatRange(low, high)
-            try:
-                found[known[key].name] = kind.convert(number, param, ctx)
-            except click.BadParameter as error:
-                self.fail(f"{each!r}: {error.message}", param, ctx)
-        return found
+        usage = f"use {name}:{', '.join(f'{other}=X' for other in known)}" if known else f"use {name} alone"
+        return {"beamformer": name, **(self.numbers(text, known, f"{name}; {usage}") if colon else {})}
+
+
+class _Cleaning(_Assignments):
+    """Levels of range-wise cleaning, as fields of `Processing`."""
+
+    name = "within=DB,above_mean=DB"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> dict[str, float]:  # noqa: ARG002
+        known = {key: BeamformerOption(f"clean_{key}_db", 0.0, 1000.0, "") for key in ("within", "above_mean")}
+        return self.numbers(str(value), known, f"--clean; use {self.name}, or one of them")
+
+
+class _Workers(click.ParamType):  # type: ignore[type-arg]  # as above
+    """Number of processes, or the address of a dask scheduler."""
+
+    name = "N|tcp://HOST:PORT"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int | str:
+        if "://" in str(value):
+            return str(value)
+        with suppress(ValueError):
+            if int(value) > 0:
+                return int(value)
+        return self.fail(
+            f"{value!r} is not a number of workers; use a number of at least 1, or the address of a dask scheduler, "
+            "as in tcp://127.0.0.1:8786",
+            param,
+            ctx,
+        )
 
 
 class _Interval(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
@@ -148,6 +191,7 @@ class _Folder(_File):
 
 BEAMFORMER = _Beamformer()
 CHANNELS = _Channels()
+CLEANING = _Cleaning()
 DIRECTION = _Direction()
 ELEVATION = _Elevation()
 ERROR_BUDGET = _ErrorBudget()
@@ -156,3 +200,4 @@ FOLDER = _Folder(path_type=Path)
 INTERVAL = _Interval()
 NAMES = _Names()
 TEXT_PATH = _File()
+WORKERS = _Workers()

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ertis_cli import options
+from ertis_cli._config import typed
 
 if TYPE_CHECKING:
-    from ertis_numba.settings import Accuracy, Settings
+    from ertis_numba.settings import Accuracy
 
 __all__ = ["report_lines", "require_plan", "wavefront_note"]
 
@@ -16,13 +17,13 @@ _MIN_MS = 0.005
 _PART = "  {name:52}  {safe:>8}  {predicted:>14}"
 
 
-def require_plan(settings: "Settings", *, explain: bool, verify: bool, max_error_db: float | None) -> None:
+def require_plan(method: str | None) -> None:
     """Raise an error for options that need a plan if the method has none."""
-    asked = {"--explain": explain, "--verify": verify, "--max-error": max_error_db is not None}
     context = click.get_current_context()
-    for name, given in asked.items():
-        if given and settings.processing.method == "paper":
-            raise click.UsageError(f"{name} needs --method fast; method 'paper' has no plan", context)
+    for name in ("explain", "verify", "max_error_db", "plan") if method == "paper" else ():
+        if typed(name) if name == "plan" else context.params.get(name) not in {None, False}:
+            spelling = f"--{name.removesuffix('_db').replace('_', '-')}"
+            raise click.UsageError(f"{spelling} needs --method fast; method 'paper' has no plan", context)
 
 
 def report_lines(sensor: str, reported: dict[str, Any]) -> Iterator[str]:

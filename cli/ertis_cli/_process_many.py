@@ -29,17 +29,7 @@ _MAX_FAILED = 50  # limit for failed recordings in the final table
 def processing(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options for processing one or several recordings: checks, device and processes."""
     for option in (
-        click.option(
-            "--scheduler",
-            metavar="tcp://HOST:PORT",
-            help="Dask scheduler whose workers process several recordings.",
-        ),
-        click.option(
-            "--workers",
-            type=click.IntRange(min=1),
-            metavar="N",
-            help="Number of processes for several recordings; one per core by default.",
-        ),
+        options.workers(" for several recordings"),
         options.threads,
         options.device,
         click.option("--strict", is_flag=True, help="Refuse recordings with faulty microphones instead of warning."),
@@ -50,12 +40,11 @@ def processing(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def require_options_of_one() -> None:
     """Refuse options for several recordings."""
-    for name in ("workers", "scheduler"):
-        if typed(name):
-            raise click.UsageError(
-                f"--{name} applies to several recordings; add recordings, use a folder or a pattern, or end -o with /",
-                click.get_current_context(),
-            )
+    if typed("workers"):
+        raise click.UsageError(
+            "--workers applies to several recordings; add recordings, use a folder or a pattern, or end -o with /",
+            click.get_current_context(),
+        )
 
 
 def are_meant(paths: Sequence[str], target: str | None) -> bool:
@@ -74,8 +63,7 @@ def process_many(
     target: str | None,
     wanted: "CampaignOptions",
     *,
-    workers: int | None,
-    scheduler: str | None,
+    workers: int | str | None,
     quiet: bool,
     as_json: bool,
 ) -> None:
@@ -91,7 +79,7 @@ def process_many(
             context,
         )
     recordings = find_recordings(paths)
-    campaign = Campaign(recordings, target, wanted, workers=workers, scheduler=scheduler)
+    campaign = Campaign(recordings, target, wanted, workers=workers)
     report = _Report([found.path for found in recordings], quiet=quiet, as_json=as_json)
     with closing(campaign.run()) as events, _shown(len(recordings), quiet=quiet) as shown:
         for event in events:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["is_results_file", "require_image", "write_results"]
 
-_OF_IMAGES = ("batch", "dtype", "explain", "mounting", "scheduler", "strict", "verify", "workers")
+_OF_IMAGES = ("dtype", "explain", "mounting", "strict", "verify", "workers")
 
 
 def is_results_file(target: str | None) -> bool:

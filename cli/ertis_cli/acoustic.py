@@ -84,8 +84,7 @@ def acoustic(
     strict: bool,
     device: str,
     threads: int | None,
-    workers: int | None,
-    scheduler: str | None,
+    workers: int | str | None,
     mounting: Path | None,
     force: bool,
     quiet: bool,
@@ -126,9 +125,7 @@ def acoustic(
         result="acoustic_map",
     )
     if _process_many.are_meant(paths, target):
-        _process_many.process_many(
-            paths, target, wanted, workers=workers, scheduler=scheduler, quiet=quiet, as_json=as_json
-        )
+        _process_many.process_many(paths, target, wanted, workers=workers, quiet=quiet, as_json=as_json)
         return
     _process_many.require_options_of_one()
     path = Path(paths[0])

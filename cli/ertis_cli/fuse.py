@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _image_options, _pulses, _results, options
+from ertis_cli import _image_options, _plans, _pulses, _results, options
 from ertis_cli._help_sections import SectionedCommand
 
 if TYPE_CHECKING:
@@ -68,6 +68,7 @@ def fuse(
 
     def changed(recorded: "Settings") -> "Settings":
         settings = _image_options.with_given(recorded, settings_file=settings_file, preset=preset, given=given)
+        _plans.require_plan(settings.processing.method)
         _results.require_image(settings, 'fusion needs images; set last_stage = "envelope" in --settings FILE')
         return settings
 

@@ -18,6 +18,7 @@ from ertis_cli._naming import with_options
 from ertis_cli._parameter_types import (
     BEAMFORMER,
     CHANNELS,
+    CLEANING,
     DIRECTION,
     ELEVATION,
     ERROR_BUDGET,
@@ -26,6 +27,7 @@ from ertis_cli._parameter_types import (
     INTERVAL,
     NAMES,
     TEXT_PATH,
+    WORKERS,
 )
 from ertis_numba.base.units import counted
 from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS
@@ -92,6 +94,7 @@ __all__ = [
     "warn_of",
     "warn_of_spacing",
     "without",
+    "workers",
 ]
 
 Item = TypeVar("Item")
@@ -181,22 +184,24 @@ def beamforming(default: str = "") -> Decorator:
 
 
 def cleaning(default: str = "") -> Decorator:
-    """Return the options of range-wise cleaning, named like the fields of `Processing`."""
-    within = click.option(
-        "--clean-within",
-        "clean_within_db",
-        type=click.FloatRange(0, 1000),
-        metavar="DB",
-        help=f"Keep amplitudes within DB of the strongest direction of each range{default}.",
+    """Return the option of range-wise cleaning, whose value has the names of fields of `Processing`."""
+    return click.option(
+        "--clean",
+        type=CLEANING,
+        metavar=CLEANING.name,
+        help="Keep only amplitudes within DB of the strongest direction of each range, at least DB above the mean of "
+        f"each range, or both{default}.",
     )
-    above_mean = click.option(
-        "--clean-above-mean",
-        "clean_above_mean_db",
-        type=click.FloatRange(0, 1000),
-        metavar="DB",
-        help=f"Keep amplitudes at least DB above the mean of each range{default}.",
+
+
+def workers(of: str = "") -> Decorator:
+    """Return the option for processes on this machine or a cluster; ``of`` states their work."""
+    return click.option(
+        "--workers",
+        type=WORKERS,
+        metavar=WORKERS.name,
+        help=f"Number of worker processes{of}, one per core by default; or the dask scheduler whose workers to use.",
     )
-    return lambda command: within(above_mean(command))
 
 
 def without(text: str) -> Decorator:
@@ -332,7 +337,7 @@ def settings_with(
         keys = preset_tables(preset, "processing")["processing"]
         settings = settings.replace(processing=settings.processing.replace(**keys))
     given = {name: value for name, value in options.items() if value is not None}
-    given |= given.pop("beamformer", {})
+    given |= given.pop("beamformer", {}) | given.pop("clean", {})
     if elevation is not None:
         given["elevation_deg" if isinstance(elevation, float) else "elevation_limits_deg"] = elevation
     directions = given.get("directions", settings.processing.directions)

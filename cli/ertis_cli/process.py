@@ -64,14 +64,6 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
     "netCDF programs cannot read it.",
 )
 @_process_many.processing
-@click.option(
-    "--batch",
-    type=click.IntRange(min=1),
-    default=8,
-    show_default=True,
-    metavar="N",
-    help="Number of measurements to process at the same time, fewer for large images; 1 is one after the other.",
-)
 @_mountings.mounting
 @options.force
 @options.quiet
@@ -91,9 +83,7 @@ def process(
     strict: bool,
     device: str,
     threads: int | None,
-    batch: int,
-    workers: int | None,
-    scheduler: str | None,
+    workers: int | str | None,
     mounting: Path | None,
     force: bool,
     quiet: bool,
@@ -105,8 +95,8 @@ def process(
     Measurements without a call are left out; 'ertis acoustic' makes maps of their sound.
 
     The settings file overrides the settings of the recording, the preset overrides both, and other options override
-    all of them. The same recording gives the same amplitudes, bit by bit, for any number of threads and any batch. All
-    sensors of a recording go into one file, each with its own settings.
+    all of them. The same recording gives the same amplitudes, bit by bit, for any number of threads. All sensors of a
+    recording go into one file, each with its own settings.
 
     Several recordings, a pattern in quotes or a folder are processed on all cores into the folder given with -o, one
     file per recording. Existing results of the same recording and settings are kept. A failed recording does not stop
@@ -122,7 +112,7 @@ def process(
         settings = _image_options.with_given(recorded, settings_file=settings_file, preset=preset, given=given)
         if not _results.is_results_file(target):
             _results.require_image(settings)
-        _plans.require_plan(settings, explain=explain, verify=verify, max_error_db=other["max_error_db"])
+        _plans.require_plan(settings.processing.method)
         return settings
 
     from ertis_numba.campaign import CampaignOptions
@@ -135,7 +125,6 @@ def process(
         device=device,
         plan=plan,
         threads=threads,
-        batch=batch,
         strict=strict,
         overwrite=force,
         mounting=_mountings.mountings(mounting, None if sensor is None else [sensor]),
@@ -143,9 +132,7 @@ def process(
         verify=verify,
     )
     if _process_many.are_meant(paths, target):
-        _process_many.process_many(
-            paths, target, wanted, workers=workers, scheduler=scheduler, quiet=quiet, as_json=as_json
-        )
+        _process_many.process_many(paths, target, wanted, workers=workers, quiet=quiet, as_json=as_json)
         return
     _require_options_of_one(target)
     _write_one(Path(paths[0]), target, wanted, quiet=quiet, as_json=as_json)

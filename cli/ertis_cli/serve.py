@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _central_watch, _network, _presets, _supervisor, options
+from ertis_cli import _central_watch, _network, _plans, _presets, _supervisor, options
+from ertis_cli._config import typed
 from ertis_cli._saving import withdrawn
 
 if TYPE_CHECKING:
@@ -24,9 +25,7 @@ __all__ = ["serve"]
 @_central_watch.rotate_size
 @_central_watch.rotate_every
 @_central_watch.max_bytes
-@click.option(
-    "--workers", type=click.IntRange(1, 256), metavar="N", help="Number of worker processes; one per core by default."
-)
+@options.workers()
 @options.threads
 @options.without("Channels to exclude, such as those of faulty microphones")
 @_presets.processing_preset
@@ -65,7 +64,6 @@ __all__ = ["serve"]
     metavar="DIR",
     help="Dead-letter folder for measurements that made two workers fail.",
 )
-@click.option("--scheduler", metavar="ADDRESS", help="Scheduler of a dask.distributed cluster whose workers to use.")
 @click.option("--duration", type=float, metavar="S", help="Duration in seconds; until Ctrl-C by default.")
 @_network.key
 @_network.allow
@@ -82,7 +80,7 @@ def serve(
     rotate_size: float,
     rotate_every: float,
     max_bytes: int,
-    workers: int | None,
+    workers: int | str | None,
     threads: int | None,
     without: "ExcludedChannels",
     preset: str | None,
@@ -95,7 +93,6 @@ def serve(
     dtype: Literal["float32", "float16"],
     deadline: float,
     quarantine: Path | None,
-    scheduler: str | None,
     duration: float | None,
     key: str | None,
     allow: Path | None,
@@ -104,6 +101,7 @@ def serve(
     quiet: bool,
     as_json: bool,
     beamformer: dict[str, Any] | None,
+    clean: dict[str, float] | None,
     **other: Any,
 ) -> None:
     """Run a central node that computes and publishes images.
@@ -114,6 +112,12 @@ def serve(
     one line per event.
     """
     _central_watch.require_use(stores=folder is not None, as_json=as_json)
+    _plans.require_plan(method)
+    if isinstance(workers, str) and typed("threads"):
+        raise click.UsageError(
+            "--threads is for processes on this machine; remove it with --workers tcp://HOST:PORT",
+            click.get_current_context(),
+        )
     life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH, at_port
     from ertis_numba.network.central_node import CentralNode
@@ -125,7 +129,14 @@ def serve(
     _network.require_address("--publish", publish)
     served = _network.metrics(metrics, lambda: node.latest)
     publish = life.addresses.get("publish") or publish or DEFAULT_PUBLISH
-    given = {"directions": directions, "range_m": range_m, "method": method, **other, **(beamformer or {})}
+    given = {
+        "directions": directions,
+        "range_m": range_m,
+        "method": method,
+        **other,
+        **(beamformer or {}),
+        **(clean or {}),
+    }
     changes = _processing(preset, given)
     keys = _network.server_keys(key, allow)
     with withdrawn(folder, quarantine) as made:
@@ -148,7 +159,6 @@ def serve(
                 expected=Settings.from_preset(
                     "default_25_50"
                 ),  # most sensors use it; kernels are then ready for their first measurement
-                cluster=scheduler,
             )
         )
         archive = None if folder is None else _central_watch.archive(folder, name, rotate_size, rotate_every)

@@ -45,8 +45,7 @@ _ONLY = {
     "threshold": (_IMAGES,),
     "range_m": (_IMAGES,),
     "decay": (_IMAGES,),
-    "clean_within_db": (_IMAGES,),
-    "clean_above_mean_db": (_IMAGES,),
+    "clean": (_IMAGES,),
     "band": (_MAPS,),
     "max_level": (_MAPS,),
 }
@@ -152,8 +151,7 @@ def view(
     range_m: tuple[float, float] | None,
     decay: float,
     colours: str,
-    clean_within_db: float | None,
-    clean_above_mean_db: float | None,
+    clean: dict[str, float] | None,
     loop: bool,
     duration: float | None,
     html: Path | None,
@@ -210,8 +208,7 @@ def view(
             host="127.0.0.1" if at_once else host,  # no other machine may connect while the page is written
             port=0 if at_once else port,
             choices=_fitting(choices, kind, source, dynamic_range=dynamic_range),
-            clean_within_db=clean_within_db,
-            clean_above_mean_db=clean_above_mean_db,
+            **(clean or {}),
             on_note=lambda text: options.say(text, quiet=quiet),
         ) as shown,
     ):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ertis_numba.base import checks
-from ertis_numba.base.errors import ArgumentError, ErtisError
+from ertis_numba.base.errors import ErtisError
 from ertis_numba.base.forks import usable_cores
 from ertis_numba.campaign.echo_measurements import count_images, no_images, passive_note, require_images
 from ertis_numba.campaign.events import Event, Outcome, RecordingEnded, RecordingProgress, RecordingStarted
@@ -67,17 +67,16 @@ class Campaign:
         Output folder. It is created if it does not exist.
     options : CampaignOptions, optional
         Options for each recording.
-    workers : int, optional
+    workers : int or str, optional
         Number of processes on this machine. By default, there is one for a GPU. On CPUs, there are as many as the cores
-        allow with ``options.threads`` threads each, or with 1 if it is None.
-    scheduler : str, optional
-        Address of a dask scheduler. Its workers then replace the processes on this machine.
+        allow with ``options.threads`` threads each, or with 1 if it is None. The address of a dask scheduler, as in
+        ``"tcp://127.0.0.1:8786"``, uses its workers instead.
 
     Raises
     ------
     ArgumentError
-        Two recordings have the same output file, the folder cannot be created, both ``workers`` and ``scheduler`` are
-        given, or channels are excluded of a sensor that is in no recording.
+        Two recordings have the same output file, the folder cannot be created, or channels are excluded of a sensor
+        that is in no recording.
     """
 
     def __init__(
@@ -86,16 +85,10 @@ class Campaign:
         folder: str | Path,
         options: CampaignOptions | None = None,
         *,
-        workers: int | None = None,
-        scheduler: str | None = None,
+        workers: int | str | None = None,
     ) -> None:
-        if workers is not None:
-            checks.integer("workers", workers, 1)
-            if scheduler is not None:
-                raise ArgumentError(
-                    "workers and scheduler cannot be combined, because a scheduler has its own workers; choose one of "
-                    "them"
-                )
+        self._scheduler = workers if isinstance(workers, str) else None
+        self._workers = None if isinstance(workers, str | None) else checks.integer("workers", workers, 1)
         self.folder, self._options = Path(folder), options or CampaignOptions()
         targets = output_paths(recordings, self.folder, self._options.result)
         self._names = {target.name for target in targets}
@@ -103,7 +96,6 @@ class Campaign:
         self._waiting = deque(map(_RecordingState, recordings, targets))
         if self._options.without.of_sensor:
             self._options.without.require_known(known_sensors(recordings))
-        self._workers, self._scheduler = workers, scheduler
         self._plans = Plans()
         self._unplanned: deque[_RecordingState] = deque()
         self._ready: deque[_RecordingState] = deque()

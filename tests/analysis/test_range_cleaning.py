@@ -135,7 +135,7 @@ def test_process_command_cleans_and_still_verifies(tmp_path):
     recording, target = tmp_path / "noise.h5", tmp_path / "images.h5"
     measurements = noise(SHORT, 2)
     write_recording(recording, measurements)
-    options = ["--clean-within", str(WITHIN_DB), "--clean-above-mean", str(ABOVE_MEAN_DB), "--verify", "-q"]
+    options = ["--clean", f"within={WITHIN_DB},above_mean={ABOVE_MEAN_DB}", "--verify", "-q"]
     done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), *options])
     assert done.exit_code == 0, done.output
     settings = cleaned_settings(WITHIN_DB, ABOVE_MEAN_DB)
@@ -143,9 +143,9 @@ def test_process_command_cleans_and_still_verifies(tmp_path):
         assert images.settings.processing == settings.processing
         for image, measurement in zip(images, measurements, strict=True):
             assert image.amplitude.tobytes() == pipeline.process(measurement).amplitude.tobytes()
-    done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), "--clean-within", "-1"])
+    done = CliRunner().invoke(cli, ["process", str(recording), "-o", str(target), "--clean", "within=-1"])
     assert done.exit_code == 2
-    assert "'--clean-within': -1.0 is not in the range 0<=x<=1000" in done.stderr
+    assert "'--clean': 'within=-1': -1.0 is not in the range 0.0<=x<=1000.0" in done.stderr
 
 
 def test_central_node_publishes_cleaned_images_and_their_points():
@@ -170,7 +170,7 @@ def test_view_shows_cleaned_images(tmp_path):
     drawn, all_drawn = (each.draw(lowest).sensors[image.stamp.sensor] for each in (scene, plain))
     assert (drawn.picture != all_drawn.picture).any()
     path, page = write_energyscapes(tmp_path / "images.h5", [image]), tmp_path / "page.html"
-    options = ["--save-html", str(page), "--clean-within", "3", "--clean-above-mean", "6", "-q"]
+    options = ["--save-html", str(page), "--clean", "within=3,above_mean=6", "-q"]
     done = CliRunner().invoke(cli, ["view", str(path), *options])
     assert done.exit_code == 0, done.output
     assert page.stat().st_size > 0

@@ -78,16 +78,16 @@ def test_cluster_files_equal_local_files(process_scheduler, scheduler, runs, tmp
     run_here(monkeypatch, [runs], tmp_path / "here", SLOW)
     (runs / "broken.h5").write_bytes(b"broken")
     monkeypatch.chdir(tmp_path)  # the worker has another current folder
-    events = list(Campaign(find_recordings(["runs"]), "out", SLOW, scheduler=process_scheduler).run())
+    events = list(Campaign(find_recordings(["runs"]), "out", SLOW, workers=process_scheduler).run())
     found = ended(events)
     assert outcomes(found) == {**dict.fromkeys(["a.h5", "b.h5", "c.h5"], "made"), "broken.h5": "failed"}
     assert "broken.h5 is not an HDF5 file" in found["broken.h5"].error
     assert names_in(tmp_path / "out") == names_in(tmp_path / "here")
     here, there = ({item.name: item.read_bytes() for item in (tmp_path / name).iterdir()} for name in ("here", "out"))
     assert [name for name in here if here[name] != there[name]] == []
-    again = ended(Campaign(find_recordings(["runs"]), "out", SLOW, scheduler=process_scheduler).run())
+    again = ended(Campaign(find_recordings(["runs"]), "out", SLOW, workers=process_scheduler).run())
     assert set(outcomes(again).values()) == {"kept", "failed"}
-    ended(Campaign(find_recordings(["runs"]), "both", SLOW, scheduler=scheduler).run())
+    ended(Campaign(find_recordings(["runs"]), "both", SLOW, workers=scheduler).run())
     assert [name for name in here if here[name] != (tmp_path / "both" / name).read_bytes()] == []
 
 
@@ -95,7 +95,7 @@ def test_cluster_workers_report_recordings_with_another_call(scheduler, tmp_path
     (tmp_path / "runs").mkdir()
     for name, call in {"same": CALL, "other": REVERSED}.items():
         write_recording(tmp_path / "runs" / f"{name}.h5", [heard(call)])
-    found = ended(list(Campaign(find_recordings([tmp_path / "runs"]), tmp_path / "out", scheduler=scheduler).run()))
+    found = ended(list(Campaign(find_recordings([tmp_path / "runs"]), tmp_path / "out", workers=scheduler).run()))
     with open_energyscapes(tmp_path / "out" / "other.energy.h5") as images:
         assert images.call_warning
         assert sum(images.call_warning in each for each in found["other.h5"].made["warnings"]) == 1
@@ -105,7 +105,7 @@ def test_cluster_workers_report_recordings_with_another_call(scheduler, tmp_path
 def test_progress_is_reported_and_close_ends_the_work(scheduler, long_runs, tmp_path, monkeypatch):
     monkeypatch.setattr(dask_workers, "_REPORT_INTERVAL_S", 0.0)
     out = tmp_path / "out"
-    events = Campaign(find_recordings([long_runs / "b.h5"]), out, SLOW, scheduler=scheduler).run()
+    events = Campaign(find_recordings([long_runs / "b.h5"]), out, SLOW, workers=scheduler).run()
     kinds = []
     for event in events:
         kinds.append(type(event))
@@ -126,7 +126,7 @@ def test_killed_dask_workers_lose_nothing(process_scheduler, long_runs, tmp_path
     found = {}
     with client_of(scheduler) as client:
         pids = client.run(os.getpid)
-        for event in Campaign(find_recordings([long_runs]), out, SLOW, scheduler=scheduler).run():
+        for event in Campaign(find_recordings([long_runs]), out, SLOW, workers=scheduler).run():
             if isinstance(event, RecordingStarted) and event.measurements == LONG:
                 for pid in pids.values():
                     os.kill(pid, signal.SIGKILL)
@@ -138,7 +138,7 @@ def test_killed_dask_workers_lose_nothing(process_scheduler, long_runs, tmp_path
 @pytest.mark.usefixtures("runs")
 def test_cluster_command_of_the_page_runs(scheduler, tmp_path, monkeypatch):
     page = path_of("many").read_text("utf-8")
-    (line,) = re.findall(r"\$ ertis (.* --scheduler .*)", page)
+    (line,) = re.findall(r"\$ ertis (.* --workers tcp.*)", page)
     monkeypatch.chdir(tmp_path)
     words = line.replace("'", "").replace("tcp://127.0.0.1:8786", scheduler).split()
     done = CliRunner().invoke(cli, words)
@@ -209,7 +209,7 @@ def test_dask_is_silent_while_a_campaign_runs(monkeypatch):
 def test_missing_scheduler_is_reported(monkeypatch, runs, tmp_path):
     monkeypatch.setattr(dask_workers, "_CONNECT_S", 0.5)
     with pytest.raises(NetworkError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        list(Campaign(find_recordings([runs]), tmp_path / "out", scheduler="tcp://127.0.0.1:9").run())
+        list(Campaign(find_recordings([runs]), tmp_path / "out", workers="tcp://127.0.0.1:9").run())
 
 
 def test_missing_workers_are_reported(monkeypatch, runs, tmp_path):
@@ -219,12 +219,12 @@ def test_missing_workers_are_reported(monkeypatch, runs, tmp_path):
         cluster_of_threads(0) as address,
         pytest.raises(NetworkError, match=r"has no workers; start some with 'dask worker tcp://"),
     ):
-        list(Campaign(find_recordings([runs]), tmp_path / "out", scheduler=address).run())
+        list(Campaign(find_recordings([runs]), tmp_path / "out", workers=address).run())
 
 
 def test_lost_scheduler_is_reported(runs, tmp_path):
     with cluster_of_threads(1) as address:
-        events = Campaign(find_recordings([runs]), tmp_path / "out", WANTED, scheduler=address).run()
+        events = Campaign(find_recordings([runs]), tmp_path / "out", WANTED, workers=address).run()
         next(events)  # From here on, the campaign submits no task until the next event is requested.
     with pytest.raises(NetworkError, match=r"is gone; finished output stays"):
         list(events)

@@ -183,7 +183,7 @@ def test_workers_that_cannot_start_are_reported(runs, tmp_path, monkeypatch):
 def command(runs, out):
     return [
         *(sys.executable, "-m", "ertis_cli", "process", str(runs / "*.h5"), "-o", str(out), "--workers", "2"),
-        *("--range", "0.5:0.8", "--directions", "2d:300", "--batch", "1", "--device", "numpy"),
+        *("--range", "0.5:0.8", "--directions", "2d:300", "--device", "numpy"),
     ]
 
 

@@ -22,6 +22,16 @@ def recording(tmp_path):
 
 
 @pytest.fixture
+def limit(recording, tmp_path, monkeypatch):
+    """Return a function that limits the number of measurements per batch by the memory for their images."""
+    run(recording, "-o", tmp_path / "img.h5", *FAST)
+    with open_energyscapes(tmp_path / "img.h5") as images:
+        image_bytes = images[0].amplitude.nbytes
+    (tmp_path / "img.h5").unlink()
+    return lambda count: monkeypatch.setattr(sensor_processing, "MAX_WAITING_BYTES", count * image_bytes)
+
+
+@pytest.fixture
 def sizes(monkeypatch):
     """Record the number of measurements in each pipeline call, and count closed pipelines."""
     calls = {"sizes": [], "closed": 0}
@@ -51,12 +61,13 @@ def run(*arguments, code=0):
     return done
 
 
-def test_file_is_independent_of_the_batch_size(recording, tmp_path, monkeypatch):
+def test_file_is_independent_of_the_batch_size(recording, tmp_path, monkeypatch, limit):
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")  # Otherwise the creation times differ.
     files = []
     for batch in (1, 3, 100):
         target = tmp_path / "img.h5"
-        run(recording, "-o", target, *FAST, "--batch", batch, "--force")
+        limit(batch)
+        run(recording, "-o", target, *FAST, "--force")
         files.append(target.read_bytes())
     assert len(set(files)) == 1
     with open_energyscapes(target) as images:
@@ -65,23 +76,13 @@ def test_file_is_independent_of_the_batch_size(recording, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "wanted"), [([], [7]), (["--batch", 3], [3, 3, 1]), (["--batch", 1], [1] * 7), (["--batch", 9], [7])]
+    ("room", "wanted"), [(9, [7]), (3, [3, 3, 1]), (2.5, [2, 2, 2, 1]), (1, [1] * 7), (0.5, [1] * 7)]
 )
-def test_batches_have_the_given_size(recording, tmp_path, sizes, arguments, wanted):
-    run(recording, "-o", tmp_path / "img.h5", *FAST, *arguments)
+def test_batch_is_as_large_as_its_images_allow(recording, tmp_path, limit, sizes, room, wanted):
+    limit(room)
+    run(recording, "-o", tmp_path / "img.h5", *FAST)
     predicted, *made = sizes.pop("sizes")  # The first image is also processed to predict its error.
     assert (predicted, made, sizes) == (1, wanted, {"closed": 1})
-
-
-def test_batch_of_large_images_is_smaller(recording, tmp_path, sizes, monkeypatch):
-    run(recording, "-o", tmp_path / "img.h5", *FAST)
-    with open_energyscapes(tmp_path / "img.h5") as images:
-        image_bytes = images[0].amplitude.nbytes
-    for room, wanted in ((2.5, [2, 2, 2, 1]), (0.5, [1] * 7)):
-        sizes["sizes"].clear()
-        monkeypatch.setattr(sensor_processing, "MAX_WAITING_BYTES", room * image_bytes)
-        run(recording, "-o", tmp_path / "img.h5", *FAST, "--force")
-        assert sizes["sizes"] == [1, *wanted]  # The first image is processed twice to predict its error.
 
 
 def test_reported_time_is_per_measurement(recording, tmp_path, monkeypatch):
@@ -93,24 +94,22 @@ def test_reported_time_is_per_measurement(recording, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("batch", [1, 3, 8])
-def test_damage_within_a_batch_is_reported_and_leaves_no_file(recording, tmp_path, batch):
+def test_damage_within_a_batch_is_reported_and_leaves_no_file(recording, tmp_path, limit, batch):
+    limit(batch)
     with h5py.File(recording, "r+") as file:
         file["sensors/eRTIS-7/pdm"][4, 777] ^= 1 << 9
-    done = run(recording, "-o", tmp_path / "img.h5", *FAST, "--batch", batch, code=1)
+    done = run(recording, "-o", tmp_path / "img.h5", *FAST, code=1)
     assert "rec.h5: measurement 4 has CRC-32" in done.stderr
     assert done.stderr.count("\n") == 1
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
-def test_failure_within_a_batch_leaves_no_file(tmp_path):
+def test_failure_within_a_batch_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(sensor_processing, "MAX_WAITING_BYTES", 1)  # one image at a time
     measurements = noise(count=5)
     warm = SMALL.replace(air=Air(temperature_c=35.0))
     measurements[3] = noise(warm, count=5)[3]
     recording = write_recording(tmp_path / "rec.h5", measurements)
-    done = run(recording, "-o", tmp_path / "img.h5", *FAST, "--batch", 2, code=1)
+    done = run(recording, "-o", tmp_path / "img.h5", *FAST, code=1)
     assert "measurement 13 was taken at 35 °C" in done.stderr
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
-
-
-def test_batch_of_zero_is_refused(recording):
-    assert "0 is not in the range x>=1" in run(recording, "--batch", 0, code=2).stderr

@@ -114,14 +114,14 @@ def test_images_beyond_the_budget_are_not_written(runs, monkeypatch):
             2,
             "--workers applies to several recordings; add recordings, use a folder or a pattern",
         ),
-        (["runs/a.h5", "--scheduler", "tcp://x:1"], 2, "--scheduler applies to several recordings"),
+        (["runs/a.h5", "--workers", "tcp://x:1"], 2, "--workers applies to several recordings"),
+        (["runs", "-o", "out", "--workers", "0"], 2, "'0' is not a number of workers; use a number of at least 1"),
         (["none/*.h5", "-o", "out"], 1, "no file matches none/*.h5; choose another pattern"),
         (
             ["runs", "-o", "runs/a.h5"],
             2,
             "-o runs/a.h5 names a file, but several recordings need a folder; use -o runs/a/",
         ),
-        (["runs", "-o", "out", "--workers", "2", "--scheduler", "tcp://x:1"], 1, "choose one of them"),
         (["runs", "-o", "out", "--directions", "90", "--azimuth", "-9:9"], 2, "directions 90 have fixed limits"),
         (["runs", "-o", "out", "--method", "paper", "--explain"], 2, "--explain needs --method fast"),
     ],
@@ -151,9 +151,7 @@ def test_progress_bars_appear_on_a_terminal(runs, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stderr", terminal)
     (runs / "broken.h5").unlink()
     with click.Context(click.Command("process")):
-        _process_many.process_many(
-            ["runs"], "out", CampaignOptions(), workers=None, scheduler=None, quiet=False, as_json=True
-        )
+        _process_many.process_many(["runs"], "out", CampaignOptions(), workers=None, quiet=False, as_json=True)
     shown = re.sub(r"\x1b\[[\d;?]*\w", "", terminal.getvalue())  # Remove colours.
     assert re.search(r"recordings ━+ \d/2", shown)
     assert "out/a.energy.h5: 3 measurements" in shown

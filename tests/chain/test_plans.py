@@ -158,6 +158,7 @@ def test_unreachable_budget_is_refused(recording, tmp_path):
         (["--max-error", "good"], "'good' is not an error budget; use dB, as in -40, or draft, standard, fine, exact"),
         (["--method", "paper", "--explain"], "--explain needs --method fast; method 'paper' has no plan"),
         (["--method", "paper", "--max-error", "fine"], "--max-error needs --method fast"),
+        (["--method", "paper", "--plan", "nominal"], "--plan needs --method fast"),
     ],
 )
 def test_plan_options_need_the_fast_method(recording, arguments, reported):

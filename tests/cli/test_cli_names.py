@@ -51,7 +51,15 @@ USAGE = {
     "capture --port p -n 1 --emissions 2 --emission-period 0 --dry-run": "--emission-period is 0; use a number",
     "sensors emulate r.h5 --unplug nan:5": "Invalid value for '--unplug': 'nan:5' is not an absence; use two times",
     "sensors emulate r.h5 --unplug -1:5": "Invalid value for '--unplug': '-1:5' is not an absence; use two times",
-    "view i.h5 --clean-within nan": "--clean-within is nan; use a finite number",
+    "serve --method paper --plan measured": "--plan needs --method fast; method 'paper' has no plan",
+    "serve --workers tcp://127.0.0.1:9 --threads 2": "--threads is for processes on this machine; remove it with --w",
+    "view i.h5 --clean within=nan": "Invalid value for '--clean': 'within=nan': use a finite number",
+    "view i.h5 --clean above-mean=6": (
+        "Invalid value for '--clean': 'above-mean=6' is not an option of --clean; use within=DB,above_mean=DB, or one"
+    ),
+    "process r.h5 -o a.h5 --beamformer capon:diagonal_loading=nan": (
+        "Invalid value for '--beamformer': 'diagonal_loading=nan': use a finite number"
+    ),
     "sensors calibrate r.h5 -o a.toml --gain-tolerance nan": "--gain-tolerance is nan; use a finite number",
     "sensors status tcp://127.0.0.1:9 --patience 0": "--patience is 0; use a number above 0",
     "listen localhost": "address 'localhost' cannot be used; use tcp://HOST:PORT",

@@ -49,7 +49,7 @@ process rec.h5 -o y.h5 --without five
 process rec.h5 -o y.h5 --device gpu
 process rec.h5 -o y.h5 --threads 0
 process rec.h5 -o y.h5 --threads 1000
-process rec.h5 -o y.h5 --batch 0
+process rec.h5 -o y.h5 --workers 0
 process rec.h5 -o y.h5 --settings nope.toml
 process rec.h5 -o y.h5 --settings text.toml
 process rec.h5 -o y.h5 --settings other.toml

@@ -8,6 +8,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 from ertis_numba import kernels
+from ertis_numba.campaign import sensor_processing
 from ertis_numba.settings import Accuracy
 from ertis_numba.storage import open_energyscapes, write_recording
 from tests import reference
@@ -32,9 +33,9 @@ def made(tmp_path_factory):
     return found
 
 
-def run(recording, device, *arguments):
+def run(recording, device):
     target = recording.with_name(f"{recording.stem} {device}.h5")
-    command = ["process", recording, "-o", target, "--device", device, "--force", "--json", *arguments]
+    command = ["process", recording, "-o", target, "--device", device, "--force", "--json"]
     done = CliRunner().invoke(cli, [str(argument) for argument in command])
     assert done.exit_code == 0, (done.stderr, done.exception)
     with open_energyscapes(target) as images:
@@ -66,9 +67,10 @@ def test_images_of_cpu_and_cuda_plans_differ_by_their_errors_at_most(made):
         assert reference.error_db(cpu, cuda) < BUDGET_DB + 6.1  # both errors at their limit, with opposite signs
 
 
-def test_cuda_file_is_independent_of_the_batch_size(made, tmp_path):
+def test_cuda_file_is_independent_of_the_batch_size(made, tmp_path, monkeypatch):
     recording = write_recording(tmp_path / "rec.h5", noise(TINIER.replace(accuracy=DIRECT), count=COUNT))
-    report, amplitudes = run(recording, "cuda", "--batch", 1)
+    monkeypatch.setattr(sensor_processing, "MAX_WAITING_BYTES", 1)  # one image at a time
+    report, amplitudes = run(recording, "cuda")
     assert report["measurements"] == COUNT
     assert amplitudes.tobytes() == made["explicit", "cuda"][1].tobytes()
 

@@ -39,7 +39,7 @@ def scheduler():
 
 @pytest.fixture
 def cluster(scheduler):
-    runner = Cluster(ProcessingOptions(cluster=scheduler, deadline_s=LONG_S), lambda _: None)
+    runner = Cluster(ProcessingOptions(workers=scheduler, deadline_s=LONG_S), lambda _: None)
     yield runner
     runner.close()
 
@@ -145,7 +145,7 @@ def test_cluster_reports_samples_of_wrong_length(cluster, measurement):
 @pytest.fixture
 def cluster_to_kill():
     with local_cluster(2) as address:
-        runner = Cluster(ProcessingOptions(cluster=address, device="numpy", deadline_s=LONG_S), lambda _: None)
+        runner = Cluster(ProcessingOptions(workers=address, device="numpy", deadline_s=LONG_S), lambda _: None)
         yield runner
         runner.close()
 
@@ -181,7 +181,7 @@ def test_cluster_recovers_jobs_of_a_killed_worker(cluster_to_kill):
 
 def test_cluster_abandons_jobs_after_their_deadline(scheduler, measurement):
     stated = []
-    runner = Cluster(ProcessingOptions(cluster=scheduler, deadline_s=1e-6), stated.append)
+    runner = Cluster(ProcessingOptions(workers=scheduler, deadline_s=1e-6), stated.append)
     kind = kind_of(measurement)
     runner.prepare(kind)
     events_of(runner)
@@ -221,7 +221,7 @@ def test_forgotten_job_kind_can_be_prepared_again(cluster, measurement):
 def test_cluster_reports_a_missing_scheduler(monkeypatch):
     monkeypatch.setattr("ertis_numba.network.processing.cluster._CONNECT_S", 0.5)
     with pytest.raises(ertis.NetworkError, match=r"no dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        Cluster(ProcessingOptions(cluster="tcp://127.0.0.1:9"), lambda _: None)
+        Cluster(ProcessingOptions(workers="tcp://127.0.0.1:9"), lambda _: None)
 
 
 @pytest.mark.parametrize("address", ["foo", "http://127.0.0.1:9", "silent"])

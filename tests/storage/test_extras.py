@@ -15,8 +15,8 @@ ROOT = Path(__file__).parents[2]
 NEEDED_BY = {
     "browser": ["{root}/docs/pictures/view.py"],
     "cluster": [
-        "process a.h5 b.h5 -o out/ --scheduler tcp://127.0.0.1:1",
-        "serve --listen tcp://127.0.0.1:0 --publish tcp://127.0.0.1:0 --scheduler tcp://127.0.0.1:1",
+        "process a.h5 b.h5 -o out/ --workers tcp://127.0.0.1:1",
+        "serve --listen tcp://127.0.0.1:0 --publish tcp://127.0.0.1:0 --workers tcp://127.0.0.1:1",
     ],
     "cu12": ["process a.h5 -o a.energy.h5 --device cuda"],
     "cu13": ["process a.h5 -o a.energy.h5 --device cuda"],

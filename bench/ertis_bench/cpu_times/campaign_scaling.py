@@ -85,7 +85,7 @@ def _crews(address: str) -> dict[str, dict[str, Any]]:
             f"{cores} workers of 1 thread": {"workers": cores, "threads": 1},
             f"{cores} workers of {cores} threads": {"workers": cores, "threads": cores},
         }
-    return crews | {f"dask's LocalCluster, {cores} workers of 1 thread": {"scheduler": address}}
+    return crews | {f"dask's LocalCluster, {cores} workers of 1 thread": {"workers": address}}
 
 
 def _recordings(folder: Path, count: int) -> tuple[Path, str]:

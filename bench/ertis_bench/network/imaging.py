@@ -42,7 +42,7 @@ def processing(
     sensors = [f"sensor-{number + 1}" for number in range(n_sensors)]
     options, given, boss = create_keys(folder, sensors)
     if scheduler is not None:
-        options += ["--scheduler", scheduler]
+        options += ["--workers", scheduler]
     if archive is not None:
         archive.mkdir()
         options += ["--record", str(archive)]

@@ -26,14 +26,13 @@ class ProcessingOptions:
     without: ExcludedChannels = field(default_factory=ExcludedChannels)  # channels to exclude, of all or some sensors
     device: str = "auto"
     plan: PlanCosts = "nominal"  # as for `Pipeline`
-    workers: int | None = None  # processes; one for each core, or one for a GPU
+    workers: int | str | None = None  # processes; one for each core, or one for a GPU; or a dask scheduler's address
     threads: int | None = None  # of all workers together; all cores by default
     deadline_s: float = 2.0  # after that, the worker of a measurement is killed
     prepare_s: float = 300.0  # includes the compilation of kernels for a sensor
     dtype: Literal["float32", "float16"] = "float32"  # of published images
     quarantine: Path | None = None  # dead-letter folder, for measurements that made two workers fail
     expected: Settings | None = None  # of a likely sensor, to prepare for in advance
-    cluster: str | None = None  # dask scheduler whose workers replace local ones
 
     def __post_init__(self) -> None:
         checks.choice("plan", self.plan, PLAN_COSTS)
@@ -42,7 +41,8 @@ class ProcessingOptions:
         checks.positive("deadline", self.deadline_s)
         checks.positive("prepare_s", self.prepare_s)
         for name in ("workers", "threads"):
-            if (value := getattr(self, name)) is not None:
+            value = getattr(self, name)
+            if value is not None and not (name == "workers" and isinstance(value, str)):
                 checks.integer(name, value, 1, 256)
         if self.quarantine is not None and not self.quarantine.is_dir():
             raise ArgumentError(f"quarantine folder {self.quarantine} does not exist; create it first")

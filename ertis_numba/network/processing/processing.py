@@ -398,7 +398,7 @@ class ImageProcessing:
 
 
 def _runner(options: ProcessingOptions, log: EventLog) -> Runner:
-    if options.cluster is None:
+    if not isinstance(options.workers, str):
         return LocalWorkerPool(options, log)
     from ertis_numba.network.processing.cluster import Cluster  # noqa: PLC0415  which needs another package
 

@@ -53,7 +53,7 @@ class LocalWorkerPool:
         self._options, self._log = options, log
         self._reported: set[tuple[str, str]] = set()  # Sensors and events, which are logged once for their settings.
         self._threads = options.threads or usable_cores()
-        count = options.workers or (1 if options.device in {"cuda", "numpy"} else self._threads)
+        count = int(options.workers or (1 if options.device in {"cuda", "numpy"} else self._threads))
         self._chosen = Choice(count, self._threads)
         self._kinds: dict[int, JobKind] = {}
         self._prepared: dict[int, Prepared] = {}
