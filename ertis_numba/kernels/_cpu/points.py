@@ -8,21 +8,23 @@ from numba import njit
 
 from ertis_numba.kernels._contract.points import ABSENT, PointKernels
 from ertis_numba.kernels._cpu.echo_fits import fit_echoes
-from ertis_numba.kernels._cpu.pulse_table import at_path, carrier_of, place_of
+from ertis_numba.kernels._cpu.pulse_table import pulse_at, unit_at
 
 __all__ = ["KERNELS"]
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def spread_amplitudes(pulse, path_m, out):
     """Compute the amplitudes of the image of a reflector, relative to that at its place."""
+    table, rate_1_m = pulse.table.view(np.float64), 1.0 / pulse.step_m
     for place in range(len(out)):
-        total = 0j
+        here, real, imag = path_m[place], 0.0, 0.0
         for mic in range(len(pulse.weights)):
-            before, between = place_of(pulse, path_m[place, mic])
-            carrier = pulse.weights[mic] * carrier_of(pulse, path_m[place, mic])
-            total += at_path(pulse.table, before, between, path_m[place, mic]) * carrier
-        out[place] = abs(total) / len(pulse.weights)
+            a, b = pulse_at(table, rate_1_m, here[mic])
+            cosine, sine = unit_at(pulse.carrier_1_m * here[mic])
+            real += pulse.weights[mic] * (a * cosine - b * sine)
+            imag += pulse.weights[mic] * (a * sine + b * cosine)
+        out[place] = math.sqrt(real * real + imag * imag) / len(pulse.weights)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
