@@ -19,7 +19,7 @@ class Bearing(RadiansFromDegrees):
     Attributes
     ----------
     azimuth_deg, elevation_deg : float
-        Direction in the sensor frame in degrees.
+        Direction in the sensor frame in degrees. A flat array sees a source behind it as its mirror image in front.
     sideways_deg, upwards_deg : float
         Standard deviations of the direction along the sphere, horizontally and vertically, in degrees. They include
         noise only, not errors of the array. They are infinite if they are unknown: ``upwards_deg`` for directions of
