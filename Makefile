@@ -124,6 +124,7 @@ gpu: $(VENV)/ready  ## test and time this machine's NVIDIA GPU in less than ten 
 release: $(VENV)/ready  ## build the distributions of the last commit in dist, and try them in empty environments
 	$(BIN)/python -m pip install --quiet --editable '.[release]'
 	$(BIN)/cffconvert --validate
+	$(BIN)/python -c "from rattler_build import Stage0Recipe; Stage0Recipe.from_file('conda/recipe.yaml').render()"
 	$(BIN)/python -m tests.release dist docs/how-to/install.md
 
 clean:
