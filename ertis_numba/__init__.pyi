@@ -102,5 +102,6 @@ from .storage import (
     write_energyscapes as write_energyscapes,
     write_recording as write_recording,
 )
+from .viewer import view as view
 
 __version__: str

@@ -2,7 +2,7 @@
 
 A source provides images or acoustic maps: `Live` those of a central node, `Playback` those of a file. `ViewedScene` and
 `ViewedMaps` compute the drawn objects from them, without a browser. `Viewer` shows these on the page and applies the
-choices made there.
+choices made there. `view` shows the page in a notebook.
 """
 
 import importlib
@@ -16,6 +16,7 @@ from ertis_numba.viewer._scene import ViewedScene
 from ertis_numba.viewer._shapes import BandLevel, Dome, Drawn, DrawnFrame, LevelScale, Pose, ReceivedImage, Sector
 
 if TYPE_CHECKING:
+    from ertis_numba.viewer._inline import InlineView, view
     from ertis_numba.viewer._live import Live
     from ertis_numba.viewer._playback import Playback
     from ertis_numba.viewer._view import Viewer
@@ -27,6 +28,7 @@ __all__ = [
     "Dome",
     "Drawn",
     "DrawnFrame",
+    "InlineView",
     "LevelScale",
     "Live",
     "Playback",
@@ -37,9 +39,10 @@ __all__ = [
     "ViewedMaps",
     "ViewedScene",
     "Viewer",
+    "view",
 ]
 
-_HOMES = {"Live": "_live", "Playback": "_playback", "Viewer": "_view"}
+_HOMES = {"InlineView": "_inline", "view": "_inline", "Live": "_live", "Playback": "_playback", "Viewer": "_view"}
 
 
 def __getattr__(name: str) -> Any:

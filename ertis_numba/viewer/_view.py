@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # one brings HDF5, the other ZeroMQ
 
 __all__ = ["Viewer"]
 
+_MAP_RANGE_DB: Final = 20.0
 _MIN_DRAW_S: Final = 1 / 15
 _POLL_INTERVAL_S: Final = 1 / 60
 _REPORT_INTERVAL_S: Final = 0.5
@@ -47,7 +48,7 @@ class Viewer:
     port : int
         0 selects a free one.
     choices : Choices, optional
-        Initial choices.
+        Initial choices; by default, colours have a range of 40 dB, and of 20 dB for acoustic maps.
     clean_within_db, clean_above_mean_db : float, optional
         Levels by which images are cleaned, as for `ertis_numba.analysis.range_cleaning.clean`.
     on_note : callable, optional
@@ -77,7 +78,7 @@ class Viewer:
         clean_above_mean_db: float | None = None,
         on_note: Callable[[str], None] | None = None,
     ) -> None:
-        self.choices = choices or Choices()
+        self.choices = choices or (Choices(dynamic_range_db=_MAP_RANGE_DB) if source.shows_maps else Choices())
         self._source, self._on_note = source, on_note
         self._playback: Playback | None = source if source.is_playback is True else None
         self._orders: queue.SimpleQueue[ControlRequest | None] = queue.SimpleQueue()

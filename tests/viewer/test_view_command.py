@@ -186,7 +186,8 @@ def test_commands_of_the_page_on_the_view_run(tmp_path):
                 reported = json.loads(run_here(tmp_path, f"{words} --port 0 --no-open --json --duration 0.2"))
                 assert reported["source"] == words.split()[1]
     assert (tmp_path / "PAGE.html").stat().st_size > 500_000
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    cell, code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert "view of reflectors.h5 at http://127.0.0.1:" in run_code_here(tmp_path, f"{cell}print(view)\nview.close()")
     assert run_code_here(tmp_path, code).startswith("http://127.0.0.1:")
 
 
