@@ -36,7 +36,7 @@ def stands_out(
     floor = echo_floor(image, false_alarm)
     if floor.exponent == 1.0:  # Side lobes of other echoes would raise it, unless the beamformer suppresses them.
         floor = floor._replace(by_range=np.zeros_like(floor.by_range))
-    limit = floor.at(image.amplitude, row, column, quantile=_QUANTILE)
+    (limit,) = floor.at(image.amplitude, row, column, _QUANTILE)
     return np.asarray((top > limit) & is_short(image, row, column, top, n_pulse))
 
 

@@ -51,12 +51,11 @@ class EchoFloor(NamedTuple):
         amplitude: NDArray[np.float32],
         direction: NDArray[np.intp],
         place: NDArray[np.intp],
-        *,
-        quantile: float = 0.5,
+        *quantiles: float,
     ) -> NDArray[np.float32]:
-        """Return the thresholds of some bins of the image, also for clicks from their direction.
+        """Return thresholds (quantile, bin) of some bins of the image, also for clicks from their direction.
 
-        Their noise is estimated from a ``quantile`` of the amplitudes around a bin. Higher ones than the median follow
+        Their noise is estimated from a quantile of the amplitudes around a bin. Higher ones than the median follow
         noise that swells and fades, but also dense echoes. They exclude the slopes of the bin's own echo.
         """
         last, n_around = amplitude.shape[1] - 1, self.n_around
@@ -64,17 +63,21 @@ class EchoFloor(NamedTuple):
         columns = np.abs(place[:, None] + first[:, None, None] + np.arange(n_around))
         columns = (last - np.abs(last - columns)).clip(0)  # The image is mirrored at its ends.
         around = amplitude[direction[:, None], columns]
-        rank = np.full(around.shape[:2], int(quantile * (n_around - 1)))
-        if quantile > 0.5:
-            is_own = np.stack([_slopes(*each) for each in zip(around, np.minimum(-first, n_around - 1), strict=True)])
-            n_own = is_own.sum(axis=2)
-            around = np.where(is_own, -np.inf, around)
-            rank = np.minimum(n_own + (quantile * (n_around - n_own - 1)).astype(np.int64), n_around - 1)
-        found = np.take_along_axis(np.sort(around, axis=2), rank[..., None], axis=2)[..., 0]
-        # Noise from one direction is coherent there, so that no beamformer changes its distribution.
-        ratio = self.ratio ** (1 / self.exponent) * (math.log(2) / -math.log1p(-quantile)) ** 0.5
-        clicks = np.maximum(found, 0).max(axis=0) * np.float32(ratio)
-        return np.asarray(np.maximum(np.maximum(self.by_direction[direction], self.by_range[place]), clicks))
+        steady = np.maximum(self.by_direction[direction], self.by_range[place])
+        found = np.empty((len(quantiles), len(place)), np.float32)
+        for quantile, out in zip(quantiles, found, strict=True):
+            rank, others = np.full(around.shape[:2], int(quantile * (n_around - 1))), around
+            if quantile > 0.5:
+                middles = np.minimum(-first, n_around - 1)
+                is_own = np.stack([_slopes(*each) for each in zip(around, middles, strict=True)])
+                n_own = is_own.sum(axis=2)
+                others = np.where(is_own, -np.inf, around)
+                rank = np.minimum(n_own + (quantile * (n_around - n_own - 1)).astype(np.int64), n_around - 1)
+            clicks = np.take_along_axis(np.sort(others, axis=2), rank[..., None], axis=2)[..., 0]
+            # Noise from one direction is coherent there, so that no beamformer changes its distribution.
+            ratio = self.ratio ** (1 / self.exponent) * (math.log(2) / -math.log1p(-quantile)) ** 0.5
+            out[:] = np.maximum(steady, np.maximum(clicks, 0).max(axis=0) * np.float32(ratio))
+        return found
 
 
 def _slopes(around: NDArray[np.float32], middle: int) -> NDArray[np.bool_]:
@@ -109,12 +112,17 @@ def medians_of(rows: NDArray[np.float32]) -> NDArray[np.float32]:
 
     `numpy.median` takes nine times as long, because it partitions at several places, without vector instructions.
     """
+    return _medians_in_place(rows.copy())
+
+
+def _medians_in_place(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the medians of rows, whose order is lost."""
     half = rows.shape[1] // 2
-    sorted_half = np.partition(rows, half, axis=1)
-    median = sorted_half[:, half]
+    rows.partition(half, axis=1)
+    median = rows[:, half]
     if rows.shape[1] % 2 == 0:
-        median = (sorted_half[:, :half].max(axis=1) + median) / 2
-    return np.where(np.isnan(sorted_half[:, half:].max(axis=1)), np.float32(np.nan), median)
+        median = (rows[:, :half].max(axis=1) + median) / 2
+    return np.where(np.isnan(rows[:, half:].max(axis=1)), np.float32(np.nan), median)
 
 
 def _medians_of_blocks(amplitude: NDArray[np.float32], n_blocks: int) -> NDArray[np.float32]:
@@ -124,7 +132,9 @@ def _medians_of_blocks(amplitude: NDArray[np.float32], n_blocks: int) -> NDArray
     parts = (amplitude[:, :split], width + 1), (amplitude[:, split:], width)
     return np.concatenate(
         [
-            medians_of(part.reshape(len(part), -1, columns).swapaxes(0, 1).reshape(-1, len(part) * columns))
+            _medians_in_place(
+                part.reshape(len(part), -1, columns).swapaxes(0, 1).copy().reshape(-1, len(part) * columns)
+            )
             for part, columns in parts
             if part.size
         ]
@@ -162,8 +172,9 @@ def echo_floor(image: Energyscape, false_alarm: float) -> EchoFloor:
     else:
         some = amplitude[:, :: max(1, amplitude.size // _DENSE)]
         width = max(1, some.shape[1] // _LONG_BLOCKS)
-        medians = medians_of(some[:, : some.shape[1] // width * width].reshape(-1, width)).reshape(n_directions, -1)
-        median = np.maximum(_quiet(medians), _quiet(medians_of(np.ascontiguousarray(medians.T))[None]))
+        blocks = some[:, : some.shape[1] // width * width].copy().reshape(-1, width)
+        medians = _medians_in_place(blocks).reshape(n_directions, -1)
+        median = np.maximum(_quiet(medians), _quiet(medians_of(medians.T)[None]))
     ratio = (math.log(amplitude.size / false_alarm) / math.log(2)) ** (exponent / 2)
     smallest = 0.0 if settings.recording.encoding == "float32" else _ROUNDING**exponent
     spread_m = settings.call.duration_s * sound_speed_m_s(settings.air) / 2

@@ -60,6 +60,7 @@ class PointSpread:
         shares = power / power.sum()
         self._turn = np.exp(1j * (wave_1_m[0] - self._carrier_1_m) * steps_m)
         self._shares, self._wave_1_m, self._path_m, self._air = shares, wave_1_m, path_m, settings.air
+        self._absorbed: tuple[Air, Floats, Floats] | None = None  # Tables for the latest air.
         # Paths may differ by half of the period.
         self.valid_m = period_m / 4 - radius_m
         self.pulse = kernels.Pulse(
@@ -125,9 +126,12 @@ class PointSpread:
         """
         frequency_hz, shares = self.spectrum
         offset_hz = frequency_hz - self._carrier_1_m * self._speed_m_s / (2 * math.pi)
-        mean_hz = float(shares @ offset_hz)
-        loss = 2 * np.outer(range_m, _absorption_1_m(air or self._air, frequency_hz))
-        change = np.exp((loss @ shares)[:, None] - loss + self._path_m * _absorption_1_m(Air(), frequency_hz))
+        mean_hz, air, known = float(shares @ offset_hz), air or self._air, self._absorbed
+        if known is None or known[0] != air:
+            usual = self._path_m * _absorption_1_m(Air(), frequency_hz)
+            known = self._absorbed = air, _absorption_1_m(air, frequency_hz), usual
+        loss = 2 * np.outer(range_m, known[1])
+        change = np.exp((loss @ shares)[:, None] - loss + known[2])
         slope_s = change @ (shares * (offset_hz - mean_hz)) / float(shares @ (offset_hz - mean_hz) ** 2 or 1.0)
         limit_s = _MOST_TILT / float(np.abs(offset_hz).max(initial=1e-30))  # Far away, lines would end below zero.
         tilt_s = np.clip(slope_s / (change @ shares - slope_s * mean_hz), -limit_s, limit_s)

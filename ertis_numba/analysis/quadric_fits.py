@@ -18,6 +18,7 @@ _MAX_GAP_RAD = 2.6  # Neighbours within less than half a turn lie on one side: a
 _LINE = 0.2  # Ratio of the widths of a direction's neighbours, below which they lie on a line.
 _OPPOSITE = -0.87  # Cosine of the angle between two neighbours that lie on opposite sides.
 _MAX_BORDERS = 16  # Each shortens an offset to the border with one other cell; most need none, some need two.
+_INNER = 0.49  # Share of the distance to the nearest other direction, within which offsets end in their cell.
 _BESIDE = 0.75  # Share of an offset within its cell, below which the maximum lies elsewhere.
 _WELL_POSED = 0.02  # Least singular value relative to the largest; uniform weights have 0.17 within a grid.
 _SAME = 1e-9  # Distance in radians below which two directions are one.
@@ -94,22 +95,23 @@ class QuadricFits:
         A width is 0 if the direction is interpolated along as many axes as the grid has, and less than that
         of the cell if the offset was shortened a little. With ``is_fitted``, also beside an edge of the grid.
         """
-        here = self.grid.data[self.wanted[directions]]
-        share = np.ones(len(offset))
-        for _ in range(_MAX_BORDERS):
-            top = here + share[:, None] * offset
+        share, width_rad = np.ones(len(offset)), self.width_rad[directions]
+        far = np.flatnonzero(np.linalg.norm(offset, axis=1) > _INNER * width_rad)  # Others cross no border.
+        here, moved, part = self.grid.data[self.wanted[directions[far]]], offset[far], np.ones(len(far))
+        for _ in range(_MAX_BORDERS if len(far) else 0):
+            top = here + part[:, None] * moved
             _, nearest = self.grid.query(top / np.linalg.norm(top, axis=1)[:, None])
             other = self.grid.data[nearest] - here
-            half, along = 0.5 * (other**2).sum(axis=1), (other * offset).sum(axis=1)
-            is_beyond = (share * along > half * (1 + _SAME)) & (half > _SAME**2)  # Equal directions share a cell.
+            half, along = 0.5 * (other**2).sum(axis=1), (other * moved).sum(axis=1)
+            is_beyond = (part * along > half * (1 + _SAME)) & (half > _SAME**2)  # Equal directions share a cell.
             if not is_beyond.any():
                 break
-            share[is_beyond] = half[is_beyond] / along[is_beyond]
-        is_between = (share > _BESIDE) & np.isfinite(self.width_rad[directions])
+            part[is_beyond] = half[is_beyond] / along[is_beyond]
+        share[far] = part
+        is_between = (share > _BESIDE) & np.isfinite(width_rad)
         if not is_fitted:
             is_between &= offset.any(axis=1) & (self.quadrics.n_axes[directions] >= self.n_axes_of_grid)
         cut_rad = (1 - share) * np.linalg.norm(offset, axis=1)  # The error is about as large: that of a wider cell.
-        width_rad = self.width_rad[directions]
         return offset * share[:, None], np.where(is_between, np.minimum(math.sqrt(12) * cut_rad, width_rad), width_rad)
 
     def within_limits(

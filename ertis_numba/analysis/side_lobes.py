@@ -1,7 +1,7 @@
 """Side lobes of reflectors in an image: predicted for an array as designed, bounded for a real array."""
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
@@ -179,36 +179,61 @@ class EdgeFloor:
         middle = directions[np.argmax(directions @ directions.mean(axis=0))]
         own = spread(directions[self._samples] - middle, np.zeros(len(self._samples)))
         self._own, self._spread = float(np.quantile(own, _QUARTILE)), spread
+        self._known: tuple[Floats, NDArray[np.intp], list[_Skirt]] | None = None
 
     def __call__(self, image: Energyscape) -> NDArray[np.float32]:
         """Return the amplitudes: (range,) float32; 0 far from both edges."""
         floor = np.zeros(len(image.range_m), np.float32)
         if len(floor) < 3 or len(self._samples) < _LEAST_DIRECTIONS:
             return floor
-        reach_m = min(self._spread.reach_m, _SHARE * float(image.range_m[-1] - image.range_m[0]))
-        before = image.range_m[0] > image.range_m[1] - image.range_m[0]  # Nothing is nearer than range 0.
-        ends = (before & (image.range_m - image.range_m[0] < reach_m)) | (image.range_m[-1] - image.range_m < reach_m)
-        places = np.flatnonzero(ends)
+        known = self._known
+        if known is None or not np.array_equal(known[0], image.range_m):
+            known = self._known = image.range_m, *self._edges(image.range_m)
+        _, places, skirts = known
         level = _upper_quartile(image.amplitude[np.ix_(self._samples, places)])
         floor[places] = level * min(_OWN / self._own, 1 / _LEAST_OWN)
-        highest = image.amplitude.max(axis=0)
-        for inwards in (slice(None), slice(None, None, -1))[0 if before else 1 :]:
-            self._raise_skirt(
-                floor[inwards], highest[inwards], np.abs(image.range_m - image.range_m[inwards][0])[inwards]
-            )
+        for skirt in skirts:
+            skirt.raise_floor(floor[skirt.inwards], image.amplitude[:, skirt.inwards])
         return floor
 
-    def _raise_skirt(self, floor: NDArray[np.float32], highest: NDArray[np.float32], offset_m: Floats) -> None:
-        """Raise the floor near the first range, unless amplitudes fall towards it as the pulse of a reflector does."""
+    def _edges(self, range_m: Floats) -> "tuple[NDArray[np.intp], list[_Skirt]]":
+        """Return the ranges near the edges, and the skirts of pulses beyond each edge."""
+        reach_m = min(self._spread.reach_m, _SHARE * float(range_m[-1] - range_m[0]))
+        before = range_m[0] > range_m[1] - range_m[0]  # Nothing is nearer than range 0.
+        ends = (before & (range_m - range_m[0] < reach_m)) | (range_m[-1] - range_m < reach_m)
+        directions = (slice(None), slice(None, None, -1))[0 if before else 1 :]
+        skirts = [_Skirt.of(self._spread, np.abs(range_m - range_m[each][0])[each], each) for each in directions]
+        return np.flatnonzero(ends), skirts
+
+
+class _Skirt(NamedTuple):
+    """Pulse of an echo beyond an edge of an image, whose ranges are (range,) ``inwards``.
+
+    ``share`` is that of its amplitude at the range ``last`` or before, which no reflector within the image exceeds.
+    """
+
+    inwards: slice
+    is_open: NDArray[np.bool_]
+    last: NDArray[np.intp]
+    share: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, spread: PointSpread, offset_m: Floats, inwards: slice) -> "_Skirt":
+        """Return the skirt at distances from an edge."""
         near = int(np.count_nonzero(offset_m < _SKIRT_M))
-        pulse = self._spread(np.zeros((near, 3)), offset_m[:near])
+        pulse = spread(np.zeros((near, 3)), offset_m[:near])
         width = int(np.argmax(pulse < _SKIRT)) or near
         envelope = np.maximum.accumulate(pulse[::-1])[::-1]
         places = np.arange(near)
         last = (places - width).clip(0, width)  # Between these bins and the edge, there is at most a skirt.
         share = _MARGIN * np.maximum(envelope[places - last], _SKIRT)
-        skirt = np.maximum.accumulate(highest[:near])[last] / share.astype(np.float32)
-        floor[:near] = np.where(pulse > _OPEN, np.inf, np.maximum(floor[:near], skirt))
+        return cls(inwards, pulse > _OPEN, last, share.astype(np.float32))
+
+    def raise_floor(self, floor: NDArray[np.float32], amplitude: NDArray[np.float32]) -> None:
+        """Raise a floor near the edge, unless amplitudes fall towards it as the pulse of a reflector does."""
+        near = len(self.last)
+        skirt = np.maximum.accumulate(amplitude[:, :near].max(axis=0))[self.last] / self.share
+        floor[:near] = np.where(self.is_open, np.inf, np.maximum(floor[:near], skirt))
 
 
 def _upper_quartile(values: NDArray[np.float32]) -> NDArray[np.float32]:

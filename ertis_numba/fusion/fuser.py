@@ -17,7 +17,7 @@ from ertis_numba.fusion.pulses import is_same_pulse
 from ertis_numba.fusion.rig import USUAL_DIAMETER_M, Mountings, emitter_diameter_m, mounted_sensors
 from ertis_numba.fusion.tables import FusionTables, PulseReflectors
 from ertis_numba.geometry import require_places
-from ertis_numba.settings import MAX_EMITTER_M
+from ertis_numba.settings import MAX_EMITTER_M, Array
 
 __all__ = ["Fused", "Fuser", "fuse"]
 
@@ -198,6 +198,7 @@ class Fuser:
         self._emitting = [number for number, sensor in enumerate(self._mountings) if sensor.name not in silent]
         self._start_s: dict[int, float] = {}  # of the calls of all sensors so far
         self._diameter_m: dict[int, float] = {}  # of the emitters of all sensors so far
+        self._observing: dict[int, tuple[Array, bool]] = {}  # Arrays that observe places, and whether images are planar
         self._tables: FusionTables | None = None
         self._last: Callable[[], PulseReflectors] | None = None  # of the pulse before
         self._first: list[tuple[tuple[Energyscape, ...], Callable[[], PulseReflectors]]] = []
@@ -338,7 +339,10 @@ class Fuser:
         for image in checks.items("images", images, Energyscape, "Pipeline.process returns"):
             number = self._number(image.stamp.sensor, "images")
             image.settings.processing.require_sensor_frame("fusion needs directions of each sensor")
-            require_places(image.settings.array, image.stamp.sensor, is_planar=image.is_planar)
+            geometry = image.settings.array, image.is_planar
+            if self._observing.get(number) != geometry:
+                require_places(image.settings.array, image.stamp.sensor, is_planar=image.is_planar)
+                self._observing[number] = geometry
             if number in found:
                 raise ArgumentError(f"images has two of sensor {image.stamp.sensor!r}; use one image of each sensor")
             if not np.isfinite(image.amplitude).all():

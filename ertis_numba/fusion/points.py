@@ -136,7 +136,7 @@ class PointFuser:
         # Between directions of a coarse grid, interpolation may exceed all bins, also for noise. Bins are compared.
         near = image.amplitude[row[:, None], (column[:, None] + _BESIDE).clip(0, len(image.range_m) - 1)].max(axis=1)
         shown = np.minimum(near, cloud.amplitude)
-        is_free = shown > floor.at(image.amplitude, row, column)
+        is_free, is_beyond_swells = shown > floor.at(image.amplitude, row, column, 0.5, _CLEAR)
         uncertainty_m = _uncertainties(cloud)
         every = _ImageEchoes(
             row=row,
@@ -145,8 +145,7 @@ class PointFuser:
             path_sd_m=2 * np.hypot(uncertainty_m[:, 0], _RANGE_SD_M),
             angle_sd_rad=np.hypot(uncertainty_m[:, 1] / range_m, _ANGLE_SD_RAD),
             power=cloud.amplitude.astype(np.float64) ** 2,
-            is_clear=(shown > floor.at(image.amplitude, row, column, quantile=_CLEAR))
-            & is_short(image, row, column, shown, self._n_pulse),
+            is_clear=is_beyond_swells & is_short(image, row, column, shown, self._n_pulse),
             is_faint=~is_free | (cloud.amplitude < _FAINT * cloud.amplitude.max(initial=0.0)),
         )
         return _ImageEchoes._make(each[shown > floor.by_direction[row]] for each in every)
