@@ -49,17 +49,29 @@ class Fitted(NamedTuple):
 
 
 class EchoFits:
-    """Fits of single echoes to maxima of images of delay-and-sum, with unit vectors (direction, axis)."""
+    """Fits of single echoes to maxima of images of delay-and-sum in ``wanted`` directions, unit vectors (…, axis)."""
 
-    def __init__(self, settings: Settings, directions: Floats) -> None:
+    def __init__(
+        self, settings: Settings, directions: Floats, neighbours: NDArray[np.int64], wanted: NDArray[np.int64]
+    ) -> None:
         self._directions = np.ascontiguousarray(directions)
         self._spread = PointSpread(settings, path_m=sum(settings.processing.range_m))
         self._beams = self._spread.beams(self._directions, deviation_of(settings, directions))
         self._is_planar = bool(np.ptp(directions[:, 2]) == 0)
+        offsets = directions[neighbours[wanted]] - directions[wanted][:, None]
+        distance = np.linalg.norm(offsets, axis=2)
+        self._is_other = distance > _SAME
+        self._width_rad = np.where(self._is_other, distance, np.inf).min(axis=1, initial=np.inf)
+        self._axes = self._axes_of(directions[wanted])
+        self._at_border = self._least_at_border()
+        self._aside = np.concatenate(
+            [share * np.einsum("pni,pji->pnj", offsets, self._axes) for share in _STARTS], axis=1
+        )
 
     def __call__(
         self,
         image: Energyscape,
+        place: NDArray[np.int64],
         rows: NDArray[np.int64],
         columns: NDArray[np.int64],
         tops: Floats,
@@ -70,17 +82,15 @@ class EchoFits:
         """Return the echoes that fit samples (place, sample) best.
 
         The second sample is the maximum, the first and third ones are those beside it in range, and its neighbours
-        follow. ``tops`` (place, 5): shift in range steps, offset of the direction, and logarithm of the amplitude.
-        ``noise`` is the RMS of the image, 0 if unknown, and ``model`` the plan's error relative to the amplitude.
+        follow. ``place`` (place,) is that of its direction among the wanted ones. ``tops`` (place, 5): shift in range
+        steps, offset of the direction, and logarithm of the amplitude. ``noise`` is the RMS of the image, 0 if unknown,
+        and ``model`` the plan's error relative to the amplitude.
         """
-        middle = rows[:, 0]
-        offsets = self._directions[rows[:, 3:]] - self._directions[middle][:, None]
         amplitude = image.amplitude[rows, columns].astype(np.float64)
         is_used = amplitude > 0
-        is_used[:, 3:] &= np.linalg.norm(offsets, axis=2) > _SAME
+        is_used[:, 3:] &= self._is_other[place]
         is_used[:, [0, 2]] &= columns[:, [0, 2]] != columns[:, 1:2]
-        axes, width_rad = self._axes(middle), _widths_rad(offsets)
-        at_border = self._at_border(width_rad, axes)
+        axes, width_rad, at_border = self._axes[place], self._width_rad[place], self._at_border[place]
         is_sparse = at_border < _SPARSE
         tilt_s, heard = self._spread.tilts(image.range_m[columns[:, 1]].astype(np.float64), image.settings.air)
         samples = kernels.EchoSamples(
@@ -93,7 +103,7 @@ class EchoFits:
             tilt_s,
         )
         step_m = float(image.range_m[1] - image.range_m[0]) if len(image.range_m) > 1 else 0.0
-        starts = self._starts(tops, step_m, offsets, axes, amplitude[:, 1])
+        starts = self._starts(tops, step_m, place, amplitude[:, 1])
         out = np.empty((len(rows), kernels.N_VALUES))
         kernels.load_points().fit_echoes(
             self._spread.pulse,
@@ -132,33 +142,26 @@ class EchoFits:
             np.sqrt(np.maximum(out[:, 21] ** 2 - (_PLAN * model) ** 2 - (_CHANCE * chance) ** 2 - _LEAST**2, 0.0)),
         )
 
-    def _axes(self, middle: NDArray[np.int64]) -> Floats:
+    def _axes_of(self, ahead: Floats) -> Floats:
         """Return unit vectors to the left and upwards, across directions: (place, 2, axis) float64."""
-        ahead = self._directions[middle]
         level = np.hypot(ahead[:, 0], ahead[:, 1])
         is_up = level < _SAME
         left = np.stack([-ahead[:, 1], np.where(is_up, 1.0, ahead[:, 0]), np.zeros(len(ahead))], axis=1)
         left /= np.where(is_up, 1.0, level)[:, None]
         return np.stack([left, np.zeros_like(left) if self._is_planar else np.cross(ahead, left)], axis=1)
 
-    def _at_border(self, width_rad: Floats, axes: Floats) -> Floats:
+    def _least_at_border(self) -> Floats:
         """Return the least amplitude, in the direction of a cell, of echoes at its border: (place,) float64."""
-        half_rad = np.where(np.isfinite(width_rad), width_rad, 0.0)[:, None] / 2
-        none_m = np.zeros(len(axes))
-        return np.minimum(*(self._spread(half_rad * axes[:, axis], none_m) for axis in (0, 1)))
+        half_rad = np.where(np.isfinite(self._width_rad), self._width_rad, 0.0)[:, None] / 2
+        none_m = np.zeros(len(half_rad))
+        return np.minimum(*(self._spread(half_rad * self._axes[:, axis], none_m) for axis in (0, 1)))
 
-    def _starts(self, tops: Floats, step_m: float, offsets: Floats, axes: Floats, amplitude: Floats) -> Floats:
+    def _starts(self, tops: Floats, step_m: float, place: NDArray[np.int64], amplitude: Floats) -> Floats:
         """Return the starts of the fits: the interpolated maximum, and places towards the neighbours."""
-        first = np.concatenate([step_m * tops[:, :1], np.einsum("pi,pji->pj", tops[:, 1:4], axes), tops[:, 4:]], axis=1)
-        aside = np.concatenate([share * np.einsum("pni,pji->pnj", offsets, axes) for share in _STARTS], axis=1)
-        level = np.broadcast_to(
-            np.log(np.maximum(amplitude, np.finfo(np.float32).tiny))[:, None, None], (*aside.shape[:2], 1)
-        )
-        others = np.concatenate([np.zeros_like(level), aside, level], axis=2)
-        return np.concatenate([first[:, None], others], axis=1)
-
-
-def _widths_rad(offsets: Floats) -> Floats:
-    """Return the distance of the nearest other direction; infinite if there is none: (place,) float64."""
-    distance = np.linalg.norm(offsets, axis=2)
-    return np.asarray(np.where(distance > _SAME, distance, np.inf).min(axis=1, initial=np.inf))
+        found = np.zeros((len(tops), 1 + self._aside.shape[1], 4))
+        found[:, 0, 0] = step_m * tops[:, 0]
+        found[:, 0, 1:3] = np.einsum("pi,pji->pj", tops[:, 1:4], self._axes[place])
+        found[:, 0, 3] = tops[:, 4]
+        found[:, 1:, 1:3] = self._aside[place]
+        found[:, 1:, 3] = np.log(np.maximum(amplitude, np.finfo(np.float32).tiny))[:, None]
+        return found

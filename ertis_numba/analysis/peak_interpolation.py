@@ -71,7 +71,7 @@ class PeakInterpolator:
         self._fits = QuadricFits.of(directions, neighbours, wanted)
         self._spread = PointSpread(settings)
         is_predicted = settings.processing.method == "fast" and not settings.processing.is_adaptive
-        self._echoes = EchoFits(settings, directions) if is_predicted else None
+        self._echoes = EchoFits(settings, directions, neighbours, wanted) if is_predicted else None
         self._model = math.hypot(_MODEL, plan_error(settings)) if is_predicted else 0.0
 
     def __call__(
@@ -88,7 +88,7 @@ class PeakInterpolator:
         is_fitted = self._echoes is not None
         if self._echoes is not None:
             shift_m, offset, level, *sds, is_sparse, misfit = self._echoes(
-                image, rows, columns, found, noise=noise, model=self._model
+                image, row, rows, columns, found, noise=noise, model=self._model
             )
             sd = np.array(sds)
         within_m = shift_m.clip(-0.5 * step_m, 0.5 * step_m)
