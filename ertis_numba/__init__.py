@@ -23,6 +23,8 @@ from typing import Any
 
 import lazy_loader
 
+from ertis_numba.base import notebook_html
+
 _attach, _, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
@@ -33,6 +35,15 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted([*__all__, "__version__"])
+
+
+def _html_of(shown: Any) -> str:
+    from ertis_numba.notebook import html_of  # noqa: PLC0415  is needed in notebooks only
+
+    return html_of(shown)
+
+
+notebook_html.renderer = _html_of
 
 
 def _version() -> str:

@@ -2,7 +2,6 @@
 
 import glob
 import json
-import math
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -466,26 +465,12 @@ def note_unknown_bearings(sensor: str, settings: "Settings") -> None:
 
 def note_doubts(sensor: str, bearings: "Iterable[Bearing]") -> bool:
     """Print a note on bearings that may not be those of sound, or are unknown; return True if there are any."""
-    listed = list(bearings)
-    doubts = {name for each in listed for name in each.doubts}
-    n_unknown = sum(math.isinf(each.sideways_deg) and math.isinf(each.upwards_deg) for each in listed)
-    if n_unknown:
-        note(
-            f"sensor {sensor}: the direction of {counted(n_unknown, 'source')} is unknown; a channel without sound may "
-            "be the cause: see 'ertis info --health'"
-        )
-    if "crosstalk" in doubts:
-        note(
-            f"sensor {sensor}: a source marked as possible crosstalk has the same signal in all channels, as "
-            "electrical crosstalk has; cover the microphones: crosstalk remains, and sound does not"
-        )
-    if "interference" in doubts:
-        note(
-            f"sensor {sensor}: a source marked as possible interference fits its direction no better than electrical "
-            "interference with random phases may by chance; cover the microphones: interference remains, and sound "
-            "does not"
-        )
-    return bool(doubts) or n_unknown > 0
+    from ertis_numba.frames import doubt_notes
+
+    notes = doubt_notes(bearings)
+    for text in notes:
+        note_of(sensor, text)
+    return bool(notes)
 
 
 def say(text: str, *, quiet: bool) -> None:

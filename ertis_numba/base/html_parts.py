@@ -2,11 +2,9 @@
 
 import base64
 import html
-import importlib
 from collections.abc import Iterable, Sequence
-from typing import Any
 
-__all__ = ["escaped", "picture", "shown_in_notebooks", "table"]
+__all__ = ["escaped", "picture", "table"]
 
 
 def escaped(text: str) -> str:
@@ -25,12 +23,3 @@ def table(columns: Sequence[tuple[str, str]], rows: Iterable[Sequence[tuple[str,
 def picture(png: bytes, alt: str) -> str:
     """Return a PNG within the page; ``alt`` is text."""
     return f"<img alt='{escaped(alt)}' src='data:image/png;base64,{base64.b64encode(png).decode()}'>"
-
-
-def shown_in_notebooks(shown: Any) -> str:
-    """Return an object as HTML, for ``_repr_html_``, which Jupyter calls.
-
-    The room `notebook` is above all classes that it shows. It is imported by name when a notebook shows one of them.
-    """
-    text: str = importlib.import_module("ertis_numba.notebook").html_of(shown)
-    return text

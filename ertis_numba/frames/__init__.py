@@ -2,7 +2,7 @@
 
 from ertis_numba.frames._acoustic_map import AcousticMap, SoundDirection
 from ertis_numba.frames._beams import Beams
-from ertis_numba.frames._bearings import Bearing
+from ertis_numba.frames._bearings import Bearing, doubt_notes
 from ertis_numba.frames._energyscape import Energyscape
 from ertis_numba.frames._gap import SequenceGap
 from ertis_numba.frames._level_reference import (
@@ -49,6 +49,7 @@ __all__ = [
     "Surfaces",
     "Trajectory",
     "TrueSource",
+    "doubt_notes",
     "is_passive",
     "known_levels",
     "level_offset_db",

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ertis_numba.base import checks
 from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.base.errors import ArgumentError
-from ertis_numba.base.html_parts import shown_in_notebooks
+from ertis_numba.base.notebook_html import shown_in_notebooks
 from ertis_numba.frames._bearings import Bearing
 from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelReference, LevelUnit, known_levels, level_offset_db
 from ertis_numba.frames._replacing import replaced

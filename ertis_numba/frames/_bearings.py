@@ -1,13 +1,15 @@
 """Bearings: directions of sources of sound."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 from ertis_numba.base.angles import RadiansFromDegrees
+from ertis_numba.base.units import counted
 from ertis_numba.frames._level_reference import LEVEL_UNITS, LevelUnit
 
-__all__ = ["Bearing"]
+__all__ = ["Bearing", "doubt_notes"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +103,24 @@ class Bearing(RadiansFromDegrees):
     def center_hz(self) -> float:
         """Geometric centre of the band in hertz."""
         return math.sqrt(self.band_hz[0] * self.band_hz[1])
+
+
+def doubt_notes(bearings: Iterable[Bearing]) -> list[str]:
+    """Return notes on bearings that may not be those of sound, or are unknown."""
+    listed = list(bearings)
+    doubts = {name for each in listed for name in each.doubts}
+    n_unknown = sum(math.isinf(each.sideways_deg) and math.isinf(each.upwards_deg) for each in listed)
+    notes = {
+        f"the direction of {counted(n_unknown, 'source')} is unknown; a channel without sound may be the cause: see "
+        "'ertis info --health'": n_unknown > 0,
+        "a source marked as possible crosstalk has the same signal in all channels, as electrical crosstalk has; cover "
+        "the microphones: crosstalk remains, and sound does not": "crosstalk" in doubts,
+        "a source marked as possible interference fits its direction no better than electrical interference with "
+        "random phases may by chance; cover the microphones: interference remains, and sound does not": (
+            "interference" in doubts
+        ),
+    }
+    return [text for text, applies in notes.items() if applies]
 
 
 def _rounded(level_db: float | None) -> float | None:

@@ -1,7 +1,7 @@
 """HTML of objects: axes with units, list of reflectors or sources, notes and picture."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import singledispatch
 from typing import TYPE_CHECKING, Any, Final
 
@@ -14,7 +14,7 @@ from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.base.errors import ErtisError
 from ertis_numba.base.html_parts import escaped, table
 from ertis_numba.base.units import counted
-from ertis_numba.frames import AcousticMap, Bearing, Energyscape, Peak, PointCloud, Stamp
+from ertis_numba.frames import AcousticMap, Bearing, Energyscape, Peak, PointCloud, Stamp, doubt_notes
 from ertis_numba.geometry import direction_grid, direction_note, observable_angles
 from ertis_numba.notebook.page import Axis, page
 from ertis_numba.settings import Settings
@@ -170,13 +170,13 @@ def _(found: AcousticMap) -> str:
         return figures.acoustic_map(found) if len(found.azimuth_rad) > 1 else figures.spectrum(found)
 
     problems = [f"no picture: {flaw}"] if (flaw := _flaw(found.power)) else []
-    problems += [f"sources may be {name}" for name in sorted({name for each in loudest for name in each.doubts})]
+    problems += doubt_notes(loudest)
     return page(_title("Acoustic map", found.stamp), axes, (_bearing_rows(loudest), missing), problems, draw)
 
 
 def _bearing_rows(bearings: Sequence[Bearing]) -> str:
     """Return a table of sources; angles without a standard deviation are unknown."""
-    columns: dict[str, tuple[str, Callable[[Bearing], float]]] = {
+    columns: dict[str, tuple[str, Callable[[Bearing], float | str]]] = {
         "from (kHz)": (".1f", lambda each: each.band_hz[0] / 1e3),
         "to (kHz)": (".1f", lambda each: each.band_hz[1] / 1e3),
         "azimuth (°)": ("+.2f", lambda each: each.azimuth_deg if math.isfinite(each.sideways_deg) else math.nan),
@@ -188,6 +188,8 @@ def _bearing_rows(bearings: Sequence[Bearing]) -> str:
     }
     if any(each.level_db is not None for each in bearings):
         columns["level (dB re 20 µPa)"] = (".1f", lambda each: math.nan if each.level_db is None else each.level_db)
+    if any(each.doubts for each in bearings):
+        columns["doubt"] = ("", lambda each: " ".join(f"{name}?" for name in each.doubts))
     return _rows(columns, bearings)
 
 
@@ -263,7 +265,7 @@ def _flaw(values: "NDArray[Any]") -> str:
     return "" if np.isfinite(values).all() else "values contain NaN or infinity"
 
 
-def _rows(columns: dict[str, tuple[str, Callable[[Any], float]]], items: Iterable[Any]) -> str:
+def _rows(columns: Mapping[str, tuple[str, Callable[[Any], float | str]]], items: Iterable[Any]) -> str:
     """Return a numbered table of items; empty if there are none."""
     lines = [
         [(str(number), _NUMBER), *((_cell(value(item), form), _NUMBER) for form, value in columns.values())]
@@ -272,8 +274,10 @@ def _rows(columns: dict[str, tuple[str, Callable[[Any], float]]], items: Iterabl
     return table([("#", _NUMBER), *((name, _NUMBER) for name in columns)], lines) if lines else ""
 
 
-def _cell(value: float, form: str) -> str:
+def _cell(value: float | str, form: str) -> str:
     """Return a number in a format, or with two digits and never with an exponent; a dash if it is unknown."""
+    if isinstance(value, str):
+        return escaped(value)
     if not math.isfinite(value):
         return _UNKNOWN
     if form == _TWO_DIGITS:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from ertis_numba.base.errors import ArgumentError, SettingsError
-from ertis_numba.base.html_parts import shown_in_notebooks
+from ertis_numba.base.notebook_html import shown_in_notebooks
 from ertis_numba.settings.accuracy import Accuracy
 from ertis_numba.settings.array import Array
 from ertis_numba.settings.beamformers import BEAMFORMERS

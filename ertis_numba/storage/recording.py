@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, DamagedError, DataError
-from ertis_numba.base.html_parts import shown_in_notebooks
+from ertis_numba.base.notebook_html import shown_in_notebooks
 from ertis_numba.frames import Measurement, SequenceGap, Trajectory
 from ertis_numba.frames.pose_doubts import warn_of_poses
 from ertis_numba.frames.sample_format import SampleFormat, sample_format

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import ertis_numba as ertis
+from ertis_numba.frames import doubt_notes
 from ertis_numba.notebook import html_of
-from tests.figures.test_acoustic_figures import acoustic_map
+from tests.figures.test_acoustic_figures import acoustic_map, bearing
 from tests.pages import ROOT
 from tests.publishing import image
 
@@ -167,10 +168,21 @@ def test_map_has_a_picture_and_says_that_sources_were_not_searched():
 
 def test_map_lists_its_sources():
     source = {"azimuth_deg": 24.0, "elevation_deg": 12.0, "sideways_deg": 0.123, "correlation": 0.0, "snr_db": 9.0}
-    bearing = ertis.Bearing(**source, upwards_deg=np.inf, band_hz=(20e3, 25e3), level_dbfs=-40.0)
-    page = shown(acoustic_map().replace(bearings=(bearing,), false_alarm=1e-3))
+    found = ertis.Bearing(**source, upwards_deg=np.inf, band_hz=(20e3, 25e3), level_dbfs=-40.0)
+    page = shown(acoustic_map().replace(bearings=(found,), false_alarm=1e-3))
     first = page.cells.index("1")
     assert page.cells[first : first + 9] == ["1", "20.0", "25.0", "+24.00", "0.12", "–", "–", "-40.0", "9.0"]
+
+
+def test_doubtful_source_is_marked_and_noted_as_by_the_command():
+    sources = [
+        bearing(24.0, 12.0, (20e3, 25e3), -40.0, may_be_crosstalk=True),
+        bearing(0.0, 0.0, (25e3, 31e3), -50.0, sideways_deg=np.inf, upwards_deg=np.inf),
+    ]
+    page = shown(acoustic_map().replace(bearings=tuple(sources), false_alarm=1e-3))
+    assert page.cells.count("crosstalk?") == 1
+    assert {f"Note: {text}" for text in doubt_notes(sources)} <= {*page.cells}
+    assert len(doubt_notes(sources)) == 2
 
 
 def test_map_without_sources_has_none():
