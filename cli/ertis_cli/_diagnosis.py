@@ -33,7 +33,6 @@ _EXTRAS: Final = {
 }
 """Modules of each extra. The modules for a GPU are checked with the GPU."""
 
-_RULE: Final = 'KERNEL=="ttyACM*", GROUP="dialout", MODE="0660"'
 _SENSOR_MB_S: Final = 13.1
 """Data rate of a sensor that takes 20 measurements of 655,360 bytes per second."""
 
@@ -213,11 +212,14 @@ def _serial(_folder: Path) -> Iterator[InstallationFinding]:
             yield InstallationFinding("sensors", "good", f"{port} can be opened")
         else:
             yield InstallationFinding(
-                "sensors", "bad", f"you lack permission to open {port}", _permission(Path(port.path))
+                "sensors",
+                "bad",
+                f"you lack permission to open {port}",
+                _permission(Path(port.path), "" if port.emulated else port.serial_number),
             )
 
 
-def _permission(path: Path) -> str:
+def _permission(path: Path, serial: str) -> str:
     """Return the remedy for a missing permission to use a port."""
     if sys.platform == "win32":
         return "close the program that uses it"
@@ -230,9 +232,10 @@ def _permission(path: Path) -> str:
             return f"run 'sudo usermod -aG {grp.getgrgid(status.st_gid).gr_name} $USER' and log in again"
     if sys.platform != "linux":
         return "ask the owner of the port to give your group read and write permission"
-    return (
-        f"as root, write '{_RULE}' to /etc/udev/rules.d/65-ertis.rules, join the group 'dialout' and plug it in again"
-    )
+    from ertis_cli.service import udev_rule
+
+    rule = udev_rule(serial if serial.isalnum() else "")
+    return f"as root, write '{rule}' to /etc/udev/rules.d/65-ertis.rules, join the group 'dialout' and plug it in again"
 
 
 def _disk(folder: Path) -> Iterator[InstallationFinding]:

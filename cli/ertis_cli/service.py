@@ -13,7 +13,7 @@ import click
 
 from ertis_cli import options
 
-__all__ = ["service"]
+__all__ = ["service", "udev_rule"]
 
 _UNITS: Final = Path("/etc/systemd/system")
 _RULES: Final = Path("/etc/udev/rules.d")
@@ -76,10 +76,7 @@ SystemCallErrorNumber=EPERM
 [Install]
 WantedBy=multi-user.target
 """)
-_RULE: Final = Template(
-    'SUBSYSTEM=="tty", ENV{ID_SERIAL_SHORT}=="$serial", SYMLINK+="ertis/$serial", GROUP="dialout", MODE="0660", '
-    'ENV{ID_MM_DEVICE_IGNORE}="1", ENV{ID_MM_PORT_IGNORE}="1"\n'
-)
+_ACCESS: Final = 'GROUP="dialout", MODE="0660"'
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False})
@@ -118,7 +115,7 @@ def service(*, node: str, arguments: tuple[str, ...], user: str | None, uninstal
     }
     serials = _serial_numbers([*(context.params.get("ports") or ()), *(context.params.get("sources") or ())])
     if serials:
-        files[rules] = "".join(_RULE.substitute(serial=each) for each in serials)
+        files[rules] = "".join(f"{udev_rule(each)}\n" for each in serials)
     if dry_run:
         for path, text in files.items():
             click.echo(f"# {path}\n{text}")
@@ -130,6 +127,16 @@ def service(*, node: str, arguments: tuple[str, ...], user: str | None, uninstal
     _reload()
     _call("systemctl", "enable", "--now", unit.name)
     options.say(f"{unit.name}: started; its log: journalctl -u {unit.name}", quiet=False)
+
+
+def udev_rule(serial: str) -> str:
+    """Return the udev rule for the port of a sensor, or for all ports of its kind if its serial number is empty."""
+    if not serial:
+        return f'SUBSYSTEM=="tty", KERNEL=="ttyACM*", {_ACCESS}'
+    return (
+        f'SUBSYSTEM=="tty", ENV{{ID_SERIAL_SHORT}}=="{serial}", SYMLINK+="ertis/{serial}", {_ACCESS}, '
+        'ENV{ID_MM_DEVICE_IGNORE}="1", ENV{ID_MM_PORT_IGNORE}="1"'
+    )
 
 
 def _checked(node: str, arguments: Sequence[str]) -> click.Context:

@@ -77,17 +77,21 @@ def test_doctor_reports_a_read_only_disk(doctor, monkeypatch):
 def test_doctor_reports_a_port_without_permission(doctor, monkeypatch, tmp_path):
     path = tmp_path / "ttyACM0"
     path.touch()
-    port = Port(path=str(path), link="", serial_number="123", description="eRTIS", emulated=True)
+    port = Port(path=str(path), link="", serial_number="123", description="eRTIS")
     monkeypatch.setattr("ertis_numba.devices.ports.find_ports", lambda: [port])
     assert doctor()["sensors"][0][0] == "good"
     may = os.access
     monkeypatch.setattr(os, "access", lambda which, *how: which != str(path) and may(which, *how))
     state, text, remedy = doctor()["sensors"][0]
     assert (state, "lack permission to open" in text) == ("bad", True)
-    assert remedy == permission(path)
+    assert remedy == permission(path, "123")
 
 
 @pytest.mark.skipif(not hasattr(os, "getgid"), reason="groups are those of POSIX")
+@pytest.mark.parametrize(
+    ("serial", "rule"),
+    [("207A", r'ENV\{ID_SERIAL_SHORT\}=="207A"'), ("", r'KERNEL=="ttyACM\*"'), ('a"b', r'KERNEL=="ttyACM\*"')],
+)
 @pytest.mark.parametrize(
     ("group_id", "mode", "remedy"),
     [
@@ -99,7 +103,7 @@ def test_doctor_reports_a_port_without_permission(doctor, monkeypatch, tmp_path)
         (os.getgid() or 21, 0o660, "udev"),  # a group of the user, which still has no access
     ],
 )
-def test_doctor_port_remedy_suits_group_and_mode(monkeypatch, group_id, mode, remedy):
+def test_doctor_port_remedy_suits_group_and_mode(monkeypatch, group_id, mode, remedy, serial, rule):
     import grp  # noqa: PLC0415  not on every system
 
     def named(number):
@@ -108,12 +112,14 @@ def test_doctor_port_remedy_suits_group_and_mode(monkeypatch, group_id, mode, re
     monkeypatch.setattr(grp, "getgrgid", named)
     monkeypatch.setattr(os, "getgroups", lambda: [21, os.getgid()])
     monkeypatch.setattr(_diagnosis.sys, "platform", "linux")
-    reported = permission(SimpleNamespace(stat=lambda: SimpleNamespace(st_gid=group_id, st_mode=0o20000 | mode)))
+    reported = permission(
+        SimpleNamespace(stat=lambda: SimpleNamespace(st_gid=group_id, st_mode=0o20000 | mode)), serial
+    )
     if remedy != "udev":
         assert reported == remedy
         return
     assert "usermod -aG root" not in reported
-    assert re.search(r"""write 'KERNEL=="ttyACM\*", .*' to /etc/udev/rules.d/\S+\.rules""", reported)
+    assert re.search(rf"""write 'SUBSYSTEM=="tty", {rule}, .*' to /etc/udev/rules.d/\S+\.rules""", reported)
 
 
 def test_doctor_checks_all_extras(doctor):
