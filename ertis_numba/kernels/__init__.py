@@ -17,6 +17,7 @@ from ertis_numba.kernels._contract.fusion import (
     ViewingSensors,
 )
 from ertis_numba.kernels._contract.mapping import MappingKernels
+from ertis_numba.kernels._contract.overlaps import DISTURBING
 from ertis_numba.kernels._contract.points import (
     ABSENT,
     N_VALUES,
@@ -45,6 +46,7 @@ __all__ = [
     "ABSENT",
     "AUDIBLE",
     "DEVICES",
+    "DISTURBING",
     "LAST_PATH_M",
     "NEAREST_M",
     "N_VALUES",

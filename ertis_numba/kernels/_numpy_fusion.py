@@ -25,6 +25,7 @@ from ertis_numba.kernels._contract.fusion import (
     Truths,
     ViewingSensors,
 )
+from ertis_numba.kernels._numpy_overlaps import overlap_echoes
 
 __all__ = ["KERNELS"]
 
@@ -319,4 +320,5 @@ KERNELS = FusionKernels(
     match_echoes=match_echoes,
     find_arrivals=find_arrivals,
     see_places=see_places,
+    overlap_echoes=overlap_echoes,
 )

@@ -17,7 +17,7 @@ N_DIRECTIONS, N_STEPS, N_RANGES, N_ENTRIES = 12, 31, 90, 200
 N_PIXELS = N_DIRECTIONS * N_STEPS
 CELLS = 1, 20, 25
 N_CELLS = 500
-DOUBLE = "compare_echoes", "locate_reflector", "match_echoes", "see_places"
+DOUBLE = "compare_echoes", "locate_reflector", "match_echoes", "overlap_echoes", "see_places"
 COUNTING = "find_arrivals", "match_echoes"  # Their first output holds indices.
 NAMES = [field.name for field in dataclasses.fields(FusionKernels)]
 
@@ -85,6 +85,24 @@ def views(draws, n_places=9, n_sensors=3):
     beside_m = draws.uniform(0.0, 0.01, (n_sensors, 33))
     is_flat, model = np.array([True, False, True]), np.array([1, -1, 0])
     return place_m, kernels.ViewingSensors(sensor_m, ahead, is_flat, model, patterns, lost, beside_m)
+
+
+def overlaps(draws, n_reflectors=7, n_echoes=25, n_sensors=3):
+    """Echoes of reflectors with small errors, some of them strong, and some of silent emitters."""
+    path_m = draws.uniform(1.0, 1.2, (n_reflectors, n_sensors, n_sensors))
+    power = draws.choice([1e-3, 1.0, 1e3], path_m.shape)
+    direction = draws.normal(size=(n_reflectors, n_sensors, 3)) * [0.2, 1.0, 0.2]
+    direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+    receiver, of = draws.integers(0, n_sensors, n_echoes), draws.integers(0, n_reflectors, n_echoes)
+    heard_m = path_m[of, receiver] + draws.normal(scale=0.01, size=(n_echoes, n_sensors))
+    heard_m[draws.random(heard_m.shape) < 0.2] = np.nan
+    is_other = np.arange(n_reflectors)[:, None] != of[:, None, None]
+    ahead = draws.normal(size=(n_sensors, 3))
+    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    widths = draws.uniform(0.01, 0.02, n_sensors), draws.uniform(0.1, 0.3, n_sensors)
+    toward, loudness = direction[of, receiver], draws.uniform(0.5, 2.0, n_echoes)
+    given = path_m, power, direction, receiver, heard_m, toward, loudness
+    return *given, np.repeat(is_other, n_sensors, axis=2), ahead, *widths
 
 
 @functools.cache
@@ -156,6 +174,7 @@ def arguments(seed=3):
         "find_arrivals": (arrivals(draws), [(3, 20)]),
         "see_places": (views(draws), [(9, 3), (9, 3, 3), (9, 3), (9, 3, 3), (9, 3), (9, 3, 3), (9, 3)]),
         "match_echoes": ((*matches(draws), 16.0, 4.0), [(3, 60), (60,)]),
+        "overlap_echoes": (overlaps(draws), [(3, 25, 7)]),
         "locate_reflector": ((*echoes(draws), 0.01, 0.05, 2.0, 8), [(3,), (3, 3)]),
     }
 

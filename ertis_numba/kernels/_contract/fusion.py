@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.kernels._contract.arrays import Real, Turns
+from ertis_numba.kernels._contract.overlaps import OverlapEchoes
 
 __all__ = [
     "AUDIBLE",
@@ -377,3 +378,4 @@ class FusionKernels:
     match_echoes: MatchEchoes
     find_arrivals: FindArrivals
     see_places: SeePlaces
+    overlap_echoes: OverlapEchoes

@@ -18,6 +18,7 @@ from ertis_numba.kernels._contract.fusion import (
     SPREADING_M,
     FusionKernels,
 )
+from ertis_numba.kernels._cpu.overlaps import overlap_echoes
 
 __all__ = ["KERNELS"]
 
@@ -382,4 +383,5 @@ KERNELS = FusionKernels(
     match_echoes=match_echoes,
     find_arrivals=find_arrivals,
     see_places=see_places,
+    overlap_echoes=overlap_echoes,
 )
