@@ -16,7 +16,7 @@ from ertis_numba.chain import costs, nominal_costs, planner
 from ertis_numba.network.processing import ProcessingOptions as ServeOptions
 from ertis_numba.pipeline import Pipeline
 from ertis_numba.settings import Accuracy
-from ertis_numba.storage import open_energyscapes, write_recording
+from ertis_numba.storage import open_energyscapes, open_recording, write_recording
 from tests.cases import SHORT, noise
 from tests.files import noise as many_noise
 from tests.pages import ROOT, path_of
@@ -204,6 +204,17 @@ def test_costs_of_some_units_are_scaled_to_the_machine_of_the_others(tmp_path, m
 def test_documented_costs_are_the_nominal_ones():
     table = bench_costs.nominal_as_markdown(nominal_costs.NOMINAL_COSTS)
     assert table in path_of("accuracy").read_text("utf-8")
+
+
+def test_documented_times_of_a_board_follow_from_its_costs():
+    kernel_set, rows = dataclasses.replace(CPU, instruction_set="NEON"), []
+    with open_recording(ROOT / "data" / "synthetic" / "reflectors.h5") as recording:
+        settings = recording.settings
+    for n_directions in (90, 1850, 3000):
+        made = planner.complete(settings.replace("processing.directions", str(n_directions)), kernel_set, threads=1)
+        times_ms = planner.Planner(made, kernel_set, threads=1).chosen(made.accuracy).stages_ms.values()
+        rows.append(f"| {n_directions} | {sum(times_ms):.0f} |")
+    assert "\n".join(rows) in path_of("single-board").read_text("utf-8")
 
 
 def test_plans_differ_only_in_time():
