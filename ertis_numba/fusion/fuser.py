@@ -1,8 +1,7 @@
 """Fusion of the images of sensors that emit together."""
 
 import functools
-import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -12,6 +11,7 @@ from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
 from ertis_numba.fusion.emissions import is_much_better
+from ertis_numba.fusion.evidence import PulseEvidence, best_evidence
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.pulses import is_same_pulse
 from ertis_numba.fusion.rig import USUAL_DIAMETER_M, Mountings, emitter_diameter_m, mounted_sensors
@@ -202,7 +202,7 @@ class Fuser:
         self._tables: FusionTables | None = None
         self._last: Callable[[], PulseReflectors] | None = None  # of the pulse before
         self._first: list[tuple[tuple[Energyscape, ...], Callable[[], PulseReflectors]]] = []
-        self._evidence: list[Callable[[], dict[int, float]]] = []  # of the pulse and those before
+        self._evidence: list[PulseEvidence] = []  # of the pulse and those before
         self._options = {"spacing_deg": spacing_deg, "range_step_m": range_step_m, "silent": tuple(silent)}
 
     @property
@@ -241,8 +241,7 @@ class Fuser:
         coarse = {number: tables.coarse(number, image) for number, image in group.items()}
         found = tables.attribution(group).without(unheard)(coarse)
         solve = self._last = functools.cache(lambda: tables.pulse_reflectors(group, found, unheard, pulses))
-        evidence: Callable[[], dict[int, float]] = functools.cache(lambda: tables.evidence(group, solve()))
-        recent = self._evidence = [*self._evidence, evidence][-_N_SHOWN:]
+        recent = self._evidence = [*self._evidence, tables.evidence(group, solve)][-_N_SHOWN:]
         if len(self._first) < _N_COMPARED:
             self._first.append((tuple(group.values()), solve))
         return Fused(
@@ -252,7 +251,7 @@ class Fuser:
             _solve=solve,
             _render=lambda reflectors: tables.image(reflectors, group, coarse),
             _locate=lambda reflectors: tables.points(reflectors, group),
-            _evidence=functools.cache(lambda: _best(recent)),
+            _evidence=functools.cache(lambda: best_evidence(recent)),
             _names=self.sensors,
         )
 
@@ -404,17 +403,6 @@ class Fuser:
             [known.get(number, known[first]) for number in numbers] for known in (self._start_s, self._diameter_m)
         )
         return FusionTables(grid, self._mountings, self._emitting, start_s, diameters_m)
-
-
-def _best(recent: Sequence[Callable[[], dict[int, float]]]) -> dict[int, float]:
-    """Return the best evidence of recent pulses for each emitter of the last one."""
-    found = recent[-1]()
-    for earlier in reversed(recent[:-1]):
-        if min(found.values(), default=math.inf) > 0:
-            break
-        before = earlier()
-        found = {number: max(better, before.get(number, better)) for number, better in found.items()}
-    return found
 
 
 def fuse(images: Iterable[Energyscape], mountings: Mountings, *, emitter_diameter_m: float | None = None) -> Fused:

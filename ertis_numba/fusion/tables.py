@@ -1,7 +1,7 @@
 """Tables of fusion: receivers, pairs and hypotheses of all sensors of a platform."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -23,6 +23,7 @@ from ertis_numba.fusion.emissions import (
     silent_one,
     suspect,
 )
+from ertis_numba.fusion.evidence import PulseEvidence
 from ertis_numba.fusion.known_echoes import explained_shares, levelled
 from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
 from ertis_numba.fusion.points import PointFuser, joined
@@ -237,21 +238,30 @@ class FusionTables:
         """Return the sensors of a group that emitted."""
         return frozenset({*self._emitting} & group.keys() - _key(group)[1])
 
-    def evidence(self, group: Mapping[int, Energyscape], found: PulseReflectors) -> dict[int, float]:
+    def evidence(self, group: Mapping[int, Energyscape], solve: Callable[[], PulseReflectors]) -> PulseEvidence:
         """Return how much better emission of each sensor explains the echoes than its silence; 0 if equally well.
 
         Infinite for emitters that echoes prove to work; negatively infinite for unheard ones, and for those without a
         located echo of their own call.
         """
-        return {number: self._evidence(group, found, number) for number in self.emitters(group)}
+        return PulseEvidence(
+            self.emitters(group),
+            lambda number: self._proof(solve(), number),
+            lambda number: self._comparison(group, solve(), number),
+        )
 
-    def _evidence(self, group: Mapping[int, Energyscape], found: PulseReflectors, number: int) -> float:
-        """Return how much better emission of one sensor explains the echoes."""
+    @staticmethod
+    def _proof(found: PulseReflectors, number: int) -> float | None:
+        """Return the evidence for one emitter that needs no other explanation of the echoes; None without any."""
         is_unheard = number in found.unheard
         if number in found.apart or (not is_unheard and found.pulses and is_heard(found.pulses[-1], number)):
             return math.inf
         if is_unheard or number not in found.reflectors.own_emitters():
             return -math.inf
+        return None
+
+    def _comparison(self, group: Mapping[int, Energyscape], found: PulseReflectors, number: int) -> float:
+        """Return how much better emission of one sensor explains the echoes than its silence."""
         silent = found.unheard | {number}
         rival = self._explained(group, self._without(group, silent), found.floor, silent)
         return math.inf if found.reflectors.needs(number, rival.reflectors) else rival.cost - found.cost

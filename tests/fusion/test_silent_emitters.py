@@ -10,6 +10,7 @@ from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba.fusion.emissions import EmissionCounts, cheapest, doubted, silent_one, suspect
+from ertis_numba.fusion.evidence import PulseEvidence, best_evidence
 from ertis_numba.ros.fused_points import FusedImages
 from ertis_numba.simulation import load_scene
 from ertis_numba.simulation.render import render
@@ -204,6 +205,33 @@ def test_emitters_that_no_echo_shows_are_doubted(counted, cost, expected):
 )
 def test_silence_must_explain_echoes_clearly_better(joint, costs, expected):
     assert cheapest(joint, costs) == expected
+
+
+@pytest.mark.parametrize(
+    ("proofs", "comparisons", "best", "compared"),
+    [
+        ([-1.0, 2.0], [], 2.0, 0),
+        ([2.0, None], [], 2.0, 0),
+        ([None, None], [3.0], 3.0, 1),
+        ([None, None], [0.0, 4.0], 4.0, 2),
+        ([None, -2.0, None], [-5.0, -1.0], -1.0, 2),
+        ([None, None], [-3.0, 0.0], 0.0, 2),
+    ],
+)
+def test_best_evidence_compares_no_more_than_it_takes_to_show_that_an_emitter_works(
+    proofs, comparisons, best, compared
+):
+    """Proofs of pulses, and the comparisons of those without one, from the last pulse back."""
+    results = iter(comparisons)
+    pulses = [PulseEvidence({7}, lambda _, proof=proof: proof, lambda _: next(results)) for proof in reversed(proofs)]
+    assert best_evidence(pulses) == {7: best}
+    assert len([*results]) == len(comparisons) - compared
+    assert best_evidence(pulses) == {7: best}  # Comparisons are made once.
+
+
+def test_best_evidence_is_that_of_the_emitters_of_the_last_pulse():
+    first, last = (PulseEvidence(each, {2: 1.0, 3: -1.0}.__getitem__, pytest.fail) for each in ({2, 3}, {3}))
+    assert best_evidence([first, last]) == {3: -1.0}
 
 
 def test_emitters_between_two_walls_are_heard(tmp_path):
