@@ -1,22 +1,24 @@
 """Draw and measure the scenes of ``synthetic/scenes`` for ``docs/how-to/gallery.md``, as a part of ``make data``.
 
-Pictures go to ``docs/pictures/gallery``; tables go between the markers ``<!-- scene NAME -->`` and
-``<!-- /scene NAME -->``. All else on the page is written by hand.
+Pictures go to ``docs/pictures/gallery``. They are the outputs of the commands beside them, smaller and with fewer
+colours. Commands and tables go between the markers ``<!-- scene NAME -->`` and ``<!-- /scene NAME -->``. All else on
+the page is written by hand.
 """
 
-import io
+import contextlib
 import itertools
 import sys
+import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from matplotlib.figure import Figure
+from click.testing import CliRunner
+from ertis_cli.main import cli
 from PIL import Image
 
 import ertis_numba as ertis
 from ertis_numba.analysis.compare import errors_of
-from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.simulation import Scene
 from ertis_numba.simulation.effect_plan import EffectPlan, make_plan
 
@@ -26,13 +28,9 @@ PAGE = ROOT / "docs" / "how-to" / "gallery.md"
 PICTURES = ROOT / "docs" / "pictures" / "gallery"
 Takes = dict[str, list[tuple[ertis.Energyscape, list[ertis.Reflector]]]]
 _MIN_LEVELS_DB = (-10.0, -30.0)
-_N_PEAKS = 5  # As many as the command marks by default.
 _USUAL_DB = 40.0  # Default of the command.
 _MAX_TAKEN = 6  # measurements of each sensor
-_MAX_BYTES = 150_000  # size limit of a picture
-_SHEET = (1.0, 92)  # share of a figure's width that is shown, and dots per inch
-_FRAME = (0.765, 84)  # the same for figures side by side: without colour bar and list
-_IN_ORDER = {"microphone_noise": False, "microphone_spread": False, "microphone_faults": False}
+_WIDTHS_PX = {1600: 920, 2240: 1288}  # of the pictures on the page, by the widths of the command's
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,13 +43,13 @@ class Shown:
         Measurements to draw.
     dynamic_range_db : float
         Range of the colours in dB; 30 by default.
-    healthy : bool
-        Whether a second picture shows the scene without microphone faults; False by default.
+    without : str
+        Word whose lines the scene of further pictures lacks; no such pictures by default.
     """
 
     frames: tuple[tuple[str, int], ...]
     dynamic_range_db: float = 30.0
-    healthy: bool = False
+    without: str = ""
 
 
 SHOWN = {
@@ -59,7 +57,7 @@ SHOWN = {
     "shelf_of_bottles": Shown(frames=(("gripper", 0),), dynamic_range_db=20.0),
     "moving_person": Shown(frames=(("door", 0), ("door", 2), ("door", 4))),
     "two_facing_sensors": Shown(frames=(("west", 0), ("east", 0)), dynamic_range_db=40.0),
-    "faulty_array": Shown(frames=(("worn", 0),), healthy=True),
+    "faulty_array": Shown(frames=(("worn", 0),), without="electronics"),
     "moving_platform": Shown(frames=(("front", 0), ("front", 3), ("front", 5))),
     "hall": Shown(frames=(("front", 0), ("right", 0))),
 }
@@ -70,20 +68,30 @@ def main() -> None:
     """Draw the pictures and write the tables of all scenes, or of scenes named on the command line."""
     PICTURES.mkdir(exist_ok=True)
     for name in sys.argv[1:] or SHOWN:
-        scene = ertis.load_scene(SCENES / f"{name}.toml")
+        path, shown = SCENES / f"{name}.toml", SHOWN[name]
+        scene = ertis.load_scene(path)
         plan = make_plan(scene)
         takes = take(scene, plan)
-        stems = [name]
-        draw(name, takes, SHOWN[name])
-        if SHOWN[name].healthy:
-            stems.append(f"{name}_healthy")
-            healthy = scene.replace(effects=_IN_ORDER)
-            new = take(healthy, make_plan(healthy))
-            draw(stems[-1], new, SHOWN[name])
+        parts = [pictures(name, commands(name, scene, shown), takes)]
+        if shown.without:
+            changed = without(path, shown.without)
+            new = take(changed, make_plan(changed))
+            parts += [
+                f"The same scene as new (`grep -v {shown.without} {name}.toml > as_new.toml`):",
+                pictures("as_new", commands("as_new", changed, shown), new),
+            ]
             takes |= {f"{sensor}, as new": shots for sensor, shots in new.items()}
-        pictures = [f"![{stem.replace('_', ' ')}](../pictures/gallery/{stem}.png)" for stem in stems]
-        text = "\n\n".join([*pictures, command(name, scene, SHOWN[name]), effects_table(plan), errors_table(takes)])
+        text = "\n\n".join([*parts, effects_table(plan), errors_table(takes)])
         PAGE.write_text(replaced(PAGE.read_text("utf-8"), f"scene {name}", text), encoding="utf-8")
+
+
+def without(path: Path, word: str) -> Scene:
+    """Return a scene without the lines that contain a word."""
+    lines = path.read_text("utf-8").splitlines(keepends=True)
+    with tempfile.TemporaryDirectory() as folder:
+        changed = Path(folder) / "as_new.toml"
+        changed.write_text("".join(line for line in lines if word not in line), "utf-8")
+        return ertis.load_scene(changed)
 
 
 def take(scene: Scene, plan: EffectPlan) -> Takes:
@@ -98,47 +106,39 @@ def take(scene: Scene, plan: EffectPlan) -> Takes:
     return takes
 
 
-def draw(stem: str, takes: Takes, shown: Shown) -> None:
-    """Draw the picture of a scene."""
-    figures = []
+def commands(name: str, scene: Scene, shown: Shown) -> list[str]:
+    """Return the command that draws each picture of a scene."""
+    found = []
     for sensor, index in shown.frames:
-        image, _ = takes[sensor][index]
-        peaks = ertis.find_peaks(image, top=_N_PEAKS, false_alarm=FALSE_ALARM)
-        figures.append(ertis.plot(image, dynamic_range_db=shown.dynamic_range_db, peaks=peaks))
-    save(figures, PICTURES / f"{stem}.png")
+        words = ["ertis plot", f"{name}.energy.h5"]
+        words += ["--sensor", sensor] if len(scene.sensors) > 1 else []
+        words += ["--measurement", str(index)] if scene.count > 1 else []
+        words += ["--dynamic-range", f"{shown.dynamic_range_db:g}"] if shown.dynamic_range_db != _USUAL_DB else []
+        found.append(" ".join(words))
+    return found
 
 
-def command(name: str, scene: Scene, shown: Shown) -> str:
-    """Return the line with the command that draws the picture of a scene."""
-    sensor, first = shown.frames[0]
-    words = ["ertis plot", f"{name}.energy.h5"]
-    words += ["--sensor", sensor] if len(scene.sensors) > 1 else []
-    words += ["--measurement", str(first)] if first or len(shown.frames) > 1 else []
-    words += ["--dynamic-range", f"{shown.dynamic_range_db:g}"] if shown.dynamic_range_db != _USUAL_DB else []
-    others = [
-        f"`--sensor {each}`" if each != sensor else f"`--measurement {index}`" for each, index in shown.frames[1:]
-    ]
-    more = f"; then with {' and '.join(others)}" if others else ""
-    return f"`{' '.join(words)}`{more}"
+def pictures(name: str, lines: Sequence[str], takes: Takes) -> str:
+    """Run the commands of a scene on its images, store their pictures, and return both as Markdown, side by side."""
+    stems = [name] if len(lines) == 1 else [f"{name}_{number}" for number in range(1, len(lines) + 1)]
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        ertis.write_energyscapes(f"{name}.energy.h5", (image for shots in takes.values() for image, _ in shots))
+        for stem, line in zip(stems, lines, strict=True):
+            done = CliRunner().invoke(cli, [*line.split()[1:], "-o", f"{stem}.png"])
+            if done.exit_code:
+                raise SystemExit(f"{line}: {done.stderr}")
+            save(Image.open(f"{stem}.png"), PICTURES / f"{stem}.png")
+    shown = [f"![{stem.replace('_', ' ')}](../pictures/gallery/{stem}.png)" for stem in stems]
+    if len(lines) == 1:
+        return f"{shown[0]}\n\n`{lines[0]}`"
+    return _table(shown, "l" * len(shown), [[f"`{line}`" for line in lines]])
 
 
-def save(figures: Sequence[Figure], path: Path) -> None:
-    """Save figures side by side."""
-    share, dpi = _SHEET if len(figures) == 1 else _FRAME
-    parts = [_raster(figure, dpi) for figure in figures]
-    widths = [round(share * part.width) for part in parts]
-    strip = Image.new("RGB", (sum(widths), parts[0].height))
-    for number, part in enumerate(parts):
-        strip.paste(part.crop((0, 0, widths[number], part.height)), (sum(widths[:number]), 0))
-    strip.save(path, optimize=True)
-    if path.stat().st_size > _MAX_BYTES:  # large pictures have so many colours that 256 of them are enough
-        strip.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
-
-
-def _raster(figure: Figure, dpi: int) -> Image.Image:
-    file = io.BytesIO()
-    figure.savefig(file, format="png", dpi=dpi)
-    return Image.open(file).convert("RGB")
+def save(drawn: Image.Image, path: Path) -> None:
+    """Save a picture at the width that the page shows; 256 colours are enough for it."""
+    width = _WIDTHS_PX[drawn.width]
+    small = drawn.convert("RGB").resize((width, round(width * drawn.height / drawn.width)), Image.Resampling.LANCZOS)
+    small.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def effects_table(plan: EffectPlan) -> str:
