@@ -266,6 +266,7 @@ class PipelinesBySensor:
         if image.stamp.sensor not in self._checked:
             self._checked.add(image.stamp.sensor)
             options.note_unknown_places(image.stamp.sensor, image.settings, quiet=self._quiet)
+            options.note_height(image.settings, image, quiet=self._quiet)
             text = None if self.warnings else spacing_warning(image.settings, image)
             if text is not None:
                 self.warnings.append(text)

@@ -67,6 +67,7 @@ __all__ = [
     "min_level",
     "note",
     "note_doubts",
+    "note_height",
     "note_layout",
     "note_missing_points",
     "note_of",
@@ -423,6 +424,7 @@ def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
                 note(f"sensor {name}: {text}")
             if images.has_points:
                 note_unknown_places(name, images.settings)
+                note_height(images.settings, images)
             elif images.points_note is None:
                 note_unknown_angles(name, images.settings, images)
 
@@ -451,6 +453,19 @@ def note_unknown_places(sensor: str, settings: "Settings", *, quiet: bool = Fals
     text = observable_angles(settings.array).note
     if text is not None:
         note(f"sensor {sensor} {text}", quiet=quiet)
+
+
+def note_height(settings: "Settings", grid: "DegreesFromRadians", *, quiet: bool = False) -> None:
+    """Print a note if the directions of several sensors lie in the horizontal plane, once for equal arrays."""
+    from ertis_numba.geometry import height_note, observable_angles
+
+    if grid.elevation_rad.any() or not observable_angles(settings.array).elevation:
+        return
+    text = height_note(settings.array)
+    noted: set[str] = click.get_current_context().meta.setdefault("ertis_cli.noted_heights", set())
+    if text not in noted:
+        noted.add(text)
+        note(text, quiet=quiet)
 
 
 def note_unknown_bearings(sensor: str, settings: "Settings") -> None:

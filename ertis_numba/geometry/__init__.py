@@ -21,7 +21,13 @@ from ertis_numba.geometry.layouts import (
 from ertis_numba.geometry.levelling import levelled_grid
 from ertis_numba.geometry.mountings import mounting
 from ertis_numba.geometry.neighbours import azimuth_columns, spacing_rad
-from ertis_numba.geometry.observable import ObservableAngles, direction_note, observable_angles, require_places
+from ertis_numba.geometry.observable import (
+    ObservableAngles,
+    direction_note,
+    height_note,
+    observable_angles,
+    require_places,
+)
 from ertis_numba.geometry.position_files import SENSOR_FRAME
 from ertis_numba.geometry.sector import Fan, plan_m, round_step
 from ertis_numba.geometry.shipped_layouts import layout_names, layout_text
@@ -46,6 +52,7 @@ __all__ = [
     "effective_count",
     "far_field_delays",
     "grid_count",
+    "height_note",
     "is_closed",
     "layout_file",
     "layout_names",

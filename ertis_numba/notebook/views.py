@@ -15,7 +15,7 @@ from ertis_numba.base.errors import ErtisError
 from ertis_numba.base.html_parts import escaped, table
 from ertis_numba.base.units import counted
 from ertis_numba.frames import AcousticMap, Bearing, Energyscape, Peak, PointCloud, Stamp, doubt_notes
-from ertis_numba.geometry import direction_grid, direction_note, observable_angles
+from ertis_numba.geometry import direction_grid, direction_note, height_note, observable_angles
 from ertis_numba.notebook.page import Axis, page
 from ertis_numba.settings import Settings
 from ertis_numba.storage import RecordingReader
@@ -75,7 +75,9 @@ def _notes_of_image(image: Energyscape, found: Sequence[Peak]) -> Iterator[str |
     """Yield the notes of ``ertis peaks`` on an image."""
     array = image.settings.array
     if image.points is not None:
-        yield _of_sensor(image.stamp, observable_angles(array).note)
+        seen = observable_angles(array)
+        yield _of_sensor(image.stamp, seen.note)
+        yield height_note(array) if image.is_planar and seen.elevation else None
     else:
         yield _of_sensor(image.stamp, direction_note(array, image))
         yield spacing_warning(image.settings, image)
