@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ertis_numba import kernels
 from ertis_numba.base import checks
 from ertis_numba.frames import Energyscape
 from ertis_numba.geometry.air import sound_speed_m_s
@@ -58,39 +59,14 @@ class EchoFloor(NamedTuple):
         Their noise is estimated from a quantile of the amplitudes around a bin. Higher ones than the median follow
         noise that swells and fades, but also dense echoes. They exclude the slopes of the bin's own echo.
         """
-        last, n_around = amplitude.shape[1] - 1, self.n_around
-        first = np.array([1 - n_around, -n_around // 2, 0])  # A click may begin or end at the bin.
-        columns = np.abs(place[:, None] + first[:, None, None] + np.arange(n_around))
-        columns = (last - np.abs(last - columns)).clip(0)  # The image is mirrored at its ends.
-        around = amplitude[direction[:, None], columns]
-        steady = np.maximum(self.by_direction[direction], self.by_range[place])
-        found = np.empty((len(quantiles), len(place)), np.float32)
-        for quantile, out in zip(quantiles, found, strict=True):
-            rank, others = np.full(around.shape[:2], int(quantile * (n_around - 1))), around
-            if quantile > 0.5:
-                middles = np.minimum(-first, n_around - 1)
-                is_own = np.stack([_slopes(*each) for each in zip(around, middles, strict=True)])
-                n_own = is_own.sum(axis=2)
-                others = np.where(is_own, -np.inf, around)
-                rank = np.minimum(n_own + (quantile * (n_around - n_own - 1)).astype(np.int64), n_around - 1)
-            clicks = np.take_along_axis(np.sort(others, axis=2), rank[..., None], axis=2)[..., 0]
-            # Noise from one direction is coherent there, so that no beamformer changes its distribution.
-            ratio = self.ratio ** (1 / self.exponent) * (math.log(2) / -math.log1p(-quantile)) ** 0.5
-            out[:] = np.maximum(steady, np.maximum(clicks, 0).max(axis=0) * np.float32(ratio))
-        return found
-
-
-def _slopes(around: NDArray[np.float32], middle: int) -> NDArray[np.bool_]:
-    """Return True for the middle column of rows, and for those beside it up to which amplitudes fall: (row, column).
-
-    Slopes of noise do not fall as deep as those of an echo.
-    """
-    found = np.zeros(around.shape, np.bool_)
-    found[:, middle] = True
-    found[:, middle + 1 :] = np.logical_and.accumulate(np.diff(around[:, middle:]) <= 0, axis=1)
-    found[:, :middle] = np.logical_and.accumulate(np.diff(around[:, middle::-1]) <= 0, axis=1)[:, ::-1]
-    found[np.where(found, around, np.inf).min(axis=1) > _FALLEN * around[:, middle]] = False
-    return found
+        first = np.array([1 - self.n_around, -self.n_around // 2, 0])  # A click may begin or end at the bin.
+        clicks = np.empty((len(quantiles), len(place)), np.float32)
+        given = np.ascontiguousarray(amplitude), direction, place, first, self.n_around, np.array(quantiles)
+        kernels.load_points().noise_around(*given, np.float32(_FALLEN), clicks)
+        # Noise from one direction is coherent there, so that no beamformer changes its distribution.
+        spread = np.array([(math.log(2) / -math.log1p(-each)) ** 0.5 for each in quantiles])
+        clicks *= (self.ratio ** (1 / self.exponent) * spread).astype(np.float32)[:, None]
+        return np.maximum(np.maximum(self.by_direction[direction], self.by_range[place]), clicks)
 
 
 def noise_of(image: Energyscape) -> float:

@@ -3,11 +3,14 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ertis_numba.kernels._contract.points import ABSENT, Doubles, Places, PointKernels, Pulse, Quadrics
 from ertis_numba.kernels._numpy_echo_fits import fit_echoes, pulse_at
 
 __all__ = ["KERNELS"]
+
+Floats = NDArray[np.float32]
 
 
 def spread_amplitudes(pulse: Pulse, path_m: Doubles, out: Doubles) -> None:
@@ -41,9 +44,44 @@ def interpolate_tops(quadrics: Quadrics, fit: Places, logs: Doubles, out: Double
     out[:] = np.column_stack([shift, found[:, :3], level + 0.25 * (after - before) * shift + found[:, 3]])
 
 
+def noise_around(
+    amplitude: Floats,
+    direction: Places,
+    place: Places,
+    first: Places,
+    n_around: int,
+    quantiles: Doubles,
+    fallen: np.float32,
+    out: Floats,
+) -> None:
+    """Compute the highest quantile of amplitudes in windows around bins."""
+    last = amplitude.shape[1] - 1
+    columns = np.abs(place[:, None] + first[:, None, None] + np.arange(n_around))
+    around = amplitude[direction[:, None], (last - np.abs(last - columns)).clip(0)]
+    middles = np.minimum(-first, n_around - 1)
+    is_own = np.stack([_slopes(*each, fallen) for each in zip(around, middles, strict=True)])
+    for quantile, row in zip(quantiles, out, strict=True):
+        is_left_out = is_own & (quantile > 0.5)
+        n_own = is_left_out.sum(axis=2)
+        rank = np.minimum(n_own + (quantile * (n_around - n_own - 1)).astype(np.int64), n_around - 1)
+        ordered = np.sort(np.where(is_left_out, -np.inf, around), axis=2)
+        row[:] = np.maximum(np.take_along_axis(ordered, rank[..., None], axis=2)[..., 0], 0).max(axis=0)
+
+
+def _slopes(around: Floats, middle: int, fallen: np.float32) -> NDArray[np.bool_]:
+    """Return True for the middle column of rows, and for those beside it up to which amplitudes fall: (row, column)."""
+    found = np.zeros(around.shape, np.bool_)
+    found[:, middle] = True
+    found[:, middle + 1 :] = np.logical_and.accumulate(np.diff(around[:, middle:]) <= 0, axis=1)
+    found[:, :middle] = np.logical_and.accumulate(np.diff(around[:, middle::-1]) <= 0, axis=1)[:, ::-1]
+    found[np.where(found, around, np.inf).min(axis=1) > fallen * around[:, middle]] = False
+    return found
+
+
 KERNELS = PointKernels(
     spread_amplitudes=spread_amplitudes,
     find_tops=find_tops,
     interpolate_tops=interpolate_tops,
     fit_echoes=fit_echoes,
+    noise_around=noise_around,
 )

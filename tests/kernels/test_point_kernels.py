@@ -126,6 +126,24 @@ def test_fitted_echoes_are_those_of_numpy_and_at_their_places(beams_have_errors,
     assert np.median(sd[5:10, 1]) > 3 * np.median(sd[single, 1])  # Two echoes are not the image of one.
 
 
+def test_noise_around_bins_is_that_of_numpy():
+    """Of noise, of echoes with slopes, of clicks, and of bins at both ends of the ranges; all to the bit."""
+    draws = np.random.default_rng(6)
+    amplitude = draws.rayleigh(size=(7, 120)).astype(np.float32)
+    direction, place = draws.integers(0, 7, N_PLACES), np.r_[0, 1, 119, draws.integers(0, 120, N_PLACES - 3)]
+    for row, column in zip(direction[::2], place[::2], strict=True):
+        amplitude[row] += 500 * np.exp(-np.abs(np.arange(120) - column, dtype=np.float32))
+    amplitude[3, 40:60] *= 20
+    for n_around in (8, 33, 150):
+        first = np.array([1 - n_around, -n_around // 2, 0])
+        given = amplitude, direction, place, first, n_around, np.array([0.5, 0.8, 0.0, 1.0]), np.float32(0.01)
+        compiled, exact = np.full((2, 4, N_PLACES), np.nan, np.float32)
+        kernels.load_points().noise_around(*given, compiled)
+        _numpy_points.KERNELS.noise_around(*given, exact)
+        np.testing.assert_array_equal(compiled, exact)
+        assert np.ptp(compiled, axis=1).min() > 0 or n_around == 150
+
+
 def amplitudes(pulse, beams, place, offset_m, is_focused, tilt_s, range_m=0.8):
     """Amplitudes of an echo as a sum over microphones, with delays of spherical waves."""
 

@@ -158,6 +158,28 @@ class FitEchoes(Protocol):
     ) -> None: ...
 
 
+class NoiseAround(Protocol):
+    """Compute the highest quantile of amplitudes in windows around bins: ``out`` (quantile, bin) float32.
+
+    ``amplitude`` (direction, range) continues as a mirror image at its ends. A window has ``n_around`` ranges from
+    ``first`` (window,) on, relative to the range ``place`` (bin,). Quantiles above 0.5 exclude the slopes of a bin's
+    own echo: ranges up to which amplitudes fall on each side, if they fall below ``fallen`` relative to the bin. Slopes
+    of noise do not.
+    """
+
+    def __call__(
+        self,
+        amplitude: NDArray[np.float32],
+        direction: Places,
+        place: Places,
+        first: Places,
+        n_around: int,
+        quantiles: Doubles,
+        fallen: np.float32,
+        out: NDArray[np.float32],
+    ) -> None: ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PointKernels:
     """Kernels of points of one device, all for one thread."""
@@ -166,3 +188,4 @@ class PointKernels:
     find_tops: FindTops
     interpolate_tops: InterpolateTops
     fit_echoes: FitEchoes
+    noise_around: NoiseAround

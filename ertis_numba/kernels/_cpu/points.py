@@ -8,6 +8,7 @@ from numba import njit
 
 from ertis_numba.kernels._contract.points import ABSENT, PointKernels
 from ertis_numba.kernels._cpu.echo_fits import fit_echoes
+from ertis_numba.kernels._cpu.noise_around import noise_around
 from ertis_numba.kernels._cpu.pulse_table import pulse_at, unit_at
 
 __all__ = ["KERNELS"]
@@ -78,4 +79,5 @@ KERNELS = PointKernels(
     find_tops=find_tops,
     interpolate_tops=interpolate_tops,
     fit_echoes=fit_echoes,
+    noise_around=noise_around,
 )
