@@ -19,6 +19,7 @@ from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Setting
 from tests import reference
 from tests.cases import SHORT, noise
 from tests.hard_cases.tuned import tuned
+from tests.pages import page
 
 SPEED_M_S = sound_speed_m_s(Air())
 CALL = Call()
@@ -70,6 +71,16 @@ def beams_of(aperture, points, spectra):
     """Sums over microphones at every frequency: (point, wave) complex128."""
     delays_s = aperture.delays_s(points, sound_speed_m_s=SPEED_M_S)
     return np.einsum("mw,pmw->pw", spectra, np.exp(2j * math.pi * delays_s[:, :, None] * SPECTRUM.frequency_hz))
+
+
+@pytest.mark.parametrize(("n_taps", "density"), [(2, 2.5), (4, 1.25), (4, 1.5), (4, 2.5), (6, 2.0)])
+def test_documented_sizes_and_errors_of_beam_grids_are_computed(n_taps, density):
+    axes = direction_grid(Processing(directions="3000"))
+    aperture = Aperture.of(ARRAYS_M["eRTIS"], unit_vectors(axes.azimuth_rad, axes.elevation_rad))
+    spacing = aperture.spacing(density, high_hz=CALL.high_frequency_hz, sound_speed_m_s=SPEED_M_S)
+    count, error_db = aperture.count_grid_points(spacing, n_taps), predicted_db_of(aperture, n_taps, density)
+    row = f"| {n_taps} × {n_taps} taps, density {density:g} | {count} | −{-error_db:.0f} dB |"
+    assert row in page("accuracy")
 
 
 @pytest.mark.parametrize(("n_taps", "density"), CHOICES)
