@@ -30,6 +30,9 @@ _N_COMPARED: Final = 8  # Number of reflectors that serve to assess the predicti
 _TRUSTED: Final = (0.25, 0.4)
 _OWN: Final = 0.7  # Share of a reflector's level that it must have by comparison with its side lobes.
 _LEAST_OWN: Final = 0.1
+# Deviations of a pulse from that of one echo, relative to its maximum. Below the first, it is one echo. Above the
+# second, its side lobes are those of several.
+_ONE_ECHO: Final = (0.1, 0.25)
 _SHARE: Final = 0.25  # Share of the ranges that count as near an edge, at most, for large arrays.
 _SKIRT_M: Final = 2.5 * PULSE_M
 _OPEN: Final = 0.65  # Amplitude of a pulse at an edge, above which its maximum may lie beyond the edge.
@@ -53,7 +56,8 @@ class SideLobes:
     it stays below ``σ √ln(N / p)`` with a probability of 1 - p. σ is measured in the image. It is the deviation from
     the prediction at the same range, and at most the mean of all side lobes that extend to this range. Echoes that
     interfere deviate as well. The prediction is therefore first compared with the reflector that fits best: if the
-    pattern around it matches, the array is as designed, and σ is 0.
+    pattern around it matches, the array is as designed, and σ is 0. A reflector whose pulse deviates from that of one
+    echo keeps its σ, because the side lobes of several echoes are not predicted.
 
     Noise adds to side lobes. ``noise`` is the amplitude that it alone reaches with the probability of a false alarm, as
     `ertis_numba.analysis.noise.threshold_of` returns it. A maximum must exceed the limit by this amplitude, too.
@@ -62,7 +66,7 @@ class SideLobes:
     def __init__(
         self, image: Energyscape, directions: NDArray[np.float64], candidates: NDArray[np.int64], *, noise: float = 0.0
     ) -> None:
-        self._noise = noise
+        self._noise, self._directions = noise, directions
         self._image, self._spread = image, PointSpread(image.settings)
         count = len(directions)
         self._samples = np.unique(np.linspace(0, count - 1, min(count, _N_DIRECTIONS)).astype(np.int64))
@@ -72,6 +76,7 @@ class SideLobes:
         self._offsets_m = np.linspace(0.0, self._spread.skirt_m, _N_OFFSETS)
         self._mean = np.zeros(_N_OFFSETS)  # Mean side lobes of a reflector of amplitude 1, for each range offset.
         self._sources: list[tuple[NDArray[np.float64], float, float]] = []
+        self._doubts: list[float] = []  # Uncertainty of the pattern of each source.
         self._deviations: dict[int, float] = {}  # The keys are range bins.
         self._doubt = self._doubt_of(directions, candidates)
 
@@ -85,15 +90,20 @@ class SideLobes:
         if not self._sources:
             self._mean = self._mean_around(direction)
         self._sources.append((direction, range_m, amplitude))
+        self._doubts.append(max(self._doubt, _MARGIN * self._doubt_of_pulse(direction, range_m)))
         self._deviations.clear()
 
     def explain(self, direction: NDArray[np.float64], range_bin: int, level: float) -> bool:
         """Return True if a maximum may be a side lobe of the reflectors added so far."""
         range_m = float(self._image.range_m[range_bin])
-        near = [source for source in self._sources if abs(range_m - source[1]) < self._spread.skirt_m]
+        near = [
+            (*source, doubt)
+            for source, doubt in zip(self._sources, self._doubts, strict=True)
+            if abs(range_m - source[1]) < self._spread.skirt_m
+        ]
         if not near:
             return False
-        sources, ranges_m, amplitudes = (np.array(each) for each in zip(*near, strict=True))
+        sources, ranges_m, amplitudes, doubts = (np.array(each) for each in zip(*near, strict=True))
         offsets_m = range_m - ranges_m
         places = np.broadcast_to(direction, sources.shape), np.full(len(near), range_m)
         predicted = float(amplitudes @ self._spread.of_echo(*places, sources, ranges_m, is_focused=self._is_focused))
@@ -101,9 +111,24 @@ class SideLobes:
         if level <= _MARGIN * predicted:
             return True
         # Echoes of real surfaces are longer than the pulse.
-        means = self._doubt * amplitudes * np.interp(np.abs(offsets_m) - PULSE_M, self._offsets_m, self._mean)
+        means = doubts * amplitudes * np.interp(np.abs(offsets_m) - PULSE_M, self._offsets_m, self._mean)
         largest = self._factor * math.hypot(*means)
-        return level <= predicted + largest and level <= predicted + self._factor * self._deviation(range_bin)
+        deviation = max(1.0, doubts.max()) * self._factor * self._deviation(range_bin)
+        return bool(level <= predicted + min(largest, deviation))
+
+    def _doubt_of_pulse(self, direction: NDArray[np.float64], range_m: float) -> float:
+        """Return the uncertainty of the pattern of a reflector, from 0 to 1, by the shape of its pulse."""
+        offsets_m = self._image.range_m - range_m
+        near = np.flatnonzero(np.abs(offsets_m) < 2 * PULSE_M)
+        if len(near) < 3 or self._image.settings.processing.is_adaptive:
+            return 0.0
+        pulse = self._spread(np.zeros((len(near), 3)), np.abs(offsets_m[near]))
+        column = int(np.argmax(self._directions @ direction))
+        measured = self._image.amplitude[column, near].astype(np.float64)
+        scale = float(measured @ pulse / (pulse @ pulse))
+        apart = float(np.abs(measured - scale * pulse).max()) - self._noise
+        low, high = _ONE_ECHO
+        return min(1.0, max(0.0, (apart / scale - low) / (high - low))) if scale > 0 else 0.0
 
     def _doubt_of(self, directions: NDArray[np.float64], candidates: NDArray[np.int64]) -> float:
         """Return the uncertainty of the side-lobe pattern, from 0 to 1, at the reflector whose pattern fits best.

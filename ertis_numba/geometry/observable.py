@@ -171,7 +171,7 @@ def _azimuth_error_rad(array: Array) -> float:
         for azimuth_rad in np.radians([-45.0, -22.5, 0.0, 22.5, 45.0])
         for arriving in unit_vectors(np.full(2, azimuth_rad), np.array([-_ABOVE_RAD, _ABOVE_RAD]))
     ]
-    return max(map(abs, errors))
+    return float(np.abs(errors).max())
 
 
 def _of_grid(grid: DegreesFromRadians) -> str | None:

@@ -19,8 +19,8 @@ def line(n_mics, length_m):
     return tuple((0.0, float(y_m), 0.0) for y_m in np.linspace(-length_m / 2, length_m / 2, n_mics))
 
 
-def images(positions_m, rng, n_images, **call):
-    """Images of one echo each, with its direction and range."""
+def images(positions_m, rng, n_images, *, are_pairs=False, **call):
+    """Images of one echo each, or of two echoes closer than a pulse, with the direction and range of the first."""
     settings = Settings(
         array=Array(positions_m=positions_m),
         call=Call(**call),
@@ -36,8 +36,13 @@ def images(positions_m, rng, n_images, **call):
     }
     for _ in range(n_images):
         azimuth_deg, range_m = rng.uniform(-55, 55), rng.uniform(0.9, 2.0)
-        path_m = range_m + np.linalg.norm(range_m * unit(azimuth_deg, 0) - microphones_m, axis=1)
-        heard = sweep(np.arange(N_SAMPLES) / RATE_HZ - path_m[:, None] / speed_m_s, **form)
+        places = [(azimuth_deg, range_m, 1.0)]
+        if are_pairs:
+            places.append((azimuth_deg + rng.uniform(-2, 2), range_m + rng.uniform(0.004, 0.01), rng.uniform(0.5, 1)))
+        heard = np.zeros((len(microphones_m), N_SAMPLES))
+        for echo_deg, echo_m, amplitude in places:
+            path_m = echo_m + np.linalg.norm(echo_m * unit(echo_deg, 0) - microphones_m, axis=1)
+            heard += amplitude * sweep(np.arange(N_SAMPLES) / RATE_HZ - path_m[:, None] / speed_m_s, **form)
         heard += 0.02 * rng.standard_normal(heard.shape)
         words = (0.01 * heard.T).astype(np.float32)
         yield pipeline.process(Measurement(words, pipeline.settings)), azimuth_deg, range_m
@@ -64,3 +69,11 @@ def test_side_lobes_of_the_call_are_no_reflectors(call):
             peaks = find_peaks(image, top=None, false_alarm=1e-3)
             assert [round(peak.range_m - range_m, 2) for peak in peaks] == [0.0]
             assert not math.isnan(peaks[0].level_db)
+
+
+@pytest.mark.parametrize("positions_m", [line(8, 0.028), line(16, 0.056)])
+def test_side_lobes_of_two_echoes_closer_than_a_pulse_are_no_reflectors(positions_m):
+    for image, azimuth_deg, _ in images(positions_m, np.random.default_rng(22), 20, are_pairs=True):
+        peaks = find_peaks(image, top=None, false_alarm=1e-3)
+        assert peaks
+        assert [peak.azimuth_deg for peak in peaks] == pytest.approx([azimuth_deg] * len(peaks), abs=10)
