@@ -135,11 +135,6 @@ class Attribution:
         """Return the reflectivity (cell,) by other shares of the pixels than those found."""
         return np.asarray(np.minimum(self._mean(found.evidence, images, shares), found.bound))
 
-    def single(self, images: Mapping[int, CoarseImage]) -> Singles:
-        """Return the mean reflectivity if each sensor takes all echoes for its own: (cell,) float32."""
-        own = [pair for pair in self._pairs if pair.emitter == pair.receiver]
-        return self._mean([self._evidence(pair, images[pair.receiver]) for pair in own], images, None)
-
     def without(self, unheard: frozenset[int]) -> "Attribution":
         """Return an attribution that expects no echoes of some emitters at other sensors."""
         if unheard == self._unheard:

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.fusion.echo_paths import NEAREST_M, EchoPaths
-from ertis_numba.fusion.hidden_walls import over_hidden_walls
-from ertis_numba.fusion.reflections import Walls, reflected_twice
+from ertis_numba.fusion.reflections import Walls, over_hidden_walls, reflected_twice
 
 __all__ = ["Confirmation", "confirmation"]
 

@@ -1,7 +1,8 @@
 """Emitters that the sensors hear: echoes of each call at the reflectors that other calls locate."""
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ from ertis_numba.fusion.receivers import Receiver
 __all__ = [
     "EmissionCounts",
     "ExpectedEchoes",
+    "PulseEvidence",
+    "best_evidence",
     "cheapest",
     "doubted",
     "expected_echoes",
@@ -214,3 +217,49 @@ def _highest(rows: NDArray[np.float32], columns: NDArray[np.int64], margin: int)
     """Return the highest value around each of several columns of a row: (row, column) float64."""
     near = (columns[..., None] + np.arange(-margin, margin + 1)).clip(0, rows.shape[1] - 1)
     return np.asarray(rows[np.arange(len(rows))[:, None, None], near].max(axis=2), np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PulseEvidence:
+    """Evidence of one pulse for each of the ``emitters`` that should have sent a call.
+
+    ``proof`` returns how much better the emission of one of them explains the echoes than its silence, if this is
+    obvious, and None otherwise. ``comparison`` computes it from an explanation without that emitter, as the reflectors
+    of a pulse once more, which takes as long as the points.
+    """
+
+    emitters: Collection[int]
+    proof: Callable[[int], float | None]
+    comparison: Callable[[int], float]
+    _compared: dict[int, float] = field(default_factory=dict)
+
+    def known(self, number: int) -> float | None:
+        """Return the evidence for an emitter if it is obvious or was computed before, or None."""
+        return self._compared.get(number) if (found := self.proof(number)) is None else found
+
+    def better(self, number: int) -> float:
+        """Return the evidence for an emitter."""
+        found = self.known(number)
+        if found is None:
+            found = self._compared[number] = self.comparison(number)
+        return found
+
+
+def best_evidence(recent: Sequence[PulseEvidence]) -> dict[int, float]:
+    """Return evidence of recent pulses for each emitter of the last one, the highest of all unless it is positive.
+
+    Any positive evidence shows that an emitter works. No more is then computed, and the last pulse is compared first.
+    """
+    found = {}
+    for number in sorted(recent[-1].emitters):
+        pulses = [each for each in reversed(recent) if number in each.emitters]
+        known = [better for each in pulses if (better := each.known(number)) is not None]
+        best = max(known, default=0.0)
+        if not best > 0:
+            best = pulses[0].better(number)
+            for each in pulses[1:]:
+                if best > 0:
+                    break
+                best = max(best, each.better(number))
+        found[number] = best
+    return found

@@ -10,8 +10,7 @@ import numpy as np
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, PointCloud, Stamp
-from ertis_numba.fusion.emissions import is_much_better
-from ertis_numba.fusion.evidence import PulseEvidence, best_evidence
+from ertis_numba.fusion.emissions import PulseEvidence, best_evidence, is_much_better
 from ertis_numba.fusion.polar_grid import PolarGrid
 from ertis_numba.fusion.pulses import is_same_pulse
 from ertis_numba.fusion.rig import USUAL_DIAMETER_M, Mountings, emitter_diameter_m, mounted_sensors

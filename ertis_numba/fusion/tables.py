@@ -14,6 +14,7 @@ from ertis_numba.fusion.association import Reflectors
 from ertis_numba.fusion.attribution import Attributed, Attribution, Rivalries
 from ertis_numba.fusion.emissions import (
     EmissionCounts,
+    PulseEvidence,
     cheapest,
     doubted,
     expected_echoes,
@@ -23,7 +24,6 @@ from ertis_numba.fusion.emissions import (
     silent_one,
     suspect,
 )
-from ertis_numba.fusion.evidence import PulseEvidence
 from ertis_numba.fusion.known_echoes import explained_shares, levelled
 from ertis_numba.fusion.pairs import Hypothesis, Pair, hypothesis, pair_of
 from ertis_numba.fusion.points import PointFuser, joined

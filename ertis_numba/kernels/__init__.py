@@ -7,6 +7,7 @@
 from ertis_numba.kernels._compile_notice import on_compiling
 from ertis_numba.kernels._contract.fusion import (
     AUDIBLE,
+    DISTURBING,
     LAST_PATH_M,
     NEAREST_M,
     SPREADING_M,
@@ -17,7 +18,6 @@ from ertis_numba.kernels._contract.fusion import (
     ViewingSensors,
 )
 from ertis_numba.kernels._contract.mapping import MappingKernels
-from ertis_numba.kernels._contract.overlaps import DISTURBING
 from ertis_numba.kernels._contract.points import (
     ABSENT,
     N_VALUES,

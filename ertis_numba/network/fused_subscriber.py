@@ -5,16 +5,20 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 
+import numpy as np
+
 from ertis_numba.base.errors import ErtisError
-from ertis_numba.frames import Energyscape
+from ertis_numba.frames import Energyscape, Stamp
 from ertis_numba.fusion import Fused, Fuser
-from ertis_numba.fusion.loading import load_kernels
 from ertis_numba.fusion.rig import Mountings
 from ertis_numba.network.keys import ClientKeys
 from ertis_numba.network.pulse_receiver import PulseReceiver, ReceivedPulse
 from ertis_numba.network.result_subscriber import ResultSubscriber
+from ertis_numba.settings import Processing, Settings
 
 __all__ = ["FusedArrival", "FusedSubscriber"]
+
+_AHEAD = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,7 +112,7 @@ class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
             "spacing_deg": spacing_deg,
             "range_step_m": range_step_m,
         }
-        load_kernels()
+        _load_kernels()
         self._mountings: Mountings = {}
         self._fuser: Fuser | None = None
         self._receiver = PulseReceiver(
@@ -141,3 +145,17 @@ class FusedSubscriber(ResultSubscriber[ReceivedPulse, FusedArrival]):
             fused = self._fuser(images)
             assert fused.image.amplitude.size  # noqa: S101  The time of the arrival includes the image.
         return FusedArrival(fused, received.images, received.first_ns, time.monotonic_ns(), time.time_ns())
+
+
+def _load_kernels() -> None:
+    """Fuse two small images, so that a later fusion and its points need not load or compile kernels."""
+    settings = Settings(processing=Processing(directions="2d:9", range_m=(0.5, 1.0)))
+    azimuth_rad, range_m = np.radians(np.linspace(-80.0, 80.0, 9)), np.arange(0.5, 1.0, 0.01)
+    amplitude = np.full((9, len(range_m)), 1e-4, dtype=np.float32)
+    amplitude[4, 20:23] = 1.0, 2.0, 1.0
+    images = [
+        Energyscape(amplitude, azimuth_rad, np.zeros(9), range_m, settings, Stamp(sensor=name))
+        for name in ("left", "right")
+    ]
+    fuser = Fuser({"left": ((0.0, 0.1, 0.0), _AHEAD), "right": ((0.0, -0.1, 0.0), _AHEAD)}, spacing_deg=10.0)
+    assert len(fuser(images).points) >= 0  # noqa: S101  points are computed when they are used

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ertis_numba.fusion.echo_paths import EchoPaths
-from ertis_numba.fusion.hidden_walls import over_hidden_walls
-from ertis_numba.fusion.reflections import Walls, reflected_twice
+from ertis_numba.fusion.reflections import Walls, over_hidden_walls, reflected_twice
 
 YAW_RAD = np.radians([0.0, 90.0, 180.0, -90.0])
 AHEAD = np.stack([np.cos(YAW_RAD), np.sin(YAW_RAD), np.zeros(4)], axis=1)

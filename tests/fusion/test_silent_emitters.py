@@ -9,8 +9,15 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.fusion.emissions import EmissionCounts, cheapest, doubted, silent_one, suspect
-from ertis_numba.fusion.evidence import PulseEvidence, best_evidence
+from ertis_numba.fusion.emissions import (
+    EmissionCounts,
+    PulseEvidence,
+    best_evidence,
+    cheapest,
+    doubted,
+    silent_one,
+    suspect,
+)
 from ertis_numba.ros.fused_points import FusedImages
 from ertis_numba.simulation import load_scene
 from ertis_numba.simulation.render import render
