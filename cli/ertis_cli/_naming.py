@@ -14,7 +14,7 @@ from ertis_cli._pipes import require_no_pipes
 __all__ = ["name_options", "named", "with_options"]
 
 _UNITS: Final = ("", "_bytes", "_c", "_db", "_deg", "_hz", "_limits_deg", "_m", "_ms", "_ns", "_s")
-_KEY: Final = r"(?P<section>(?:accuracy|air|array|passive|processing)\.)?(?P<name>[a-z_]+)"
+_KEY: Final = r"(?P<section>(?:accuracy|air|array|passive|processing|scene)\.)?(?P<name>[a-z_]+)"
 _NAMED: Final = re.compile(
     rf"(?P<before>option |parameter of )?(?P<quote>'?){_KEY}(?P=quote)(?:\[\d+\])?"
     r"(?(section)(?= )|(?= (?:is|holds|runs from)\b))"

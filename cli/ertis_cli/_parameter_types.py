@@ -9,7 +9,8 @@ from typing import Any
 import click
 
 from ertis_numba.base.constants import MAX_MICROPHONES
-from ertis_numba.settings.beamformers import BEAMFORMERS, BeamformerOption
+from ertis_numba.settings.beamformers import BEAMFORMERS
+from ertis_numba.settings.limits import CLEANING_DB, Limits
 
 __all__ = [
     "BEAMFORMER",
@@ -24,27 +25,33 @@ __all__ = [
     "NAMES",
     "TEXT_PATH",
     "WORKERS",
+    "ranged",
 ]
 
 _MAX_DEG = 90.0  # limit of azimuth and elevation in front of an array
 
 
+def ranged(limits: Limits) -> Any:
+    """Return the type of an option whose value has the limits of a field."""
+    high: Any = None if math.isinf(limits.high) else limits.high
+    return click.IntRange(limits.low, high) if isinstance(limits.low, int) else click.FloatRange(limits.low, high)
+
+
 class _Assignments(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.4 only
     """Numbers as ``KEY=X,...``, by the names of their fields."""
 
-    def numbers(self, text: str, known: Mapping[str, BeamformerOption], usage: str) -> dict[str, float]:
-        """Return the numbers of a text by name; ``known`` has the key of each, and ``usage`` completes errors."""
+    def numbers(self, text: str, known: Mapping[str, tuple[str, Limits]], usage: str) -> dict[str, float]:
+        """Return the numbers of a text; ``known`` has the name and the limits of each, ``usage`` completes errors."""
         found: dict[str, float] = {}
         for each in text.split(","):
             key, _, number = each.partition("=")
             if key not in known:
                 self.fail(f"{each!r} is not an option of {usage}")
-            name, low, high = known[key].name, known[key].low, known[key].high
+            name, limits = known[key]
             if name in found:
                 self.fail(f"{key} appears twice; state it once")
-            kind: Any = click.IntRange(low, int(high)) if isinstance(low, int) else click.FloatRange(low, high)
             try:
-                found[name] = kind.convert(number, None, None)
+                found[name] = ranged(limits).convert(number, None, None)
             except click.BadParameter as error:
                 self.fail(f"{each!r}: {error.message}")
             if not math.isfinite(found[name]):
@@ -62,7 +69,7 @@ class _Beamformer(_Assignments):
         declared = {str(known): each.options for known, each in BEAMFORMERS.items()}
         if name not in declared:
             self.fail(f"{name!r} is not a beamformer; choose one of {', '.join(declared)}", param, ctx)
-        known = {option.name.removeprefix(f"{name}_"): option for option in declared[name]}
+        known = {option.name.removeprefix(f"{name}_"): (option.name, option.limits) for option in declared[name]}
         usage = f"use {name}:{', '.join(f'{other}=X' for other in known)}" if known else f"use {name} alone"
         return {"beamformer": name, **(self.numbers(text, known, f"{name}; {usage}") if colon else {})}
 
@@ -73,7 +80,7 @@ class _Cleaning(_Assignments):
     name = "within=DB,above_mean=DB"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> dict[str, float]:  # noqa: ARG002
-        known = {key: BeamformerOption(f"clean_{key}_db", 0.0, 1000.0, "") for key in ("within", "above_mean")}
+        known = {key: (f"clean_{key}_db", CLEANING_DB) for key in ("within", "above_mean")}
         return self.numbers(str(value), known, f"--clean; use {self.name}, or one of them")
 
 

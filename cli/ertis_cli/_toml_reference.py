@@ -1,13 +1,14 @@
 """Reference of the keys of TOML files, generated from the structures that read these files."""
 
 import inspect
+import math
 import re
 import tomllib
 import types
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
-from typing import Any, Final, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import msgspec
 import tomli_w
@@ -16,6 +17,7 @@ from ertis_numba.base.units import unit_of
 from ertis_numba.geometry.layout_files import LayoutFile
 from ertis_numba.settings import Settings
 from ertis_numba.settings.documents import TomlTable
+from ertis_numba.settings.limits import Limits
 from ertis_numba.simulation.scene import Scene
 
 __all__ = ["DOCUMENTS", "KeyReference", "TableReference", "reference"]
@@ -139,7 +141,7 @@ def _key(field: msgspec.structs.FieldInfo, default: Any, kind: str, about: str, 
     return KeyReference(
         name=field.name,
         about=about,
-        shape=_shape(field.type) + (f" {parts[0]}" if parts else ""),
+        shape=" ".join(filter(None, (_shape(field.type), parts and parts[0], _range(field.type)))),
         unit=unit_of(field.name)[1],
         default="required" if default is msgspec.NODEFAULT else "none" if default is None else _toml(default),
         example="" if example is None else f"{field.name} = {_toml(example)}",
@@ -157,6 +159,7 @@ def _toml(value: Any) -> str:
 
 def _shape(kind: Any) -> str:
     """Return a type in words."""
+    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
     origin, parts = get_origin(kind), get_args(kind)
     if origin in {Union, types.UnionType}:
         return " or ".join(_shape(part) for part in parts if part is not type(None))
@@ -169,6 +172,17 @@ def _shape(kind: Any) -> str:
             return f"list of {_plural(_shape(parts[0]))}"
         return f"list of {len(parts)} {_plural(_shape(parts[0]))}"
     return _TYPES[kind]
+
+
+def _range(kind: Any) -> str:
+    """Return the limits in a type in words, each once; nothing if a part, such as the time of a pose, has none."""
+    found = list(_limits(kind))
+    return "" if any(math.isinf(each.low) for each in found) else " and ".join(dict.fromkeys(map(str, found)))
+
+
+def _limits(kind: Any) -> Iterator[Limits]:
+    for part in get_args(kind):
+        yield from [part] if isinstance(part, Limits) else _limits(part)
 
 
 def _plural(shape: str) -> str:

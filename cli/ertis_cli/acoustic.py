@@ -8,6 +8,8 @@ import click
 
 from ertis_cli import _image_options, _mountings, _process_many, options
 from ertis_cli._help_sections import SectionedCommand
+from ertis_cli._parameter_types import ranged
+from ertis_numba.settings.limits import AVERAGES, FOCUS_M
 from ertis_numba.settings.map_methods import MAP_METHODS
 
 if TYPE_CHECKING:
@@ -57,14 +59,14 @@ class _Bands(click.ParamType):  # type: ignore[type-arg]  # generic since click 
 @click.option(
     "--average",
     "passive_averages",
-    type=click.IntRange(1, 100_000),
+    type=ranged(AVERAGES),
     metavar="N",
     help="Number of measurements in a map.",
 )
 @click.option(
     "--focus",
     "passive_focus_m",
-    type=click.FloatRange(0.01, 10_000.0),
+    type=ranged(FOCUS_M),
     metavar="M",
     help="Distance of the sources in m.",
 )

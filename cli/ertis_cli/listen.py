@@ -13,9 +13,11 @@ import click
 
 from ertis_cli import _listen_bearings, _listen_fused, _listen_odometry, _mountings, _network, options
 from ertis_cli._config import typed
+from ertis_cli._parameter_types import ranged
 from ertis_cli._product_printer import PRINTERS, ProductTable
 from ertis_cli._saving import PRODUCTS as FILED, saving
 from ertis_cli._stop_signals import stopped_by_signals
+from ertis_numba.settings.limits import AVERAGES
 
 if TYPE_CHECKING:
     from ertis_cli._saving import Write
@@ -60,7 +62,7 @@ _POLL_INTERVAL_S = 0.1
 @click.option("--bearings", is_flag=True, help="Print the bearings of sources of sound that the sensors did not emit.")
 @click.option(
     "--average",
-    type=click.IntRange(1, 100_000),
+    type=ranged(AVERAGES),
     metavar="N",
     help="With --bearings: number of measurements of each sensor to average; that of its settings by default.",
 )

@@ -27,9 +27,11 @@ from ertis_cli._parameter_types import (
     NAMES,
     TEXT_PATH,
     WORKERS,
+    ranged,
 )
 from ertis_numba.base.units import counted
 from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS
+from ertis_numba.settings.limits import EMITTER_M
 
 if TYPE_CHECKING:
     from ertis_numba.analysis.compare import Comparison
@@ -167,7 +169,7 @@ def beamforming(default: str = "") -> Decorator:
     ``default`` ends the help of each option, unless a heading above them states the default.
     """
     about = "; ".join(
-        f"{name.removeprefix(f'{beamformer}_')}: {option.help}, {option.low:g} to {option.high:g}"
+        f"{name.removeprefix(f'{beamformer}_')}: {option.help}, {option.limits}"
         for beamformer, declared in BEAMFORMERS.items()
         for option in declared.options
         for name in [option.name]
@@ -220,7 +222,7 @@ def emitter_diameter(text: str) -> Decorator:
     return click.option(
         "--emitter-diameter",
         "emitter_diameter_m",
-        type=click.FloatRange(0.0, 0.2),
+        type=ranged(EMITTER_M),
         metavar="M",
         help=f"{text} in m instead of that of the recordings; 0 is omnidirectional.",
     )

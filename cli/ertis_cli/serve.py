@@ -84,9 +84,6 @@ def serve(
     threads: int | None,
     without: "ExcludedChannels",
     preset: str | None,
-    directions: str | None,
-    range_m: tuple[float, float] | None,
-    method: str | None,
     max_error_db: float | None,
     plan: Literal["nominal", "measured"],
     device: str,
@@ -112,12 +109,8 @@ def serve(
     one line per event.
     """
     _central_watch.require_use(stores=folder is not None, as_json=as_json)
-    _plans.require_plan(method)
-    if isinstance(workers, str) and typed("threads"):
-        raise click.UsageError(
-            "--threads is for processes on this machine; remove it with --workers tcp://HOST:PORT",
-            click.get_current_context(),
-        )
+    _plans.require_plan(other["method"])
+    _require_threads(workers)
     life = _supervisor.supervised()
     from ertis_numba.network.addresses import DEFAULT_LISTEN, DEFAULT_PUBLISH, at_port
     from ertis_numba.network.central_node import CentralNode
@@ -129,15 +122,7 @@ def serve(
     _network.require_address("--publish", publish)
     served = _network.metrics(metrics, lambda: node.latest)
     publish = life.addresses.get("publish") or publish or DEFAULT_PUBLISH
-    given = {
-        "directions": directions,
-        "range_m": range_m,
-        "method": method,
-        **other,
-        **(beamformer or {}),
-        **(clean or {}),
-    }
-    changes = _processing(preset, given)
+    changes = _processing(preset, other | (beamformer or {}) | (clean or {}))
     keys = _network.server_keys(key, allow)
     with withdrawn(folder, quarantine) as made:
         if quarantine is not None:
@@ -156,9 +141,8 @@ def serve(
                 deadline_s=deadline,
                 dtype=dtype,
                 quarantine=quarantine,
-                expected=Settings.from_preset(
-                    "default_25_50"
-                ),  # most sensors use it; kernels are then ready for their first measurement
+                # Most sensors use this preset. Kernels are then ready for their first measurement.
+                expected=Settings.from_preset("default_25_50"),
             )
         )
         archive = None if folder is None else _central_watch.archive(folder, name, rotate_size, rotate_every)
@@ -180,6 +164,15 @@ def serve(
         _central_watch.run(node, watch, made=made, metrics=served, duration_s=life.remaining_s(duration))
     _central_watch.report(node.latest, watch, event="served")
     _warn_of_unknown(without, node.latest.sensors)
+
+
+def _require_threads(workers: int | str | None) -> None:
+    """Refuse a number of threads for the workers of a cluster, which have their own."""
+    if isinstance(workers, str) and typed("threads"):
+        raise click.UsageError(
+            "--threads is for processes on this machine; remove it with --workers tcp://HOST:PORT",
+            click.get_current_context(),
+        )
 
 
 def _processing(preset: str | None, given: dict[str, Any]) -> dict[str, Any]:

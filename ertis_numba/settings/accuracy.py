@@ -1,10 +1,11 @@
 """Accuracy of an image: the error budget and the plan."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings.documents import TomlTable
+from ertis_numba.settings.limits import Limits
 
 __all__ = ["ERROR_PRESETS_DB", "MAX_FOCAL_ZONES", "Accuracy"]
 
@@ -27,15 +28,15 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
     Attributes
     ----------
     max_error_db : float, default -35
-        Error budget in dB, -200 to 0: norm of the difference between the image and the exact image, relative to the
+        Error budget in dB: norm of the difference between the image and the exact image, relative to the
         norm of the exact image. `ERROR_PRESETS_DB` names some budgets.
     precision : {"auto", "float32", "int16"}, default "auto"
         Number format of the samples that are summed to beams. ``auto`` chooses the
         faster one on the instruction set.
     oversampling : int, optional, default None
-        Samples kept per range of the energyscape, 1 to 64.
+        Samples kept per range of the energyscape.
     delay_taps : int, optional, default None
-        Samples from which a delayed sample is interpolated, 1 to 8. The weights minimise the error in the call's band.
+        Samples from which a delayed sample is interpolated. The weights minimise the error in the call's band.
         With 0, delays are exact, as phase shifts of spectra. This needs ``precision`` ``float32``, an ``oversampling``
         of 1 and no beam grid, and is for ``delay_and_sum`` without a weighting.
     beam_taps : int, optional, default None
@@ -44,35 +45,27 @@ class Accuracy(TomlTable, frozen=True, kw_only=True):
         Adaptive beamformers combine all microphones at each point of the image if this is 0, ``delay_taps`` is 1 and
         ``precision`` is ``float32``, and streams otherwise; see ``docs/explanation/beamformers.md``.
     beam_density : float, optional, default None
-        Density of the beam grid relative to the resolution of the aperture at the call's highest frequency, 1.1 to 8.
+        Density of the beam grid relative to the resolution of the aperture at the call's highest frequency.
     stopband_attenuation_db : float, optional, default None
-        Stopband attenuation of the decimation filter in dB, 40 to 140: attenuation of sound that would alias into the
+        Stopband attenuation of the decimation filter in dB: attenuation of sound that would alias into the
         call's band.
     focal_zones : int, optional, default None
-        Number of focal zones for spherical wavefronts, from 1. Ranges within a focal zone share their delays.
+        Number of focal zones for spherical wavefronts. Ranges within a focal zone share their delays.
     """
 
-    max_error_db: float = -35.0
+    max_error_db: Annotated[float, Limits(-200.0, 0.0)] = -35.0
     precision: Literal["auto", "float32", "int16"] = "auto"
-    oversampling: int | None = None
-    delay_taps: int | None = None
+    oversampling: Annotated[int, Limits(1, 64)] | None = None
+    delay_taps: Annotated[int, Limits(0, 8)] | None = None
     beam_taps: int | None = None
-    beam_density: float | None = None
-    stopband_attenuation_db: float | None = None
-    focal_zones: int | None = None
+    beam_density: Annotated[float, Limits(1.1, 8.0)] | None = None
+    stopband_attenuation_db: Annotated[float, Limits(40.0, 140.0)] | None = None
+    focal_zones: Annotated[int, Limits(1, MAX_FOCAL_ZONES)] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.between("accuracy.max_error_db", self.max_error_db, -200.0, 0.0)
-        checks.choice("accuracy.precision", self.precision, ("auto", "float32", "int16"))
-        for name, low, high in (("oversampling", 1, 64), ("delay_taps", 0, 8), ("focal_zones", 1, MAX_FOCAL_ZONES)):
-            if getattr(self, name) is not None:
-                checks.integer(f"accuracy.{name}", getattr(self, name), low, high)
         if self.beam_taps is not None:
             checks.choice("accuracy.beam_taps", self.beam_taps, (0, 2, 4, 6))
-        for name, smallest, largest in (("beam_density", 1.1, 8.0), ("stopband_attenuation_db", 40.0, 140.0)):
-            if getattr(self, name) is not None:
-                checks.between(f"accuracy.{name}", getattr(self, name), smallest, largest)
         if self.delay_taps == 0:
             self._check_phase_shifts()
 

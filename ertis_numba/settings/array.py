@@ -1,7 +1,7 @@
 """Microphone array: positions, calibration and word format."""
 
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 import numpy as np
@@ -10,6 +10,7 @@ from ertis_numba.base import checks
 from ertis_numba.base.constants import MAX_MICROPHONES, MAX_NAME_LENGTH, WORD_BITS
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings.documents import TomlTable
+from ertis_numba.settings.limits import EMITTER_M, Limits
 
 __all__ = ["LAYOUT_SUFFIXES", "LENGTH_UNITS_M", "MAX_EMITTER_M", "MAX_SPAN_M", "MIN_SPAN_M", "OWN_ARRAY", "Array"]
 
@@ -23,12 +24,11 @@ MIN_SPAN_M: Final = 2e-3
 """Smallest extent of an array; single microphones are larger than that."""
 MAX_SPAN_M: Final = 25.0
 """Largest extent of an array. An array of 26 mm has a larger one if its millimetres are taken for metres."""
-MAX_EMITTER_M: Final = 0.2
+MAX_EMITTER_M: Final = EMITTER_M.high
 """Largest diameter of an emitter."""
 
 _NAMED: Final = "eRTIS_v3D1"
-_SENSITIVITIES_DBFS = -120.0, 20.0
-_MAX_COORDINATE_M = 1e7  # Positions may be in a grid of the Earth, whose coordinates reach this.
+_Coordinate = Annotated[float, Limits(-1e7, 1e7)]  # Positions may be in a grid of the Earth.
 
 
 class Array(TomlTable, frozen=True, kw_only=True):
@@ -47,7 +47,7 @@ class Array(TomlTable, frozen=True, kw_only=True):
         Calibrated sensitivity of each channel, 0.001 to 1000; 1 by default. Signals are divided by it. A negative
         value, -1000 to -0.001, corrects inverted polarity.
     delay_s : tuple of float, optional, default None
-        Calibrated delay of each channel in seconds, -0.001 to 0.001; 0 by default. Images correct it.
+        Calibrated delay of each channel in seconds; 0 by default. Images correct it.
     disabled : tuple of int, optional, default None
         Channels that images leave out although they carry a microphone, such as faulty ones; none by default. The
         origin of images stays the centre of the whole array.
@@ -55,21 +55,21 @@ class Array(TomlTable, frozen=True, kw_only=True):
         Bits of one PDM word. An array with more channels has several words per sample.
     sensitivity_dbfs : float, optional, default None
         Sensitivity of the microphones as in their data sheet: level of a sine of 94 dB, 1 Pa RMS, relative to a
-        full-scale sine, -120 to 20 dBFS. That of the layout by default; sound pressures are unknown without it.
+        full-scale sine, in dBFS. That of the layout by default; sound pressures are unknown without it.
     emitter_diameter_m : float, optional, default None
-        Diameter of the emitter beside the array as a circular piston, 0 to 0.2 m; 0 is omnidirectional. That of the
+        Diameter of the emitter beside the array as a circular piston, in metres; 0 is omnidirectional. That of the
         layout by default. Fusion and maps assume 0.012 if it is unknown.
     """
 
     layout: str = ""
-    positions_m: tuple[tuple[float, float, float], ...] | None = None
+    positions_m: tuple[tuple[_Coordinate, _Coordinate, _Coordinate], ...] | None = None
     enabled: tuple[bool, ...] | None = None
-    gain: tuple[float, ...] | None = None
-    delay_s: tuple[float, ...] | None = None
-    disabled: tuple[int, ...] | None = None
+    gain: tuple[Annotated[float, Limits(-1e3, 1e3)], ...] | None = None
+    delay_s: tuple[Annotated[float, Limits(-1e-3, 1e-3)], ...] | None = None
+    disabled: tuple[Annotated[int, Limits(0, MAX_MICROPHONES - 1)], ...] | None = None
     word_bits: int = 32
-    sensitivity_dbfs: float | None = None
-    emitter_diameter_m: float | None = None
+    sensitivity_dbfs: Annotated[float, Limits(-120.0, 20.0)] | None = None
+    emitter_diameter_m: Annotated[float, EMITTER_M] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,11 +77,6 @@ class Array(TomlTable, frozen=True, kw_only=True):
             msgspec.structs.force_setattr(self, "layout", _NAMED if self.positions_m is None else OWN_ARRAY)
         checks.length("array.layout", self.layout, MAX_NAME_LENGTH)
         checks.choice("array.word_bits", checks.integer("array.word_bits", self.word_bits, 1), WORD_BITS)
-        for name, limits in (("sensitivity_dbfs", _SENSITIVITIES_DBFS), ("emitter_diameter_m", (0.0, MAX_EMITTER_M))):
-            if (given := getattr(self, name)) is not None:
-                checks.between(f"array.{name}", given, *limits)
-        for channel in self.disabled or ():
-            checks.integer("array.disabled", channel, 0, MAX_MICROPHONES - 1)
         if self.positions_m is None:
             self._refuse_per_channel()
             return
@@ -91,10 +86,11 @@ class Array(TomlTable, frozen=True, kw_only=True):
             checks.shape("array.enabled", (len(self.enabled),), (n_channels,))
             if not any(self.enabled):
                 raise ArgumentError("array.enabled is false for all channels; enable at least one")
-        self._check_per_channel("gain", -1e3, 1e3)
+        for name in ("gain", "delay_s"):
+            if (values := getattr(self, name)) is not None:
+                checks.shape(f"array.{name}", (len(values),), (n_channels,))
         for channel, gain in enumerate(self.gain or ()):
             checks.between(f"magnitude of array.gain[{channel}]", abs(gain), 1e-3, 1e3)
-        self._check_per_channel("delay_s", -1e-3, 1e-3)
 
     def _refuse_per_channel(self) -> None:
         for name in ("enabled", "gain", "delay_s"):
@@ -115,10 +111,6 @@ class Array(TomlTable, frozen=True, kw_only=True):
 
     def _check_positions(self, positions_m: tuple[tuple[float, float, float], ...]) -> None:
         checks.integer("number of array.positions_m", len(positions_m), 1, MAX_MICROPHONES)
-        checks.finite_array("array.positions_m", np.asarray(positions_m, dtype=np.float64))
-        for channel, position in enumerate(positions_m):
-            for coordinate_m in position:
-                checks.between(f"array.positions_m[{channel}]", coordinate_m, -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
         enabled = np.ones(len(positions_m), dtype=np.bool_) if self.enabled is None else np.asarray(self.enabled)
         if len(enabled) == len(positions_m) and enabled.any():
             span_m = float(np.ptp(np.asarray(positions_m)[enabled], axis=0).max())
@@ -127,11 +119,3 @@ class Array(TomlTable, frozen=True, kw_only=True):
                     f"array.positions_m spans {span_m:.4g} m, more than {MAX_SPAN_M:g} m; if the numbers are "
                     "millimetres, divide them by 1000"
                 )
-
-    def _check_per_channel(self, name: str, low: float, high: float) -> None:
-        """Refuse a list without exactly one number in ``[low, high]`` for each channel."""
-        values = getattr(self, name)
-        if values is not None:
-            checks.shape(f"array.{name}", (len(values),), (len(self.positions_m or ()),))
-            for channel, value in enumerate(values):
-                checks.between(f"array.{name}[{channel}]", value, low, high)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.base.units import counted
+from ertis_numba.settings.limits import Limits
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,11 +39,10 @@ class SignalStream(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BeamformerOption:
-    """Key of `Processing` for a beamformer, its limits, and help in one line. Limits of integers are of type int."""
+    """Key of `Processing` for a beamformer, its limits, of type int for whole numbers, and help in one line."""
 
     name: str
-    low: float
-    high: float
+    limits: Limits
     help: str
 
 
@@ -140,7 +140,9 @@ BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
         "dmas": Beamformer(
             title="DMAS",
             kernel="combine_dmas",
-            options=(BeamformerOption("dmas_order", 2, 8, "Microphone signals that dmas multiplies at a time"),),
+            options=(
+                BeamformerOption("dmas_order", Limits(2, 8), "Microphone signals that dmas multiplies at a time"),
+            ),
             weights=_dmas_roots,
             sensitivity=lambda _, order: (float(order), 0.0),  # error powers of the factors add up
             # Power sums, from which Newton's identities give the sum of the products.
@@ -152,8 +154,8 @@ BEAMFORMERS: Final[Mapping[BeamformerName, Beamformer]] = MappingProxyType(
             title="Capon",
             kernel="combine_capon",
             options=(
-                BeamformerOption("snapshots", 1, 32, "Ranges from which capon estimates its covariance matrix"),
-                BeamformerOption("diagonal_loading", 1e-6, 1e6, "Loading of capon, relative to the mean power"),
+                BeamformerOption("snapshots", Limits(1, 32), "Ranges from which capon estimates its covariance matrix"),
+                BeamformerOption("diagonal_loading", Limits(1e-6, 1e6), "Loading of capon, relative to the mean power"),
             ),
             sensitivity=_capon_sensitivity,
             single_precision=_capon_single_precision,

@@ -2,13 +2,14 @@
 
 import functools
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import msgspec
 
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.settings.documents import TomlTable
+from ertis_numba.settings.limits import Limits
 from ertis_numba.settings.waveform import band_hz, normalise, read_waveform
 
 __all__ = ["MAX_CALL_SAMPLES", "Call"]
@@ -30,12 +31,12 @@ class Call(TomlTable, frozen=True, kw_only=True):
     sample_rate_hz : float, default 450000
         Rate of the digital-to-analogue converter in hertz.
     ramp_fraction : float, default 0.1
-        Fraction of the call under the Hann ramp at each end, 0 to 0.5.
+        Fraction of the call under the Hann ramp at each end.
     modulation : {"hyperbolic", "linear"}, default "hyperbolic"
         ``hyperbolic`` sweeps change their period at a constant rate, ``linear`` ones their frequency. Motion shifts the
         echoes of hyperbolic sweeps without blurring them; eRTIS uses these.
     delay_s : float, default 0
-        Silence before the call in seconds, 0 to 1, rounded to samples at ``sample_rate_hz``. Sensors with different
+        Silence before the call in seconds, rounded to samples at ``sample_rate_hz``. Sensors with different
         delays emit in sequence. Ranges count from the emission.
     waveform : str or tuple of float, optional, default None
         Custom waveform instead of a sweep: 17 to 4096 samples at ``sample_rate_hz``, or the name of a file with
@@ -54,9 +55,9 @@ class Call(TomlTable, frozen=True, kw_only=True):
     stop_frequency_hz: float = 25_000.0
     duration_s: float = 2.5e-3
     sample_rate_hz: float = 450_000.0
-    ramp_fraction: float = 0.1
+    ramp_fraction: Annotated[float, Limits(0.0, 0.5)] = 0.1
     modulation: Literal["hyperbolic", "linear"] = "hyperbolic"
-    delay_s: float = 0.0
+    delay_s: Annotated[float, Limits(0.0, 1.0)] = 0.0
     waveform: str | tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -79,7 +80,6 @@ class Call(TomlTable, frozen=True, kw_only=True):
                 "different frequencies"
             )
         checks.between("call.duration_s", self.duration_s, 16 / self.sample_rate_hz, 1.0)
-        checks.between("call.delay_s", self.delay_s, 0.0, 1.0)
         if self.end_s * self.sample_rate_hz > MAX_CALL_SAMPLES:
             raise ArgumentError(
                 f"call has {self.end_s * self.sample_rate_hz:.0f} samples ({self.end_s:g} s at "
@@ -91,8 +91,6 @@ class Call(TomlTable, frozen=True, kw_only=True):
                 f"call.duration_s is {self.duration_s:g}, less than a period of {self.low_frequency_hz:g} Hz; "
                 f"use {1 / self.low_frequency_hz:g} or more"
             )
-        checks.between("call.ramp_fraction", self.ramp_fraction, 0.0, 0.5)
-        checks.choice("call.modulation", self.modulation, ("hyperbolic", "linear"))
 
     def _derive_from_waveform(self, waveform: tuple[float, ...]) -> None:
         """Derive the other fields from samples, and refuse values that contradict them."""

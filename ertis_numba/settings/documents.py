@@ -1,19 +1,18 @@
 """Frozen structures that are read from TOML and written to it: the base of settings, scenes and layouts.
 
-A structure checks its values when it is created, in ``__post_init__``: first their types, then their ranges. It refuses
-unknown keys.
+A structure checks its values when it is created, in ``__post_init__``: first their types, then the limits and choices
+in its annotations. It refuses unknown keys.
 """
 
-import bisect
 import datetime as dt
 import difflib
 import os
 import re
-import reprlib
-from collections.abc import Iterator
+import types
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal, Self, get_args, get_origin
+from typing import Any, ClassVar, Final, Literal, Self, Union, get_args, get_origin
 
 import msgspec
 import tomli_w
@@ -21,32 +20,20 @@ import tomli_w
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.base.file_kinds import kind_of, markup_of, problem_of
+from ertis_numba.settings.document_errors import document_error, line_of_error, type_error
+from ertis_numba.settings.limits import checker
 
 __all__ = ["MAX_KEY_PARTS", "TomlDocument", "TomlTable"]
 
 _NO_VALUE: Final = object()
 """Default of a value that was not given, because None is a value."""
 
-_HEADER = re.compile(r"\s*\[[\w\[. -]*\]")
-_KEY = re.compile(r"\s*([\w.-]+)\s*=")
 MAX_KEY_PARTS: Final = 16
 """Limit on the parts of a dotted key, such as 2 of ``call.duration_s``: the parser's time grows with their square."""
 
 _NAME = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_NAME}(?:[ \t]*+\.[ \t]*+{_NAME}){{{MAX_KEY_PARTS}}}")
-_PATH_PART = re.compile(r"\.(\w+)|\[(\d+)\]")
-_EXPECTED = re.compile(r"Expected `([^`]*)`(?: of length (\d+), got (\d+))?")
-_CHOICE = re.compile(r"Invalid enum value '(.*)'")
 _TOML_TYPES: Final = (dt.datetime, dt.date, dt.time)
-_TYPE_NAMES = {
-    "array": "a list",
-    "bool": "true or false",
-    "float": "a number",
-    "int": "a whole number",
-    "null": "None",
-    "str": "text",
-}
-"""Descriptions of the types that msgspec names in errors."""
 
 
 class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -64,9 +51,11 @@ class TomlTable(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
             try:
                 typed = msgspec.convert(given, _type_checking_struct(type(self)))
             except msgspec.ValidationError as error:
-                raise ArgumentError(_type_error(self, given, str(error))) from None
+                raise ArgumentError(type_error(self, given, str(error))) from None
         for name in self.__struct_fields__:
             msgspec.structs.force_setattr(self, name, getattr(typed, name))
+        for name, key, check in _checks(type(self)):
+            check(key, getattr(self, name))
 
     @classmethod
     def label(cls) -> str:
@@ -198,10 +187,10 @@ class TomlDocument(TomlTable, frozen=True, kw_only=True):
         try:
             return cls._decoded(text)
         except msgspec.ValidationError as error:
-            line = _line_of_error(cls, text, error) if find_line else 0
-            raise SettingsError(_document_error(cls, source, error, f", line {line}" if line else "")) from error
+            line = line_of_error(cls, text, error) if find_line else 0
+            raise SettingsError(document_error(cls, source, error, f", line {line}" if line else "")) from error
         except msgspec.DecodeError as error:  # A syntax error names its line itself.
-            raise SettingsError(_document_error(cls, source, error)) from error
+            raise SettingsError(document_error(cls, source, error)) from error
         except RecursionError as error:
             raise SettingsError(
                 f"{source or cls.label()}: lists or tables are nested too deeply; flatten them"
@@ -306,10 +295,22 @@ def _text_of(path: Path, wanted: str) -> str:
 @cache
 def _type_checking_struct(kind: type[TomlTable]) -> type[msgspec.Struct]:
     """Return a structure with the same fields that checks only types; choices are checked elsewhere."""
-    fields = [
-        (field.name, str if get_origin(field.type) is Literal else field.type) for field in msgspec.structs.fields(kind)
-    ]
+    fields = [(field.name, _with_any_text(field.type)) for field in msgspec.structs.fields(kind)]
     return msgspec.defstruct(kind.__name__, fields, kw_only=True)
+
+
+def _with_any_text(kind: Any) -> Any:
+    """Return a type with text in place of choices."""
+    if get_origin(kind) in {Union, types.UnionType}:
+        return Union[tuple(map(_with_any_text, get_args(kind)))]  # noqa: UP007  of a computed list
+    return str if get_origin(kind) is Literal else kind
+
+
+@cache
+def _checks(kind: type[TomlTable]) -> list[tuple[str, str, Callable[[str, Any], object]]]:
+    """Return fields with limits or choices: name, name in errors, and check."""
+    found = ((field.name, checker(field.type)) for field in msgspec.structs.fields(kind))
+    return [(name, f"{kind.label()}.{name}", check) for name, check in found if check is not None]
 
 
 def _to_builtin(value: Any) -> Any:
@@ -323,34 +324,6 @@ def _to_builtin(value: Any) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
-def _type_error(table: TomlTable, given: dict[str, Any], error: str) -> str:
-    """Return the message of a type error: key, value and accepted types."""
-    reason, _, path = error.partition(" - at `$")
-    expected = _EXPECTED.match(reason)
-    if expected is None and reason != "Number out of range":  # the error of a table that was given as a dictionary
-        return reason
-    value: Any = given
-    for name, place in _PATH_PART.findall(path):
-        value = value[name or int(place)]
-    key = f"{table.label()}{path.rstrip('`')}"
-    if expected is None:
-        return f"{key} exceeds the range of floating-point numbers; use a finite number"
-    if expected[2]:
-        return f"{key} has shape ({expected[3]},); pass shape ({expected[2]},)"
-    field = next(field for field in msgspec.structs.fields(table) if field.name == _PATH_PART.findall(path)[0][0])
-    tables = " or ".join(f"{kind.__name__}(...)" for kind in _tables(field.type))
-    wanted = [_TYPE_NAMES.get(name, tables) for name in expected[1].split(" | ")]
-    return f"{key} is {' '.join(reprlib.repr(value).split())}; use {' or '.join(wanted)}"
-
-
-def _tables(kind: Any) -> Iterator[type[TomlTable]]:
-    """Yield the table types that a field accepts."""
-    if isinstance(kind, type) and issubclass(kind, TomlTable):
-        yield kind
-    for part in get_args(kind):
-        yield from _tables(part)
-
-
 def _without_none(value: Any) -> Any:
     """Remove keys without a value, because TOML has no null."""
     if isinstance(value, dict):
@@ -358,55 +331,3 @@ def _without_none(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_without_none(item) for item in value]
     return value
-
-
-def _document_error(kind: type[TomlDocument], source: str | None, error: msgspec.MsgspecError, line: str = "") -> str:
-    """Return the message of an error: place, problem and remedy."""
-    reason, _, path = str(error).partition(" - at `$")
-    choice = _CHOICE.fullmatch(reason)
-    if choice is not None:
-        reason = checks.unknown_choice("value", choice[1], list(_choices(kind, re.findall(r"[a-z]\w*", path))))
-    path = f", {path.strip('.`')}" if path.strip(".`") else ""
-    reason = reason.replace("Object contains unknown field", "unknown key")
-    if reason.startswith("Object missing required field "):
-        reason = f"{reason.removeprefix('Object missing required field ')} is missing; add it"
-    remedy = "" if ";" in reason else "; correct it or remove it"
-    return f"{source or kind.__name__.lower()}{line}{path}: {reason}{remedy}"
-
-
-def _choices(kind: Any, keys: list[str]) -> Iterator[str]:
-    """Yield the texts that a key accepts."""
-    if not keys:
-        if get_origin(kind) is Literal:
-            yield from get_args(kind)
-        for part in get_args(kind):
-            yield from _choices(part, keys)
-        return
-    for table in _tables(kind):
-        types = {field.name: field.type for field in msgspec.structs.fields(table)}
-        if keys[0] in types:
-            yield from _choices(types[keys[0]], keys[1:])
-
-
-def _line_of_error(kind: type[TomlDocument], text: str, error: msgspec.ValidationError) -> int:
-    """Return the line, from 1, of the key with the error or of its table; 0 if there is none."""
-    lines = text.splitlines()
-    starts = [1, *(n for n, line in enumerate(lines, 1) if n > 1 and _HEADER.match(line))]
-    stops = [*starts[1:], len(lines) + 1]
-    # Tables are read in order, and an error persists as lines are added, so that bisection finds the first wrong table.
-    table = bisect.bisect_left(stops[:-1], x=True, key=lambda stop: _error(kind, lines[: stop - 1]) == str(error))
-    begin, stop = starts[table], stops[table]
-    reported, _, path = str(error).partition(" - at `$")
-    named = {*re.findall(r"\w+", reported.partition(";")[0]), *re.findall(r"\w+", path.rpartition(".")[2])}
-    named |= {former for former, key in kind.former_keys.items() if key in named}
-    keys = ((n, _KEY.match(lines[n - 1])) for n in range(begin, stop))
-    is_table = bool(lines and _HEADER.match(lines[begin - 1]))
-    return next((n for n, key in keys if key and not named.isdisjoint(key[1].split("."))), begin if is_table else 0)
-
-
-def _error(kind: type[TomlDocument], lines: list[str]) -> str:
-    try:
-        kind._decoded("\n".join(lines))  # noqa: SLF001  of its own kind
-    except msgspec.DecodeError as error:
-        return str(error)
-    return ""

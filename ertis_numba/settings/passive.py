@@ -1,11 +1,12 @@
 """Passive listening: maps of sound that the sensor did not emit."""
 
 import itertools
-from typing import Final
+from typing import Annotated, Final
 
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.settings.documents import TomlTable
+from ertis_numba.settings.limits import AVERAGES, FOCUS_M, Limits
 from ertis_numba.settings.map_methods import MAP_METHODS, MapMethod, MapMethodName
 from ertis_numba.settings.recording import Recording
 
@@ -16,6 +17,7 @@ MAX_BANDS: Final = 100
 HIGHEST_SHARE: Final = 0.8
 """Highest frequency of bands relative to half of the sample rate; filters attenuate beyond."""
 
+_BAND_HZ: Final = Limits(1.0, 1e9)
 _PDM_LIMITS_HZ: Final = (8_900.0, 89_500.0)
 _BLOCK: Final = 1024  # Samples of a block, whose spacing is a third of the lowest band …
 _BLOCKS: Final = 4.0  # … and least number of blocks in a record.
@@ -38,46 +40,34 @@ class Passive(TomlTable, frozen=True, kw_only=True):
     diagonal_removal : bool, default false
         Leave out the power of each microphone itself, which contains its noise. Not all methods support this.
     functional_order : float, default 8
-        Order of ``functional``, 1 to 100; 1 is delay-and-sum, and higher ones have narrower lobes.
+        Order of ``functional``; 1 is delay-and-sum, and higher ones have narrower lobes.
     n_sources : int, default 1
-        Number of sources that ``music`` expects in a band, from 1 to the number of microphones − 1.
+        Number of sources that ``music`` expects in a band, at most the number of microphones − 1.
     diagonal_loading : float, default 0.01
-        Diagonal loading of ``capon`` relative to the mean power of a microphone, 1e-6 to 1e6.
+        Diagonal loading of ``capon`` relative to the mean power of a microphone.
     resolution_hz : float, optional, default None
         Largest spacing of frequencies in hertz; by default a third of the narrowest band, and at most 1 kHz.
         Arrays above 11 cm have longer blocks by default: three times as long as sound takes to cross them.
     averages : int, default 1
-        Number of measurements in a map, 1 to 100000, over which powers are averaged.
+        Number of measurements in a map, over which powers are averaged.
     focus_m : float, optional, default None
-        Distance of the sources in metres, from 0.01, which also gives their source levels. By default, waves are
-        plane.
+        Distance of the sources in metres, which also gives their source levels. By default, waves are plane.
     """
 
-    bands_hz: str | tuple[tuple[float, float], ...] = "third_octaves"
-    limits_hz: tuple[float, float] | None = None
+    bands_hz: str | tuple[Annotated[tuple[float, float], _BAND_HZ], ...] = "third_octaves"
+    limits_hz: Annotated[tuple[float, float], _BAND_HZ] | None = None
     method: MapMethodName = "delay_and_sum"
     diagonal_removal: bool = False
-    functional_order: float = 8.0
-    n_sources: int = 1
-    diagonal_loading: float = 0.01
-    resolution_hz: float | None = None
-    averages: int = 1
-    focus_m: float | None = None
+    functional_order: Annotated[float, Limits(1.0, 100.0)] = 8.0
+    n_sources: Annotated[int, Limits(1)] = 1
+    diagonal_loading: Annotated[float, Limits(1e-6, 1e6)] = 0.01
+    resolution_hz: Annotated[float, Limits(0.1, 1e8)] | None = None
+    averages: Annotated[int, AVERAGES] = 1
+    focus_m: Annotated[float, FOCUS_M] | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.choice("passive.method", self.method, MAP_METHODS)
         self._check_bands()
-        if self.limits_hz is not None:
-            checks.interval("passive.limits_hz", self.limits_hz, 1.0, 1e9)
-        checks.between("passive.functional_order", self.functional_order, 1.0, 100.0)
-        checks.integer("passive.n_sources", self.n_sources, 1)
-        checks.between("passive.diagonal_loading", self.diagonal_loading, 1e-6, 1e6)
-        if self.resolution_hz is not None:
-            checks.between("passive.resolution_hz", self.resolution_hz, 0.1, 1e8)
-        checks.integer("passive.averages", self.averages, 1, 100_000)
-        if self.focus_m is not None:
-            checks.between("passive.focus_m", self.focus_m, 0.01, 10_000.0)
         if self.diagonal_removal and not self.traits.removes_diagonal:
             supported = ", ".join(name for name, each in MAP_METHODS.items() if each.removes_diagonal)
             raise ArgumentError(
@@ -118,8 +108,6 @@ class Passive(TomlTable, frozen=True, kw_only=True):
             return
         if not 1 <= len(given) <= MAX_BANDS:
             raise ArgumentError(f"passive.bands_hz lists {len(given)} bands; use 1 to {MAX_BANDS}")
-        for number, band in enumerate(given):
-            checks.interval(f"passive.bands_hz[{number}]", band, 1.0, 1e9)
         for (low_hz, high_hz), (next_low_hz, next_high_hz) in itertools.pairwise(sorted(given)):
             if next_low_hz < high_hz:  # The sum of all bands would count their frequencies twice.
                 raise ArgumentError(

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from ertis_numba.base import checks
 from ertis_numba.base.constants import MAX_MICROPHONES, MAX_NAME_LENGTH
@@ -12,6 +12,7 @@ from ertis_numba.settings.beamformers import BEAMFORMERS, WEIGHTINGS, Beamformer
 from ertis_numba.settings.delay_lists import check_delays
 from ertis_numba.settings.documents import TomlTable
 from ertis_numba.settings.fir_filters import FILTERS, FirFilters, check_taps
+from ertis_numba.settings.limits import CLEANING_DB, Limits
 from ertis_numba.settings.preset_files import preset_tables
 from ertis_numba.settings.waveform import read_waveform
 
@@ -19,6 +20,9 @@ __all__ = ["MAX_LISTED_DIRECTIONS", "STAGES", "Processing"]
 
 MAX_LISTED_DIRECTIONS: Final = 1000
 """Limit on the directions that settings list; recordings and messages hold settings as text."""
+
+_ListedAzimuth = Annotated[float, Limits(-360.0, 360.0, "azimuth of {} in degrees")]
+_ListedElevation = Annotated[float, Limits(-90.0, 90.0, "elevation of {} in degrees")]
 
 STAGES: Final = ("demodulation", "matched_filter", "beams", "envelope")
 """Steps of processing after which it may end."""
@@ -43,20 +47,20 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     azimuth_limits_deg, elevation_limits_deg : (low, high), default (-90, 90)
         Limits of grids with a count (``2d:N`` and ``3d:N``) in degrees.
     elevation_deg : float, default 0
-        Elevation of all directions of ``2d:N``, -90 to 90 degrees.
+        Elevation of all directions of ``2d:N`` in degrees.
     level_directions : bool, default False
         Turn the directions by the roll and pitch of each measurement's pose, so that azimuth and elevation refer to the
         horizontal plane; see ``docs/how-to/motion.md``.
     range_m : (first, last), default (0.5, 5)
         First and last range in metres.
     range_decimation : int, default 100
-        Samples of the record per range of the energyscape, 1 to 10000.
+        Samples of the record per range of the energyscape.
     band_edges_hz : (low, high), optional, default None
         Frequencies in hertz, below and above the call's band, at which the matched filter reaches 0. By default, each
         lies 5 kHz outside the band, or half of the band's lowest frequency if that is less; see
         ``docs/explanation/accuracy.md``.
     decimation : int, optional, default None
-        Samples of the record per signal sample, 1 to 1000, a divisor of ``range_decimation``. By default the largest
+        Samples of the record per signal sample, a divisor of ``range_decimation``. By default the largest
         divisor that suits the method and the call's band; see `Settings.decimation`.
     wavefront : {"plane", "spherical", "auto"}, default "auto"
         Shape of an echo's wavefront. ``plane`` is that of the paper. ``spherical`` focuses on each range, which matters
@@ -79,10 +83,10 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         ``kaiser:BETA`` (0 to 20, 6 by default); or one number per channel, not below 0. For delay_and_sum only; see
         ``docs/explanation/beamformers.md``.
     clean_within_db : float, optional, default None
-        Largest level below the strongest direction of the same range, 0 to 1000 dB; weaker amplitudes become 0. Half of
+        Largest level below the strongest direction of the same range in dB; weaker amplitudes become 0. Half of
         the strongest amplitude is 6.02 dB. No such limit by default; see ``docs/how-to/plots.md``.
     clean_above_mean_db : float, optional, default None
-        Smallest level above the mean amplitude over the directions of a range, 0 to 1000 dB; weaker amplitudes become
+        Smallest level above the mean amplitude over the directions of a range in dB; weaker amplitudes become
         0. Twice the mean is 6.02 dB. No such limit by default.
     pre_filter, post_filter : str or list of float, default []
         Taps of own FIR filters, 1 to 1024, or the name of a CSV or NPY file with them. ``pre_filter`` filters the
@@ -109,29 +113,29 @@ class Processing(TomlTable, frozen=True, kw_only=True):
 
     mode: Literal["auto", "active", "passive"] = "auto"
     method: Literal["fast", "paper"] = "fast"
-    directions: str | tuple[tuple[float, float], ...] = "90"
-    azimuth_limits_deg: tuple[float, float] = (-90.0, 90.0)
-    elevation_limits_deg: tuple[float, float] = (-90.0, 90.0)
-    elevation_deg: float = 0.0
+    directions: str | tuple[tuple[_ListedAzimuth, _ListedElevation], ...] = "90"
+    azimuth_limits_deg: Annotated[tuple[float, float], Limits(-180.0, 180.0)] = (-90.0, 90.0)
+    elevation_limits_deg: Annotated[tuple[float, float], Limits(-90.0, 90.0)] = (-90.0, 90.0)
+    elevation_deg: Annotated[float, Limits(-90.0, 90.0)] = 0.0
     level_directions: bool = False
-    range_m: tuple[float, float] = (0.5, 5.0)
-    range_decimation: int = 100
-    band_edges_hz: tuple[float, float] | None = None
-    decimation: int | None = None
+    range_m: Annotated[tuple[float, float], Limits(0.0, 10_000.0)] = (0.5, 5.0)
+    range_decimation: Annotated[int, Limits(1, 10_000)] = 100
+    band_edges_hz: Annotated[tuple[float, float], Limits(0.0, 1e9)] | None = None
+    decimation: Annotated[int, Limits(1, 1000)] | None = None
     wavefront: Literal["plane", "spherical", "auto"] = "auto"
     beamformer: BeamformerName = "delay_and_sum"
     weighting: WeightingName = "none"
     dmas_order: int = 2
     snapshots: int = 5
     diagonal_loading: float = 1.0
-    array_weights: str | tuple[float, ...] = "uniform"
-    clean_within_db: float | None = None
-    clean_above_mean_db: float | None = None
+    array_weights: str | tuple[Annotated[float, Limits(0.0, 1e6)], ...] = "uniform"
+    clean_within_db: Annotated[float, CLEANING_DB] | None = None
+    clean_above_mean_db: Annotated[float, CLEANING_DB] | None = None
     pre_filter: str | tuple[float, ...] = ()
     post_filter: str | tuple[float, ...] = ()
-    filter_rate_hz: float | None = None
+    filter_rate_hz: Annotated[float, Limits(1.0, 1e9)] | None = None
     delay_matrix: str | tuple[tuple[float, ...], ...] = ()
-    delay_rate_hz: float | None = None
+    delay_rate_hz: Annotated[float, Limits(1.0, 1e9)] | None = None
     last_stage: Literal["demodulation", "matched_filter", "beams", "envelope"] = "envelope"
 
     @classmethod
@@ -189,30 +193,23 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             raise ArgumentError(
                 f"processing.directions has shape {shape}; use azimuth and elevation in degrees, of shape (n, 2)"
             )
+        if str(self.beamformer) in WEIGHTINGS:
+            raise ArgumentError(
+                f"processing.beamformer {self.beamformer!r} is a weighting; set it as processing.weighting, with"
+                f" one of the beamformers {', '.join(BEAMFORMERS)}"
+            )
         super().__post_init__()
-        checks.choice("processing.mode", self.mode, ("auto", "active", "passive"))
-        checks.choice("processing.method", self.method, ("fast", "paper"))
         self._check_directions()
-        checks.interval("processing.azimuth_limits_deg", self.azimuth_limits_deg, -180.0, 180.0)
-        checks.interval("processing.elevation_limits_deg", self.elevation_limits_deg, -90.0, 90.0)
-        checks.between("processing.elevation_deg", self.elevation_deg, -90.0, 90.0)
-        checks.interval("processing.range_m", self.range_m, 0.0, 10_000.0)
-        checks.integer("processing.range_decimation", self.range_decimation, 1, 10_000)
-        if self.band_edges_hz is not None:
-            checks.interval("processing.band_edges_hz", self.band_edges_hz, 0.0, 1e9)
-            if self.method == "paper":
-                raise ArgumentError(
-                    "processing.band_edges_hz is not supported by processing.method 'paper'; leave it out, or use "
-                    "method 'fast'"
-                )
-        if self.decimation is not None:
-            checks.integer("processing.decimation", self.decimation, 1, 1000)
-            if self.range_decimation % self.decimation:
-                raise ArgumentError(
-                    f"processing.decimation is {self.decimation}; use a divisor of processing.range_decimation "
-                    f"({self.range_decimation})"
-                )
-        checks.choice("processing.wavefront", self.wavefront, ("plane", "spherical", "auto"))
+        if self.band_edges_hz is not None and self.method == "paper":
+            raise ArgumentError(
+                "processing.band_edges_hz is not supported by processing.method 'paper'; leave it out, or use method "
+                "'fast'"
+            )
+        if self.decimation is not None and self.range_decimation % self.decimation:
+            raise ArgumentError(
+                f"processing.decimation is {self.decimation}; use a divisor of processing.range_decimation "
+                f"({self.range_decimation})"
+            )
         if self.wavefront == "spherical" and self.method == "paper":
             raise ArgumentError(
                 "processing.wavefront is 'spherical', but processing.method 'paper' supports only plane wavefronts; "
@@ -222,12 +219,8 @@ class Processing(TomlTable, frozen=True, kw_only=True):
         self._check_array_weights()
         self._check_filters()
         self._check_delays()
-        checks.choice("processing.last_stage", self.last_stage, STAGES)
         if self.last_stage == "beams":
             self.require_beams("processing.last_stage is 'beams'")
-        for name in ("clean_within_db", "clean_above_mean_db"):
-            if (level_db := getattr(self, name)) is not None:
-                checks.between(f"processing.{name}", level_db, 0.0, 1000.0)
 
     def _check_directions(self) -> None:
         given = self.directions
@@ -239,9 +232,6 @@ class Processing(TomlTable, frozen=True, kw_only=True):
                 f"processing.directions lists {len(given)} directions; use 1 to {MAX_LISTED_DIRECTIONS}, or more of "
                 "them in a CSV file"
             )
-        for row, (azimuth_deg, elevation_deg) in enumerate(given):
-            checks.between(f"azimuth of processing.directions[{row}] in degrees", azimuth_deg, -360.0, 360.0)
-            checks.between(f"elevation of processing.directions[{row}] in degrees", elevation_deg, -90.0, 90.0)
 
     def _check_array_weights(self) -> None:
         """Refuse weights that are negative, and any but uniform ones for adaptive beamformers."""
@@ -250,9 +240,6 @@ class Processing(TomlTable, frozen=True, kw_only=True):
             parse_window(given)
         elif not 1 <= len(given) <= MAX_MICROPHONES:
             raise ArgumentError(f"processing.array_weights has {len(given)} numbers; use one number for each channel")
-        else:
-            for channel, weight in enumerate(given):
-                checks.between(f"processing.array_weights[{channel}]", weight, 0.0, 1e6)
         if given != "uniform" and self.is_adaptive:
             raise ArgumentError(
                 f"processing.array_weights is {_shortened(given)}, but {self._adaptive_part} supports only 'uniform'; "
@@ -261,20 +248,9 @@ class Processing(TomlTable, frozen=True, kw_only=True):
 
     def _check_beamformer(self) -> None:
         """Refuse options of beamformers that are out of range, and those that only delay-and-sum supports."""
-        weightings: tuple[str, ...] = tuple(WEIGHTINGS)
-        if self.beamformer in weightings:
-            raise ArgumentError(
-                f"processing.beamformer {self.beamformer!r} is a weighting; set it as processing.weighting, with"
-                f" one of the beamformers {', '.join(BEAMFORMERS)}"
-            )
-        checks.choice("processing.beamformer", self.beamformer, tuple(BEAMFORMERS))
-        checks.choice("processing.weighting", self.weighting, weightings)
         for option in (option for each in BEAMFORMERS.values() for option in each.options):
             value = getattr(self, option.name)
-            if isinstance(option.low, int) and isinstance(option.high, int):
-                checks.integer(f"processing.{option.name}", value, option.low, option.high)
-            else:
-                checks.between(f"processing.{option.name}", value, option.low, option.high)
+            option.limits.checker(type(option.limits.low))(f"processing.{option.name}", value)
         if self.is_adaptive and self.method == "paper":
             raise ArgumentError(
                 "processing.method is 'paper', which supports only processing.beamformer 'delay_and_sum' and weighting "
@@ -289,8 +265,6 @@ class Processing(TomlTable, frozen=True, kw_only=True):
 
     def _check_filters(self) -> None:
         """Refuse filters that cannot be used, by themselves or with the method and the beamformer."""
-        if self.filter_rate_hz is not None:
-            checks.between("processing.filter_rate_hz", self.filter_rate_hz, 1.0, 1e9)
         for name in FILTERS:
             taps = getattr(self, name)
             if isinstance(taps, tuple):
@@ -308,8 +282,6 @@ class Processing(TomlTable, frozen=True, kw_only=True):
 
     def _check_delays(self) -> None:
         """Refuse delays that settings cannot hold, and those that beamformer or wavefront do not support."""
-        if self.delay_rate_hz is not None:
-            checks.between("processing.delay_rate_hz", self.delay_rate_hz, 1.0, 1e9)
         given = self.delay_matrix
         if not given:
             return

@@ -1,8 +1,7 @@
 """Record of a measurement, and the air that it is taken in."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from ertis_numba.base import checks
 from ertis_numba.base.constants import (
     ERTIS_PDM_RATE_HZ,
     STANDARD_HUMIDITY_PERCENT,
@@ -10,6 +9,7 @@ from ertis_numba.base.constants import (
     STANDARD_TEMPERATURE_C,
 )
 from ertis_numba.settings.documents import TomlTable
+from ertis_numba.settings.limits import Limits
 
 __all__ = ["DEFAULT_SAMPLES", "ENCODINGS", "Air", "Recording"]
 
@@ -27,7 +27,7 @@ class Recording(TomlTable, frozen=True, kw_only=True):
     Attributes
     ----------
     sample_rate_hz : float, default 4500000
-        PDM clock or PCM rate in hertz, 1000 to 1e9.
+        PDM clock or PCM rate in hertz.
     n_samples : int, default 163840
         Samples of each microphone in one measurement.
     encoding : {"pdm", "int16", "float32"}, default "pdm"
@@ -35,15 +35,9 @@ class Recording(TomlTable, frozen=True, kw_only=True):
         microphone and sample; full scale is 32768 or 1.
     """
 
-    sample_rate_hz: float = ERTIS_PDM_RATE_HZ
-    n_samples: int = DEFAULT_SAMPLES
+    sample_rate_hz: Annotated[float, Limits(1e3, 1e9)] = ERTIS_PDM_RATE_HZ
+    n_samples: Annotated[int, Limits(1, _MAX_SAMPLES)] = DEFAULT_SAMPLES
     encoding: Literal["pdm", "int16", "float32"] = "pdm"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.choice("recording.encoding", self.encoding, ENCODINGS)
-        checks.between("recording.sample_rate_hz", self.sample_rate_hz, 1e3, 1e9)
-        checks.integer("recording.n_samples", self.n_samples, 1, _MAX_SAMPLES)
 
     @property
     def duration_s(self) -> float:
@@ -67,19 +61,13 @@ class Air(TomlTable, frozen=True, kw_only=True):
     Attributes
     ----------
     temperature_c : float, default 20
-        Temperature in degrees Celsius, -40 to 60.
+        Temperature in degrees Celsius.
     humidity_percent : float, default 50
-        Relative humidity in percent, 0 to 100.
+        Relative humidity in percent.
     pressure_pa : float, default 101325
-        Air pressure in pascals, 10000 to 200000.
+        Air pressure in pascals.
     """
 
-    temperature_c: float = STANDARD_TEMPERATURE_C
-    humidity_percent: float = STANDARD_HUMIDITY_PERCENT
-    pressure_pa: float = STANDARD_PRESSURE_PA
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.between("air.temperature_c", self.temperature_c, -40.0, 60.0)
-        checks.between("air.humidity_percent", self.humidity_percent, 0.0, 100.0)
-        checks.between("air.pressure_pa", self.pressure_pa, 10_000.0, 200_000.0)
+    temperature_c: Annotated[float, Limits(-40.0, 60.0)] = STANDARD_TEMPERATURE_C
+    humidity_percent: Annotated[float, Limits(0.0, 100.0)] = STANDARD_HUMIDITY_PERCENT
+    pressure_pa: Annotated[float, Limits(10_000.0, 200_000.0)] = STANDARD_PRESSURE_PA

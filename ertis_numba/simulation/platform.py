@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +11,14 @@ from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.frames import Trajectory
 from ertis_numba.settings.documents import TomlTable
-from ertis_numba.simulation.trajectory import MAX_DISTANCE_M, MAX_SPEED_M_S, check_vector
+from ertis_numba.settings.limits import Limits
+from ertis_numba.simulation.trajectory import MAX_SPEED_M_S, Coordinate, Instant
 
 __all__ = ["MovingPose", "Platform"]
 
 Floats = NDArray[np.float64]
 _MAX_YAW_RATE_DEG_S = 3600.0
-_MAX_TURNS = 1e6
+_Yaw = Annotated[float, Limits(-360e6, 360e6, "{} yaw_deg")]
 _NS_PER_S = 10**9
 
 
@@ -61,16 +62,12 @@ class Platform(TomlTable, frozen=True, kw_only=True):
     ([0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.785])
     """
 
-    waypoints: tuple[tuple[float, float, float, float, float], ...]
+    waypoints: tuple[tuple[Instant, Coordinate, Coordinate, Coordinate, _Yaw], ...]
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.waypoints:
             raise ArgumentError("platform has no waypoints; write at least one (time_s, x, y, z, yaw_deg)")
-        for number, (time_s, x, y, z, yaw_deg) in enumerate(self.waypoints):
-            checks.finite(f"platform.waypoints[{number}] time", time_s)
-            check_vector(f"platform.waypoints[{number}]", (x, y, z), MAX_DISTANCE_M)
-            checks.between(f"platform.waypoints[{number}] yaw_deg", yaw_deg, -360.0 * _MAX_TURNS, 360.0 * _MAX_TURNS)
         for (before_s, *a, start_deg), (after_s, *b, stop_deg) in itertools.pairwise(self.waypoints):
             if after_s <= before_s:
                 raise ArgumentError(

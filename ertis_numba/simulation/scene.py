@@ -4,7 +4,7 @@ Levels and strengths are relative to full scale. A signal of amplitude 1, or 0 d
 """
 
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import msgspec
 import numpy as np
@@ -13,6 +13,7 @@ from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, SettingsError
 from ertis_numba.geometry import require_plausible_size, written_out
 from ertis_numba.settings.documents import TomlDocument
+from ertis_numba.settings.limits import Limits
 from ertis_numba.simulation.effects import EFFECTS, INDISPENSABLE
 from ertis_numba.simulation.platform import MovingPose, Platform
 from ertis_numba.simulation.sensors import Sensor
@@ -21,8 +22,6 @@ from ertis_numba.simulation.targets import Box, Point, Sphere, Wall
 from ertis_numba.simulation.trajectory import Placed
 
 __all__ = ["Scene", "load_scene"]
-
-_MAX_REFLECTIONS = 4
 
 
 class Scene(TomlDocument, frozen=True, kw_only=True):
@@ -43,7 +42,7 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
         Largest acceptable change of an image in decibels; 0.1 by default. Effects that change no image by more are left
         out, unless a key of the scene requests them. 0 keeps all effects.
     max_reflections : int
-        Maximum number of walls on a sound path, 0 to 4; 2 by default.
+        Maximum number of walls on a sound path; 2 by default.
     effects : dict of str to bool
         Effects to switch on or off by name, regardless of the tolerance; none by default.
     platform : Platform, optional
@@ -66,12 +65,12 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
     former_keys: ClassVar[dict[str, str]] = Sensor.former_keys
     former_values: ClassVar[dict[tuple[str, str], dict[str, str]]] = Sensor.former_values
 
-    seed: int = 0
-    rate_hz: float = 20.0
-    count: int = 1
-    sync_every: int = 1
-    tolerance_db: float = 0.1
-    max_reflections: int = 2
+    seed: Annotated[int, Limits(0, 2**63 - 1)] = 0
+    rate_hz: Annotated[float, Limits(1e-6, 1e6)] = 20.0
+    count: Annotated[int, Limits(1, 10**9)] = 1
+    sync_every: Annotated[int, Limits(1, 10**9)] = 1
+    tolerance_db: Annotated[float, Limits(0.0, 60.0)] = 0.1
+    max_reflections: Annotated[int, Limits(0, 4)] = 2
     effects: dict[str, bool] = msgspec.field(default_factory=dict)
     platform: Platform | None = None
     sensors: tuple[Sensor, ...] = (Sensor(),)
@@ -96,12 +95,6 @@ class Scene(TomlDocument, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.integer("seed", self.seed, 0, 2**63 - 1)
-        checks.between("rate_hz", self.rate_hz, 1e-6, 1e6)
-        checks.integer("count", self.count, 1, 10**9)
-        checks.integer("sync_every", self.sync_every, 1, 10**9)
-        checks.between("tolerance_db", self.tolerance_db, 0.0, 60.0)
-        checks.integer("max_reflections", self.max_reflections, 0, _MAX_REFLECTIONS)
         for name, wanted in self.effects.items():
             checks.choice("effect", name, EFFECTS)
             if name in INDISPENSABLE and not wanted:

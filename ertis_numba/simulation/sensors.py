@@ -2,26 +2,27 @@
 
 import math
 import re
+from typing import Annotated, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.base import checks
+from ertis_numba.base.constants import MAX_MICROPHONES
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import microphones
-from ertis_numba.settings import MAX_EMITTER_M, Settings
+from ertis_numba.settings import Settings
 from ertis_numba.settings.documents import TomlTable
-from ertis_numba.simulation.trajectory import Placed, Vector, check_vector
+from ertis_numba.settings.limits import EMITTER_M, Limits
+from ertis_numba.simulation.trajectory import Coordinate, Instant, Placed, Position, Velocity
 
 __all__ = ["Electronics", "Emitter", "Sensor"]
 
-_LOUDEST_DB = 120.0
+_LEVEL_DB: Final = Limits(-300.0, 120.0)
+_Channel = Annotated[int, Limits(0, MAX_MICROPHONES - 1)]
+_Offset = Annotated[float, Limits(-10.0, 10.0)]  # size of one housing; a farther emitter belongs to another sensor
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.@+-]*")  # characters that are valid in files
-_MAX_OFFSET_M = 10.0  # size of one housing; an emitter farther away belongs to a separate sensor
-_QUALITY_FACTORS = 1e-6, 200.0  # from a film with a flat response to a bare crystal
 _QUALITY_FACTOR = 5.0
-_MAX_DRIFT_PPM = 1000.0
 
 
 class Emitter(TomlTable, frozen=True, kw_only=True):
@@ -54,21 +55,17 @@ class Emitter(TomlTable, frozen=True, kw_only=True):
     5.0
     """
 
-    level_db: float = 0.0
-    diameter_m: float = 0.0
-    direct_sound_db: float | None = None
+    level_db: Annotated[float, _LEVEL_DB] = 0.0
+    diameter_m: Annotated[float, EMITTER_M] = 0.0
+    direct_sound_db: Annotated[float, _LEVEL_DB] | None = None
     silent: bool = False
-    position_m: Vector = (0.0, 0.0, 0.0)
-    resonance_hz: float | None = None
-    quality_factor: float | None = None
+    position_m: tuple[_Offset, _Offset, _Offset] = (0.0, 0.0, 0.0)
+    resonance_hz: Annotated[float, Limits(1e3, 1e6)] | None = None
+    quality_factor: Annotated[float, Limits(1e-6, 200.0)] | None = None  # from a flat film to a bare crystal
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_vector("emitter.position_m", self.position_m, _MAX_OFFSET_M)
-        if self.resonance_hz is not None:
-            checks.between("emitter.resonance_hz", self.resonance_hz, 1e3, 1e6)
         if self.quality_factor is not None:
-            checks.between("emitter.quality_factor", self.quality_factor, *_QUALITY_FACTORS)
             if self.quality_factor == _QUALITY_FACTOR and self.resonance_hz is None:
                 # Scenes in older recordings hold the default without a resonance.
                 msgspec.structs.force_setattr(self, "quality_factor", None)
@@ -77,10 +74,6 @@ class Emitter(TomlTable, frozen=True, kw_only=True):
                     f"emitter.quality_factor is {self.quality_factor:g}, but the emitter has no resonance; "
                     "add emitter.resonance_hz, or remove quality_factor"
                 )
-        checks.between("emitter.level_db", self.level_db, -300.0, _LOUDEST_DB)
-        checks.between("emitter.diameter_m", self.diameter_m, 0.0, MAX_EMITTER_M)
-        if self.direct_sound_db is not None:
-            checks.between("emitter.direct_sound_db", self.direct_sound_db, -300.0, _LOUDEST_DB)
 
     @property
     def resonance_quality(self) -> float:
@@ -97,7 +90,7 @@ class Electronics(TomlTable, frozen=True, kw_only=True):
         RMS of each microphone's white noise in dBFS, over the whole band up to half of the sample rate; no noise by
         default. Over a bandwidth B it is lower by ``10 log10(sample_rate / 2 B)`` decibels.
     modulator_order : int
-        Order of the sigma-delta modulators, 1 to 4; 4 by default.
+        Order of the sigma-delta modulators; 4 by default.
     dither : float
         Width of the uniform dither at the quantiser, full scale 1; 0.5 by default.
     microphone_diameter_m : float
@@ -119,27 +112,19 @@ class Electronics(TomlTable, frozen=True, kw_only=True):
     (3, 7)
     """
 
-    noise_dbfs: float | None = None
-    modulator_order: int = 4
-    dither: float = 0.5
-    microphone_diameter_m: float = 0.0
-    gain_spread_db: float = 0.0
-    delay_spread_s: float = 0.0
-    dead_channels: tuple[int, ...] = ()
-    stuck_low: tuple[int, ...] = ()
-    stuck_high: tuple[int, ...] = ()
-    clock_drift_ppm: float = 0.0
+    noise_dbfs: Annotated[float, Limits(-300.0, 0.0)] | None = None
+    modulator_order: Annotated[int, Limits(1, 4)] = 4
+    dither: Annotated[float, Limits(0.0, 2.0)] = 0.5
+    microphone_diameter_m: Annotated[float, EMITTER_M] = 0.0
+    gain_spread_db: Annotated[float, Limits(0.0, 20.0)] = 0.0
+    delay_spread_s: Annotated[float, Limits(0.0, 1e-4)] = 0.0
+    dead_channels: tuple[_Channel, ...] = ()
+    stuck_low: tuple[_Channel, ...] = ()
+    stuck_high: tuple[_Channel, ...] = ()
+    clock_drift_ppm: Annotated[float, Limits(-1000.0, 1000.0)] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.noise_dbfs is not None:
-            checks.between("electronics.noise_dbfs", self.noise_dbfs, -300.0, 0.0)
-        checks.integer("electronics.modulator_order", self.modulator_order, 1, 4)
-        checks.between("electronics.dither", self.dither, 0.0, 2.0)
-        checks.between("electronics.microphone_diameter_m", self.microphone_diameter_m, 0.0, MAX_EMITTER_M)
-        checks.between("electronics.gain_spread_db", self.gain_spread_db, 0.0, 20.0)
-        checks.between("electronics.delay_spread_s", self.delay_spread_s, 0.0, 1e-4)
-        checks.between("electronics.clock_drift_ppm", self.clock_drift_ppm, -_MAX_DRIFT_PPM, _MAX_DRIFT_PPM)
         both = set(self.stuck_low) & set(self.stuck_high)
         if both:
             raise ArgumentError(
@@ -153,8 +138,6 @@ class Electronics(TomlTable, frozen=True, kw_only=True):
 
 
 class _Pose(Placed, frozen=True, kw_only=True):
-    position_m: Vector | None = None
-
     @classmethod
     def label(cls) -> str:
         return "sensor"
@@ -188,12 +171,12 @@ class Sensor(Settings, frozen=True, kw_only=True):
     """
 
     name: str = "sensor"
-    position_m: Vector | None = None
-    velocity_m_s: Vector = (0.0, 0.0, 0.0)
-    waypoints: tuple[tuple[float, float, float, float], ...] = ()
-    yaw_deg: float = 0.0
-    pitch_deg: float = 0.0
-    roll_deg: float = 0.0
+    position_m: Position | None = None
+    velocity_m_s: Velocity = (0.0, 0.0, 0.0)
+    waypoints: tuple[tuple[Instant, Coordinate, Coordinate, Coordinate], ...] = ()
+    yaw_deg: Annotated[float, Limits(-180.0, 180.0)] = 0.0
+    pitch_deg: Annotated[float, Limits(-90.0, 90.0)] = 0.0
+    roll_deg: Annotated[float, Limits(-180.0, 180.0)] = 0.0
     emitter: Emitter = Emitter()
     electronics: Electronics = Electronics()
 
@@ -203,13 +186,7 @@ class Sensor(Settings, frozen=True, kw_only=True):
             raise ArgumentError(
                 f"sensor.name is {self.name!r}; use letters, digits and _, and from the second character also . @ + -"
             )
-        checks.between("sensor.yaw_deg", self.yaw_deg, -180.0, 180.0)
-        checks.between("sensor.pitch_deg", self.pitch_deg, -90.0, 90.0)
-        checks.between("sensor.roll_deg", self.roll_deg, -180.0, 180.0)
         self.path()
-        for name in ("dead_channels", "stuck_low", "stuck_high"):
-            for channel in getattr(self.electronics, name):
-                checks.integer(f"electronics.{name}", channel, 0, 1023)
 
     def require_microphones(self) -> None:
         """Raise an error for faults of channels without a microphone, once the layout is read."""

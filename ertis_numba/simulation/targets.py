@@ -1,17 +1,21 @@
 """Reflectors: points, spheres, walls and boxes."""
 
 import math
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError
-from ertis_numba.simulation.trajectory import Placed, direction
+from ertis_numba.settings.limits import Limits
+from ertis_numba.simulation.trajectory import Facing, Placed, direction
 
 __all__ = ["Box", "Point", "Sphere", "Wall"]
 
-_LOUDEST_DB = 120.0  # far beyond any overload; the limit catches amplitudes given instead of levels
+_LOUDEST_DB: Final = 120.0  # far beyond any overload; the limit catches amplitudes given instead of levels
+_REFLECTION_DB: Final = Limits(-300.0, 0.0)
+_Side = Annotated[float, Limits(1e-3, 1e5)]
+_Edge = Annotated[float, Limits(1e-3, 1e4)]
 
 
 class Point(Placed, frozen=True, kw_only=True):
@@ -34,22 +38,17 @@ class Point(Placed, frozen=True, kw_only=True):
     [0.0, 2.0, 0.0]
     """
 
-    strength_db: float = -20.0
-    diameter_m: float = 0.0
-    facing_deg: tuple[float, float] | None = None
+    strength_db: Annotated[float, Limits(-300.0, _LOUDEST_DB)] = -20.0
+    diameter_m: Annotated[float, Limits(0.0, 10.0)] = 0.0
+    facing_deg: Facing | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.between("point.strength_db", self.strength_db, -300.0, _LOUDEST_DB)
-        checks.between("point.diameter_m", self.diameter_m, 0.0, 10.0)
-        if self.facing_deg is not None:
-            checks.between("point.facing_deg azimuth", self.facing_deg[0], -180.0, 180.0)
-            checks.between("point.facing_deg elevation", self.facing_deg[1], -90.0, 90.0)
-            if not self.diameter_m:
-                raise ArgumentError(
-                    "point.facing_deg is given, but a point without a diameter reflects equally in all directions; "
-                    "add point.diameter_m for a disc, or remove facing_deg"
-                )
+        if self.facing_deg is not None and not self.diameter_m:
+            raise ArgumentError(
+                "point.facing_deg is given, but a point without a diameter reflects equally in all directions; "
+                "add point.diameter_m for a disc, or remove facing_deg"
+            )
 
     def normal_at(self, time_s: float) -> NDArray[np.float64]:
         """Return the unit normal of a disc at a time of the scene: (axis,) float64."""
@@ -73,13 +72,8 @@ class Sphere(Placed, frozen=True, kw_only=True):
     0.0
     """
 
-    radius_m: float
-    reflection_db: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.between("sphere.radius_m", self.radius_m, 1e-3, 1e3)
-        checks.between("sphere.reflection_db", self.reflection_db, -300.0, 0.0)
+    radius_m: Annotated[float, Limits(1e-3, 1e3)]
+    reflection_db: Annotated[float, _REFLECTION_DB] = 0.0
 
 
 class Wall(Placed, frozen=True, kw_only=True):
@@ -102,17 +96,9 @@ class Wall(Placed, frozen=True, kw_only=True):
     [-1.0, 0.0, 0.0]
     """
 
-    facing_deg: tuple[float, float]
-    size_m: tuple[float, float] | None = None
-    reflection_db: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.between("wall.facing_deg azimuth", self.facing_deg[0], -180.0, 180.0)
-        checks.between("wall.facing_deg elevation", self.facing_deg[1], -90.0, 90.0)
-        for side_m in self.size_m or ():
-            checks.between("wall.size_m", side_m, 1e-3, 1e5)
-        checks.between("wall.reflection_db", self.reflection_db, -300.0, 0.0)
+    facing_deg: Facing
+    size_m: tuple[_Side, _Side] | None = None
+    reflection_db: Annotated[float, _REFLECTION_DB] = 0.0
 
     def axes(self) -> NDArray[np.float64]:
         """Return the unit vectors of normal, width and height: (3, axis) float64."""
@@ -141,16 +127,12 @@ class Box(Placed, frozen=True, kw_only=True):
     6
     """
 
-    size_m: tuple[float, float, float]
-    yaw_deg: float = 0.0
-    reflection_db: float = 0.0
+    size_m: tuple[_Edge, _Edge, _Edge]
+    yaw_deg: Annotated[float, Limits(-180.0, 180.0)] = 0.0
+    reflection_db: Annotated[float, _REFLECTION_DB] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for side_m in self.size_m:
-            checks.between("box.size_m", side_m, 1e-3, 1e4)
-        checks.between("box.yaw_deg", self.yaw_deg, -180.0, 180.0)
-        checks.between("box.reflection_db", self.reflection_db, -300.0, 0.0)
         if self.waypoints:
             raise ArgumentError(
                 "box has waypoints, but boxes support only position_m and velocity_m_s; use one of these"

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +11,32 @@ from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import unit_vectors
 from ertis_numba.settings.documents import TomlTable
+from ertis_numba.settings.limits import Limits
 
-__all__ = ["MAX_DISTANCE_M", "MAX_SPEED_M_S", "Placed", "Vector", "check_vector", "direction"]
+__all__ = [
+    "MAX_SPEED_M_S",
+    "Coordinate",
+    "Facing",
+    "Instant",
+    "Placed",
+    "Position",
+    "Velocity",
+    "direction",
+]
 
-Vector = tuple[float, float, float]
-MAX_DISTANCE_M: Final = 1e4
+_MAX_DISTANCE_M: Final = 1e4
 MAX_SPEED_M_S: Final = 100.0  # a third of the speed of sound; beyond, air flow around the object would matter
-_STILL: Vector = (0.0, 0.0, 0.0)
+
+Coordinate = Annotated[float, Limits(-_MAX_DISTANCE_M, _MAX_DISTANCE_M)]
+Position = tuple[Coordinate, Coordinate, Coordinate]
+_Speed = Annotated[float, Limits(-MAX_SPEED_M_S, MAX_SPEED_M_S)]
+Velocity = tuple[_Speed, _Speed, _Speed]
+Instant = Annotated[float, Limits(-math.inf, math.inf, "{} time")]
+Facing = tuple[
+    Annotated[float, Limits(-180.0, 180.0, "{} azimuth")], Annotated[float, Limits(-90.0, 90.0, "{} elevation")]
+]
+"""Azimuth and elevation of an axis in the world frame, in degrees."""
+_STILL: Velocity = (0.0, 0.0, 0.0)
 
 
 class Placed(TomlTable, frozen=True, kw_only=True):
@@ -36,12 +55,12 @@ class Placed(TomlTable, frozen=True, kw_only=True):
         between them, and rests before the first and after the last; none by default.
     """
 
-    position_m: Vector | None = None
-    azimuth_deg: float | None = None
-    elevation_deg: float | None = None
-    range_m: float | None = None
-    velocity_m_s: Vector = _STILL
-    waypoints: tuple[tuple[float, float, float, float], ...] = ()
+    position_m: Position | None = None
+    azimuth_deg: Annotated[float, Limits(-180.0, 180.0)] | None = None
+    elevation_deg: Annotated[float, Limits(-90.0, 90.0)] | None = None
+    range_m: Annotated[float, Limits(1e-3, _MAX_DISTANCE_M)] | None = None
+    velocity_m_s: Velocity = _STILL
+    waypoints: tuple[tuple[Instant, Coordinate, Coordinate, Coordinate], ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -52,20 +71,10 @@ class Placed(TomlTable, frozen=True, kw_only=True):
                 f"{name} does not have exactly one position; choose one of position_m, range_m with azimuth_deg and "
                 "elevation_deg, or waypoints"
             )
-        if polar:
-            if self.range_m is None:
-                raise ArgumentError(f"{name} has a direction but no range_m; add range_m")
-            checks.between(f"{name}.range_m", self.range_m, 1e-3, MAX_DISTANCE_M)
-            checks.between(f"{name}.azimuth_deg", self.azimuth_deg or 0.0, -180.0, 180.0)
-            checks.between(f"{name}.elevation_deg", self.elevation_deg or 0.0, -90.0, 90.0)
-        if self.position_m is not None:
-            check_vector(f"{name}.position_m", self.position_m, MAX_DISTANCE_M)
-        check_vector(f"{name}.velocity_m_s", self.velocity_m_s, MAX_SPEED_M_S)
+        if polar and self.range_m is None:
+            raise ArgumentError(f"{name} has a direction but no range_m; add range_m")
         if self.waypoints and self.velocity_m_s != _STILL:
             raise ArgumentError(f"{name} has both waypoints and velocity_m_s; use only one of them")
-        for number, (time_s, *place) in enumerate(self.waypoints):
-            checks.finite(f"{name}.waypoints[{number}] time", time_s)
-            check_vector(f"{name}.waypoints[{number}]", (place[0], place[1], place[2]), MAX_DISTANCE_M)
         for (before_s, *a), (after_s, *b) in itertools.pairwise(self.waypoints):
             if after_s <= before_s:
                 raise ArgumentError(
@@ -103,12 +112,6 @@ class Placed(TomlTable, frozen=True, kw_only=True):
             return np.array(self.position_m)
         azimuth_rad, elevation_rad = math.radians(self.azimuth_deg or 0.0), math.radians(self.elevation_deg or 0.0)
         return np.asarray((self.range_m or 0.0) * unit_vectors(np.array(azimuth_rad), np.array(elevation_rad)))
-
-
-def check_vector(name: str, vector: Vector, largest: float) -> None:
-    """Raise an error for a vector with a component beyond ±``largest``."""
-    for part in vector:
-        checks.between(name, part, -largest, largest)
 
 
 def direction(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:

@@ -159,9 +159,9 @@ def test_registry_names_are_those_of_the_type():
     "option", [option for each in BEAMFORMERS.values() for option in each.options], ids=lambda option: option.name
 )
 def test_options_keep_their_limits(option):
-    for value in (option.low, option.high):
+    for value in (option.limits.low, option.limits.high):
         assert getattr(Processing(**{option.name: value}), option.name) == value
-    for value in (option.low - 1, option.high + 1):
+    for value in (option.limits.low - 1, option.limits.high + 1):
         with pytest.raises(ArgumentError, match=f"processing.{option.name}"):
             Processing(**{option.name: value})
 

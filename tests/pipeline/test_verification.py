@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from ertis_bench.error_trials import reference_image, verify_trials as campaign
-from ertis_bench.error_trials.random_settings import Limits, random_measurement, random_settings
+from ertis_bench.error_trials.random_settings import DrawLimits, random_measurement, random_settings
 from ertis_cli.main import cli
 
 from ertis_numba.base.errors import ArgumentError
@@ -219,7 +219,7 @@ def test_bench_verification_names_the_error(monkeypatch):
 
 
 def test_random_settings_cover_every_kind():
-    drawn = [random_settings(np.random.default_rng(seed), Limits()) for seed in range(60)]
+    drawn = [random_settings(np.random.default_rng(seed), DrawLimits()) for seed in range(60)]
     assert {settings.processing.beamformer for settings in drawn} == set(BEAMFORMERS)
     assert {settings.processing.weighting for settings in drawn} == set(WEIGHTINGS)
     shapes = {(settings.processing.wavefront, settings.processing.is_adaptive) for settings in drawn}
@@ -231,4 +231,4 @@ def test_random_settings_cover_every_kind():
 
 def test_random_settings_refuse_impossible_limits():
     with pytest.raises(ArgumentError, match=r"100 draws gave no valid settings; the last error: .*Widen the limits"):
-        random_settings(np.random.default_rng(1), Limits(max_samples=0))
+        random_settings(np.random.default_rng(1), DrawLimits(max_samples=0))

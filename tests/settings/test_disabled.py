@@ -75,7 +75,7 @@ def test_settings_omit_empty_disabled_list():
     ("disabled", "message"),
     [
         ((32,), "array.disabled is 32; use a whole number from 0 to 31"),
-        ((-1,), "array.disabled is -1; use a whole number from 0"),
+        ((-1,), "array.disabled\\[0\\] is -1; use a whole number from 0"),
         (tuple(range(32)), "array.disabled disables all 32 microphones; name fewer channels"),
     ],
 )

@@ -141,7 +141,7 @@ def test_settings_are_immutable():
         ("[array]\ndelay_s = [0]", r"array\.delay_s is given without array\.positions_m; use both or neither"),
         ("[array]\npositions_m = []", r"number of array\.positions_m is 0; use a whole number from 1 to 1024"),
         ("[array]\npositions_m = [[0, 0]]", r"s, line 2, array\.positions_m\[0\]: Expected `array` of length 3, got 2"),
-        ("[array]\npositions_m = [[0, 0, nan]]", r"array\.positions_m holds nan at \[0, 2\]; pass finite numbers"),
+        ("[array]\npositions_m = [[0, 0, nan]]", r"array\.positions_m\[0\] is nan; use a finite number"),
         (
             "[array]\npositions_m = [[0, 0, 0]]\nenabled = [true, true]",
             r"array\.enabled has shape \(2,\); pass shape \(1,\)",

@@ -278,7 +278,7 @@ def test_faults_of_missing_channels_are_refused(tmp_path, channel):
         ("[[sensors]]\nelectronics.delay_spread_s = 1", r"electronics\.delay_spread_s is 1; use a number from 0 to"),
         (
             "[[sensors]]\nelectronics.dead_channels = [-1]",
-            r"electronics\.dead_channels is -1; use a whole number from 0",
+            r"electronics\.dead_channels\[0\] is -1; use a whole number from 0",
         ),
         ("[[sensors]]\nrecording.n_samples = 0", r"recording\.n_samples is 0; use a whole number from 1 to 268435456"),
     ],

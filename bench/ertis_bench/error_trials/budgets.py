@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_bench import machine
-from ertis_bench.error_trials.random_settings import Limits, recorded
+from ertis_bench.error_trials.random_settings import DrawLimits, recorded
 from ertis_bench.machine import sentence
 from ertis_bench.markdown import table
 from ertis_bench.network.processes import ask
@@ -151,7 +151,7 @@ def _settings(random: np.random.Generator) -> Settings:
     first_m = float(random.uniform(0.3, 0.8))
     beamformer, weighting = _COMBINATIONS[random.integers(len(_COMBINATIONS))]
     n_mics = len(microphones(array).enabled_positions_m)
-    if n_mics < Limits().max_mics and beamformer == "dmas" and n_mics < 2:
+    if n_mics < DrawLimits().max_mics and beamformer == "dmas" and n_mics < 2:
         beamformer = "delay_and_sum"
     # A generator of its own, so that the seeds of former reports still give the same settings otherwise.
     if beamformer in {"dmas", "capon"} and random.spawn(1)[0].integers(_WEIGHTED) == 0:

@@ -16,7 +16,7 @@ from ertis_numba.geometry.waveform import call_at
 from ertis_numba.settings import Accuracy, Air, Array, Call, Processing, Recording, Settings
 from ertis_numba.settings.beamformers import ADAPTIVE_COMBINATIONS, BeamformerName, WeightingName
 
-__all__ = ["Limits", "random_measurement", "random_settings", "recorded"]
+__all__ = ["DrawLimits", "random_measurement", "random_settings", "recorded"]
 
 _DRAWS = 100  # Draws that constructors may refuse, before the limits are considered too narrow.
 
@@ -26,7 +26,7 @@ _COMBINATIONS: Final[tuple[tuple[BeamformerName, WeightingName], ...]] = (_PLAIN
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class DrawLimits:
     """Maximum sizes of random settings, which keep slow references feasible.
 
     Attributes
@@ -46,17 +46,17 @@ class Limits:
     max_products: int = 5_000
 
 
-def random_measurement(seed: int, limits: Limits | None = None) -> Measurement:
+def random_measurement(seed: int, limits: DrawLimits | None = None) -> Measurement:
     """Return a measurement whose settings and words are drawn from a seed.
 
     Words contain noise, echoes from random positions, or both; see `random_settings`.
     """
     random = np.random.default_rng(seed)
-    settings = random_settings(random, limits or Limits())
+    settings = random_settings(random, limits or DrawLimits())
     return Measurement(_words(random, settings), settings)
 
 
-def random_settings(random: np.random.Generator, limits: Limits) -> Settings:
+def random_settings(random: np.random.Generator, limits: DrawLimits) -> Settings:
     """Return valid and complete settings.
 
     They cover short calls, calls without ramps, PDM and PCM, and every beamformer.
@@ -75,7 +75,7 @@ def random_settings(random: np.random.Generator, limits: Limits) -> Settings:
     raise ArgumentError(f"{_DRAWS} draws gave no valid settings; the last error: {refused}. Widen the limits")
 
 
-def _drawn(random: np.random.Generator, limits: Limits) -> Settings:
+def _drawn(random: np.random.Generator, limits: DrawLimits) -> Settings:
     array, call, recording = _array(random, limits), _call(random), _recording(random, limits)
     air = Air(temperature_c=float(random.uniform(-10, 40)), humidity_percent=float(random.uniform(5, 95)))
     return Settings(
@@ -88,7 +88,7 @@ def _drawn(random: np.random.Generator, limits: Limits) -> Settings:
     )
 
 
-def _array(random: np.random.Generator, limits: Limits) -> Array:
+def _array(random: np.random.Generator, limits: DrawLimits) -> Array:
     """Return a shipped layout, or microphones on a line, in a plane or in a volume.
 
     Every third array is calibrated.
@@ -123,7 +123,7 @@ def _call(random: np.random.Generator) -> Call:
     )
 
 
-def _recording(random: np.random.Generator, limits: Limits) -> Recording:
+def _recording(random: np.random.Generator, limits: DrawLimits) -> Recording:
     encoding = _ENCODINGS[random.integers(len(_ENCODINGS))]
     rate_hz = random.choice([4.5e6, 4.5e6, 3.072e6, 2.4e6] if encoding == "pdm" else [1e6, 4.5e5, 3.84e5, 2.5e5])
     longest = min(limits.max_samples, int(15e-3 * rate_hz))
@@ -133,7 +133,7 @@ def _recording(random: np.random.Generator, limits: Limits) -> Recording:
 
 
 def _processing(
-    random: np.random.Generator, limits: Limits, call: Call, recording: Recording, n_mics: int, air: Air
+    random: np.random.Generator, limits: DrawLimits, call: Call, recording: Recording, n_mics: int, air: Air
 ) -> Processing:
     """Return processing settings for an image within the record, with at most the limit's number of ranges."""
     low_hz, high_hz = call.low_frequency_hz, call.high_frequency_hz
