@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from ertis_numba.base import checks
 from ertis_numba.base.errors import DataError
-from ertis_numba.calibration.advice import how_to_record, not_observable, require_directions
-from ertis_numba.calibration.array_fit import ArrayFit, fit_array, fit_gains
+from ertis_numba.calibration.advice import how_to_record, require_directions
+from ertis_numba.calibration.array_fit import ArrayFit, fit_array
 from ertis_numba.calibration.channel_order import find_swaps
-from ertis_numba.calibration.contrast import image_contrast_db
+from ertis_numba.calibration.fit_result import NEPER_DB, SCALE_S, PreparedFit, assembled
 from ertis_numba.calibration.observations import Observations, Tolerances
 from ertis_numba.calibration.reference_place import (
     ReflectorPlace,
@@ -23,11 +23,10 @@ from ertis_numba.calibration.reference_place import (
     speed_from_distance,
     speed_from_spread,
 )
-from ertis_numba.calibration.result import Calibration, Residuals
+from ertis_numba.calibration.result import Calibration
 from ertis_numba.calibration.sounds import is_line
 from ertis_numba.calibration.usable_sounds import (
     MIN_COHERENCE,
-    Heard,
     Microphones,
     hear_all,
     ordered,
@@ -38,15 +37,12 @@ from ertis_numba.calibration.usable_sounds import (
 from ertis_numba.calibration.wavefronts import TARGETS, Target, locate_source, travel_times
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry import Layout
-from ertis_numba.geometry.air import absorption_db_m
 
 __all__ = ["calibrate"]
 
-_NEPER_DB: Final = 20 / math.log(10)
 _MIN_MICROPHONES: Final = 8
 _MAX_LEVEL: Final = 4.0  # Largest plausible level of a microphone in expected deviations.
 _NEAR: Final = 3.0  # A sound that is more expected deviations from its expected time is another one.
-_SCALE_S: Final = 5e-6
 _INVERTED_SHARE: Final = 0.8  # Share of the recordings in which an inverted channel is inverted.
 _MIN_EVIDENCE: Final = 100.0  # Sum over the recordings of the logarithm of the likelihood of an inverted polarity.
 _FEW: Final = 4  # Number of recordings from which on residuals reveal errors of the model.
@@ -57,26 +53,6 @@ _MAX_SPEED: Final = 0.1  # Relative difference of a measured speed of sound.
 _BAD_RECORD: Final = 6.0  # Residual of a bad recording relative to that of the median one.
 _MIN_BAD_S: Final = 1e-7
 _MAX_OTHER_S: Final = 3e-7  # Error of times because of other sound, beyond which a recording is left out.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Prepared:
-    """Sounds and microphones of a calibration, with the order of the channels known."""
-
-    heard: Heard
-    every: Microphones
-    used: NDArray[np.bool_]
-    kept: Microphones
-    source_m: NDArray[np.float64]
-    target: Target
-    expected: Tolerances
-    order: str
-    swaps: tuple[tuple[int, ...], ...]
-    silent: tuple[int, ...]
-
-    def speed_m_s(self) -> NDArray[np.float64]:
-        """Return the speed of sound of each recording: (record,) float64."""
-        return np.array([sound.speed_m_s for sound in self.heard.sounds.values()])
 
 
 def calibrate(
@@ -172,7 +148,7 @@ def calibrate(
     speed_m_s = np.array([sound.speed_m_s for sound in heard.sounds.values()])
     time_s = np.stack([sound.arrival.time_s for sound in heard.sounds.values()])[:, used] - kept.delay_s
     found = find_swaps(time_s, kept.positions_m, source_m, speed_m_s, target)
-    prepared = _Prepared(
+    prepared = PreparedFit(
         heard=heard,
         every=every,
         used=used,
@@ -187,7 +163,7 @@ def calibrate(
     return _with_place(_fitted(prepared), prepared, place)
 
 
-def _fitted(job: _Prepared) -> Calibration:
+def _fitted(job: PreparedFit) -> Calibration:
     """Return the calibration, after leaving out recordings that do not agree with the others."""
     seen, inverted = _observed(job)
     source_m = job.source_m
@@ -205,10 +181,10 @@ def _fitted(job: _Prepared) -> Calibration:
         seen, source_m = _left_out(job, bad, seen, source_m)
         fit = _fit(job, seen, source_m)
     _require_plausible(job, fit)
-    return _assembled(job, seen, fit, inverted)
+    return assembled(job, seen, fit, inverted)
 
 
-def _overlapped(job: _Prepared, few: dict[int, str]) -> dict[int, str]:
+def _overlapped(job: PreparedFit, few: dict[int, str]) -> dict[int, str]:
     """Return the recordings whose echo another sound overlaps, with the reason, if enough others remain.
 
     Such a sound, as from a floor, moves the times of neighbouring microphones together. Residuals do not show that.
@@ -223,12 +199,12 @@ def _overlapped(job: _Prepared, few: dict[int, str]) -> dict[int, str]:
     return found if n_left >= _FEW else {}
 
 
-def _fit(job: _Prepared, seen: Observations, source_m: NDArray[np.float64]) -> ArrayFit:
+def _fit(job: PreparedFit, seen: Observations, source_m: NDArray[np.float64]) -> ArrayFit:
     kept = job.kept
     return fit_array(seen, kept.delay_s, kept.positions_m, source_m, job.speed_m_s(), job.target, job.expected)
 
 
-def _of_other_targets(job: _Prepared, seen: Observations, fit: ArrayFit) -> dict[int, str]:
+def _of_other_targets(job: PreparedFit, seen: Observations, fit: ArrayFit) -> dict[int, str]:
     """Return recordings of another kind of target, with the reason; raise DataError if all are."""
     if job.target == "direct":
         return {}
@@ -251,7 +227,7 @@ def _of_other_targets(job: _Prepared, seen: Observations, fit: ArrayFit) -> dict
         time_s, places_m = (seen.time_s[record] - fit.delay_s)[valid], fit.positions_m[valid]
         speed = float(job.speed_m_s()[record])
         start_m = scale * fit.source_m[record]
-        source_m = locate_source(time_s, places_m, start_m, speed, other, scale_s=_SCALE_S)
+        source_m = locate_source(time_s, places_m, start_m, speed, other, scale_s=SCALE_S)
         rest_s = time_s - travel_times(source_m[None], places_m, speed, other).time_s[0]
         if np.median(np.abs(rest_s)) / seen.noise_s[record] < misfit[record] / 2:
             found[record] = f"its sound fits a {other} better than a {job.target}"
@@ -263,7 +239,7 @@ def _misfit(residual_s: NDArray[np.float64], seen: Observations) -> NDArray[np.f
     return np.asarray(np.nanmedian(np.abs(residual_s), axis=1) / seen.noise_s)
 
 
-def _require_plausible(job: _Prepared, fit: ArrayFit) -> None:
+def _require_plausible(job: PreparedFit, fit: ArrayFit) -> None:
     """Refuse changes that are far larger than their tolerances."""
     later = _rms(fit.delay_s - job.kept.delay_s)
     moved = _rms(fit.positions_m - job.kept.positions_m)
@@ -277,7 +253,7 @@ def _require_plausible(job: _Prepared, fit: ArrayFit) -> None:
 
 
 def _left_out(
-    job: _Prepared, reasons: dict[int, str], seen: Observations, source_m: NDArray[np.float64]
+    job: PreparedFit, reasons: dict[int, str], seen: Observations, source_m: NDArray[np.float64]
 ) -> tuple[Observations, NDArray[np.float64]]:
     """Leave out recordings by their places among the usable ones, with reasons; return the rest."""
     numbers = list(job.heard.sounds)
@@ -293,7 +269,7 @@ def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def _observed(job: _Prepared) -> tuple[Observations, NDArray[np.bool_]]:
+def _observed(job: PreparedFit) -> tuple[Observations, NDArray[np.bool_]]:
     """Measure all sounds again, with gates around their times; also return which microphones are inverted."""
     heard, used, kept, expected = job.heard, job.used, job.kept, job.expected
     rows, evidence = [], []
@@ -318,7 +294,7 @@ def _observed(job: _Prepared) -> tuple[Observations, NDArray[np.bool_]]:
                 float(np.median(again.time_sd_s[used])),
                 again.level[used],
                 np.where(
-                    valid, np.hypot(again.level_sd[used], math.hypot(other, expected.model_db / _NEPER_DB)), np.inf
+                    valid, np.hypot(again.level_sd[used], math.hypot(other, expected.model_db / NEPER_DB)), np.inf
                 ),
             )
         )
@@ -337,70 +313,6 @@ def _bad_records(residual_s: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(typical_s > np.maximum(_MIN_BAD_S, _BAD_RECORD * np.median(typical_s)))
 
 
-def _assembled(job: _Prepared, seen: Observations, fit: ArrayFit, inverted: NDArray[np.bool_]) -> Calibration:
-    """Return the result: the new layout, changes, residuals and findings."""
-    heard, every, kept, expected = job.heard, job.every, job.kept, job.expected
-    former, n_mics = heard.former, len(kept.channels)
-    settings = next(iter(heard.sounds.values())).settings
-    centre_hz = (settings.call.low_frequency_hz + settings.call.high_frequency_hz) / 2
-    absorption = float(absorption_db_m(settings.air, np.array([centre_hz]))[0]) / _NEPER_DB
-    former_gain = former.gain[kept.channels]
-    change_np, gain_covariance, level_rest = fit_gains(
-        seen, np.log(np.abs(former_gain)), fit.distance_m, absorption, expected
-    )
-    change_db = _NEPER_DB * change_np
-    covariance = np.zeros((n_mics, 5, n_mics, 5))
-    covariance[:, 0, :, 0] = _NEPER_DB**2 * gain_covariance
-    covariance[:, 1:, :, 1:] = fit.covariance.reshape(n_mics, 4, n_mics, 4)
-    levels = _NEPER_DB * level_rest
-    residuals = Residuals(
-        before_time_s=_before(job, seen, fit),
-        after_time_s=fit.residual_s,
-        before_level_db=levels + change_db - np.mean(change_db),
-        after_level_db=levels,
-    )
-    enabled = former.enabled.copy()
-    enabled[[*job.silent, *heard.copies]] = False
-    gain, delay_s, positions_m = former.gain.copy(), former.delay_s.copy(), former.positions_m.copy()
-    positions_m[every.channels] = every.positions_m
-    gain[kept.channels] = former_gain * np.exp(change_np) * np.where(inverted, -1.0, 1.0)
-    delay_s[kept.channels] = fit.delay_s
-    positions_m[kept.channels] = fit.positions_m
-    layout = replace(former, enabled=enabled, gain=gain, delay_s=delay_s, positions_m=positions_m)
-    sounds = list(heard.sounds.values())
-    unclear = tuple(np.setdiff1d(np.flatnonzero(enabled), kept.channels).tolist())
-    made = Calibration(
-        layout=layout,
-        former=former,
-        channels=tuple(kept.channels.tolist()),
-        gain_db=change_db,
-        delay_s=fit.delay_s - kept.delay_s,
-        moved_m=fit.positions_m - kept.positions_m,
-        covariance=covariance,
-        expected_sd=np.array([expected.gain_db, 1e6 * expected.delay_s, *(3 * [1e3 * expected.position_m])]),
-        residuals=residuals,
-        source_m=fit.source_m,
-        swaps=job.swaps,
-        inverted=tuple(kept.channels[inverted].tolist()),
-        silent=job.silent,
-        unclear=unclear,
-        duplicates=heard.copies,
-        order=job.order,
-        mirrored="",
-        sound_speed=None,
-        not_observable=(),
-        contrast_db=tuple(image_contrast_db(sounds, every.channels, each) for each in (former, layout)),
-        rejected=dict(sorted(heard.rejected.items())),
-    )
-    positions = expected.position_m > 0
-    return replace(
-        made,
-        not_observable=not_observable(
-            made.is_observed, job.target, positions=positions, is_line=is_line(every.positions_m)
-        ),
-    )
-
-
 def _inverted(evidence: NDArray[np.float64], sign: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return True for microphones whose polarity certainly differs from that of most microphones: (mic,) bool."""
     relative = evidence * sign
@@ -409,21 +321,7 @@ def _inverted(evidence: NDArray[np.float64], sign: NDArray[np.float64]) -> NDArr
     return np.asarray(is_negative & (relative.sum(axis=0) < -_MIN_EVIDENCE))
 
 
-def _before(job: _Prepared, seen: Observations, fit: ArrayFit) -> NDArray[np.float64]:
-    """Return the residuals of the layout in use, with sources that fit it best: (record, mic) float64."""
-    heard, kept, target, speed_m_s = job.heard, job.kept, job.target, job.speed_m_s()
-    positions_m = heard.former.positions_m[kept.channels]
-    rest_s = np.full_like(seen.time_s, np.nan)
-    for record, start_m in enumerate(fit.source_m):
-        valid = np.isfinite(seen.time_sd_s[record])
-        time_s = (seen.time_s[record] - kept.delay_s)[valid]
-        speed = float(speed_m_s[record])
-        source_m = locate_source(time_s, positions_m[valid], start_m, speed, target, scale_s=_SCALE_S)
-        rest_s[record, valid] = time_s - travel_times(source_m[None], positions_m[valid], speed, target).time_s[0]
-    return rest_s
-
-
-def _with_place(made: Calibration, job: _Prepared, place: ReflectorPlace | None) -> Calibration:
+def _with_place(made: Calibration, job: PreparedFit, place: ReflectorPlace | None) -> Calibration:
     """Return the calibration with the findings from the place of the first reflector, or from direct sound."""
     first = next(iter(job.heard.sounds))
     speed_m_s = job.heard.sounds[first].speed_m_s
@@ -464,7 +362,7 @@ def _with_place(made: Calibration, job: _Prepared, place: ReflectorPlace | None)
     )
 
 
-def _at_speed(job: _Prepared, made: Calibration, ratio: float) -> _Prepared:
+def _at_speed(job: PreparedFit, made: Calibration, ratio: float) -> PreparedFit:
     """Return the calibration to repeat with another speed of sound."""
     sounds = {number: replace(sound, speed_m_s=ratio * sound.speed_m_s) for number, sound in job.heard.sounds.items()}
     return replace(job, heard=replace(job.heard, sounds=sounds), source_m=ratio * made.source_m)

@@ -9,13 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.base.errors import ArgumentError
-from ertis_numba.chain.beam_grid import FEWEST_RANGES, Aperture, BeamGrid, require_beam_grid
+from ertis_numba.chain.beam_grid import FEWEST_RANGES, BeamGrid, require_beam_grid
 from ertis_numba.chain.beamform import whole_limits
+from ertis_numba.chain.cached_estimates import (
+    PlannedBeams,
+    aperture_of,
+    estimated,
+    estimated_errors,
+    fitted,
+    grid_points,
+)
 from ertis_numba.chain.costs import Work
 from ertis_numba.chain.error_model import PARTS, ErrorModel, SignalModel
 from ertis_numba.chain.focal_zones import squared_curvature
 from ertis_numba.chain.instance_cache import cached_in_instance
-from ertis_numba.chain.interpolation_fit import DelayFit, Spectrum
 from ertis_numba.chain.phase_shifts import SHIFT_BYTES, SHIFT_TABLE_BYTES, rows_at_a_time
 from ertis_numba.chain.plan_elements import (
     chain_taps,
@@ -47,8 +54,6 @@ _COHERENCE_ERROR = 10**-4.8
 
 Echoes of `data/synthetic/reflectors.h5` had −48.3 to −49.2 dB with plans for budgets from −40 to −68 dB.
 """
-_MAX_APERTURES = 8  # Arrays with their directions.
-_MAX_FITS = 288  # Four times the number of fits in one search.
 
 
 class ImagePlan(NamedTuple):
@@ -84,18 +89,6 @@ class Delays:
     squares: float
 
 
-class _Beams(NamedTuple):
-    """Determines a beam grid and its errors; equal if its elements are, arrays by identity."""
-
-    aperture: Aperture
-    spectrum: Spectrum
-    n_taps: int
-    density: float
-    high_hz: float
-    sound_speed_m_s: float
-    nearest_m: float
-
-
 class PlanModel:
     """Predictions about complete plans for one kind of measurement; without a signal model, they are safe values."""
 
@@ -107,7 +100,7 @@ class PlanModel:
         layout, grid = microphones(settings.array), direction_grid(settings.processing)
         self.n_mics, self._n_words = int(layout.enabled.sum()), layout.n_words
         self._own_s = layout.delay_s[layout.enabled]
-        self.aperture = _aperture_of(
+        self.aperture = aperture_of(
             layout.enabled_positions_m.tobytes(),
             unit_vectors(grid.azimuth_rad, grid.elevation_rad).tobytes(),
             settings.processing.level_directions,
@@ -221,7 +214,7 @@ class PlanModel:
         weights that nearly cancel each other add up the errors of their grid points.
         """
         step_s = 1 / (self.settings.output_rate_hz * plan.n_phases)
-        fit, _ = _fitted(self._spectrum, plan.delay_taps, step_s)
+        fit, _ = fitted(self._spectrum, plan.delay_taps, step_s)
         if nodes.grid is None or self._few_delays(step_s) is not None:
             return error * max(1.0, nodes.squares)
         passed = sum(share * nodes.grid.passed(order / step_s) for order, share in fit.images.items())
@@ -307,7 +300,7 @@ class PlanModel:
     def delays(self, n_phases: int, n_taps: int) -> Delays:
         """Return the prediction for an interpolation of delays."""
         step_s = 1 / (self.settings.output_rate_hz * n_phases)
-        fit, weights = _fitted(self._spectrum, n_taps, step_s)
+        fit, weights = fitted(self._spectrum, n_taps, step_s)
         delays_s = self._few_delays(step_s)
         fractions = None if delays_s is None else fit.split(delays_s)[1]
         return Delays(
@@ -322,11 +315,11 @@ class PlanModel:
 
     def count_grid_points(self, n_taps: int, density: float) -> int:
         """Return the number of beam-grid points."""
-        return _grid_points(self._beams(n_taps, density))
+        return grid_points(self._beams(n_taps, density))
 
-    def _beams(self, n_taps: int, density: float) -> _Beams:
+    def _beams(self, n_taps: int, density: float) -> PlannedBeams:
         high_hz = self.settings.call.high_frequency_hz
-        return _Beams(self.aperture, self._spectrum, n_taps, density, high_hz, self._speed_m_s, self._nearest_m)
+        return PlannedBeams(self.aperture, self._spectrum, n_taps, density, high_hz, self._speed_m_s, self._nearest_m)
 
     @cached_in_instance
     def nodes(self, n_taps: int, density: float) -> Nodes:
@@ -334,11 +327,11 @@ class PlanModel:
         require_beam_grid(self.aperture, len(self.window.range_m))
         beams = self._beams(n_taps, density)
         if self.errors.needs_steering and math.isinf(self._nearest_m):
-            grid = _estimated(beams)
+            grid = estimated(beams)
             error, squares = self.errors.beams(grid), grid.squares
         else:
             grid = None
-            power, squares = _estimated_errors(beams)
+            power, squares = estimated_errors(beams)
             error = self.errors.uniform_beams(power)
         n_pairs = n_taps**self.aperture.n_axes // 2
         return Nodes(self.count_grid_points(n_taps, density), n_pairs, error, squares, grid)
@@ -390,13 +383,6 @@ class PlanModel:
         return math.sqrt(float(np.max(positions_m, initial=0.0))) / self._speed_m_s
 
 
-@functools.lru_cache(maxsize=_MAX_FITS)
-def _fitted(spectrum: Spectrum, n_taps: int, step_s: float) -> tuple[DelayFit, NDArray[np.float64]]:
-    """Return a fit and the magnitudes of its weights, cached because fits would dominate the time of a planner."""
-    fit = DelayFit(n_taps, step_s, spectrum)
-    return fit, np.abs(fit.weights(fit.fractions))
-
-
 def plan_of(accuracy: Accuracy) -> ImagePlan:
     """Return accuracy settings as a plan; missing values get their defaults."""
     return ImagePlan(
@@ -407,39 +393,4 @@ def plan_of(accuracy: Accuracy) -> ImagePlan:
         accuracy.beam_density or 2.0,
         accuracy.stopband_attenuation_db or 60.0,
         accuracy.focal_zones or 1,
-    )
-
-
-@functools.lru_cache(maxsize=_MAX_APERTURES)
-def _aperture_of(positions_m: bytes, directions: bytes, is_turned: bool) -> Aperture:  # noqa: FBT001  cached
-    """Return the aperture, as the same object for the same positions and directions, so its errors can be cached."""
-    given = (np.frombuffer(values).reshape(-1, 3) for values in (positions_m, directions))
-    return Aperture.of(*given, is_turned=is_turned)
-
-
-@functools.lru_cache(maxsize=_MAX_FITS)
-def _grid_points(beams: _Beams) -> int:
-    """Return the number of beam-grid points, cached because it is the same for many pipelines."""
-    aperture = beams.aperture
-    spacing = aperture.spacing(beams.density, high_hz=beams.high_hz, sound_speed_m_s=beams.sound_speed_m_s)
-    return aperture.count_grid_points(spacing, beams.n_taps)
-
-
-@functools.lru_cache(maxsize=_MAX_FITS)
-def _estimated_errors(beams: _Beams) -> tuple[NDArray[np.float64], float]:
-    """Return the errors and the squares of a beam grid, cached because they dominate the time of a planner."""
-    nodes = _estimated(beams)
-    return nodes.errors, nodes.squares
-
-
-def _estimated(beams: _Beams) -> BeamGrid:
-    return BeamGrid(
-        beams.aperture,
-        beams.spectrum,
-        n_taps=beams.n_taps,
-        density=beams.density,
-        high_hz=beams.high_hz,
-        sound_speed_m_s=beams.sound_speed_m_s,
-        estimate=True,
-        nearest_m=beams.nearest_m,
     )

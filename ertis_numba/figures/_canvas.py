@@ -1,7 +1,7 @@
 """Common parts of pictures of levels: raster, marked reflectors and their list."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -12,11 +12,12 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from ertis_numba.analysis.levels import below_strongest_db
+from ertis_numba.base import checks
 from ertis_numba.figures._marks import name_points
-from ertis_numba.figures.style import Style, minus
+from ertis_numba.figures.style import Style, StyleOptions, minus, style_of
 from ertis_numba.frames import Peak
 
-__all__ = ["Canvas"]
+__all__ = ["Canvas", "canvas_of"]
 
 _RING_PT = 5.0
 
@@ -109,3 +110,10 @@ def _angle(angle_deg: float) -> str:
 def _tenth(value: float) -> float:
     """Return a number to one digit, 0 without a sign."""
     return round(value, 1) + 0.0
+
+
+def canvas_of(dynamic_range_db: float, look: StyleOptions, peaks: Sequence[Peak] | None = None) -> Canvas:
+    """Return the canvas of a figure with marked peaks; none means that they have not been searched for."""
+    checks.positive("dynamic_range_db", dynamic_range_db)
+    marked = tuple(checks.items("peaks", peaks or (), Peak, "find_peaks returns"))
+    return Canvas(style_of(**look), dynamic_range_db, marked, is_searched=peaks is not None)

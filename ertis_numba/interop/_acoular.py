@@ -21,8 +21,8 @@ from ertis_numba.geometry import SENSOR_FRAME, Layout, microphones, received_set
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Array, Recording, Settings
 from ertis_numba.storage.opening import open_file, reading
-from ertis_numba.storage.schema import to_python
 from ertis_numba.storage.structure import local_member, require_attributes, stored_bytes
+from ertis_numba.storage.variables import to_python
 
 __all__ = ["read_acoular", "write_acoular"]
 

@@ -3,25 +3,19 @@
 import contextlib
 import math
 from collections.abc import Iterator
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.base import checks
-from ertis_numba.kernels._contract import Complex, ComplexOrDouble, Index, Pcm, Real, Short, Taps, Turns, Words
-from ertis_numba.kernels._contract.passive import (
-    CLEAN_GROWTH,
-    CLEAN_HOLLOW_ROUNDS,
-    CLEAN_LOOP_GAIN,
-    CLEAN_ROUNDS_PER_MICROPHONE,
-)
+from ertis_numba.kernels import _numpy_passive, _numpy_signals
+from ertis_numba.kernels._contract import Complex, ComplexOrDouble, Index, Real, Short
 from ertis_numba.kernels._host import HostMemory
 from ertis_numba.kernels._kernel_set import KernelSet
 
 __all__ = ["KERNELS"]
 
-Number = TypeVar("Number", np.float32, np.float64)
 
 _TILE_RANGES = 96  # as in the compiled kernels
 _NOISE_UNIT = 1 / math.sqrt((2.0**24 - 1) / 3)  # 1 / RMS of a sum of four integers from 0 to 4095, without its mean
@@ -32,119 +26,6 @@ def threads(count: int) -> Iterator[None]:
     """Run the enclosed kernels of this Python thread on ``count`` threads."""
     checks.integer("threads", count, 1, 1)
     yield
-
-
-def unpack_bits(words: Words, channels: Index, out: Real) -> None:
-    """Convert the bits of PDM words to signals of +1 and −1."""
-    octets = words.view(np.uint8).reshape(len(words), words.shape[1] * words.itemsize)
-    out[:] = np.unpackbits(octets, axis=1, bitorder="little")[:, channels].T
-    out *= np.float32(2)
-    out -= np.float32(1)
-
-
-def unpack_pcm(words: Pcm, channels: Index, scale: np.float32, silence: np.float32, first: int, out: Real) -> None:
-    """Convert PCM samples to signals: ``out[mic, n] = scale · words[first + n, channels[mic]]``, 0 elsewhere."""
-    start, stop = max(first, 0), min(first + out.shape[1], len(words))
-    out[:] = 0
-    if start < stop:
-        heard = words[start:stop, channels].T.astype(np.float32)
-        heard[np.abs(heard) < silence] = 0
-        np.multiply(heard, scale, out=out[:, start - first : stop - first])
-
-
-def decimate(signals: Real, taps: Real, factor: int, out: Real) -> None:
-    """Filter signals and keep every ``factor``-th sample."""
-    out[:] = _filtered(signals, taps, factor, 1 - len(taps), out.shape[1])
-
-
-def remove_group_delay(signals: Real, delay: int, out: Real) -> None:
-    """Advance signals in time: ``out[mic, n] = signals[mic, n + delay]``, 0 beyond the end."""
-    moved = signals[:, delay : delay + out.shape[1]]
-    out[:, : moved.shape[1]] = moved
-    out[:, moved.shape[1] :] = 0
-
-
-def demodulate_words(
-    words: Words,
-    channels: Index,
-    taps: Taps,
-    scale: np.float32,
-    factor: int,
-    first: int,
-    n_outputs: int,
-    out: Real,
-) -> None:
-    """Unpack, decimate and remove the group delay in one pass over the words."""
-    half = len(taps) // 2
-    start = max(first * factor - half, 0)
-    stop = min((first + n_outputs - 1) * factor + half + 1, len(words))
-    signals = np.empty((len(channels), max(stop - start, 0)), dtype=np.float32)
-    unpack_bits(words[start : start + signals.shape[1]], channels, signals)
-    # Sums of integers below 2^24 are exact in float32 in any order; 32-bit taps need float64.
-    begin = first * factor - half - start
-    if taps.dtype == np.int16:
-        out[:, :n_outputs] = _filtered(signals, taps.astype(np.float32), factor, begin, n_outputs)
-    else:
-        out[:, :n_outputs] = _filtered(signals.astype(np.float64), taps.astype(np.float64), factor, begin, n_outputs)
-    out *= scale
-    out[:, n_outputs:] = 0
-
-
-def _filtered(
-    signals: NDArray[Number], taps: NDArray[Number], factor: int, start: int, n_outputs: int
-) -> NDArray[Number]:
-    """Return filtered and decimated signals; the first tap of output 0 is at sample ``start``. Other samples are 0."""
-    needed = (n_outputs - 1) * factor + len(taps)
-    padded = np.zeros((len(signals), needed + factor), dtype=signals.dtype)
-    source = signals[:, max(start, 0) : max(start + needed, 0)]
-    padded[:, max(-start, 0) :][:, : source.shape[1]] = source
-    # The taps are split into blocks of ``factor``: n_taps / factor matrix products over views of the signal.
-    total = np.zeros((len(signals), n_outputs), dtype=signals.dtype)
-    for tap in range(0, len(taps), factor):
-        part = taps[tap : tap + factor]
-        blocks = padded[:, tap : tap + n_outputs * factor]
-        if blocks.shape[1] < n_outputs * factor:
-            blocks = np.pad(blocks, ((0, 0), (0, n_outputs * factor - blocks.shape[1])))
-        with np.errstate(invalid="ignore"):  # BLAS may set the flag for lanes that it discards; the results are finite
-            total += blocks.reshape(len(signals), n_outputs, factor)[:, :, : len(part)] @ part
-    return total
-
-
-def multiply_spectra(spectra: Complex, response: Complex, out: Complex) -> None:
-    """Multiply the spectrum of each microphone by a filter: ``out[mic, bin] = spectra · response``."""
-    n_bins = spectra.shape[1]
-    np.multiply(spectra, response, out=out[:, :n_bins])
-    out[:, n_bins:] = 0
-
-
-def multiply_and_fold(spectra: Complex, responses: Complex, first_bin: int, out: Complex) -> None:
-    """Multiply spectra by one filter per phase and fold each product to the length of ``out``."""
-    n_bins, n_out = responses.shape[2], out.shape[2]
-    out[:] = 0
-    done = 0
-    while done < n_bins:
-        place = (first_bin + done) % n_out
-        run = min(n_bins - done, n_out - place)
-        part = spectra[:, None, first_bin + done : first_bin + done + run]
-        out[:, :, place : place + run] += part * responses[:, :, done : done + run]
-        done += run
-
-
-def sum_spectra(spectra: Complex, starts: Turns, steps: Turns, first_bin: int, n_bins: int, out: Complex) -> None:
-    """Delay spectra by phase shifts, and sum them over the microphones: one matrix-vector product per bin."""
-    bins = np.arange(n_bins, dtype=np.uint32)
-    heard = spectra[:, 0, (first_bin + np.arange(n_bins)) % spectra.shape[2]]
-    places = (first_bin + np.arange(n_bins)) % out.shape[2]
-    out[:] = 0
-    for direction, (start, step) in enumerate(zip(starts, steps, strict=True)):
-        turns = (start[:, None] + step[:, None] * bins).view(np.int32)
-        shifts = np.exp(np.float32(2 * np.pi / 2**32) * turns * np.complex64(1j))
-        np.add.at(out[direction, 0], places, np.einsum("mb,mb->b", heard, shifts))
-
-
-def envelope_rows(beams: Complex, lead: int, first: int, stop: int, out: Real) -> None:
-    """Compute the magnitude of successive samples: ``out[row, range] = |beams[row, 0, lead + range]|``."""
-    np.abs(beams[: len(out), 0, lead + first : lead + stop], out=out[:, first:stop])
 
 
 def combine_delayed(
@@ -501,85 +382,8 @@ def _noise_and_dither(
     return noise, dither
 
 
-def cross_spectra(spectra: Complex, first: int, out: Complex) -> None:
-    """Sum the products of the spectra of each two microphones over blocks of samples."""
-    heard = spectra[:, :, first : first + len(out)].transpose(2, 0, 1)
-    np.matmul(heard, heard.conj().transpose(0, 2, 1), out=out)
-
-
-def steer_power(matrices: Complex, steps: Turns, bins: Turns, out: Real) -> None:
-    """Compute the power that Hermitian matrices have for the wave from each direction."""
-    for matrix, number, power in zip(matrices, bins, out, strict=True):
-        lags = _waves(steps, number)
-        upper = np.triu(matrix, 1)
-        power[:] = 2 * (lags.conj() * (upper @ lags)).real.sum(axis=0) + np.trace(matrix).real
-
-
-def steer_vectors(vectors: Complex, steps: Turns, bins: Turns, out: Real) -> None:
-    """Compute the power that vectors have for the wave from each direction."""
-    for each, number, power in zip(vectors, bins, out, strict=True):
-        power[:] = (np.abs(each.conj() @ _waves(steps, number)) ** 2).sum(axis=0)
-
-
-def _waves(steps: Turns, number: np.uint32) -> Complex:
-    """Return the waves from all directions at a bin: (mic, direction) complex64."""
-    return np.asarray(np.exp(np.float32(-2 * np.pi / 2**32) * (steps * number).view(np.int32) * np.complex64(1j)))
-
-
-def clean_sources(
-    matrices: Complex,
-    steps: Turns,
-    bins: Turns,
-    powers: Real,
-    hollow: bool,  # noqa: FBT001 - kernels have no keywords
-    out: Real,
-) -> None:
-    """Find the sources of each bin, by subtracting all sound that is coherent with the loudest direction."""
-    for matrix, number, power, found in zip(matrices, bins, powers, out, strict=True):
-        _clean(matrix.copy(), _waves(steps, number), power.copy(), found, hollow=hollow)
-
-
-def _clean(rest: Complex, waves: Complex, left: Real, found: Real, *, hollow: bool) -> None:
-    """Fill the sources of one bin; its matrix and its map are overwritten."""
-    n_mics = len(rest)
-    norm = np.float32(max(n_mics * n_mics - n_mics, 1) if hollow else n_mics * n_mics)
-    found[:] = 0
-    conjugate, peaks = np.ascontiguousarray(waves.conj().T), []
-    diagonal = np.arange(n_mics if hollow else 0)
-    rest[diagonal, diagonal] = 0
-    for number in range(CLEAN_ROUNDS_PER_MICROPHONE * n_mics):
-        loudest = int(left.argmax())
-        peak = left[loudest]
-        if not peak > 0:
-            break
-        share = CLEAN_LOOP_GAIN * peak
-        found[loudest] += share
-        peaks.append(peak)
-        if number > CLEAN_GROWTH and peak > peaks[number - CLEAN_GROWTH]:
-            break
-        component = _component(rest, waves[:, loudest], peak, norm, hollow=hollow)
-        seen = conjugate @ component
-        own = (np.abs(component) ** 2).sum() if hollow else np.float32(0)
-        rest -= share * np.outer(component, component.conj())
-        rest[diagonal, diagonal] = 0
-        left -= share / norm * (seen.real**2 + seen.imag**2 - own)
-
-
-def _component(rest: Complex, wave: Complex, peak: np.float32, norm: np.float32, *, hollow: bool) -> Complex:
-    """Return the sound at each microphone that is coherent with a direction, relative to the root of its power."""
-    weights = wave / np.sqrt(norm)
-    seen = rest @ weights / peak
-    if not hollow:
-        return np.asarray(seen, np.complex64)
-    component = wave
-    for _ in range(CLEAN_HOLLOW_ROUNDS):
-        own = np.abs(component) ** 2
-        component = (seen + own * weights) / np.sqrt(1 + own.sum() / norm)
-    return np.asarray(component, np.complex64)
-
-
 KERNELS = KernelSet.of(
-    vars(),
+    {**vars(_numpy_signals), **vars(_numpy_passive), **vars()},
     device="numpy",
     hardware="",
     transforms="scipy",

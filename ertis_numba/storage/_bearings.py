@@ -11,7 +11,8 @@ import numpy as np
 from ertis_numba.base.errors import DamagedError
 from ertis_numba.frames import Bearing, known_levels
 from ertis_numba.settings import Settings
-from ertis_numba.storage.schema import BEARINGS, create_variables
+from ertis_numba.storage.schema import BEARINGS
+from ertis_numba.storage.variables import create_variables
 
 __all__ = ["BEARING_SIZES", "BearingReader", "write_bearings"]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.geometry import mounting
-from ertis_numba.storage.schema import set_attributes, to_python
+from ertis_numba.storage.variables import set_attributes, to_python
 
 __all__ = ["read_mounting", "write_mounting"]
 

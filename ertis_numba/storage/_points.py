@@ -10,7 +10,8 @@ import numpy as np
 from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.settings import Settings
-from ertis_numba.storage.schema import POINTS, create_variables
+from ertis_numba.storage.schema import POINTS
+from ertis_numba.storage.variables import create_variables
 
 __all__ = ["POINT_SIZES", "PointReader", "require_uniform", "write_points"]
 

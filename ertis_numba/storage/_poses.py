@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import Trajectory
-from ertis_numba.storage.schema import POSES, create_variables
+from ertis_numba.storage.schema import POSES
 from ertis_numba.storage.structure import MAX_TEXT_BYTES, local_member
+from ertis_numba.storage.variables import create_variables
 
 __all__ = [
     "MAX_GAP_S",

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry import mounting
-from ertis_numba.storage.recording import RecordingReader
+from ertis_numba.storage.recording_reader import RecordingReader
 
 __all__ = ["provenance", "recorded_mountings"]
 

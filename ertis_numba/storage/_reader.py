@@ -17,9 +17,10 @@ from ertis_numba.frames import Stamp
 from ertis_numba.geometry import received_settings
 from ertis_numba.storage._rows import RowReader
 from ertis_numba.storage.opening import RESULT_OR_RECORDING, open_file, reading
-from ertis_numba.storage.schema import FORMAT_VERSION, SensorGroup, Variable, content_sha256, to_python
+from ertis_numba.storage.schema import FORMAT_VERSION, Variable, content_sha256
 from ertis_numba.storage.structure import local_member, require_attributes, require_variables, sensors_of
 from ertis_numba.storage.truth import GroundTruth, read_truth
+from ertis_numba.storage.variables import SensorGroup, to_python
 
 __all__ = ["FileReader", "file_kind", "sensor_names"]
 

@@ -19,17 +19,11 @@ from ertis_numba.storage._provenance import provenance, recorded_mountings
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import FileWriter
-from ertis_numba.storage.recording import Mounting, RecordingReader
-from ertis_numba.storage.schema import (
-    BEARINGS,
-    FORMAT_VERSION,
-    POINTS,
-    POSES,
-    Variable,
-    create_variables,
-    set_attributes,
-)
+from ertis_numba.storage.recording import Mounting
+from ertis_numba.storage.recording_reader import RecordingReader
+from ertis_numba.storage.schema import BEARINGS, FORMAT_VERSION, POINTS, POSES, Variable
 from ertis_numba.storage.truth import GroundTruth
+from ertis_numba.storage.variables import create_variables, set_attributes
 
 __all__ = ["ResultFile", "ResultReader", "ResultWriter"]
 

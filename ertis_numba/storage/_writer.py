@@ -31,10 +31,10 @@ from ertis_numba.storage.schema import (
     content_uuid,
     date_created,
     sensor_path,
-    set_attributes,
     software_versions,
 )
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog, write_truth
+from ertis_numba.storage.variables import set_attributes
 
 __all__ = ["FileWriter"]
 

@@ -21,14 +21,12 @@ from ertis_numba.storage.schema import (
     Variable,
     content_sha256,
     content_uuid,
-    create_variables,
     date_created,
-    set_attributes,
     software_versions,
-    to_python,
 )
 from ertis_numba.storage.structure import require_attributes, require_variables
 from ertis_numba.storage.truth import GroundTruth, read_truth, write_truth
+from ertis_numba.storage.variables import create_variables, set_attributes, to_python
 
 __all__ = ["is_map", "read_map", "read_map_truth", "write_map_file"]
 

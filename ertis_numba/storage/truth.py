@@ -16,7 +16,8 @@ from ertis_numba.base import checks
 from ertis_numba.base.atomic_files import remedy
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Reflector, TrueSource
-from ertis_numba.storage.schema import TRUTH, create_variables, set_attributes, text_type, to_python
+from ertis_numba.storage.schema import TRUTH
+from ertis_numba.storage.variables import create_variables, set_attributes, text_type, to_python
 
 __all__ = ["Frame", "GroundTruth", "GroundTruthLog", "read_truth", "write_truth"]
 

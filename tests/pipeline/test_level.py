@@ -25,7 +25,7 @@ from ertis_numba.pipeline import verification
 from ertis_numba.settings import Accuracy, Processing
 from ertis_numba.simulation import Electronics, Point, Scene, Sensor
 from ertis_numba.storage import open_energyscapes, open_recording, write_recording
-from ertis_numba.storage.schema import to_python
+from ertis_numba.storage.variables import to_python
 from tests.publishing import results_of
 
 TILTS_DEG = ((25.0, 0.0), (0.0, -15.0), (-20.0, 18.0))  # roll, pitch

@@ -22,7 +22,8 @@ from ertis_numba.storage import (
     write_recording,
 )
 from ertis_numba.storage._gaps import UNKNOWN
-from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING, create_variables
+from ertis_numba.storage.schema import ENERGYSCAPE, RECORDING
+from ertis_numba.storage.variables import create_variables
 from tests.files import SMALL, image, line, noise, open_dataset
 
 
