@@ -6,8 +6,7 @@ return a figure, or the axes given as ``ax``; `save` writes a figure to a file. 
 """
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import IO, Unpack, overload
+from typing import Unpack, overload
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -22,15 +21,14 @@ from ertis_numba.figures import (
     _captions,
     _images,
     _map,
-    _pareto_front,
     _points,
     _slices,
 )
 from ertis_numba.figures._canvas import Canvas, canvas_of
-from ertis_numba.figures._page import compose
-from ertis_numba.figures._pareto_front import Rated
+from ertis_numba.figures._page import compose, save
+from ertis_numba.figures._pareto_front import Rated, front
 from ertis_numba.figures._sound_figures import acoustic_map, matched_filter, signals, spectrogram, spectrum
-from ertis_numba.figures.style import StyleOptions, parameters, style_of
+from ertis_numba.figures.style import StyleOptions, style_of
 from ertis_numba.frames import Energyscape, OccupancyMap, Peak, PointCloud, Trajectory
 from ertis_numba.geometry import observable_angles
 from ertis_numba.settings import Array, Settings
@@ -54,8 +52,6 @@ __all__ = [
     "spectrogram",
     "spectrum",
 ]
-
-_FORMATS = ("pdf", "png", "svg")
 
 
 @overload
@@ -310,29 +306,6 @@ def calibration(
     )
 
 
-def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack[StyleOptions]) -> Figure:
-    """Draw error and time of plans, and the Pareto front as a line.
-
-    Parameters
-    ----------
-    points : sequence of Rated
-    title, note : str
-        Heading, and the line below it.
-    **look
-        Style of the figure, as for `plot`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    ArgumentError
-        The theme is unknown.
-    """
-    return _pareto_front.draw(style_of(**look), points, title=title, note=note)
-
-
 def occupancy(
     found: OccupancyMap,
     *,
@@ -368,35 +341,6 @@ def occupancy(
     if trajectory is not None:
         checks.instance("trajectory", trajectory, Trajectory, "read_trajectory returns")
     return _map.draw(style_of(**look), found, trajectory, mountings or {})
-
-
-def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None = None) -> None:  # noqa: A002 - as savefig
-    """Write a figure as .png, .svg or .pdf, the same bytes each time; letters of a .pdf can be searched and edited.
-
-    Parameters
-    ----------
-    figure : Figure
-    target : str, Path or binary file
-    format : {"png", "svg", "pdf"}, optional
-        By default the suffix of the name.
-
-    Raises
-    ------
-    ArgumentError
-        The format is unknown, or the name has none.
-    """
-    kind = format or Path(str(target)).suffix.lower().lstrip(".")
-    if format:
-        checks.choice("format", format, _FORMATS)
-    elif kind not in _FORMATS:
-        raise ArgumentError(
-            "an open file has no name that states a format; set format"
-            if hasattr(target, "write")
-            else f"{target} ends in none of .pdf, .png and .svg; use such a name, or set format"
-        )
-    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
-    with parameters({"pdf.fonttype": 42, "svg.hashsalt": "ertis"}):
-        figure.savefig(target, format=kind, metadata=undated)
 
 
 def _seen(image: Energyscape, *, side_lobes: bool) -> tuple[Energyscape, bool]:

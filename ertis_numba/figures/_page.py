@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import IO, Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -10,13 +11,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
+from ertis_numba.base import checks
+from ertis_numba.base.errors import ArgumentError
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._captions import Heading
-from ertis_numba.figures.style import MONOSPACE, Style, text_width_pt
+from ertis_numba.figures.style import MONOSPACE, Style, parameters, text_width_pt
 
-__all__ = ["Panel", "compose"]
+__all__ = ["Panel", "compose", "save"]
 
 _TITLE_LINE, _LINE, _ROW = 1.35, 1.55, 1.6  # heights of lines, by the size of their letters
+_FORMATS = ("pdf", "png", "svg")
 _DOT = " · "
 _WIDE_EMS = 55.0  # from which on pictures are beside each other
 _ACROSS_EMS, _UP_EMS = 6.5, 6.0  # what ticks and names take around a picture
@@ -181,3 +185,32 @@ def _wrapped(parts: Sequence[str], size_pt: float, font: str, width_pt: float, *
         else:
             lines.append(cut)
     return lines
+
+
+def save(figure: Figure, target: str | Path | IO[bytes], *, format: str | None = None) -> None:  # noqa: A002 - as savefig
+    """Write a figure as .png, .svg or .pdf, the same bytes each time; letters of a .pdf can be searched and edited.
+
+    Parameters
+    ----------
+    figure : Figure
+    target : str, Path or binary file
+    format : {"png", "svg", "pdf"}, optional
+        By default the suffix of the name.
+
+    Raises
+    ------
+    ArgumentError
+        The format is unknown, or the name has none.
+    """
+    kind = format or Path(str(target)).suffix.lower().lstrip(".")
+    if format:
+        checks.choice("format", format, _FORMATS)
+    elif kind not in _FORMATS:
+        raise ArgumentError(
+            "an open file has no name that states a format; set format"
+            if hasattr(target, "write")
+            else f"{target} ends in none of .pdf, .png and .svg; use such a name, or set format"
+        )
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+    with parameters({"pdf.fonttype": 42, "svg.hashsalt": "ertis"}):
+        figure.savefig(target, format=kind, metadata=undated)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import cycle
-from typing import Any
+from typing import Any, Unpack
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -14,9 +14,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from ertis_numba.figures._canvas import Canvas
 from ertis_numba.figures._captions import Heading
 from ertis_numba.figures._page import Panel, compose
-from ertis_numba.figures.style import Style
+from ertis_numba.figures.style import Style, StyleOptions, style_of
 
-__all__ = ["Rated", "draw"]
+__all__ = ["Rated", "front"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +41,30 @@ class Rated:
     label: str = ""
 
 
-def draw(style: Style, points: Sequence[Rated], *, title: str, note: str) -> Figure:
+def front(points: Sequence[Rated], *, title: str, note: str = "", **look: Unpack[StyleOptions]) -> Figure:
+    """Draw error and time of plans, and the Pareto front as a line.
+
+    Parameters
+    ----------
+    points : sequence of Rated
+    title, note : str
+        Heading, and the line below it.
+    **look
+        Style of the figure, as for `plot`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ArgumentError
+        The theme is unknown.
+    """
+    return _draw(style_of(**look), points, title=title, note=note)
+
+
+def _draw(style: Style, points: Sequence[Rated], *, title: str, note: str) -> Figure:
     """Draw the points of each series in its colour, and a line through its front."""
 
     def paint(axes: Axes) -> None:

@@ -178,14 +178,12 @@ class Processing(TomlTable, frozen=True, kw_only=True):
     @property
     def azimuth_limits_rad(self) -> tuple[float, float]:
         """Limits of the azimuth in radians."""
-        low_deg, high_deg = self.azimuth_limits_deg
-        return math.radians(low_deg), math.radians(high_deg)
+        return math.radians(self.azimuth_limits_deg[0]), math.radians(self.azimuth_limits_deg[1])
 
     @property
     def elevation_limits_rad(self) -> tuple[float, float]:
         """Limits of the elevation in radians."""
-        low_deg, high_deg = self.elevation_limits_deg
-        return math.radians(low_deg), math.radians(high_deg)
+        return math.radians(self.elevation_limits_deg[0]), math.radians(self.elevation_limits_deg[1])
 
     def __post_init__(self) -> None:
         shape = getattr(self.directions, "shape", None)  # of an array, before its rows become tuples

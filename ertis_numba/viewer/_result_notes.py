@@ -13,8 +13,9 @@ from ertis_numba.storage import EnergyscapeReader
 
 if TYPE_CHECKING:
     from ertis_numba.settings import Settings
+    from ertis_numba.viewer._shapes import DrawnFrame
 
-__all__ = ["ResultNotes"]
+__all__ = ["ResultNotes", "missing_band_note"]
 
 
 class ResultNotes:
@@ -54,3 +55,15 @@ class ResultNotes:
         warning_of = coarse_map_warning if isinstance(item, AcousticMap) else spacing_warning
         if text := warning_of(settings, item):
             yield f"sensor {sensor}: {text}"
+
+
+def missing_band_note(frame: "DrawnFrame", chosen_hz: float | None) -> str:
+    """Return a note that no map of a frame contains the chosen frequency; empty if one does, or there is no map."""
+    bands = () if frame.scale is None else frame.scale.bands
+    if not bands or any(each.is_shown for each in bands):
+        return ""
+    edges_khz = [edge_hz / 1e3 for each in bands if each.band_hz is not None for edge_hz in each.band_hz]
+    return (
+        f"no map has a band at {(chosen_hz or 0.0) / 1e3:g} kHz, so the page shows none; choose a frequency from "
+        f"{min(edges_khz):.3g} to {max(edges_khz):.3g} kHz (band)"
+    )

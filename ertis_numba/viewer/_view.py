@@ -16,6 +16,7 @@ from ertis_numba.viewer._origins import is_loopback
 from ertis_numba.viewer._page import ControlRequest, ViewerPage
 from ertis_numba.viewer._pause import Pause
 from ertis_numba.viewer._recordings import Recordings, ToBrowser, ToFile
+from ertis_numba.viewer._result_notes import missing_band_note
 from ertis_numba.viewer._rows import FrameCounts, rows_of
 from ertis_numba.viewer._saving import picture_png, points_ply, with_legend
 from ertis_numba.viewer._scene import ViewedScene
@@ -234,15 +235,10 @@ class Viewer:
 
     def _note_missing_band(self, frame: "DrawnFrame") -> None:
         """Note once that no map contains the chosen frequency."""
-        bands, chosen_hz = () if frame.scale is None else frame.scale.bands, self.choices.band_hz
-        if chosen_hz == self._noted_band_hz or any(each.is_shown for each in bands) or not bands:
-            return
-        self._noted_band_hz = chosen_hz
-        edges_khz = [edge_hz / 1e3 for each in bands if each.band_hz is not None for edge_hz in each.band_hz]
-        self._note(
-            f"no map has a band at {(chosen_hz or 0.0) / 1e3:g} kHz, so the page shows none; choose a frequency from "
-            f"{min(edges_khz):.3g} to {max(edges_khz):.3g} kHz (band)"
-        )
+        chosen_hz = self.choices.band_hz
+        if chosen_hz != self._noted_band_hz and (note := missing_band_note(frame, chosen_hz)):
+            self._noted_band_hz = chosen_hz
+            self._note(note)
 
     def _completion(self) -> Callable[[str], str]:
         """Return a function that adds a legend of the present view to a saved page."""
@@ -401,6 +397,5 @@ class Viewer:
 
     def _content(self, name: str, frame: "DrawnFrame") -> tuple[bytes, str]:
         """Return the content of a file, and its suffix."""
-        if name == "picture":
-            return picture_png(frame), "png"
-        return points_ply(self._scene.latest(self.choices)), "ply"
+        is_picture = name == "picture"
+        return (picture_png(frame), "png") if is_picture else (points_ply(self._scene.latest(self.choices)), "ply")

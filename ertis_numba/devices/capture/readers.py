@@ -20,6 +20,7 @@ __all__ = [
     "SensorReader",
     "SensorReconnected",
     "TriggerClock",
+    "drain",
 ]
 
 
@@ -222,3 +223,14 @@ class SensorReader(threading.Thread):
                 continue
             break
         self._waited_s += time.monotonic() - begin_s
+
+
+def drain(events: "queue.Queue[Event]") -> list[Event]:
+    """Wait up to 0.1 s for an event, and return all events that have arrived."""
+    found: list[Event] = []
+    try:
+        found.append(events.get(timeout=0.1))
+        while True:
+            found.append(events.get_nowait())
+    except queue.Empty:
+        return found

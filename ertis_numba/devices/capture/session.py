@@ -21,9 +21,10 @@ from ertis_numba.devices.capture.readers import (
     SensorReader,
     SensorReconnected,
     TriggerClock,
+    drain,
 )
 from ertis_numba.devices.capture.sink import CaptureCounts, MeasurementSink
-from ertis_numba.devices.capture.sync_counts import PulseAligner
+from ertis_numba.devices.capture.sync_counts import PulseAligner, SequenceState
 from ertis_numba.devices.driver import SonarDriver
 from ertis_numba.frames import Measurement, Stamp
 from ertis_numba.journal import JournalEntry
@@ -43,17 +44,6 @@ class SettingsChange:
 
     settings: Settings
     on_done: Callable[[Exception | None], None] = lambda _: None  # None, or the error that keeps former settings
-
-
-@dataclass(slots=True)
-class _SequenceState:
-    """Sequence numbers of one sensor."""
-
-    sequence: int | None = None  # Number of the latest measurement, stored or missing.
-    first_pulse: int | None = None
-    tick: int = -1  # Number of the latest command.
-    why: str = ""  # Reason for missing measurements, if known.
-    passed: bool = False  # True once a pulse beyond the last requested one has arrived.
 
 
 class CaptureSession:
@@ -111,7 +101,7 @@ class CaptureSession:
         """Begin to count measurements with these settings."""
         self._settings, self._session_id = settings, session_id
         self._record_ns = round(1e9 * settings.recording.duration_s)
-        self._sequence_states = {sensor: _SequenceState() for sensor in self._sonars}
+        self._sequence_states = {sensor: SequenceState() for sensor in self._sonars}
         self._pulses: PulseAligner[BlockArrived] = PulseAligner(
             list(self._sonars), shortest_s=settings.recording.duration_s
         )
@@ -257,7 +247,7 @@ class CaptureSession:
             if not self._changes.empty() or self._is_over(end_s):
                 for reader in readers:
                     reader.stop()
-            self._handle(sink, _drain(events))
+            self._handle(sink, drain(events))
             self._on_tick()
         self._store(sink, self._pulses.release(time.monotonic_ns(), at_once=True))
         for sync_count in sorted(self._groups):
@@ -401,14 +391,3 @@ class CaptureSession:
             self.complete += 1
         else:
             self.incomplete += 1
-
-
-def _drain(events: "queue.Queue[Event]") -> list[Event]:
-    """Wait up to 0.1 s for an event, and return all events that have arrived."""
-    found: list[Event] = []
-    try:
-        found.append(events.get(timeout=0.1))
-        while True:
-            found.append(events.get_nowait())
-    except queue.Empty:
-        return found

@@ -5,7 +5,7 @@ from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
-__all__ = ["PulseAligner"]
+__all__ = ["PulseAligner", "SequenceState"]
 
 Item = TypeVar("Item")
 
@@ -161,3 +161,14 @@ class PulseAligner(Generic[Item]):
         self._pulses[number] = arrived_ns
         while len(self._pulses) > _MAX_PULSES:
             del self._pulses[min(self._pulses)]
+
+
+@dataclass(slots=True)
+class SequenceState:
+    """Sequence numbers of one sensor."""
+
+    sequence: int | None = None  # Number of the latest measurement, stored or missing.
+    first_pulse: int | None = None
+    tick: int = -1  # Number of the latest command.
+    why: str = ""  # Reason for missing measurements, if known.
+    passed: bool = False  # True once a pulse beyond the last requested one has arrived.

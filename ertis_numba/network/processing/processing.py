@@ -32,7 +32,7 @@ from ertis_numba.network.processing.runner import (
 )
 from ertis_numba.network.processing.sensors import Sensors
 from ertis_numba.network.processing.shared_slots import SlotPool
-from ertis_numba.network.processing.worker_pool import LocalWorkerPool
+from ertis_numba.network.processing.worker_pool import new_runner
 from ertis_numba.network.status import Latencies, ProcessingStatus, Status
 from ertis_numba.network.trace import mark
 from ertis_numba.settings import Settings
@@ -93,7 +93,7 @@ class ImageProcessing:
     def start(self, stopping: Callable[[], bool] = lambda: False) -> None:
         """Start the processes, until applications can subscribe or ``stopping``, polled each 0.2 s, is True."""
         try:
-            self._runner = _runner(self._options, self._log)
+            self._runner = new_runner(self._options, self._log)
             self._publisher.start(stopping)
             if self._options.expected is not None:
                 self._sensors.expect(self._options.expected)
@@ -395,11 +395,3 @@ class ImageProcessing:
     def _emit_event(self, groups: Iterable[Group]) -> None:
         for group in groups:
             self._publisher.group(group)
-
-
-def _runner(options: ProcessingOptions, log: EventLog) -> Runner:
-    if not isinstance(options.workers, str):
-        return LocalWorkerPool(options, log)
-    from ertis_numba.network.processing.cluster import Cluster  # noqa: PLC0415  which needs another package
-
-    return Cluster(options, lambda text: log.warning("cluster", text=text))

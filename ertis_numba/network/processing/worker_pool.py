@@ -30,6 +30,7 @@ from ertis_numba.network.processing.runner import (
     KindFailed,
     KindReady,
     Lost,
+    Runner,
     bytes_of,
 )
 from ertis_numba.network.processing.shared_slots import Slot
@@ -37,7 +38,7 @@ from ertis_numba.network.processing.worker import SLOTS, Worker
 from ertis_numba.network.status import WorkerStatus
 from ertis_numba.network.trace import mark
 
-__all__ = ["LocalWorkerPool"]
+__all__ = ["LocalWorkerPool", "new_runner"]
 
 _LOADING_S: Final = 60.0
 _TRIES: Final = 3  # Limit on workers that die while preparing for a kind that has never been ready.
@@ -310,3 +311,12 @@ class LocalWorkerPool:
         if job is not None:
             found.append(Lost(job, f"worker {pid} died while processing it, or was killed", again=True))
         return found
+
+
+def new_runner(options: ProcessingOptions, log: EventLog) -> Runner:
+    """Return the local pool of workers, or those of a cluster."""
+    if not isinstance(options.workers, str):
+        return LocalWorkerPool(options, log)
+    from ertis_numba.network.processing.cluster import Cluster  # noqa: PLC0415  which needs another package
+
+    return Cluster(options, lambda text: log.warning("cluster", text=text))
