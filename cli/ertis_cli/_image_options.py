@@ -9,9 +9,29 @@ import click
 from ertis_cli import options
 
 if TYPE_CHECKING:
-    from ertis_numba.settings import Settings
+    from ertis_numba.settings import PresetKind, Settings
 
-__all__ = ["grid_options", "image_options", "with_given"]
+
+__all__ = ["grid_options", "image_options", "preset_completion", "processing_preset", "with_given"]
+
+
+def preset_completion(kind: "PresetKind | None" = None) -> Callable[..., list[str]]:
+    """Return a function that completes the names of presets in a shell."""
+
+    def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:  # noqa: ARG001
+        from ertis_numba.settings import presets
+
+        return [name for name in presets(kind) if name.startswith(incomplete)]
+
+    return complete
+
+
+processing_preset: Callable[[Callable[..., Any]], Callable[..., Any]] = click.option(
+    "--preset",
+    metavar="NAME",
+    shell_complete=preset_completion("processing"),
+    help="Preset of directions and ranges, such as 2d_181_5m; 'ertis reference presets' lists all.",
+)
 
 
 def grid_options(command: Callable[..., Any]) -> Callable[..., Any]:

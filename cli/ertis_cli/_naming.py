@@ -3,15 +3,16 @@
 import functools
 import math
 import re
-from collections.abc import Callable, Iterator
+import stat
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import click
 
 from ertis_cli._config import long_name
-from ertis_cli._pipes import require_no_pipes
 
-__all__ = ["name_options", "named", "with_options"]
+__all__ = ["name_options", "named", "require_no_pipes", "with_options"]
 
 _UNITS: Final = ("", "_bytes", "_c", "_db", "_deg", "_hz", "_limits_deg", "_m", "_ms", "_ns", "_s")
 _KEY: Final = r"(?P<section>(?:accuracy|air|array|passive|processing|scene)\.)?(?P<name>[a-z_]+)"
@@ -203,3 +204,24 @@ def _given(ctx: click.Context) -> Iterator[click.Parameter]:
     for option in ctx.command.params:
         if option.name and ctx.get_parameter_source(option.name) is not click.core.ParameterSource.DEFAULT:
             yield option
+
+
+def require_no_pipes(options: Mapping[str, Any]) -> None:
+    """Raise ArgumentError if an option or argument is a named pipe; those of a shell, such as ``<(…)``, are allowed."""
+    for path in _paths(list(options.values())):
+        try:
+            is_pipe = stat.S_ISFIFO(path.stat().st_mode)
+        except (OSError, ValueError):  # missing, or no path at all
+            continue
+        if is_pipe and path.parts[:2] not in {("/", "dev"), ("/", "proc")}:
+            from ertis_numba.base.errors import ArgumentError
+
+            raise ArgumentError(f"{path} is a named pipe; write its content to a file, and use the file")
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    if isinstance(value, list | tuple):
+        for each in value:
+            yield from _paths(each)
+    elif isinstance(value, str | Path) and str(value):
+        yield Path(value)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _mountings, _presets, _results, options
+from ertis_cli import _image_options, _mountings, _results, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def processing(command: "Callable[..., Any]") -> "Callable[..., Any]":
         options.threads,
         options.device,
         options.settings_file,
-        _presets.processing_preset,
+        _image_options.processing_preset,
     ):
         command = option(command)
     return command

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _presets, options
+from ertis_cli import _image_options, options
 
 if TYPE_CHECKING:
     from ertis_numba.settings import Settings
@@ -24,7 +24,7 @@ _OPTIONS = (
     click.option(
         "--preset",
         metavar="NAME",
-        shell_complete=_presets.completion("recording"),
+        shell_complete=_image_options.preset_completion("recording"),
         help="Record length (short_, default_, long_) and band (20_80, 25_50); default_25_50 by default, except for "
         "'ertis sensors configure'.",
     ),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _export_drive, _export_poses, _export_sound, _mountings, options
+from ertis_cli import _export_drive, _export_sound, _mountings, _poses, options
 from ertis_numba.interop.export_formats import EXPORT_FORMATS, TOPICS
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def export(
     content = interop.EXPORT_FORMATS[name].content
     _export_drive.require_fitting(name, paths)
     if content == "poses":
-        _export_poses.export_poses(paths[0], target, sensor, force=force, quiet=quiet, as_json=as_json)
+        _poses.export_poses(paths[0], target, sensor, force=force, quiet=quiet, as_json=as_json)
         return
     from ertis_numba.storage import check_target, file_kind, open_recording, sensor_names
 

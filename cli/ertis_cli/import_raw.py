@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ertis_cli import _presets, options
+from ertis_cli import _image_options, options
 from ertis_cli._config import typed
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class _Time(click.DateTime):
 @click.option(
     "--preset",
     metavar="NAME",
-    shell_complete=_presets.completion("recording"),
+    shell_complete=_image_options.preset_completion("recording"),
     help="Record length (short_, default_, long_) and band (20_80, 25_50); not needed if a folder contains settings.",
 )
 @click.option(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _image_options, _mountings, _plans, _presets, _process_many, _results, options
+from ertis_cli import _image_options, _mountings, _plans, _process_many, _results, options
 from ertis_cli._help_sections import SectionedCommand
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".pdf", ".svg")
 )
 @options.sensor("Process this sensor only; all sensors by default.")
 @options.without("Channels to exclude, such as those of faulty microphones")
-@_presets.processing_preset
+@_image_options.processing_preset
 @_image_options.image_options
 @click.option(
     "--level/--no-level",

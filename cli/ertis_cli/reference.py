@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ertis_cli import _presets, _tables, options
+from ertis_cli import _image_options, _tables, options
 from ertis_cli.completion import completion
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def layouts(*, name: str | None, as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("name", required=False, shell_complete=_presets.completion())
+@click.argument("name", required=False, shell_complete=_image_options.preset_completion())
 @options.as_json
 def presets(*, name: str | None, as_json: bool) -> None:
     """List the shipped presets, or print one as TOML.

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from ertis_cli import _central_watch, _network, _plans, _presets, _supervisor, options
+from ertis_cli import _central_watch, _image_options, _network, _plans, _supervisor, options
 from ertis_cli._config import typed
 from ertis_cli._saving import withdrawn
 
@@ -28,7 +28,7 @@ __all__ = ["serve"]
 @options.workers()
 @options.threads
 @options.without("Channels to exclude, such as those of faulty microphones")
-@_presets.processing_preset
+@_image_options.processing_preset
 @click.option("--directions", metavar="GRID", help="90, 1850, 3000, 2d:N or 3d:N; the sensor's own grid by default.")
 @click.option("--range", "range_m", type=options.INTERVAL, help="First and last range in m.")
 @click.option("--method", type=click.Choice(["fast", "paper"]), help="Processing method; the sensor's own by default.")

@@ -11,22 +11,20 @@ from numpy.typing import NDArray
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.chain.beam_grid import FEWEST_RANGES, BeamGrid, require_beam_grid
 from ertis_numba.chain.beamform import whole_limits
-from ertis_numba.chain.cached_estimates import (
-    PlannedBeams,
-    aperture_of,
-    estimated,
-    estimated_errors,
-    fitted,
-    grid_points,
-)
 from ertis_numba.chain.costs import Work
 from ertis_numba.chain.error_model import PARTS, ErrorModel, SignalModel
 from ertis_numba.chain.focal_zones import squared_curvature
 from ertis_numba.chain.instance_cache import cached_in_instance
 from ertis_numba.chain.phase_shifts import SHIFT_BYTES, SHIFT_TABLE_BYTES, rows_at_a_time
 from ertis_numba.chain.plan_elements import (
+    PlannedBeams,
+    aperture_of,
     chain_taps,
+    estimated,
+    estimated_errors,
     few_delays,
+    fitted,
+    grid_points,
     nearest_m_of,
     ringing_db,
     spectrum_of,

@@ -16,11 +16,10 @@ from ertis_numba.frames._measurement import Measurement, MicrophoneSignals
 from ertis_numba.frames._occupancy_map import FREE_BELOW, MAX_CELLS, OCCUPIED_ABOVE, OccupancyMap
 from ertis_numba.frames._point_cloud import PointCloud
 from ertis_numba.frames._reflectors import Peak, Reflector
-from ertis_numba.frames._sound_event import SoundEvent
+from ertis_numba.frames._sound_event import SoundEvent, TrueSource
 from ertis_numba.frames._stamp import BEHAVIOURS, Behaviour, Stamp, is_passive
 from ertis_numba.frames._surfaces import Surfaces
 from ertis_numba.frames._trajectory import PoseAxes, Trajectory
-from ertis_numba.frames._true_source import TrueSource
 
 __all__ = [
     "BEHAVIOURS",

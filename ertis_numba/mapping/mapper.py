@@ -3,7 +3,7 @@
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Energyscape, OccupancyMap, PointCloud, Trajectory
+from ertis_numba.frames.pose_doubts import PoseWatch, warn_of_poses
 from ertis_numba.fusion import Fused, Fuser
 from ertis_numba.fusion.rig import Emitters, Mountings, emitter_diameter_m, mounted_sensors
 from ertis_numba.geometry import mounting
-from ertis_numba.mapping.attitude_check import AttitudeCheck
 from ertis_numba.mapping.cell_grid import CellGrid
 from ertis_numba.mapping.coverage import Coverage, heard_m
 from ertis_numba.mapping.echoes import LocatedEchoes, UsualAmplitude, View, displaced_covariance, echoes_of
@@ -25,7 +25,7 @@ from ertis_numba.motion import compensate_motion
 if TYPE_CHECKING:
     from ertis_numba.settings import Air, Call
 
-__all__ = ["Mapper", "Pose"]
+__all__ = ["AttitudeCheck", "Mapper", "Pose"]
 
 Floats = NDArray[np.float64]
 Pose = tuple[Sequence[float], Sequence[float]] | Trajectory
@@ -299,3 +299,22 @@ def _pose(pose: Pose, time_ns: int) -> tuple[Floats, Floats, Floats]:
         raise ArgumentError(f"pose is {pose!r}; pass a position and a unit quaternion, or a Trajectory") from error
     found = mounting("platform", translation_m, rotation_xyzw)
     return found["translation_m"], Rotation.from_quat(found["rotation_xyzw"]).as_matrix(), np.zeros((6, 6))
+
+
+_CALLER: Final = 3  # stack level of the caller of Mapper.add
+
+
+class AttitudeCheck:
+    """Check of the poses of a mapper: each trajectory as a whole, and single poses together."""
+
+    def __init__(self) -> None:
+        self._trajectory: Trajectory | None = None
+        self._watch = PoseWatch()
+
+    def __call__(self, pose: Any, translation_m: NDArray[np.float64], rotation: NDArray[np.float64]) -> None:
+        """Issue a `PoseWarning` for a doubtful pose of a pulse, once for each trajectory."""
+        if not isinstance(pose, Trajectory):
+            self._watch(translation_m, Rotation.from_matrix(rotation).as_quat(), stacklevel=_CALLER)
+        elif pose is not self._trajectory:
+            self._trajectory = pose
+            warn_of_poses(pose, stacklevel=_CALLER)

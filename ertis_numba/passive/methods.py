@@ -6,7 +6,8 @@ function.
 """
 
 from collections.abc import Callable
-from typing import Any, Final
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +15,10 @@ from numpy.typing import NDArray
 from ertis_numba.base.errors import DataError
 from ertis_numba.passive.cross_spectrum import CrossSpectrum
 from ertis_numba.passive.high_resolution import HighResolutionClean
-from ertis_numba.passive.parallel_bins import in_parts
 from ertis_numba.passive.waves import Waves
 from ertis_numba.settings import MapMethodName, Passive
 
-__all__ = ["METHODS", "capon", "clean_sc", "delay_and_sum", "functional", "hr_clean_sc", "music"]
+__all__ = ["METHODS", "capon", "clean_sc", "delay_and_sum", "functional", "hr_clean_sc", "in_parts", "music"]
 
 Matrices = NDArray[np.complex64]
 Powers = NDArray[np.float32]
@@ -28,6 +28,25 @@ _LEAST: Final = np.float32(1e-30)
 _CANCELLED: Final = 3e-4  # Relative power of a wave below which single precision errs by more than 0.01 dB.
 
 Method = Callable[[CrossSpectrum, Waves, Passive], Powers]
+
+
+Number = TypeVar("Number", np.complex64, np.complex128)
+
+_MIN_BINS: Final = 8  # Matrices of fewer bins take less time than the start of a thread.
+
+
+def in_parts(function: Callable[..., NDArray[Number]], *of_bins: NDArray[Any], threads: int) -> NDArray[Number]:
+    """Return the rows of a function of bins, called once per thread with a part of each array.
+
+    NumPy computes linear algebra without holding the lock of the interpreter, so the parts run in parallel.
+    """
+    n_bins = len(of_bins[0])
+    count = max(1, min(threads, n_bins // _MIN_BINS))
+    if count == 1:
+        return function(*of_bins)
+    parts = [np.array_split(each, count) for each in of_bins]
+    with ThreadPoolExecutor(count, thread_name_prefix="ertis-bins") as pool:
+        return np.concatenate(list(pool.map(function, *parts)))
 
 
 def delay_and_sum(spectrum: CrossSpectrum, waves: Waves, passive: Passive) -> Powers:

@@ -14,7 +14,7 @@ from ertis_numba.analysis.range_cleaning import clean_in_place
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError, DeviceError
 from ertis_numba.chain import paper, paper_scipy, planner
-from ertis_numba.chain.chain_protocol import Chain
+from ertis_numba.chain.beam_chain import Chain
 from ertis_numba.chain.costs import PLAN_COSTS, PlanCosts
 from ertis_numba.chain.fast_chain import FastChain
 from ertis_numba.chain.kernel_chain import KernelChain

@@ -16,8 +16,7 @@ from ertis_numba.storage.energyscape import (
 )
 from ertis_numba.storage.maps import is_map, read_map, read_map_truth, write_map_file
 from ertis_numba.storage.poses import add_poses, platform_trajectory, recorded_trajectory, require_fitting_poses
-from ertis_numba.storage.recording import RecordingWriter, write_recording
-from ertis_numba.storage.recording_reader import RecordingReader, open_recording
+from ertis_numba.storage.recording import RecordingReader, RecordingWriter, open_recording, write_recording
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 
 __all__ = [

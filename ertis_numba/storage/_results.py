@@ -12,20 +12,18 @@ from ertis_numba.base.angles import DegreesFromRadians
 from ertis_numba.base.atomic_files import check_target
 from ertis_numba.base.errors import ArgumentError, DamagedError
 from ertis_numba.frames import AcousticMap, Energyscape, Trajectory
-from ertis_numba.geometry import mounting as mounted, self_contained
+from ertis_numba.geometry import mounting, mounting as mounted, self_contained
 from ertis_numba.storage._mounting import read_mounting, write_mounting
 from ertis_numba.storage._poses import POSE_SIZES, read_poses, write_poses
-from ertis_numba.storage._provenance import provenance, recorded_mountings
 from ertis_numba.storage._reader import FileReader
 from ertis_numba.storage._rows import RowWriter
 from ertis_numba.storage._writer import FileWriter
-from ertis_numba.storage.recording import Mounting
-from ertis_numba.storage.recording_reader import RecordingReader
+from ertis_numba.storage.recording import Mounting, RecordingReader
 from ertis_numba.storage.schema import BEARINGS, FORMAT_VERSION, POINTS, POSES, Variable
 from ertis_numba.storage.truth import GroundTruth
 from ertis_numba.storage.variables import create_variables, set_attributes
 
-__all__ = ["ResultFile", "ResultReader", "ResultWriter"]
+__all__ = ["ResultFile", "ResultReader", "ResultWriter", "provenance", "recorded_mountings"]
 
 _LEVEL_COMMENT: Final = (
     "relative to the horizontal plane and to the heading of the sensor (processing.level_directions)"
@@ -185,3 +183,28 @@ class ResultReader(ResultFile, FileReader[Result], DegreesFromRadians):
         except ArgumentError as error:
             raise DamagedError(f"{self.path}: {self._row_name} {index}: {error}") from error
         return made
+
+
+def provenance(readers: Sequence[RecordingReader]) -> dict[str, str]:
+    """Return the attributes of a file that describe its recording."""
+    if not readers:
+        return {"source": "", "history": ""}
+    first = readers[0]
+    for reader in readers:
+        if reader.uuid != first.uuid:
+            raise ArgumentError(f"{reader.path} is not the same recording as {first.path}; write one file for each")
+    return {
+        "source": first.path.name,
+        "history": f"processed from recording {first.uuid}",
+        "recording_uuid": first.uuid,
+        "recording_sha256": first.sha256(),
+    }
+
+
+def recorded_mountings(readers: Sequence[RecordingReader]) -> dict[str, dict[str, NDArray[np.float64]]]:
+    """Return the known mountings by name of the sensor, in the form of `ertis_numba.geometry.mounting`."""
+    return {
+        reader.sensor: mounting(reader.sensor, reader.translation_m.tolist(), reader.rotation_xyzw.tolist())
+        for reader in readers
+        if reader.translation_m is not None and reader.rotation_xyzw is not None
+    }

@@ -13,8 +13,7 @@ from ertis_numba.frames import AcousticMap, Bearing
 from ertis_numba.storage._bearings import BEARING_SIZES, BearingReader, write_bearings
 from ertis_numba.storage._results import ResultFile, ResultReader, ResultWriter
 from ertis_numba.storage._rows import RowWriter
-from ertis_numba.storage.recording import Mounting
-from ertis_numba.storage.recording_reader import RecordingReader
+from ertis_numba.storage.recording import Mounting, RecordingReader
 from ertis_numba.storage.schema import ACOUSTIC_MAP, BEARINGS, POSES, Variable
 from ertis_numba.storage.variables import set_attributes, to_python
 

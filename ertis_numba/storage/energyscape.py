@@ -17,8 +17,7 @@ from ertis_numba.frames import Energyscape, PointCloud
 from ertis_numba.storage._points import POINT_SIZES, PointReader, require_uniform, write_points
 from ertis_numba.storage._results import ResultFile, ResultReader, ResultWriter
 from ertis_numba.storage._rows import RowReader, RowWriter
-from ertis_numba.storage.recording import Mounting
-from ertis_numba.storage.recording_reader import RecordingReader
+from ertis_numba.storage.recording import Mounting, RecordingReader
 from ertis_numba.storage.schema import ENERGYSCAPE, FORMAT_VERSION, POINTS, POSES, Variable
 from ertis_numba.storage.truth import GroundTruth, GroundTruthLog
 from ertis_numba.storage.variables import set_attributes, to_python

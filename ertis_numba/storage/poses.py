@@ -20,7 +20,7 @@ from ertis_numba.storage._poses import MAX_GAP_S, checked_poses, remove_poses, r
 from ertis_numba.storage._reader import file_kind, sensor_names
 from ertis_numba.storage.acoustic_maps import AcousticMapReader, open_acoustic_maps
 from ertis_numba.storage.energyscape import EnergyscapeReader, open_energyscapes
-from ertis_numba.storage.recording_reader import RecordingReader, open_recording
+from ertis_numba.storage.recording import RecordingReader, open_recording
 from ertis_numba.storage.schema import FORMAT_VERSION, POSES, RECORDING, content_sha256, content_uuid, sensor_path
 from ertis_numba.storage.variables import SensorGroup, set_attributes, to_python
 

@@ -31,8 +31,7 @@ from ertis_numba.journal import (
 from ertis_numba.storage._journal_rows import JournalRows, damaged_poses
 from ertis_numba.storage._poses import MAX_GAP_S
 from ertis_numba.storage._reader import sensor_names
-from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingWriter
-from ertis_numba.storage.recording_reader import RecordingReader, open_recording
+from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingReader, RecordingWriter, open_recording
 from ertis_numba.storage.recording_variables import create_sensor_variables
 from ertis_numba.storage.schema import sensor_path
 

@@ -6,7 +6,7 @@ from ertis_numba.base.errors import DataError
 from ertis_numba.journal.storage_processes import FoundSessions, ReadSessions, StorageFailed
 from ertis_numba.processes import connect
 from ertis_numba.storage._reader import file_kind, sensor_names
-from ertis_numba.storage.recording_reader import open_recording
+from ertis_numba.storage.recording import open_recording
 
 __all__ = ["sessions_of"]
 

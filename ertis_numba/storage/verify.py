@@ -10,8 +10,7 @@ from ertis_numba.journal import Journal
 from ertis_numba.storage._axes_check import find_damage
 from ertis_numba.storage._journal_rows import DamagedMeasurement, JournalRows, damaged_poses
 from ertis_numba.storage._reader import sensor_names
-from ertis_numba.storage.recording import JOURNAL_DAMAGE
-from ertis_numba.storage.recording_reader import RecordingReader, open_recording
+from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingReader, open_recording
 
 __all__ = ["DamagedMeasurement", "SensorReport", "verify"]
 

@@ -156,7 +156,7 @@ class Viewer:
             self._obey()
             if self._file is not None:
                 self._file.check()
-            self._note_all()
+            self._note(*self._source.notes())
             now_s = time.monotonic()
             if self._playback is not None and self._page.is_seen:
                 self._playback.held = False
@@ -191,7 +191,7 @@ class Viewer:
             raise TypeError("record needs a file; run records a live view")
         self._begin(html, overwrite=overwrite)
         for place, time_step in enumerate(playback.time_steps):
-            self._note_all()
+            self._note(*self._source.notes())
             if self._stopped():  # a partial recording is not written
                 self._recordings.drop(_OURS)
                 return
@@ -225,19 +225,16 @@ class Viewer:
             self._ended |= self._orders.get() is None
         return self._ended
 
-    def _note(self, text: str) -> None:
+    def _note(self, *texts: str) -> None:
         if self._on_note is not None:
-            self._on_note(text)
-
-    def _note_all(self) -> None:
-        for note in self._source.notes():
-            self._note(note)
+            for text in texts:
+                self._on_note(text)
 
     def _note_missing_band(self, frame: "DrawnFrame") -> None:
         """Note once that no map contains the chosen frequency."""
-        chosen_hz = self.choices.band_hz
-        if chosen_hz != self._noted_band_hz and (note := missing_band_note(frame, chosen_hz)):
-            self._noted_band_hz = chosen_hz
+        band_hz = self.choices.band_hz
+        if band_hz != self._noted_band_hz and (note := missing_band_note(frame, band_hz)):
+            self._noted_band_hz = band_hz
             self._note(note)
 
     def _completion(self) -> Callable[[str], str]:

@@ -96,7 +96,7 @@ def test_measurement_that_hangs_two_workers_is_quarantined(tmp_path, monkeypatch
 
 
 def test_failing_sensor_is_suspended_and_others_continue(loop, monkeypatch):
-    monkeypatch.setattr("ertis_numba.network.processing.circuit_breaker._PAUSE_S", 1000.0)
+    monkeypatch.setattr("ertis_numba.network.processing.queues._PAUSE_S", 1000.0)
     for sensor in ("bad", "good"):
         loop.processing.register(hello(sensor), SHORT)
     loop.until(lambda: loop.workers("idle"))

@@ -14,8 +14,7 @@ from ertis_numba.geometry import far_field_delays, microphones, unit_vectors
 from ertis_numba.geometry.air import sound_speed_m_s, transmission_loss_db
 from ertis_numba.passive import AcousticCamera, CrossSpectrum, find_bearings, octave_bands
 from ertis_numba.passive.bands import bin_shares
-from ertis_numba.passive.methods import METHODS
-from ertis_numba.passive.parallel_bins import in_parts
+from ertis_numba.passive.methods import METHODS, in_parts
 from ertis_numba.settings import MAP_METHODS, Settings
 from tests.on_device import KERNELS
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from ertis_numba.base.errors import DataError
 from ertis_numba.base.file_kinds import problem_of
-from ertis_numba.base.wav._chunks import lengths_notes, read_chunks
+from ertis_numba.base.wav._chunks import Samples, lengths_notes, read_chunks, samples_of
 from ertis_numba.base.wav._form import Form
 from ertis_numba.base.wav._lengths import Content
-from ertis_numba.base.wav._samples import Samples, samples_of
 
 __all__ = ["Samples", "WavFile", "read_wav", "wav_bytes"]
 

@@ -1,14 +1,24 @@
 """Fourier transforms with one interface for all devices."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ertis_numba.kernels.fft._protocol import Transforms
-
 __all__ = ["Transforms", "plan"]
+
+
+class Transforms(Protocol):
+    """Transforms of two fixed arrays along the last axis, in single precision, not normalised in either direction."""
+
+    def forward(self, *, threads: int) -> NDArray[np.complex64]:
+        """Return the one-sided spectra of the real signals: (mic, n // 2 + 1) complex64."""
+        ...
+
+    def inverse(self, *, threads: int) -> None:
+        """Transform the spectra in the array of analytic signals, (mic, phase, n), to signals in place."""
+        ...
 
 
 def plan(

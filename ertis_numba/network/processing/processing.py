@@ -11,14 +11,12 @@ from ertis_numba.chain.memory import require_images
 from ertis_numba.network.log import EventLog, logger
 from ertis_numba.network.messages import Data, Group, Hello
 from ertis_numba.network.processing import pipe_messages
-from ertis_numba.network.processing.circuit_breaker import CircuitBreaker
 from ertis_numba.network.processing.dead_letter_queue import DeadLetterQueue, entry_of
 from ertis_numba.network.processing.groups import Groups
 from ertis_numba.network.processing.options import ProcessingOptions
 from ertis_numba.network.processing.parallelism import Load
 from ertis_numba.network.processing.publisher import Publisher
-from ertis_numba.network.processing.queues import SUPERSEDED, ProcessingCounts, Queues
-from ertis_numba.network.processing.reorder_buffer import ReorderBuffer
+from ertis_numba.network.processing.queues import SUPERSEDED, CircuitBreaker, ProcessingCounts, Queues, ReorderBuffer
 from ertis_numba.network.processing.runner import (
     Event,
     FinishedJob,

@@ -1,7 +1,9 @@
-"""Queues of measurements for workers: the latest has priority, and each drop is counted."""
+"""Queues of measurements for workers, whose drops are counted, and the order of finished images."""
 
+import itertools
+import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -9,7 +11,7 @@ from ertis_numba.network.messages import Data
 from ertis_numba.network.processing.runner import Job
 from ertis_numba.network.status import Latencies, Percentiles
 
-__all__ = ["SUPERSEDED", "ProcessingCounts", "Queues"]
+__all__ = ["SUPERSEDED", "CircuitBreaker", "ProcessingCounts", "Queues", "ReorderBuffer"]
 
 _QUEUE: Final = 2  # Limit on waiting measurements of a sensor; a new one replaces the oldest.
 _REPORTED: Final = 4096  # Limit on kept drops, until they are reported.
@@ -118,3 +120,83 @@ class Queues:
                 waiting.remove(job)
                 self.drop(job.data, reason)
             self.counts[sensor].queue = len(waiting)
+
+
+class ReorderBuffer:
+    """Jobs under way by sensor; a failed one leaves its place, and is published once it is done."""
+
+    def __init__(self) -> None:
+        self._jobs: dict[str, deque[Job]] = {}
+        self._done: set[int] = set()  # Jobs that wait for an older one, or for the publisher.
+
+    def add(self, job: Job) -> None:
+        """Add a job whose first try begins."""
+        if not job.tries:
+            self._jobs.setdefault(job.data.sensor, deque()).append(job)
+
+    def leave(self, job: Job) -> None:
+        """Release the place of a failed job, so that it delays no others."""
+        jobs = self._jobs.get(job.data.sensor, deque())
+        if job in jobs:
+            jobs.remove(job)
+
+    def done(self, job: Job) -> None:
+        """Mark a job with an image."""
+        if not job.tries:
+            self._done.add(job.number)
+
+    def take(self, sensor: str) -> Job | None:
+        """Remove and return the next image of a sensor; None if it is not done."""
+        jobs = self._jobs.get(sensor)
+        if not jobs or jobs[0].number not in self._done:
+            return None
+        self._done.discard(jobs[0].number)
+        return jobs.popleft()
+
+    @property
+    def sensors(self) -> list[str]:
+        """Sensors with jobs so far."""
+        return list(self._jobs)
+
+    @property
+    def jobs(self) -> Iterable[Job]:
+        """All jobs under way."""
+        return itertools.chain.from_iterable(self._jobs.values())
+
+
+_IN_A_ROW: Final = 3  # Number of successive measurements of a sensor that fail twice, after which it is suspended …
+_PAUSE_S: Final = 10.0  # … for this time, doubled at each further suspension.
+_LONGEST_PAUSE_S: Final = 640.0
+
+
+@dataclass(slots=True)
+class _Failing:
+    in_a_row: int = 0
+    pause_s: float = 0.0
+    until_s: float = 0.0
+
+
+class CircuitBreaker:
+    """Sensors with successive failures."""
+
+    def __init__(self) -> None:
+        self._failing: dict[str, _Failing] = {}
+
+    def holds(self, sensor: str, now_s: float) -> bool:
+        """Return True if a sensor is suspended; ``now_s`` is a time of `time.monotonic`."""
+        failing = self._failing.get(sensor)
+        return failing is not None and now_s < failing.until_s
+
+    def failed(self, sensor: str) -> float:
+        """Count a measurement that has failed twice; return the suspension of its sensor in s, 0 if there is none."""
+        failing = self._failing.setdefault(sensor, _Failing())
+        failing.in_a_row += 1
+        if failing.in_a_row < _IN_A_ROW:
+            return 0.0
+        failing.pause_s = min(2 * failing.pause_s, _LONGEST_PAUSE_S) or _PAUSE_S
+        failing.until_s = time.monotonic() + failing.pause_s
+        return failing.pause_s
+
+    def succeeded(self, sensor: str) -> None:
+        """Reset the failures of a sensor."""
+        self._failing.pop(sensor, None)

@@ -16,8 +16,7 @@ from ertis_numba.chain.focal_zones import NEAREST_M, zone_edges
 from ertis_numba.chain.interpolation_fit import WAVES, DelayFit, Spectrum, one_thread
 from ertis_numba.chain.time_window import TimeWindow
 from ertis_numba.geometry import air, unit_vectors
-from ertis_numba.pipeline.arrays._arguments import band_of, numbers_of
-from ertis_numba.pipeline.arrays._device import on_device
+from ertis_numba.pipeline.arrays._device import band_of, numbers_of, on_device
 from ertis_numba.pipeline.arrays._geometry import directions_of, ranges_of, weights_of
 from ertis_numba.settings import Air
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba.base.errors import ArgumentError
-from ertis_numba.pipeline.arrays._arguments import numbers_of
+from ertis_numba.pipeline.arrays._device import numbers_of
 
 __all__ = ["directions_of", "ranges_of", "weights_of"]
 

@@ -13,8 +13,7 @@ from ertis_numba.chain.matched_filter import MatchedFilter
 from ertis_numba.chain.time_window import TimeWindow
 from ertis_numba.geometry.waveform import integer_taps, matched_guard_s
 from ertis_numba.kernels import fft
-from ertis_numba.pipeline.arrays._arguments import band_of
-from ertis_numba.pipeline.arrays._device import on_device
+from ertis_numba.pipeline.arrays._device import band_of, on_device
 from ertis_numba.settings import Call, Processing, Recording, Settings
 
 __all__ = ["matched_filter"]
