@@ -11,7 +11,7 @@ from ertis_numba.base import checks
 from ertis_numba.base.csv_numbers import npy_content
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry.position_headings import AXES
-from ertis_numba.geometry.position_tables import PositionTable, read_position_table
+from ertis_numba.geometry.position_tables import PositionTable, read_position_table, require_no_count
 from ertis_numba.geometry.shipped_layouts import layout_names
 
 __all__ = ["FLAT", "SENSOR_FRAME", "layout_bytes", "layout_file_text", "read_position_file"]
@@ -78,6 +78,8 @@ def _of_numpy(source: str, content: bytes) -> PositionTable:
         found = f"{numbers.dtype} of shape {numbers.shape}" if isinstance(numbers, np.ndarray) else "several arrays"
         raise ArgumentError(f"{source} contains {found}; save numbers of shape (channels, 2) or (channels, 3)")
     checks.finite_array(source, numbers.astype(np.float64))
+    for place, (column, axis) in enumerate(zip(numbers.T.tolist(), AXES[-numbers.shape[1] :], strict=True)):
+        require_no_count(source, [str(number) for number in column], place, axis)
     positions = np.zeros((len(numbers), len(AXES)))
     positions[:, len(AXES) - numbers.shape[1] :] = numbers
     return PositionTable(positions, "")

@@ -2,6 +2,7 @@
 
 import csv
 import itertools
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,11 +15,12 @@ from ertis_numba.base.errors import ArgumentError
 from ertis_numba.geometry.position_headings import AXES, ColumnHeading, heading, unit_in_comment, unit_named
 from ertis_numba.settings import LENGTH_UNITS_M
 
-__all__ = ["HEADER_EXAMPLES", "PositionTable", "read_position_table"]
+__all__ = ["HEADER_EXAMPLES", "PositionTable", "read_position_table", "require_no_count"]
 
 HEADER_EXAMPLES: Final = "x_m,y_m,z_m or y_mm,z_mm"
 _DECIMAL_COMMA: Final = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _SEPARATE_NUMBERS: Final = re.compile(r"\d[ \t]+[-+.\d]")
+_ORDINALS: Final = ("first", "second", "third", "fourth")
 _MIN_COUNTED: Final = 3  # Fewer rows can have positions of 0 and 1 by chance.
 
 _Rows = Sequence[tuple[int, list[str]]]
@@ -190,13 +192,7 @@ def _in_comments(comments: Sequence[str], width: int) -> list[ColumnHeading]:
 def _usual(source: str, rows: _Rows, *, has_index: bool) -> list[ColumnHeading]:
     """Return the headings of a table without a header: names or numbers of the channels, then y, z or x, y, z."""
     width, first = len(rows[0][1]), [cells[0] for _, cells in rows]
-    counts = first in (_counted(len(rows)), _counted(len(rows), 1))
-    if width == len(AXES) and counts and len(rows) >= _MIN_COUNTED and not has_index:
-        raise ArgumentError(
-            f"{source}: the first column may be channel numbers or positions along x; add the header "
-            "channel,y_mm,z_mm or x_mm,y_mm,z_mm"
-        )
-    has_labels = has_index or not any(map(_is_number, first)) or (width == len(AXES) + 1 and counts)
+    has_labels = has_index or not any(map(_is_number, first)) or (width == len(AXES) + 1 and _counts(first))
     n_axes = width - has_labels
     if n_axes not in {2, 3}:
         raise ArgumentError(
@@ -208,7 +204,25 @@ def _usual(source: str, rows: _Rows, *, has_index: bool) -> list[ColumnHeading]:
             f"{source}, line {rows[0][0]}: {', '.join(rows[0][1])} may be column numbers or a position; replace the "
             f"line by a header, such as {HEADER_EXAMPLES}, or write the position with decimal points"
         )
+    for place, axis in enumerate(AXES[-n_axes:], int(has_labels)):
+        require_no_count(source, [cells[place] for _, cells in rows], place, axis)
     return [ColumnHeading()] * has_labels + [ColumnHeading(axis, axis) for axis in AXES[-n_axes:]]
+
+
+def require_no_count(source: str, column: Sequence[str], place: int, axis: str) -> None:
+    """Refuse a column of a table without a header that may number the channels."""
+    if len(column) >= _MIN_COUNTED and _counts(column):
+        raise ArgumentError(
+            f"{source}: the {_ORDINALS[place]} column may be channel numbers or positions along {axis}; "
+            f"{'save a .csv file with' if source.endswith('.npy') else 'add'} the header channel,y_mm,z_mm or "
+            "x_mm,y_mm,z_mm"
+        )
+
+
+def _counts(column: Sequence[str]) -> bool:
+    """Return True for the numbers from 0 or 1 on, one per row, also with decimals."""
+    numbers = [float(cell) if _is_number(cell) else math.nan for cell in column]
+    return numbers[0] in {0.0, 1.0} and numbers == [numbers[0] + row for row in range(len(numbers))]
 
 
 def _places(source: str, headings: Sequence[ColumnHeading]) -> dict[str, int]:

@@ -234,6 +234,26 @@ REFUSED = {
         b"0,0,0\n1,42,0\n2,0,42\n",
         r"the first column may be channel numbers or positions along x",
     ),
+    "index of savetxt": (
+        "a.csv",
+        b"0.000e+00,-3.100e+01,7.500e+00\n1.000e+00,4.200e+01,0.000e+00\n2.000e+00,0.000e+00,4.200e+01\n",
+        r"the first column may be channel numbers or positions along x; add the header channel,y_mm,z_mm",
+    ),
+    "index from 1": (
+        "a.txt",
+        b"1.0 -31 7.5\n2.0 42.0 0\n3.0 0 42.0\n",
+        r"the first column may be channel numbers or positions along x",
+    ),
+    "index at the end": (
+        "a.csv",
+        b"-31,7.5,0.0\n42.5,0,1.0\n0,42.5,2.0\n",
+        r"the third column may be channel numbers or positions along z",
+    ),
+    "two indices": (
+        "a.csv",
+        b"0,1.0,-31,7.5\n1,2.0,42.5,0\n2,3.0,0,42.5\n",
+        r"the second column may be channel numbers or positions along x",
+    ),
     "numbered": (
         "a.csv",
         b"0,1,2\n0.0,0.0,0.0\n0.0,42.0,0.0\n",

@@ -192,6 +192,27 @@ BEAMFORM = {
             lambda: ertis.matched_filter(SIGNALS, sample_rate_hz=450e3, call=Call(), band_edges_hz=(3e4, 6e4)),
             "band_edges_hz is 30000 to 60000 Hz, but the call sweeps over 25000 to 50000 Hz",
         ),
+        (
+            lambda: ertis.matched_filter((SIGNALS * 32767).astype("i2"), sample_rate_hz=450e3, call=Call()),
+            "signals holds int16, whose full scale is unknown; divide by it, as in samples / 32768",
+        ),
+        (lambda: ertis.beamform(**BEAMFORM | {"signals": SIGNALS.astype("i2")}), "signals holds int16, whose full"),
+        (
+            lambda: ertis.beamform(**BEAMFORM | {"sample_rate_hz": 450.0}),
+            "sample_rate_hz is 450; use a number from 1000",
+        ),
+        (
+            lambda: ertis.beamform(**BEAMFORM | {"sample_rate_hz": 2e4, "band_hz": (5e3, 2e4)}),
+            "band_hz ends at 20000 Hz, above half of sample_rate_hz, 10000 Hz",
+        ),
+        (
+            lambda: ertis.beamform(**BEAMFORM | {"positions_m": [[0, 0, 0], [0, 50.0, 0]]}),
+            "positions_m spans 50 m, more than 25 m; if the numbers are millimetres, divide them by 1000",
+        ),
+        (
+            lambda: ertis.beamform(**BEAMFORM | {"positions_m": [[0, 0, 0], [0, 5.0, 0]]}),
+            "positions_m lie up to 5 m from the origin, beyond the last of ranges_m, .* if the unit is not the metre",
+        ),
         (lambda: ertis.beamform(**BEAMFORM | {"signals": SIGNALS[0]}), "signals holds float64 of shape"),
         (lambda: ertis.beamform(**BEAMFORM | {"positions_m": np.zeros((3, 3))}), r"positions_m has shape \(3, 3\)"),
         (lambda: ertis.beamform(**BEAMFORM | {"positions_m": "here"}), "positions_m holds no array of numbers"),

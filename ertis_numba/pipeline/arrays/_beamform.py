@@ -16,8 +16,8 @@ from ertis_numba.chain.focal_zones import NEAREST_M, zone_edges
 from ertis_numba.chain.interpolation_fit import WAVES, DelayFit, Spectrum, one_thread
 from ertis_numba.chain.time_window import TimeWindow
 from ertis_numba.geometry import air, unit_vectors
-from ertis_numba.pipeline.arrays._device import band_of, numbers_of, on_device
-from ertis_numba.pipeline.arrays._geometry import directions_of, ranges_of, weights_of
+from ertis_numba.pipeline.arrays._device import band_of, numbers_of, on_device, require_no_integers
+from ertis_numba.pipeline.arrays._geometry import directions_of, places_of, ranges_of, weights_of
 from ertis_numba.settings import Air
 
 __all__ = ["beamform"]
@@ -107,7 +107,7 @@ def beamform(
     >>> image.shape, int(image.max(axis=1).argmax())
     ((3, 200), 1)
     """
-    rate_hz = checks.positive("sample_rate_hz", sample_rate_hz)
+    rate_hz = checks.between("sample_rate_hz", sample_rate_hz, 1e3, 1e9)
     speed_m_s = (
         air.sound_speed_m_s(Air()) if sound_speed_m_s is None else checks.positive("sound_speed_m_s", sound_speed_m_s)
     )
@@ -117,8 +117,9 @@ def beamform(
         raise ArgumentError(
             f"signals holds {given.dtype} of shape {given.shape}; pass real or complex numbers of shape (mic, sample)"
         )
+    require_no_integers("signals", given)
     checks.finite_array("signals", given)
-    places_m = numbers_of("positions_m", positions_m, (len(given), 3))
+    places_m = places_of(positions_m, len(given))
     angles_rad = directions_of(directions_rad)
     range_m, step_m = ranges_of(ranges_m)
     record_m = speed_m_s * given.shape[1] / rate_hz / 2
@@ -127,10 +128,20 @@ def beamform(
             f"ranges_m ends at {range_m[-1]:g} m, but signals of {1e3 * given.shape[1] / rate_hz:.4g} ms reach "
             f"{record_m:.4g} m; use smaller ranges or longer signals"
         )
+    largest_m = float(np.linalg.norm(places_m, axis=1).max())
+    if wavefront == "plane" and largest_m > range_m[-1]:
+        raise ArgumentError(
+            f"positions_m lie up to {largest_m:.3g} m from the origin, beyond the last of ranges_m, {range_m[-1]:.3g} "
+            "m; if the unit is not the metre, convert it, or use wavefront='spherical'"
+        )
     own_s = np.zeros(len(given)) if delay_s is None else numbers_of("delay_s", delay_s, (len(given),))
     amplitudes = weights_of(weights, len(given))
     spectra, spacing_hz = _one_sided(given, rate_hz)
     low_hz, high_hz = _occupied(spectra, spacing_hz) if band_hz is None else band_of("band_hz", band_hz)
+    if high_hz > rate_hz / 2 * (1 + 1e-9):
+        raise ArgumentError(
+            f"band_hz ends at {high_hz:g} Hz, above half of sample_rate_hz, {rate_hz / 2:g} Hz; correct one of them"
+        )
     output_rate_hz = speed_m_s / (2 * step_m)
     spectrum = Spectrum(np.linspace(low_hz, high_hz, WAVES), np.full(WAVES, 1 / WAVES))
     aperture = Aperture.of(places_m, unit_vectors(angles_rad[:, 0], angles_rad[:, 1]))

@@ -11,7 +11,7 @@ from ertis_numba import kernels
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ArgumentError
 
-__all__ = ["DeviceCall", "band_of", "numbers_of", "on_device"]
+__all__ = ["DeviceCall", "band_of", "numbers_of", "on_device", "require_no_integers"]
 
 
 class DeviceCall(NamedTuple):
@@ -59,3 +59,11 @@ def numbers_of(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[
     checks.shape(name, given.shape, shape)
     checks.finite_array(name, given)
     return given
+
+
+def require_no_integers(name: str, given: NDArray[Any]) -> None:
+    """Refuse integer samples, whose full scale is unknown."""
+    if given.dtype.kind in "iu":
+        raise ArgumentError(
+            f"{name} holds {given.dtype}, whose full scale is unknown; divide by it, as in samples / 32768 for 16 bits"
+        )

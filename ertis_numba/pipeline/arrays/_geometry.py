@@ -1,4 +1,4 @@
-"""Checks of directions, ranges and array weights."""
+"""Checks of positions, directions, ranges and array weights."""
 
 import math
 from typing import Final
@@ -8,8 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ertis_numba.base.errors import ArgumentError
 from ertis_numba.pipeline.arrays._device import numbers_of
+from ertis_numba.settings import MAX_SPAN_M
 
-__all__ = ["directions_of", "ranges_of", "weights_of"]
+__all__ = ["directions_of", "places_of", "ranges_of", "weights_of"]
 
 _MAX_STEP_ERROR: Final = 1e-6  # relative to the spacing of ranges
 
@@ -30,6 +31,18 @@ def directions_of(directions_rad: ArrayLike) -> NDArray[np.float64]:
                 f"{-limit_rad:.3g} to {limit_rad:.3g}, such as numpy.radians returns"
             )
     return angles_rad
+
+
+def places_of(positions_m: ArrayLike, n_mics: int) -> NDArray[np.float64]:
+    """Return microphone positions (mic, 3) of an array that is not too large."""
+    places_m = numbers_of("positions_m", positions_m, (n_mics, 3))
+    span_m = float(np.ptp(places_m, axis=0).max())
+    if span_m > MAX_SPAN_M:
+        raise ArgumentError(
+            f"positions_m spans {span_m:.4g} m, more than {MAX_SPAN_M:g} m; if the numbers are millimetres, divide "
+            "them by 1000"
+        )
+    return places_m
 
 
 def ranges_of(ranges_m: ArrayLike) -> tuple[NDArray[np.float64], float]:

@@ -13,7 +13,7 @@ from ertis_numba.chain.matched_filter import MatchedFilter
 from ertis_numba.chain.time_window import TimeWindow
 from ertis_numba.geometry.waveform import integer_taps, matched_guard_s
 from ertis_numba.kernels import fft
-from ertis_numba.pipeline.arrays._device import band_of, on_device
+from ertis_numba.pipeline.arrays._device import band_of, on_device, require_no_integers
 from ertis_numba.settings import Call, Processing, Recording, Settings
 
 __all__ = ["matched_filter"]
@@ -150,5 +150,6 @@ def _real(name: str, signals: ArrayLike) -> NDArray[Any]:
         raise ArgumentError(
             f"{name} holds {given.dtype} of shape {given.shape}; pass real numbers of shape (..., sample)"
         )
+    require_no_integers(name, given)
     checks.finite_array(name, given)
     return given
