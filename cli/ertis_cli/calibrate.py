@@ -90,7 +90,7 @@ _PLACE = _Place()
     type=_PLACE,
     metavar="AZ:EL:M",
     help="Place of the reflector in the first recording: azimuth and elevation in °, range in m. It reveals a mirrored "
-    "layout and gives the speed of sound.",
+    "layout or another size of the array, and gives the speed of sound.",
 )
 @click.option(
     "--ideal",
@@ -179,6 +179,7 @@ def calibrate(
     if target is not None and is_better:
         count = options.counted(len(made.source_m), "measurement")
         text = f"ertis sensors calibrate, {count} of a {source}, from layout {made.former.name}"
+        text += "" if ideal or not position_mm else ", whose scale it keeps"
         content = layout_file(made.layout, name=target.stem, source=text).to_toml()
         with atomic_write(target, overwrite=force) as partial:
             partial.write_text(content, "utf-8")
@@ -189,8 +190,8 @@ def calibrate(
     if not is_better:
         raise ArgumentError(
             f"the calibration lowers the contrast of images from {before_db:.2f} to {after_db:.2f} dB, so it is "
-            f"{'only printed' if target is None else 'not written'}: other sound overlaps the {source}; record it at "
-            "more places, far from other objects"
+            f"{'only printed' if target is None else 'not written'}: other sound overlaps the {source}, or the array "
+            "is larger or smaller than the layout; record at more places, far from other objects, and measure the array"
         )
     if target is not None:
         options.say(f"wrote {target}; use it as array.layout in a settings file", quiet=quiet)
@@ -249,6 +250,7 @@ def _report(made: "Calibration", places: list[str], written: Path | None) -> dic
             )
         },
         "sound_speed_m_s": None if made.sound_speed is None else [round(value, 3) for value in made.sound_speed],
+        "scale": None if made.scale is None else [round(value, 4) for value in made.scale],
         "contrast_db": [round(value, 3) for value in made.contrast_db],
         "sources_m": [[round(float(value), 5) for value in row] for row in made.source_m],
         "not_observable": list(made.not_observable),
@@ -277,6 +279,8 @@ def _print(made: "Calibration", places: list[str], *, quiet: bool) -> None:
     if made.sound_speed is not None:
         speed_m_s, sd_m_s = made.sound_speed
         click.echo(f"speed of sound: {speed_m_s:.1f} ± {_INTERVAL * sd_m_s:.1f} m/s")
+    if made.scale is not None:
+        click.echo(f"size of the array by the direction of the first place: {made.scale}")
     for line in made.not_observable:
         options.say(f"not observable: {line}", quiet=quiet)
     for number, reason in made.rejected.items():

@@ -47,8 +47,13 @@ def require_directions(source_m: NDArray[np.float64], target: Target) -> None:
         )
 
 
-def not_observable(observed: NDArray[np.bool_], target: Target, *, positions: bool, is_line: bool) -> tuple[str, ...]:
-    """Return the quantities that no recording determines, one line each; observed is (mic, gain, delay, x, y, z)."""
+def not_observable(
+    observed: NDArray[np.bool_], target: Target, *, positions: bool, is_line: bool, has_scale: bool
+) -> tuple[str, ...]:
+    """Return the quantities that no recording determines, one line each; observed is (mic, gain, delay, x, y, z).
+
+    ``has_scale`` is True if curved wavefronts reveal the scale, as those of an exactly known scene.
+    """
     lines = [
         "a common gain, delay or polarity of all microphones: their means are unchanged",
         "a rotation or shift of the whole array, or a mirrored layout if the place of no reflector is given",
@@ -59,6 +64,11 @@ def not_observable(observed: NDArray[np.bool_], target: Target, *, positions: bo
         else:
             lines.append("positions: with a tolerance of 0, delays take up their errors, for these directions only")
         return tuple(lines)
+    if not has_scale:
+        lines.append(
+            "the scale of the array: it remains that of the layout, and intervals leave its error out; measure the "
+            "distance of two microphones, or state an exact --first-place far to the side"
+        )
     for axis, name in enumerate(_AXES):
         missing = int(np.sum(~observed[:, 2 + axis]))
         if missing:

@@ -17,9 +17,11 @@ from ertis_numba.calibration.channel_order import find_swaps
 from ertis_numba.calibration.fit_result import NEPER_DB, SCALE_S, PreparedFit, assembled
 from ertis_numba.calibration.observations import Observations, Tolerances
 from ertis_numba.calibration.reference_place import (
+    ArrayScale,
     ReflectorPlace,
     flipped,
     mirror_of,
+    scale_from_direction,
     speed_from_distance,
     speed_from_spread,
 )
@@ -86,8 +88,8 @@ def calibrate(
     position_tolerance_m : float
         The same of positions along each axis. 0 keeps the positions of the layout. Direct sound always keeps them.
     first_place : (azimuth_deg, elevation_deg, range_m), optional
-        Place of the reflector in the first recording. The direction, which may be rough, reveals a mirrored layout, and
-        the range gives the speed of sound, which the fit then uses.
+        Place of the reflector in the first recording. The direction, which may be rough, reveals a mirrored layout and
+        another size of the array, and the range gives the speed of sound, which the fit then uses.
     ideal : bool
         True if air, emitter and reflector are exactly as the settings say, as in simulations; False, the default, adds
         model errors of 100 ns and 0.05 dB, so that positions and intervals do not depend on them.
@@ -349,6 +351,7 @@ def _with_place(made: Calibration, job: PreparedFit, place: ReflectorPlace | Non
         line = "a mirrored layout, because the azimuth or elevation of the place is below 10°, or the array is a line"
         return replace(made, not_observable=(*made.not_observable, line))
     name = mirror_of(made.source_m[0], place)
+    made = replace(made, scale=_scale(job, made.source_m[0], speed.speed_m_s, place))
     if not name:
         return made
     flip = flipped(name)
@@ -360,6 +363,15 @@ def _with_place(made: Calibration, job: PreparedFit, place: ReflectorPlace | Non
         source_m=made.source_m * flip,
         mirrored=name,
     )
+
+
+def _scale(
+    job: PreparedFit, start_m: NDArray[np.float64], speed_m_s: float, place: ReflectorPlace
+) -> ArrayScale | None:
+    """Return the size of the array relative to the layout, whose fitted delays would hide some of it."""
+    time_s = next(iter(job.heard.sounds.values())).arrival.time_s[job.used] - job.kept.delay_s
+    source_m = locate_source(time_s, job.kept.positions_m, start_m, speed_m_s, job.target, scale_s=SCALE_S)
+    return scale_from_direction(source_m, place)
 
 
 def _at_speed(job: PreparedFit, made: Calibration, ratio: float) -> PreparedFit:

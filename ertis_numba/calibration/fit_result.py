@@ -102,6 +102,7 @@ def assembled(job: PreparedFit, seen: Observations, fit: ArrayFit, inverted: NDA
         order=job.order,
         mirrored="",
         sound_speed=None,
+        scale=None,
         not_observable=(),
         contrast_db=tuple(image_contrast_db(sounds, every.channels, each) for each in (former, layout)),
         rejected=dict(sorted(heard.rejected.items())),
@@ -110,7 +111,11 @@ def assembled(job: PreparedFit, seen: Observations, fit: ArrayFit, inverted: NDA
     return replace(
         made,
         not_observable=not_observable(
-            made.is_observed, job.target, positions=positions, is_line=is_line(every.positions_m)
+            made.is_observed,
+            job.target,
+            positions=positions,
+            is_line=is_line(every.positions_m),
+            has_scale=expected.model_s == 0,
         ),
     )
 

@@ -1,4 +1,4 @@
-"""Use of a reflector at a known place: mirrored layouts, and the speed of sound."""
+"""Use of a reflector at a known place: mirrored layouts, the speed of sound, and the size of the array."""
 
 import math
 from typing import Final, NamedTuple
@@ -12,7 +12,16 @@ from ertis_numba.base.errors import DataError
 from ertis_numba.calibration.wavefronts import Target, travel_times
 from ertis_numba.geometry import unit_vectors
 
-__all__ = ["ReflectorPlace", "SoundSpeed", "flipped", "mirror_of", "speed_from_distance", "speed_from_spread"]
+__all__ = [
+    "ArrayScale",
+    "ReflectorPlace",
+    "SoundSpeed",
+    "flipped",
+    "mirror_of",
+    "scale_from_direction",
+    "speed_from_distance",
+    "speed_from_spread",
+]
 
 _FLIPS: Final[dict[str, tuple[float, float, float]]] = {
     "mirrored left to right": (1.0, -1.0, 1.0),
@@ -23,6 +32,8 @@ _MAX_APART_DEG: Final = 20.0  # A place that is given roughly may differ so far 
 _MIN_ASIDE_DEG: Final = 10.0
 _PACE_SD: Final = 0.05  # Relative deviation of the speed of sound between 0 and 60 °C.
 _DISTANCE_SD_M: Final = 2e-3  # of a tape measure
+_ROUGH_DEG: Final = 8.0  # Error of a direction that is stated roughly.
+_MIN_OFF_AXIS_DEG: Final = 15.0  # The sine of smaller angles is not known to 13 %.
 
 
 class ReflectorPlace(NamedTuple):
@@ -52,6 +63,21 @@ class SoundSpeed(NamedTuple):
     sd_m_s: float
 
 
+class ArrayScale(NamedTuple):
+    """Size of the array relative to the layout, and its error for each degree of error of the direction."""
+
+    ratio: float
+    error_1_deg: float
+
+    @property
+    def contradicts(self) -> bool:
+        """True if even a rough direction contradicts the size of the layout."""
+        return abs(self.ratio - 1) > _ROUGH_DEG * self.error_1_deg / self.ratio
+
+    def __str__(self) -> str:
+        return f"{self.ratio:.2f} times that of the layout (± {self.error_1_deg:.2f} per degree of error)"
+
+
 def mirror_of(source_m: NDArray[np.float64], place: ReflectorPlace) -> str:
     """Return how the layout is mirrored; empty if it is not; raise DataError if no mirror image explains source_m."""
     known = unit_vectors(np.radians(place.azimuth_deg), np.radians(place.elevation_deg)).ravel()
@@ -67,6 +93,20 @@ def mirror_of(source_m: NDArray[np.float64], place: ReflectorPlace) -> str:
         f"{math.degrees(math.asin(found[2])):.0f}°, but the given place is {place.azimuth_deg:g}°, "
         f"{place.elevation_deg:g}°, which no mirrored layout explains; correct the place, or turn the sensor"
     )
+
+
+def scale_from_direction(source_m: NDArray[np.float64], place: ReflectorPlace) -> ArrayScale | None:
+    """Return the size of the array relative to the layout by the known direction of a reflector; None near the axis.
+
+    Delays across an array that is k times as large as its layout are those of a sine from the axis that is k times as
+    large.
+    """
+    ahead, *aside = unit_vectors(np.radians(place.azimuth_deg), np.radians(place.elevation_deg)).ravel()
+    known = math.hypot(*aside)
+    if known < math.sin(math.radians(_MIN_OFF_AXIS_DEG)):
+        return None
+    ratio = float(np.linalg.norm(source_m[1:]) / np.linalg.norm(source_m)) / known
+    return ArrayScale(ratio, ratio * math.radians(1) * abs(ahead) / known)
 
 
 def flipped(name: str) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.calibration.reference_place import SoundSpeed
+from ertis_numba.calibration.reference_place import ArrayScale, SoundSpeed
 from ertis_numba.geometry import Layout
 
 __all__ = ["Calibration", "Residuals"]
@@ -86,6 +86,9 @@ class Calibration:
         How the layout is mirrored; empty if it is not, or if no place of a reflector is known.
     sound_speed : SoundSpeed, optional
         Measured speed of sound, from the distance of a reflector or from direct sound.
+    scale : ArrayScale, optional
+        Size of the array relative to the layout, from the direction of the first place. Positions keep the scale of the
+        layout.
     not_observable : tuple of str
         Quantities that these recordings cannot determine, with what to do about it.
     contrast_db : tuple of float
@@ -120,6 +123,7 @@ class Calibration:
     order: str
     mirrored: str
     sound_speed: SoundSpeed | None
+    scale: ArrayScale | None
     not_observable: tuple[str, ...]
     contrast_db: tuple[float, ...]
     rejected: dict[int, str]
@@ -161,6 +165,11 @@ class Calibration:
         """Faults of the array, one line each."""
         lines = [f"channels are in {self.order}"] if self.order else []
         lines += [f"the layout is {self.mirrored}"] if self.mirrored else []
+        if self.scale is not None and self.scale.contradicts:
+            lines.append(
+                f"the array is about {self.scale.ratio:.2f} times as large as the layout, or the direction of the "
+                "first place is wrong; neither is corrected"
+            )
         for cycle in self.swaps:
             if len(cycle) == 2:
                 lines.append(f"channels {cycle[0]} and {cycle[1]} are swapped")

@@ -14,10 +14,11 @@ from ertis_numba.calibration.channel_order import find_swaps
 from ertis_numba.calibration.observations import Observations, Tolerances
 from ertis_numba.calibration.separable_problem import SeparableProblem
 from ertis_numba.calibration.wavefronts import TARGETS, travel_times
-from ertis_numba.frames import Measurement
-from ertis_numba.geometry import load_layout
+from ertis_numba.frames import Measurement, Stamp
+from ertis_numba.geometry import load_layout, unit_vectors
+from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.pipeline import Pipeline
-from ertis_numba.settings import Array, Recording, Settings
+from ertis_numba.settings import Array, Call, Processing, Recording, Settings
 from ertis_numba.simulation import Electronics, Emitter, Point, Scene, Sensor, Wall
 from ertis_numba.simulation.render import Simulator
 from tests.scenes import line_array
@@ -366,3 +367,44 @@ def test_swaps_of_one_or_two_recordings_are_not_judged():
     time_s = travel_times(source_m, LAYOUT.positions_m[::-1], 343.0, "reflector").time_s
     found = find_swaps(time_s, LAYOUT.positions_m, source_m, np.array([343.0]), "reflector")
     assert not found.cycles()
+
+
+def echoes_of_points(positions_m, places_m, *, seed, n_samples=1600):
+    """Return measurements of a point at some places, rendered from travel times without the simulation."""
+    call = Call(start_frequency_hz=50e3, stop_frequency_hz=25e3, duration_s=2.5e-3, modulation="linear")
+    settings = Settings(
+        array=LAYOUT.to_array(),
+        call=call,
+        recording=Recording(encoding="float32", sample_rate_hz=192e3, n_samples=n_samples),
+        processing=Processing(range_decimation=4),
+    )
+    draws, made = np.random.default_rng(seed), []
+    for number, place_m in enumerate(places_m):
+        path_m = np.linalg.norm(place_m) + np.linalg.norm(positions_m - place_m, axis=1)
+        t_s = np.arange(n_samples)[:, None] / 192e3 - path_m / sound_speed_m_s(settings.air)
+        shape = np.clip(np.minimum(t_s, 2.5e-3 - t_s) / 2.5e-4, 0, 1)
+        sound = 0.3 * np.sin(2 * np.pi * (50e3 * t_s - 25e3 / 2.5e-3 * t_s**2 / 2)) * np.sin(np.pi / 2 * shape) ** 2
+        data = (sound + 1e-3 * draws.standard_normal(sound.shape)).astype(np.float32)
+        made.append(Measurement(data, settings, Stamp(sensor="a", sequence=number)))
+    return made
+
+
+@pytest.mark.parametrize(("scale", "is_found"), [(1.0, False), (1.05, False), (1.3, True)])
+def test_scale_of_the_array_is_not_observable_but_compared_with_the_first_place(scale, is_found):
+    draws = np.random.default_rng(5)
+    true_m = scale * (LAYOUT.positions_m + np.array([0, 3e-4, 3e-4]) * draws.standard_normal((32, 3)))
+    angles = np.radians(np.column_stack([draws.uniform(-45, 45, 12), draws.uniform(-35, 35, 12)]))
+    angles[0] = np.radians([24.0, -20.0])
+    places_m = draws.uniform(0.6, 1.1, (12, 1)) * unit_vectors(*angles.T)
+    first = (24.0, -20.0, float(np.linalg.norm(places_m[0])))
+    made = calibrate(echoes_of_points(true_m, places_m, seed=6), LAYOUT, first_place=first)
+    assert any("the scale of the array: it remains that of the layout" in line for line in made.not_observable)
+    assert abs(made.scale.ratio - scale) < 0.02
+    assert [line for line in made.findings if "times as large as the layout" in line] == list(made.findings)
+    assert bool(made.findings) == is_found
+    # Intervals hold for the shape, without a shift and a scale.
+    found_m = made.layout.positions_m - made.layout.positions_m.mean(axis=0)
+    shape_m = true_m - true_m.mean(axis=0)
+    error_m = found_m - shape_m * np.sum(found_m * shape_m) / np.sum(shape_m**2)
+    if not is_found:
+        assert np.all(np.abs(error_m) < 2 * made.position_sd_m)
