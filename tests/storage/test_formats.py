@@ -63,8 +63,8 @@ def test_format_tables_match_the_code(first, table):
 
 def test_format_names_and_versions_match_the_code():
     assert f"`{CONVENTIONS}`" in PAGE
-    assert f"`ertis_format_version` ({FORMAT_VERSION})" in PAGE
-    assert f"Files without poses have version {VERSION_WITHOUT_POSES}." in " ".join(PAGE.split())
+    versions = f"{VERSION_WITHOUT_POSES}; {FORMAT_VERSION} with poses, and for fused files with points"
+    assert f"| {versions} | 1 to {FORMAT_VERSION} |" in PAGE
 
 
 def test_format_presets_match_the_code():
