@@ -23,6 +23,7 @@ __all__ = ["Reflectors"]
 _MANY_PAIRS: Final = 9  # If so many pairs should hear a reflector, more than those of two calls, one echo shows none.
 _N_UNCLEAR: Final = 4  # Echoes of a reflector in space from which none needs to be clear (`SensorEchoes.is_clear`).
 _STRONG: Final = 10 ** (-10.0 / 10)  # Reflectivity relative to the median, from which echoes need their own call.
+_LOUD: Final = 10 ** (-6.0 / 10)  # Power relative to the strongest echo of an image, from which it proves a call.
 _N_SEVERAL: Final = 3  # Echoes of a reflector that need no confirmation to explain pixels.
 
 
@@ -93,6 +94,16 @@ class Reflectors:
             if each.reflectivity > least
         ]
         return any(bool(silent.is_unexplained[echo].any()) for echo in own)
+
+    def proves(self, number: int, silent: "Reflectors") -> bool:
+        """Return True if loud echoes of a sensor show that it emits; ``silent`` is without its emitter.
+
+        Fainter ones, which no other call explains, may be sound that several surfaces reflect.
+        """
+        heard = self._echoes
+        is_own = heard.receiver == number
+        is_loud = is_own & (heard.power > _LOUD * heard.power[is_own].max(initial=0.0)) & silent.is_unexplained
+        return any(bool(is_loud[each.echo[each.emitter == number]].any()) for each in self.located)
 
     def own_emitters(self) -> frozenset[int]:
         """Return the emitters to whose calls the echoes of their own sensors are attributed."""

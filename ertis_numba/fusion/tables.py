@@ -264,7 +264,7 @@ class FusionTables:
         """Return how much better emission of one sensor explains the echoes than its silence."""
         silent = found.unheard | {number}
         rival = self._explained(group, self._without(group, silent), found.floor, silent)
-        return math.inf if found.reflectors.needs(number, rival.reflectors) else rival.cost - found.cost
+        return math.inf if found.reflectors.proves(number, rival.reflectors) else rival.cost - found.cost
 
     def _without(self, group: Mapping[int, Energyscape], unheard: frozenset[int]) -> Attributed:
         """Return the attribution of a group whose sensors do not hear some emitters."""

@@ -2,6 +2,7 @@
 
 import functools
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
+from ertis_numba.fusion.association import Reflectors
 from ertis_numba.fusion.emissions import (
     EmissionCounts,
     PulseEvidence,
@@ -264,3 +266,16 @@ def test_emitters_between_two_walls_are_heard(tmp_path):
     assert fused.unheard == ()
     found_m = fused.points.position_m[fused.points.is_certain]
     assert (np.linalg.norm(found_m[:, None] - posts_m, axis=2).min(axis=0) < 0.03).all()
+
+
+@pytest.mark.parametrize(
+    ("power", "is_unexplained", "expected"),
+    [([1.0, 0.1, 9.0], True, False), ([1.0, 0.5, 9.0], True, True), ([1.0, 0.5, 9.0], False, False)],
+)
+def test_loud_echoes_that_no_other_call_explains_prove_an_emission(power, is_unexplained, expected):
+    """The first sensor hears two echoes, of which the second one is attributed to its call."""
+    reflectors = object.__new__(Reflectors)
+    reflectors._echoes = SimpleNamespace(receiver=np.array([0, 0, 1]), power=np.array(power))
+    reflectors.located = (SimpleNamespace(echo=np.array([1, 2]), emitter=np.array([0, 0])),)
+    silent = SimpleNamespace(is_unexplained=np.array([True, is_unexplained, False]))
+    assert reflectors.proves(0, silent) == expected
