@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from ertis_numba.base.errors import DataError
 from ertis_numba.base.units import counted
+from ertis_numba.calibration.observations import Tolerances
 from ertis_numba.calibration.wavefronts import Target
 
 __all__ = ["how_to_record", "not_observable", "require_directions"]
@@ -48,23 +49,23 @@ def require_directions(source_m: NDArray[np.float64], target: Target) -> None:
 
 
 def not_observable(
-    observed: NDArray[np.bool_], target: Target, *, positions: bool, is_line: bool, has_scale: bool
+    observed: NDArray[np.bool_], target: Target, expected: Tolerances, *, is_line: bool
 ) -> tuple[str, ...]:
     """Return the quantities that no recording determines, one line each; observed is (mic, gain, delay, x, y, z).
 
-    ``has_scale`` is True if curved wavefronts reveal the scale, as those of an exactly known scene.
+    Curved wavefronts reveal the scale only without errors of the model.
     """
     lines = [
         "a common gain, delay or polarity of all microphones: their means are unchanged",
         "a rotation or shift of the whole array, or a mirrored layout if the place of no reflector is given",
     ]
-    if not positions:
+    if not expected.position_m:
         if target == "direct" or is_line:
             lines.append("positions: direct sound and lines of microphones do not tell them from delays")
         else:
             lines.append("positions: with a tolerance of 0, delays take up their errors, for these directions only")
         return tuple(lines)
-    if not has_scale:
+    if expected.model_s:
         lines.append(
             "the scale of the array: it remains that of the layout, and intervals leave its error out; measure the "
             "distance of two microphones, or state an exact --first-place far to the side"

@@ -107,16 +107,9 @@ def assembled(job: PreparedFit, seen: Observations, fit: ArrayFit, inverted: NDA
         contrast_db=tuple(image_contrast_db(sounds, every.channels, each) for each in (former, layout)),
         rejected=dict(sorted(heard.rejected.items())),
     )
-    positions = expected.position_m > 0
     return replace(
         made,
-        not_observable=not_observable(
-            made.is_observed,
-            job.target,
-            positions=positions,
-            is_line=is_line(every.positions_m),
-            has_scale=expected.model_s == 0,
-        ),
+        not_observable=not_observable(made.is_observed, job.target, expected, is_line=is_line(every.positions_m)),
     )
 
 

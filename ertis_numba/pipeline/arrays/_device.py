@@ -1,5 +1,6 @@
 """One call: conversions of its arguments, and kernels, memory and lane of its device."""
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -44,10 +45,14 @@ def on_device(device: str, threads: int | None) -> Iterator[DeviceCall]:
         memory.close()
 
 
-def band_of(name: str, band_hz: tuple[float, float]) -> tuple[float, float]:
+def band_of(name: str, band_hz: tuple[float, float], rate_hz: float = math.inf) -> tuple[float, float]:
     low_hz, high_hz = numbers_of(name, band_hz, (2,)).tolist()
     if not 0 <= low_hz < high_hz:
         raise ArgumentError(f"{name} is {low_hz:g} to {high_hz:g} Hz; use 0 <= low < high")
+    if high_hz > rate_hz / 2:
+        raise ArgumentError(
+            f"{name} ends at {high_hz:g} Hz, above half of sample_rate_hz, {rate_hz / 2:g} Hz; correct one of them"
+        )
     return low_hz, high_hz
 
 

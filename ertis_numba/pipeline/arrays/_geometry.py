@@ -33,14 +33,20 @@ def directions_of(directions_rad: ArrayLike) -> NDArray[np.float64]:
     return angles_rad
 
 
-def places_of(positions_m: ArrayLike, n_mics: int) -> NDArray[np.float64]:
-    """Return microphone positions (mic, 3) of an array that is not too large."""
+def places_of(positions_m: ArrayLike, n_mics: int, farthest_m: float) -> NDArray[np.float64]:
+    """Return microphone positions (mic, 3) of an array that is not too large; images end at farthest_m."""
     places_m = numbers_of("positions_m", positions_m, (n_mics, 3))
     span_m = float(np.ptp(places_m, axis=0).max())
     if span_m > MAX_SPAN_M:
         raise ArgumentError(
             f"positions_m spans {span_m:.4g} m, more than {MAX_SPAN_M:g} m; if the numbers are millimetres, divide "
             "them by 1000"
+        )
+    largest_m = float(np.linalg.norm(places_m, axis=1).max())
+    if largest_m > farthest_m:
+        raise ArgumentError(
+            f"positions_m lie up to {largest_m:.3g} m from the origin, beyond the last of ranges_m, {farthest_m:.3g} "
+            "m; if the unit is not the metre, convert it, or use wavefront='spherical'"
         )
     return places_m
 
