@@ -1,6 +1,7 @@
 """Time differences of arrival between pairs of microphones, by generalised cross-correlation."""
 
 import itertools
+import math
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -30,6 +31,10 @@ _LEAKED_SHARES: Final = (0.5, 0.1, *(1e-3 * (3 / apart) ** 6 for apart in range(
 _MAX_COHERENCE: Final = 1 - 1e-9
 _FALSE_SHARE: Final = 5e-4  # Share of frequencies by chance among the coherent ones.
 _ALONE: Final = 0.01  # Probability by chance of coherent neighbours.
+_ONE_MOMENT: Final = 2.2
+_DISTORTION: Final = 0.3  # Error of the delay of signals of one step, in samples …
+_COARSE: Final = 1 / 6  # … and the step relative to their deviation that has no effect.
+_LIMITED: Final = 5e-3  # Share of samples at the extremes of a limited signal.
 _INDEPENDENT: Final = 0.947  # Share of independent blocks: neighbours have a correlation of 1/6 under Hann windows.
 
 
@@ -44,7 +49,7 @@ class TimeDifference(NamedTuple):
         Time by which the sound arrives later at the second, in seconds.
     uncertainty_s : float
         Standard deviation in seconds. Infinite if the signals are not coherent, if there are fewer than three blocks,
-        or if the delay is the largest permitted one.
+        if a single step or click is all they share, or if the delay is the largest permitted one.
     peak : float
         Correlation at the delay, relative to that of equal signals.
     """
@@ -84,7 +89,9 @@ def time_differences(
     one. Sources or echoes may fit as one where the band does not resolve them (less than about 0.2 divided by its width
     apart), or where it is narrower than a tenth of its frequencies. The error of their common delay may then exceed the
     uncertainty. Sound of a steep spectrum, such as 1/f² at 40 dB above the noise, needs ``phat`` or ``scot``:
-    unweighted, its errors may exceed the uncertainty.
+    unweighted, its errors may exceed the uncertainty. Signals of steps above a sixth of their standard deviation, and
+    limited ones, have harmonics that shift the delay; the uncertainty contains up to 0.3 samples for them. Sound that
+    both channels pick up electrically, such as hum or several clicks, looks like a source at delay 0.
 
     Parameters
     ----------
@@ -204,10 +211,15 @@ class _Correlator:
                 f"band_hz {band_hz[0]:g} to {band_hz[1]:g} contains none of the frequencies {frequency_hz[1]:g} "
                 "Hz apart; use a wider band, or a smaller resolution_hz"
             )
-        largest = np.abs(signals.rows).max()  # Powers of very large or small sound exceed single precision.
-        signals = signals._replace(rows=signals.rows / (largest if largest > 0 else np.float32(1)))
+        heard = signals.rows
+        largest = np.abs(heard).max()  # Powers of very large or small sound exceed single precision.
+        rows = heard / (largest if largest > 0 else np.float32(1))
+        rows -= rows.mean(axis=1, keepdims=True, dtype=np.float64).astype(np.float32)
+        rows[np.ptp(heard, axis=1) == 0] = 0  # A constant is no sound.
+        signals = signals._replace(rows=rows)
         self._signals, self._n_block, self._weighting = signals, n_block, weighting
-        self._spectra = [self._spectra_of(row) for row in signals.rows]
+        self._spectra = [self._spectra_of(row) for row in rows]
+        self._coarse_s = [_distortion(row) / rate_hz for row in heard]
 
     def _spectra_of(self, row: NDArray[np.float32]) -> NDArray[np.complex64]:
         """Return the spectra of the blocks of a signal, (block, frequency)."""
@@ -234,7 +246,9 @@ class _Correlator:
             rows = rows[0][max(-n_late, 0) :][:n_common], rows[1][max(n_late, 0) :][:n_common]
             bins = self._bins(*(self._spectra_of(each) for each in rows))
             found = Correlation(*rows, bins, n_late / rate_hz - own_s, rate_hz)
-        return TimeDifference(first, second, *found.result(most_s))
+        delay_s, uncertainty_s, peak = found.result(most_s)
+        coarse_s = max(self._coarse_s[first], self._coarse_s[second])
+        return TimeDifference(first, second, delay_s, math.hypot(uncertainty_s, coarse_s), peak)
 
     def _bins(self, first: NDArray[np.complex64], second: NDArray[np.complex64]) -> Bins:
         """Return the cross-spectrum of blocks, and the weights of frequencies."""
@@ -274,7 +288,32 @@ class _Correlator:
         # A coherence that noise may reach by chance does not tell which of several maxima is right.
         by_chance = 1 - _BY_CHANCE ** (1 / n_free)
         evidence = np.maximum(1 - by_chance / np.maximum(coherence, _TINY), 0.0)
-        return Bins(self._n_block, cross, weights, most, ratio / (1 + ratio), evidence, is_coherent and n_blocks > 2)
+        is_known = is_coherent and n_blocks > 2 and self._n_loud(first, second) > _ONE_MOMENT
+        return Bins(self._n_block, cross, weights, most, ratio / (1 + ratio), evidence, is_known)
+
+    def _n_loud(self, *spectra: NDArray[np.complex64]) -> float:
+        """Return the number of blocks that contain the power: at most 2 if it is a single step or click."""
+        numbers = []
+        for each in spectra:
+            power = np.abs(each[:, self._chosen]) ** 2
+            shares = (power / np.maximum(power.mean(axis=0), _TINY)).mean(axis=1, dtype=np.float64)
+            numbers.append(float(shares.sum()) ** 2 / max(float((shares**2).sum()), _TINY))
+        return min(numbers)
+
+
+def _distortion(row: NDArray[np.float32]) -> float:
+    """Return the error in samples by the harmonics of a coarse or limited signal, which may be aliased.
+
+    Steps of a sixth of its standard deviation or less have no effect.
+    """
+    values = np.unique(row)
+    if len(values) < 2:
+        return 0.0
+    limited = (np.count_nonzero((row == values[0]) | (row == values[-1])) - 2) / row.size
+    coarseness = float(np.diff(values).min()) / max(float(row.std(dtype=np.float64)), _TINY)
+    if limited > _LIMITED:
+        return _DISTORTION
+    return _DISTORTION * min(coarseness, 1.0) if coarseness > _COARSE else 0.0
 
 
 def _leaked(size: NDArray[np.float64]) -> NDArray[np.float64]:

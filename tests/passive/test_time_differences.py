@@ -269,3 +269,49 @@ def test_loudness_does_not_change_time_differences(scale, weighting):
     )
     assert found.delay_s == pytest.approx(expected.delay_s, abs=1e-9)
     assert found.uncertainty_s == pytest.approx(expected.uncertainty_s, rel=0.01)
+
+
+def delayed(random, delay_s, band_hz=(2e3, 20e3), snr_db=30, n=9600):
+    """Noise in a band at two microphones, with independent noise."""
+    frequency_hz = np.fft.rfftfreq(n + 4096, 1 / 96e3)
+    spectrum = np.fft.rfft(random.standard_normal(n + 4096))
+    spectrum[(frequency_hz < band_hz[0]) | (frequency_hz > band_hz[1])] = 0
+    turned = [spectrum, spectrum * np.exp(-2j * np.pi * frequency_hz * delay_s)]
+    rows = np.fft.irfft(turned, n + 4096)[:, 2048 : 2048 + n]
+    return rows / rows[0].std() + 10 ** (-snr_db / 20) * random.standard_normal((2, n))
+
+
+@pytest.mark.parametrize("band_hz", [(2e3, 20e3), (8e3, 12e3)])
+@pytest.mark.parametrize(
+    "coarse",
+    [np.sign, lambda rows: np.rint(0.6 * rows), lambda rows: np.rint(2 * rows), lambda rows: np.clip(rows, -0.5, 0.5)],
+    ids=["sign", "0.6 steps", "2 steps", "limited"],
+)
+def test_uncertainty_covers_the_shift_by_coarse_or_limited_signals(coarse, band_hz):
+    random = np.random.default_rng(8)
+    deviations = []
+    for delay_s in random.uniform(-2e-4, 2e-4, 12):
+        rows = coarse(delayed(random, delay_s, band_hz)).astype("f4")
+        (found,) = ertis.time_differences(rows, rate_hz=96e3)
+        deviations.append((found.delay_s - delay_s) / found.uncertainty_s)
+    assert np.sqrt(np.mean(np.square(deviations))) < 1.2
+    assert np.abs(deviations).max() < 3
+
+
+def test_constants_and_single_moments_are_no_sound():
+    """A step or a click of both channels, as of their supply, shows no delay of sound."""
+    random, time_s = np.random.default_rng(3), np.arange(9600) / 96e3
+    noise = 1e-4 * random.standard_normal((2, 9600))
+    click = delayed(random, 1e-4, snr_db=0)
+    click[:, 4000] += 300
+    for rows in (
+        np.ones((2, 9600)),
+        np.array([[0.1], [-0.3]]) * np.ones(9600),
+        np.outer([1, 0.7], time_s > 0.05) + noise,
+        np.outer([1, 1], np.arange(9600) == 500),
+        click,
+    ):
+        (found,) = ertis.time_differences(rows.astype("f4"), rate_hz=96e3)
+        assert np.isinf(found.uncertainty_s)
+    (found,) = ertis.time_differences((delayed(random, 1e-4) + np.array([[3.0], [5.0]])).astype("f4"), rate_hz=96e3)
+    assert abs(found.delay_s - 1e-4) < 4 * found.uncertainty_s < 1e-6
