@@ -23,6 +23,7 @@ _DIGITS = 6
 _REMARKS = {
     "pause": "last velocity assumed",
     "few echoes": "last velocity assumed",
+    "copies": "images are copies of those before",
     "other motion": "another motion fits as well",
 }
 

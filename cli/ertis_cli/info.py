@@ -236,6 +236,7 @@ def _energyscapes(reader: "EnergyscapeReader") -> dict[str, Any]:
         **({"call_warning": reader.call_warning} if reader.call_warning else {}),
         **({"start_warning": reader.start_warning} if reader.start_warning else {}),
         **({"layout_warning": reader.layout_warning} if reader.layout_warning else {}),
+        **({"samples_warning": reader.samples_warning} if reader.samples_warning else {}),
     }
 
 

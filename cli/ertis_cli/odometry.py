@@ -24,12 +24,15 @@ _NS_PER_S = 1e9
 _NOTES = {
     "pause": "follow a pause of more than a second and assume that the last velocity continued",
     "few echoes": "have too few echoes in common and assume that the last velocity continued",
+    "copies": "have images that are copies of those before in every value; check the link to the sensors",
     "other motion": "are uncertain because standing still, mirrored motion or the motion of objects explains the "
     "echoes about as well; the more likely motion is assumed",
 }
 _REFUSALS = {
     "few echoes": "no two successive pulses have enough echoes in common, at most a second apart; record more pulses "
     "per second, or a place with more reflectors",
+    "copies": "all measurements are copies of those before in every sample; check the link to the sensors, and record "
+    "again",
     "other motion": "no step determines the motion, because standing still, mirrored motion or the motion of objects "
     "explains the echoes about as well; add the recordings of sensors that face other ways, use 'ertis odometry "
     "--alone' if no other sensor emits, or record a place with more reflectors at rest",
@@ -133,7 +136,8 @@ def odometry_of(
             found.add([pipelines.image(by_name[name][place.index]) for name, place in emitted.items()])
     doubts = Counter(pose.doubt for pose in found.poses if pose.doubt)
     if doubts.total() == len(groups) - 1:
-        raise DataError(f"{readers[0].path}: {_REFUSALS['other motion' if doubts['other motion'] else 'few echoes']}")
+        reason = next((each for each in ("other motion", "copies") if doubts[each]), "few echoes")
+        raise DataError(f"{readers[0].path}: {_REFUSALS[reason]}")
     for doubt, number in doubts.items():
         steps = options.counted(len(groups) - 1, "step")
         options.note(f"{number} of {steps} {_NOTES[doubt]}", quiet=quiet)

@@ -422,7 +422,8 @@ def note_unlisted_directions(path: Path, sensors: Sequence[str]) -> None:
     for name in sensors:
         with open_energyscapes(path, sensor=name) as images:
             note_missing_points(images)
-            for text in filter(None, (images.call_warning, images.start_warning, images.layout_warning)):
+            texts = images.call_warning, images.start_warning, images.layout_warning, images.samples_warning
+            for text in filter(None, texts):
                 note(f"sensor {name}: {text}")
             if images.has_points:
                 note_unknown_places(name, images.settings)

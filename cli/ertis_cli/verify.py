@@ -69,6 +69,10 @@ def _line(report: "SensorReport") -> str:
         reported.append(f"{len(report.damaged)} damaged (at {_places(item.index for item in report.damaged)})")
     if report.out_of_order:
         reported.append(f"{len(report.out_of_order)} out of order (at {_places(report.out_of_order)})")
+    if report.copies:
+        count = len(report.copies)
+        kind = "copies" if count > 1 else "copy"
+        reported.append(f"{count} {kind} of the measurement before (at {_places(report.copies)})")
     if report.remark:
         reported.append(report.remark)
     return f"{report.sensor}: {', '.join(reported)}{', whole' if report.is_intact else ''}"

@@ -1,16 +1,17 @@
-"""Comparison of a sensor's sound with its settings: the call, the start of the record, and the layout."""
+"""Comparison of a sensor's sound with its settings: the call, the start of the record, and the layout; lost samples."""
 
 from typing import Final, Literal, NamedTuple
 
 from ertis_numba.analysis.call_match import SILENT, call_match
 from ertis_numba.analysis.emission_time import EmissionTimes, describe_start, emissions_of
 from ertis_numba.analysis.layout_match import layout_match
+from ertis_numba.analysis.sample_faults import SampleFaults
 from ertis_numba.frames import Measurement
 from ertis_numba.geometry.air import sound_speed_m_s
 
 __all__ = ["SoundChecks", "SoundMismatch", "Subject"]
 
-Subject = Literal["call", "start", "layout"]
+Subject = Literal["call", "start", "layout", "samples"]
 _MAX_TRIES: Final = 8  # Measurements that are compared with call and layout, if they contain no sound.
 
 
@@ -27,11 +28,13 @@ class SoundChecks:
     Call and layout are compared until they are known, in at most 8 measurements. A note is reported once while the call
     is unknown. The start of the record may change later, so that it is compared in measurements 1, 2, 4, 8 and so on,
     or in all if not ``thinned`` because the caller skips some. Another call ends all checks, because its filter does
-    not find the times of arrival.
+    not find the times of arrival. Dropouts are reported once, and so are copies of measurements if ``live``: a program
+    may process one measurement several times.
     """
 
-    def __init__(self, *, thinned: bool = True) -> None:
+    def __init__(self, *, thinned: bool = True, live: bool = False) -> None:
         self._thinned, self._count = thinned, 0
+        self._faults: SampleFaults | None = SampleFaults(copies=live)
         self._is_other_call = self._is_shifted = self._is_noted = False
         self._emissions: list[EmissionTimes | None] = []
         self._tries: dict[Literal["call", "layout"], int] = {"call": _MAX_TRIES, "layout": _MAX_TRIES}
@@ -39,13 +42,24 @@ class SoundChecks:
     def check(self, measurement: Measurement) -> list[SoundMismatch]:
         """Return the settings that the sound of the next measurement contradicts."""
         self._count += 1
+        lost = SoundMismatch("samples", self._samples(measurement))
         if self._is_other_call:
-            return []
-        found = [SoundMismatch("call", self._call(measurement))]
+            return [lost] if lost.warning else []
+        found = [lost, SoundMismatch("call", self._call(measurement))]
         if not self._is_other_call:
             found.append(SoundMismatch("start", self._start(measurement)))
             found.append(SoundMismatch("layout", self._layout(measurement)))
         return [each for each in found if each.warning]
+
+    def _samples(self, measurement: Measurement) -> str:
+        """Return a warning at the first dropout or copy."""
+        if self._faults is None:
+            return ""
+        self._faults.add(measurement)
+        note = self._faults.note()
+        if note:
+            self._faults = None
+        return note
 
     def _call(self, measurement: Measurement) -> str:
         """Return a warning if the sound contradicts the call, or a note if it may."""

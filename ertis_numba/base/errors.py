@@ -17,11 +17,12 @@
     └── NetworkError (OSError)           another node cannot be reached or does not answer as it should
         └── RefusedError                 it denies access or rejects a request
 
-Each class also inherits the built-in exception in brackets. Eight warnings, all ``UserWarning``, complete them:
+Each class also inherits the built-in exception in brackets. Nine warnings, all ``UserWarning``, complete them:
 ``ErrorBudgetWarning`` for images that may exceed their error budget, ``CallMismatchWarning`` for echoes that do not
 match the call, ``StartMismatchWarning`` for records that do not begin with the emission,
-``LayoutMismatchWarning`` for echoes that do not match the layout, ``LayoutUnitWarning`` for files of
-positions that state no unit, ``CoarseGridWarning`` for directions that miss sources between them,
+``LayoutMismatchWarning`` for echoes that do not match the layout, ``SampleFaultWarning`` for records with
+dropouts, ``LayoutUnitWarning`` for files of positions that state no unit, ``CoarseGridWarning`` for directions that
+miss sources between them,
 ``OutsideBandsWarning`` for sound that the bands of acoustic maps leave out, and ``PoseWarning`` for files of poses
 with doubtful rows, and poses that are hardly those of a platform.
 """
@@ -45,6 +46,7 @@ __all__ = [
     "OutsideBandsWarning",
     "PoseWarning",
     "RefusedError",
+    "SampleFaultWarning",
     "SettingsError",
     "SonarDisconnectedError",
     "SonarError",
@@ -122,6 +124,10 @@ class StartMismatchWarning(UserWarning):
 
 class LayoutMismatchWarning(UserWarning):
     """Echoes do not match the layout in the settings, so that directions in images are wrong."""
+
+
+class SampleFaultWarning(UserWarning):
+    """Samples of a record are missing, so that echoes may be missing in images, or too wide."""
 
 
 class LayoutUnitWarning(UserWarning):

@@ -12,6 +12,7 @@ import numpy as np
 
 from ertis_numba.analysis.health import health
 from ertis_numba.analysis.layout_match import LayoutMatch
+from ertis_numba.analysis.sample_faults import SampleFaults
 from ertis_numba.base.constants import FALSE_ALARM
 from ertis_numba.base.errors import DataError
 from ertis_numba.campaign.sensor_processing import describe_faults, require_same_air
@@ -81,12 +82,13 @@ class _MapsOfSensor:
         """Process the recording and write its maps, all with its air unless settings replace it; yield after each."""
         recording, camera = self._recording, self._camera
         settings, n_left, elapsed_s = camera.settings, len(recording), 0.0
-        as_recorded = settings.air == recording.settings.air
+        as_recorded, faults = settings.air == recording.settings.air, SampleFaults()
         self._compile()
         for measurement in recording:
             if as_recorded:
                 require_same_air(measurement, settings)
             start_s = time.perf_counter()
+            faults.add(measurement)
             camera.add(replace(measurement, settings=settings))
             n_left -= 1
             is_complete = not n_left or camera.n_measurements == settings.passive.averages
@@ -98,9 +100,13 @@ class _MapsOfSensor:
                 camera.reset()
                 elapsed_s = 0.0
             yield
-        if camera.band_note is not None:
-            writer.note_bands(recording.sensor, camera.band_note)
-            self._warn(f"{recording.path}: sensor {recording.sensor}: {camera.band_note}")
+        lost = faults.note("maps leave out the blocks of samples with them") if recording.truth is None else ""
+        notes = list(filter(None, (camera.band_note, lost)))
+        if notes:
+            writer.note_bands(recording.sensor, "; also, ".join(notes))
+        for note in notes:
+            if note is not lost or not faults.is_first_only:
+                self._warn(f"{recording.path}: sensor {recording.sensor}: {note}")
         if self._masked_s:
             n_emitted = sum(stamp.behaviour == "active" for stamp in recording.stamps())
             self._warn(

@@ -41,9 +41,13 @@ class RecordingJob:
     """A recording that is ready to be processed; nothing is written yet."""
 
     def __init__(
-        self, recordings: Sequence[EchoMeasurements], runs: Sequence[SensorProcessing], writer: EnergyscapeWriter
+        self,
+        recordings: Sequence[EchoMeasurements],
+        runs: Sequence[SensorProcessing],
+        writer: EnergyscapeWriter,
+        warn: Callable[[str], None],
     ) -> None:
-        self._recordings, self._runs, self._writer = recordings, runs, writer
+        self._recordings, self._runs, self._writer, self._warn = recordings, runs, writer, warn
         self.measurements = sum(map(len, recordings))
         """Number of measurements."""
 
@@ -55,6 +59,8 @@ class RecordingJob:
                 for _ in run.write(recording, self._writer):
                     done += 1
                     yield done
+                if run.samples_warning and not run.is_first_only:
+                    self._warn(f"{recording.path}: sensor {recording.sensor}: {run.samples_warning}")
 
     def report(self) -> dict[str, Any]:
         """Return the report of ``--json``; entries of a single sensor are repeated at the top level."""
@@ -135,7 +141,7 @@ def prepare_recording(
             writer.note_start(recording.sensor, run.start_warning)
             writer.note_layout(recording.sensor, run.layout_warning)
             writer.note_wavefront(recording.sensor, run.reported.get("wavefront_error_db"))
-        yield RecordingJob(recordings, runs, writer)
+        yield RecordingJob(recordings, runs, writer, warn)
 
 
 def check_recording(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ertis_numba.analysis.health import ARRAY_FAULTS, Health
 from ertis_numba.analysis.health.kinds import DISABLE
+from ertis_numba.analysis.sample_faults import SampleFaults
 from ertis_numba.base.errors import DataError
 from ertis_numba.campaign.attitudes import Attitudes
 from ertis_numba.campaign.echo_measurements import EchoMeasurements
@@ -66,7 +67,8 @@ class SensorProcessing:
         self.times_ms: list[float] = []
         self.reported: dict[str, Any] = {}
         self.prediction: Prediction | None = None
-        self.call_warning = self.start_warning = self.layout_warning = ""
+        self.call_warning = self.start_warning = self.layout_warning = self.samples_warning = ""
+        self.is_first_only = False
         image_bytes = 4 * len(pipeline.grid) * len(pipeline.range_m)
         self._size = max(1, min(batch, int((max_bytes or MAX_WAITING_BYTES) / image_bytes)))
 
@@ -78,12 +80,14 @@ class SensorProcessing:
         """Process a recording and write its images, all with its air unless settings replace it; yield after each."""
         settings = self.pipeline.settings
         as_recorded = settings.air == recording.settings.air
-        measurements = iter(recording)
+        measurements, faults = iter(recording), SampleFaults()
         while group := list(itertools.islice(measurements, self._size)):
             if as_recorded:
                 for measurement in group:
                     require_same_air(measurement, settings)
             taken = [self.with_pipeline_settings(measurement) for measurement in group]
+            for measurement in taken:
+                faults.add(measurement)
             is_first = not self.times_ms
             images = self._processed(taken)
             if is_first and self.times_ms[0] > _SLOW_MS:  # The first call may have compiled kernels.
@@ -94,6 +98,10 @@ class SensorProcessing:
             while images:  # Written images are released: on a GPU, the next batch needs their memory.
                 writer.write(images.pop())
                 yield
+        if recording.recording.truth is None:  # Simulated measurements without noise are alike.
+            self.samples_warning = faults.note()
+            self.is_first_only = faults.is_first_only
+            writer.note_samples(recording.sensor, self.samples_warning)
 
     def _processed(self, measurements: Sequence[Measurement]) -> list[Energyscape]:
         start_s = time.perf_counter()
@@ -122,6 +130,7 @@ class SensorProcessing:
             **({"call_warning": self.call_warning} if self.call_warning else {}),
             **({"start_warning": self.start_warning} if self.start_warning else {}),
             **({"layout_warning": self.layout_warning} if self.layout_warning else {}),
+            **({"samples_warning": self.samples_warning} if self.samples_warning else {}),
             **self.reported,
         }
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.base.errors import DataError
-from ertis_numba.frames import Trajectory
+from ertis_numba.frames import Energyscape, Trajectory
 from ertis_numba.fusion.rig import MountedSensor, Mountings, mounted_sensors
 from ertis_numba.motion.echoes import EchoExtractor, GroupEchoes
 from ertis_numba.motion.flow import FlowFit, fit_flow
@@ -18,7 +18,7 @@ from ertis_numba.motion.velocity import MAX_TIME_S, EgoVelocity, Item, grouped, 
 __all__ = ["Odometry", "PlanarPose"]
 
 Floats = NDArray[np.float64]
-Doubt: TypeAlias = Literal["", "pause", "few echoes", "other motion"]
+Doubt: TypeAlias = Literal["", "pause", "few echoes", "other motion", "copies"]
 
 # Changes of speed and yaw rate between two groups that the search covers.
 _MAX_CHANGE: Final = np.array([0.6, 0.6, math.radians(60.0)])
@@ -47,11 +47,12 @@ class PlanarPose(NamedTuple):
     x_m, y_m, yaw_rad : float
     covariance : (3, 3) float64
         Covariance of x, y and yaw since the start, in metres and radians.
-    doubt : {"", "pause", "few echoes", "other motion"}
+    doubt : {"", "pause", "few echoes", "other motion", "copies"}
         Reason why the motion is unknown; empty if it was measured. After a pause of more than a second, or if no more
         echoes match than those of noise or of one moving object (``few echoes``), the last velocity is assumed to have
         continued, for at most a second. If another motion explains about as much (``other motion``), the more likely
-        one is assumed. Others are standing still, mirrored motion, and the motion of objects.
+        one is assumed. Others are standing still, mirrored motion, and the motion of objects. Images that equal those
+        before in every value (``copies``) show no motion.
 
     Examples
     --------
@@ -145,6 +146,7 @@ class Odometry:
         self._suspects: tuple[Floats, ...] = ()  # Twists of the last groups with several possible motions.
         self._path: list[PlanarPose] = []
         self._times_ns: dict[str, int] = {}  # of the last group, by sensor
+        self._items: Mapping[str, Item] = {}  # of the last group
 
     @property
     def poses(self) -> tuple[PlanarPose, ...]:
@@ -235,17 +237,18 @@ class Odometry:
                 f"group is {(self._path[-1].timestamp_ns - timestamp_ns) / 1e9:.3g} s before the last one; add groups "
                 "in order of time"
             )
-        echoes = self._extract(items)
-        self._times_ns = times_ns_of(items)
+        fresh = {name: item for name, item in items.items() if not _is_copy(item, self._items.get(name))}
+        echoes = self._extract(fresh or items)
+        self._times_ns, self._items = times_ns_of(items), items
         if not self._path:
             self._path.append(PlanarPose(timestamp_ns, 0.0, 0.0, 0.0, np.zeros((3, 3))))
             self._begin(echoes)
             return None
         time_s = (timestamp_ns - self._path[-1].timestamp_ns) / 1e9
-        found = self._since_last(echoes, time_s) if time_s <= MAX_TIME_S else None
+        found = self._since_last(echoes, time_s) if fresh and time_s <= MAX_TIME_S else None
         if found is None or not found.is_certain:
-            self._guess(found, time_s, timestamp_ns)
-            self._begin(echoes)
+            self._guess(found, time_s, timestamp_ns, has_copies=not fresh)
+            self._begin(echoes if fresh else None)
             return None
         self._twist, self._twist_ns = twist_of(found.displacement, time_s), timestamp_ns
         change = _of_change(self._last.twist, self._twist, echoes) if self._last else np.zeros((3, 3))
@@ -282,14 +285,14 @@ class Odometry:
         last_ns = self._path[-1].timestamp_ns if self._path else 0
         return time_after_ns(group, self._times_ns, last_ns)
 
-    def _guess(self, found: FlowFit | None, time_s: float, timestamp_ns: int) -> None:
+    def _guess(self, found: FlowFit | None, time_s: float, timestamp_ns: int, *, has_copies: bool) -> None:
         """Add the pose by the more likely of several motions, or else by the last velocity, for at most a second.
 
         Errors of successive guesses have one cause, such as a person who walks by, so their deviations add up.
         """
         age_s = math.inf if self._twist_ns is None else (timestamp_ns - self._twist_ns) / 1e9
         if found is None:
-            doubt: Doubt = "pause" if time_s > MAX_TIME_S else "few echoes"
+            doubt: Doubt = "copies" if has_copies else "pause" if time_s > MAX_TIME_S else "few echoes"
             way = _displacement(self._twist, max(0.0, min(time_s, MAX_TIME_S, MAX_TIME_S + time_s - age_s)))
             deviation = np.minimum(_UNKNOWN_SD, _ACCELERATION_SD * age_s) * time_s
         else:
@@ -353,6 +356,16 @@ class Odometry:
                     return
         self._keyframe = self._last and self._last._replace(change=change)
         self._path.append(step)
+
+
+def _is_copy(item: Item, last: Item | None) -> bool:
+    """Return True if an image with sound equals the last one of its sensor in every value, as never happens."""
+    return (
+        isinstance(item, Energyscape)
+        and isinstance(last, Energyscape)
+        and bool(item.amplitude.any())
+        and np.array_equal(item.amplitude, last.amplitude)
+    )
 
 
 def _propagation(yaw_rad: float, displacement: Floats) -> tuple[Floats, Floats]:

@@ -7,6 +7,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from ertis_numba.analysis.dropouts import dropouts
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.kernels import KernelSet, fft
@@ -16,6 +17,7 @@ from ertis_numba.settings import Settings
 
 __all__ = ["BlockSpectra", "Products"]
 
+_SPREAD: Final = 8  # Samples by which the filter of a decimation spreads.
 _CHANNELS: Final = 16  # Largest number of channels whose frequencies are measured.
 
 
@@ -61,7 +63,7 @@ class BlockSpectra:
         self._sums = self._memory.zeros((len(self.bins), n_mics, n_mics), np.complex64)
 
     def products(self, measurement: Measurement, *, masked: bool) -> Products:
-        """Return the sums over a measurement of this sensor, without the time of the call if masked."""
+        """Return the sums over the blocks of a measurement without dropouts, and of the call if masked."""
         heard = self._read(measurement, out=self._heard)
         hop = self._n_block // 2
         first = self._read.n_masked if masked else 0
@@ -71,10 +73,17 @@ class BlockSpectra:
                 f"a measurement has no block of {self._n_block} samples after its call; use wider bands, a larger "
                 "passive.resolution_hz, or passive measurements"
             )
+        kept = self._intact(measurement, first, n_blocks)
+        n_blocks, starts = len(kept), kept * hop
+        if not n_blocks:
+            raise DataError(
+                f"a measurement has no block of {self._n_block} samples without a dropout; check the link to the "
+                "sensor, and record again"
+            )
         blocks, transforms = self._planned(n_blocks)
         with self._kernels.threads(self._threads), self._lane.entered():
             pieces = np.lib.stride_tricks.sliding_window_view(heard[:, first:], self._n_block, axis=1)
-            np.multiply(pieces[:, : n_blocks * hop : hop], self._window, out=blocks)
+            np.multiply(pieces[:, starts], self._window, out=blocks)
             self._lane.send(blocks.reshape(-1, self._n_block))
             shape = (*blocks.shape[:2], self._n_block // 2 + 1)
             spectra = transforms.forward(threads=self._threads).reshape(shape)
@@ -83,7 +92,18 @@ class BlockSpectra:
             self._lane.fetch(self._sums, out)
             self._lane.wait()
         out *= self._scale
-        return Products(out, *self._slopes(pieces[self.channels, : n_blocks * hop : hop]), n_blocks)
+        return Products(out, *self._slopes(pieces[np.ix_(self.channels, starts)]), n_blocks)
+
+    def _intact(self, measurement: Measurement, first: int, n_blocks: int) -> NDArray[np.intp]:
+        """Return the numbers of the blocks from a sample on that contain no dropout."""
+        hop, intact = self._n_block // 2, np.ones(n_blocks, bool)
+        per_sample = self._read.shape[1] / len(measurement.data)
+        for start, stop in dropouts(measurement, self._read.settings):
+            # The filter of a decimation spreads the ends of a dropout.
+            begins, ends = (per_sample * each - first for each in (start, stop))
+            low = math.floor((begins - _SPREAD - self._n_block) / hop) + 1
+            intact[max(low, 0) : max(math.ceil((ends + _SPREAD) / hop), 0)] = False
+        return np.flatnonzero(intact)
 
     def _slopes(self, pieces: NDArray[np.float32]) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
         """Return products of blocks (channel, block, sample) under the slope of the window, and powers.

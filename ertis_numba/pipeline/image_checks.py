@@ -12,6 +12,7 @@ from ertis_numba.base.errors import (
     DeviceError,
     ErrorBudgetWarning,
     LayoutMismatchWarning,
+    SampleFaultWarning,
     StartMismatchWarning,
 )
 from ertis_numba.frames import Energyscape, Measurement
@@ -28,6 +29,7 @@ _CATEGORIES: Final[dict[Subject, type[UserWarning]]] = {
     "call": CallMismatchWarning,
     "start": StartMismatchWarning,
     "layout": LayoutMismatchWarning,
+    "samples": SampleFaultWarning,
 }
 _CALLER: Final = 5  # Frames from a warning to the caller of `Pipeline.process`.
 

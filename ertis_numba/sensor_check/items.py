@@ -7,6 +7,7 @@ from typing import Final, Literal, NamedTuple
 from ertis_numba.analysis.call_match import CallMatch
 from ertis_numba.analysis.health import Health
 from ertis_numba.analysis.health.limits import MAX_DELAY_S, MAX_GAIN_DB, MAX_WHITE_DB
+from ertis_numba.analysis.sample_faults import LINK as LINK_REMEDY
 from ertis_numba.base.units import counted
 from ertis_numba.calibration import OtherLayoutError
 from ertis_numba.geometry.air import sound_speed_m_s
@@ -170,6 +171,10 @@ def of_storage(stored: SensorReport) -> CheckResult:
         add(f"{count} of {stored.measurements} measurements {'is' if count == 1 else 'are'} damaged", COPY)
     if stored.out_of_order:
         add(f"{counted(len(stored.out_of_order), 'measurement')} out of order", "record again")
+    if stored.copies:
+        count = len(stored.copies)
+        kind = "are copies" if count > 1 else "is a copy"
+        add(f"{count} of {stored.measurements} measurements {kind} of the one before in every sample", LINK_REMEDY)
     if stored.remark:
         add(stored.remark, COPY)
     return _result_of(faults, f"{stored.measurements} stored, none missing or damaged")

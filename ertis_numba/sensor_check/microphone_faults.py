@@ -30,8 +30,10 @@ _RECORDS: Final = {
     "size of the array": "the positions of the microphones have another unit",
     "half late": "the channels of two converters are out of step",
     "order of bytes": "the bytes of each sample are swapped",
+    "dropout": "the record has dropouts",
     "repeated blocks": "blocks of samples are repeated",
 }
+_FULL_DBFS: Final = -0.1
 _EVERY_REMEDY: Final = "check the cable and the supply of the array, and record again"
 _SATURATED_REMEDY: Final = "emit less, or move the array away from near objects, and record again"
 
@@ -68,9 +70,16 @@ def microphone_faults(report: Health) -> tuple[CheckFault, ...]:
     for names, channels in alike.items():
         every = len(channels) == len(report.channels) > 1
         who = "every channel" if every else channels_in_words(channels)
-        text = f"{who} {_predicate(names, is_one=every or len(channels) == 1)}"
+        text = f"{who} {_predicate(names, is_one=every or len(channels) == 1)}{_clip_level(report, channels)}"
         faults.append(CheckFault(check=MICROPHONES, text=text, remedy=_remedy(names[0], excluded, every=every)))
     return tuple(sorted(faults, key=lambda fault: [int(number) for number in re.findall(r"\d+", fault.text)]))
+
+
+def _clip_level(report: Health, channels: Sequence[int]) -> str:
+    """Return the lowest level at which some channels are clipped, unless it is full scale."""
+    levels = [each.clip_dbfs for each in report.channels if each.channel in channels and each.clip_dbfs is not None]
+    lowest_dbfs = min(levels, default=0.0)
+    return f" from {lowest_dbfs:.1f} dBFS on" if lowest_dbfs < _FULL_DBFS else ""
 
 
 def _predicate(names: Sequence[str], *, is_one: bool) -> str:

@@ -26,7 +26,14 @@ __all__ = ["EnergyscapeReader", "EnergyscapeWriter", "open_energyscapes", "write
 
 _ERRORS_DB: Final = ("predicted_error_db", "max_error_db", "wavefront_error_db")
 PLATFORM_FRAME: Final = "base_link"  # Sensor of fused images; the fusion lies above this package.
-_TEXTS: Final = ("budget_applies_to", "error_warning", "call_warning", "start_warning", "layout_warning")
+_TEXTS: Final = (
+    "budget_applies_to",
+    "error_warning",
+    "call_warning",
+    "start_warning",
+    "layout_warning",
+    "samples_warning",
+)
 
 
 class _EnergyscapeFile(ResultFile):
@@ -130,6 +137,13 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         """
         self._state(sensor, layout_warning=layout_warning)
 
+    def note_samples(self, sensor: str, samples_warning: str) -> None:
+        """Store a warning on dropouts or copies among a sensor's measurements; empty if there are none.
+
+        Call this before the file is closed.
+        """
+        self._state(sensor, samples_warning=samples_warning)
+
     def note_wavefront(self, sensor: str, wavefront_error_db: float | None) -> None:
         """Store the error of plane wavefronts at the first range of a sensor; None stores nothing.
 
@@ -157,11 +171,13 @@ class EnergyscapeWriter(_EnergyscapeFile, ResultWriter[Energyscape]):
         return row
 
     def _complete(self, group: h5py.Group, rows: RowWriter) -> None:
-        clouds = self._points.get(group.name.rpartition("/")[2])
+        sensor = group.name.rpartition("/")[2]
+        clouds = self._points.get(sensor)
         if clouds is not None:
             write_points(group, clouds)
             self._format_version = FORMAT_VERSION
         super()._complete(group, rows)
+        set_attributes(group, self._stated.get(sensor, {}))
 
     def _sensor_truth(self, sensor: str, group: h5py.Group) -> GroundTruth | GroundTruthLog | None:
         given = super()._sensor_truth(sensor, group)
@@ -226,6 +242,8 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
         Warning that records do not begin with the emission; empty if they may, or if it was not examined.
     layout_warning : str
         Warning that echoes do not match the layout; empty if they may, or if it was not examined.
+    samples_warning : str
+        Warning that measurements have dropouts or are copies; empty if not, or if it was not examined.
     """
 
     range_m: NDArray[np.float64]
@@ -236,6 +254,7 @@ class EnergyscapeReader(_EnergyscapeFile, ResultReader[Energyscape]):
     call_warning: str
     start_warning: str
     layout_warning: str
+    samples_warning: str
     wavefront_error_db: float | None
 
     def _load(self) -> None:

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import h5py
 
+from ertis_numba.analysis.sample_faults import are_copies
 from ertis_numba.base.errors import ArgumentError, DamagedError, DataError, ForeignDataError
 from ertis_numba.frames import SequenceGap
 from ertis_numba.journal import Journal
@@ -90,6 +91,7 @@ class SensorReport:
 
     ``measurements`` counts damaged ones too; ``out_of_order`` are indices with a number not above the previous one of
     the session. ``remark`` describes damage to the file or to poses, and losses from its journal that no gap covers.
+    ``copies`` are indices of recorded measurements that equal the one before in every sample, as sound never does.
     """
 
     sensor: str
@@ -99,6 +101,7 @@ class SensorReport:
     out_of_order: tuple[int, ...] = ()
     fault: str = ""
     remark: str = ""
+    copies: tuple[int, ...] = ()
 
     @property
     def missing(self) -> int:
@@ -158,13 +161,19 @@ def _of_recording(path: Path, sensor: str, structure: str) -> SensorReport:
     except (ArgumentError, DataError) as error:
         return SensorReport(sensor=sensor, fault=str(error))
     damaged: list[DamagedMeasurement] = []
+    copies, last = [], None
     with recording:
         stamps = recording.stamps()
         for index, stamp in enumerate(stamps):
             try:
-                recording[index]
+                data = recording[index].data
             except DamagedError as error:
                 damaged.append(DamagedMeasurement(index, stamp.sequence, str(error)))
+                continue
+            # Simulated measurements without noise are alike.
+            if recording.truth is None and last is not None and are_copies(last, data):
+                copies.append(index)
+            last = data
         return SensorReport(
             sensor=sensor,
             measurements=len(recording),
@@ -172,6 +181,7 @@ def _of_recording(path: Path, sensor: str, structure: str) -> SensorReport:
             damaged=tuple(damaged),
             out_of_order=_out_of_order((stamp.session_id, stamp.sequence) for stamp in stamps),
             remark="; ".join(filter(None, (_journal_damage(recording), structure))),
+            copies=tuple(copies),
         )
 
 

@@ -37,7 +37,8 @@ class ResultNotes:
         """Yield the warnings that a file of images stores about the sound of a sensor, once."""
         if sensor not in self._files:
             self._files.add(sensor)
-            for text in filter(None, (images.call_warning, images.start_warning, images.layout_warning)):
+            texts = images.call_warning, images.start_warning, images.layout_warning, images.samples_warning
+            for text in filter(None, texts):
                 yield f"sensor {sensor}: {text}"
 
     def of(self, item: Energyscape | AcousticMap, band_note: str | None = None) -> Iterator[str]:

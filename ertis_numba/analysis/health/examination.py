@@ -2,7 +2,6 @@
 
 import functools
 import math
-import statistics
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -11,6 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis import _bits
+from ertis_numba.analysis.dropouts import (
+    MIN_DROPOUT_NUMBERS,
+    MIN_DROPOUT_WORDS,
+    Parts,
+    constant_parts,
+    describe_dropouts,
+)
 from ertis_numba.analysis.health.bits import by_bits
 from ertis_numba.analysis.health.kinds import kind_of
 from ertis_numba.analysis.health.limits import (
@@ -99,10 +105,12 @@ def health(measurement: Measurement) -> Health:
         if has_call
         else settings.passive.extent_of(settings.recording)
     )
-    reported, tones_hz, unknown, findings = by_spectra(signal_of, len(words), moving, settings, band_hz)
+    missing = constant_parts(words, enabled, is_pdm=settings.recording.is_pdm) if moving else []
+    reported, tones_hz, unknown, findings = by_spectra(signal_of, len(words), moving, settings, band_hz, missing)
     found |= {item.channel: item for item in reported}
     moved = [(item.channel, columns(item.channel)) for item in moving]
-    findings += _by_words(words, moved, found, settings, half_scale)
+    findings += _by_words(words, moved, found, settings, half_scale, missing)
+    findings += _of_dropouts(missing, sounding.start or 0, settings, enabled)
     deaf = {finding.channels[0] for finding in findings if finding.fault in _DEAF}
     heard = [item.channel for item in reported if not set(item.faults) & _DEAF and item.channel not in deaf]
     not_observable = () if has_call else _hidden("no call was emitted", "record with calls")
@@ -184,19 +192,38 @@ def _by_words(
     found: dict[int, ChannelHealth],
     settings: Settings,
     half_scale: float,
+    missing: Parts,
 ) -> list[Finding]:
     """Return the findings of the checks that need no spectrum."""
     recording, enabled = settings.recording, tuple(found)
     comparable = moved if recording.is_pdm or _have_noise(found.values()) else []
     findings = duplicates(comparable, is_pdm=recording.is_pdm)
     findings += repeated_blocks(words, enabled) if moved else []
-    findings += stuck_at_times(comparable, largest=MAX_STUCK_SAMPLES if recording.is_pdm else MAX_STUCK_NUMBERS)
+    intact = np.ones(len(words), bool)
+    for first, stop in missing:
+        intact[first:stop] = False
+    findings += stuck_at_times(
+        [(channel, column[intact]) for channel, column in comparable],
+        largest=MAX_STUCK_SAMPLES if recording.is_pdm else MAX_STUCK_NUMBERS,
+    )
     steady = [(channel, column) for channel, column in moved if not {"saturated", "offset"} & {*found[channel].faults}]
     block = round(_HUM_BLOCK_S * recording.sample_rate_hz)
     findings += hum(steady, block=block, full_scale=half_scale)
     if recording.encoding == "int16":
         findings += swapped_bytes(words, enabled)
     return findings
+
+
+def _of_dropouts(missing: Parts, start: int, settings: Settings, enabled: NDArray[np.intp]) -> list[Finding]:
+    """Return a finding for the dropouts of a record of which the examined part begins at a sample."""
+    if not missing:
+        return []
+    shifted = [(start + first, start + stop) for first, stop in missing]
+    longest = max(stop - first for first, stop in missing)
+    limit = MIN_DROPOUT_WORDS if settings.recording.is_pdm else MIN_DROPOUT_NUMBERS
+    channels = tuple(enabled.tolist())
+    detail = describe_dropouts(shifted)
+    return [Finding(fault="dropout", channels=channels, measured=float(longest), limit=float(limit), detail=detail)]
 
 
 def _with_faults(found: dict[int, ChannelHealth], findings: Iterable[Finding]) -> tuple[ChannelHealth, ...]:
@@ -214,9 +241,12 @@ def _column(words: NDArray[Any], channel: int) -> NDArray[Any]:
 
 
 def _have_noise(channels: Iterable[ChannelHealth]) -> bool:
-    """Return True if PCM samples contain noise; without noise, a symmetrical array may receive identical echoes."""
-    levels = [item.noise_dbfs for item in channels if item.noise_dbfs is not None]
-    return bool(levels) and statistics.median(levels) > _LOWEST_NOISE_DBFS
+    """Return True if PCM samples contain noise; without noise, a symmetrical array may receive identical echoes.
+
+    Up to three quarters of the channels may be stuck where the record is quietest.
+    """
+    levels = sorted(item.noise_dbfs for item in channels if item.noise_dbfs is not None)
+    return bool(levels) and levels[3 * len(levels) // 4] > _LOWEST_NOISE_DBFS
 
 
 def _of_channels(channels: Collection[ChannelHealth]) -> list[Finding]:
@@ -230,7 +260,13 @@ def _of_channels(channels: Collection[ChannelHealth]) -> list[Finding]:
         "dead": ("level_db", MIN_LEVEL_DB),
     }
     return [
-        Finding(fault=fault, channels=(item.channel,), measured=float(getattr(item, figure)), limit=limit)
+        Finding(
+            fault=fault,
+            channels=(item.channel,),
+            measured=float(getattr(item, figure)),
+            limit=limit,
+            detail="" if fault != "saturated" or item.clip_dbfs is None else f"at {item.clip_dbfs:.1f} dBFS",
+        )
         for item in channels
         for fault in item.faults
         for name, (figure, limit) in measured.items()

@@ -51,6 +51,7 @@ KINDS = {
         unit="µs", remedy="synchronise the converters, or set their delays as array.delay_s", of_record=True
     ),
     "order of bytes": FaultKind(unit="dB", remedy="swap the bytes of every number when importing", of_record=True),
+    "dropout": FaultKind(unit="samples", remedy="record again, and check the link to the sensor", of_record=True),
     "repeated blocks": FaultKind(
         unit="samples", remedy="record again, and check the link to the sensor", of_record=True
     ),

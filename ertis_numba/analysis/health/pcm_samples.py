@@ -13,6 +13,11 @@ __all__ = ["by_numbers", "scaled", "sounding_part", "swapped_bytes"]
 
 # The largest 16-bit sample, relative to full scale. float32 has no limit, so it clips at the level of its source.
 _FULL = 1 - 2.0**-15
+_STEP = 2.0**-15
+_FLOAT_WIDTH = 2.0**-12  # Width of the values below the extremes of float samples, relative to their peak.
+_MIN_STEPS = 64  # Least peak in steps; small noise has many equal samples.
+_MIN_VALUES = 4  # Least number of different values in the upper half.
+_SPIKE = 8.0  # Samples at an extreme, relative to those in four steps below.
 
 
 def scaled(words: NDArray[Any], full: float, channel: int) -> NDArray[np.float32]:
@@ -29,9 +34,8 @@ def sounding_part(words: NDArray[Any], enabled: NDArray[np.intp]) -> slice:
 def by_numbers(channel: int, signal: NDArray[np.float32], *, is_float: bool) -> ChannelHealth:
     """Return the statistics and faults of a PCM channel that need no spectrum."""
     changes = float(np.mean(signal[1:] != signal[:-1]))
-    level = np.abs(signal)
-    peak = float(level.max())
-    overload = float(np.mean(level >= (peak if is_float else _FULL)))
+    peak = float(np.abs(signal).max())
+    overload, clip = _clipped(signal, peak, 0.0 if is_float else _STEP)
     offset = float(np.mean(signal, dtype=np.float64))
     if changes < MIN_CHANGES:
         faults: tuple[str, ...] = (f"stuck at {float(np.median(signal)):g}",)
@@ -40,7 +44,37 @@ def by_numbers(channel: int, signal: NDArray[np.float32], *, is_float: bool) -> 
         deviation = float(np.std(signal, dtype=np.float64)) / math.sqrt(len(signal))
         max_offset = MAX_OFFSET * full + OFFSET_DEVIATIONS * deviation
         faults = ("saturated",) * (overload > MAX_SATURATED) + ("offset",) * (abs(offset) > max_offset)
-    return ChannelHealth(channel=channel, faults=faults, offset=offset, changes=changes, overload=overload)
+    clip_dbfs = 20 * math.log10(clip) if "saturated" in faults else None
+    return ChannelHealth(
+        channel=channel, faults=faults, offset=offset, changes=changes, overload=overload, clip_dbfs=clip_dbfs
+    )
+
+
+def _clipped(signal: NDArray[np.float32], peak: float, step: float) -> tuple[float, float]:
+    """Return the share of samples at the limits of a converter or of an amplifier before it, and the level of these.
+
+    Samples within ``step`` of the largest or least value are clipped if far more than just below: a sine has 1.4 times
+    as many, noise fewer. A preamplifier may clip at any level, on both sides differently.
+    """
+    width = step or peak * _FLOAT_WIDTH
+    overload = float(np.mean(np.abs(signal) >= (_FULL if step else peak)))
+    if overload > MAX_SATURATED or peak < _MIN_STEPS * width:
+        return overload, peak
+    share, levels = 0.0, []
+    for side in (signal, -signal):
+        top = float(side.max())
+        n_top = int(np.count_nonzero(side >= top - 1.5 * step))
+        n_below = int(np.count_nonzero(side >= top - 1.5 * step - 4 * width)) - n_top
+        if top > 0 and n_top > _SPIKE * (n_below + 1) and not _is_steady(side, top - 1.5 * step, n_top):
+            share += n_top / len(side)
+            levels.append(top)
+    return (share, min(levels)) if share > MAX_SATURATED else (overload, peak)
+
+
+def _is_steady(side: NDArray[np.float32], top: float, n_top: int) -> bool:
+    """Return True for a steady tone without noise, whose other values are few, or as frequent as its largest ones."""
+    counts = np.unique(side[(side > top / 2) & (side < top)], return_counts=True)[1]
+    return bool(n_top <= _SPIKE * counts.max(initial=0)) or len(counts) < _MIN_VALUES
 
 
 def swapped_bytes(words: NDArray[np.int16], channels: tuple[int, ...]) -> list[Finding]:

@@ -48,8 +48,10 @@ class ChannelHealth:
     changes : float or None
         Share of samples that differ from the previous one.
     overload : float or None
-        Share of samples at which 17 equal bits start, or of PCM samples at full scale. For float32, full scale is the
-        highest amplitude of the record.
+        Share of samples at which 17 equal bits start, or of PCM samples at full scale or at a lower level at which they
+        are clipped. For float32, full scale is the highest amplitude of the record.
+    clip_dbfs : float or None
+        Level at which PCM samples are clipped; None unless the channel is saturated.
     level_db : float or None
         Level of the sound in the call's band in the loud eighth of the record, relative to the median of all channels.
         The noise is subtracted, and the calibrated gain is compensated.
@@ -70,6 +72,7 @@ class ChannelHealth:
     noise_dbfs: float | None = None
     tone_hz: float | None = None
     tone_db: float | None = None
+    clip_dbfs: float | None = None
 
     @property
     def state(self) -> str:
@@ -163,7 +166,7 @@ def merge(reports: Sequence[Health]) -> Health:
 
 def _merged(items: Sequence[ChannelHealth]) -> ChannelHealth:
     """Return the merged health of one channel."""
-    names = ("offset", "changes", "overload", "level_db", "noise_dbfs")
+    names = ("offset", "changes", "overload", "level_db", "noise_dbfs", "clip_dbfs")
     figures = {name: _median(getattr(item, name) for item in items) for name in names}
     loudest = max(items, key=lambda item: item.tone_db or 0.0)
     return ChannelHealth(

@@ -17,6 +17,7 @@ from ertis_numba.settings import Settings
 __all__ = ["by_spectra"]
 
 _SEGMENTS = 8  # Minimum number of segments without overlap, so that some are loud and some are quiet.
+_MIN_INTACT = 3  # Minimum number of segments with overlap that contain no dropout.
 _LONGEST_SEGMENT = 2**14  # 3.6 ms of an eRTIS, about the length of a call, with lines of 275 Hz.
 _MIN_LINES = 8  # Minimum in the call's band. With fewer lines, echoes may cancel at one microphone by chance.
 _FIRST_LINE = 3  # A Hann window leaks an offset into the lines below.
@@ -33,8 +34,12 @@ def by_spectra(
     found: Sequence[ChannelHealth],
     settings: Settings,
     band_hz: tuple[float, float],
+    missing: Sequence[tuple[int, int]] = (),
 ) -> tuple[list[ChannelHealth], tuple[float, ...], tuple[str, ...], list[Finding]]:
-    """Return channels with spectral statistics, common tones, impossible checks, and findings of level and noise."""
+    """Return channels with spectral statistics, common tones, impossible checks, and findings of level and noise.
+
+    The statistics are those of the segments without ``missing`` parts (first, stop).
+    """
     size = min(_LONGEST_SEGMENT, 2 ** int(math.log2(n_samples / _SEGMENTS)))
     line_hz = settings.recording.sample_rate_hz / size
     low = round(band_hz[0] / line_hz)
@@ -44,7 +49,10 @@ def by_spectra(
     if high - low < _MIN_LINES or low < _FIRST_LINE:
         why = f"{n_samples} samples are too few to resolve the band of {band_hz[0] / 1e3:g} to {band_hz[1] / 1e3:g} kHz"
         return list(found), (), (f"dead microphones, tones and noise: {why}",), []
-    spectra = [_bits.spectrogram(signal_of(item.channel), size=size, n_lines=high) for item in found]
+    intact = _intact(n_samples, size, missing)
+    if intact.sum() < _MIN_INTACT:
+        return list(found), (), ("dead microphones, tones and noise: dropouts leave too few samples",), []
+    spectra = [_bits.spectrogram(signal_of(item.channel), size=size, n_lines=high)[intact] for item in found]
     power = np.stack([lines[:, low:].sum(axis=1, dtype=np.float64) for lines in spectra])
     order = np.argsort(np.median(power, axis=0), kind="stable")
     few = max(1, len(order) // 8)
@@ -65,10 +73,8 @@ def by_spectra(
         unknown = ("a dead microphone: no other channel is available for comparison",)
     elif np.median(_bits.decibels(loud) - noise_db) < MIN_RISE_DB:
         unknown = (f"dead microphones: no sound exceeds the noise by {MIN_RISE_DB:g} dB",)
-
     elif settings.recording.is_pdm and in_limit_cycles(quiet_db):
         unknown = ("dead microphones: the modulators are in limit cycles without noise",)
-
     first = max(_FIRST_LINE, math.ceil(_LOWEST_HZ / line_hz))
     # In the mean of decibels, a permanent tone exceeds intermittent echoes.
     rise_db = _bits.rises(np.stack([_bits.decibels(lines[:, first:]).mean(axis=0) for lines in spectra]))
@@ -93,6 +99,14 @@ def by_spectra(
     findings = noise_findings(reported, quiet_db, white_db=white_db if settings.recording.is_pdm else None)
     findings += flip_findings(reported, floor_db) if settings.recording.is_pdm else []
     return reported, tuple(float((first + line) * line_hz) for line in common), unknown, findings
+
+
+def _intact(n_samples: int, size: int, missing: Sequence[tuple[int, int]]) -> NDArray[np.bool_]:
+    """Return True for each segment that overlaps no missing part."""
+    intact = np.ones((n_samples - size) // (size // 2) + 1, bool)
+    for start, stop in missing:
+        intact[max((start - size) // (size // 2) + 1, 0) : (stop - 1) // (size // 2) + 1] = False
+    return intact
 
 
 def _deaf(

@@ -13,10 +13,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Predictions"]
 
-_EVENTS: Final[dict["Subject", Literal["call_mismatch", "start_mismatch", "layout_mismatch"]]] = {
+_EVENTS: Final[dict["Subject", Literal["call_mismatch", "start_mismatch", "layout_mismatch", "sample_fault"]]] = {
     "call": "call_mismatch",
     "start": "start_mismatch",
     "layout": "layout_mismatch",
+    "samples": "sample_fault",
 }
 
 
@@ -59,7 +60,7 @@ class Predictions:
             call, array = measurement.settings.call, measurement.settings.array
             known = self._checks.get(sensor)
             if known is None or known[:2] != (call, array):
-                known = self._checks[sensor] = (call, array, SoundChecks(thinned=False))
+                known = self._checks[sensor] = (call, array, SoundChecks(thinned=False, live=True))
             for subject, text in known[2].check(measurement):
                 self._found.append(Predicted(sensor=sensor, event=_EVENTS[subject], warning=text))
         except Exception as error:  # noqa: BLE001  a failed check must not end a worker that makes images

@@ -138,7 +138,15 @@ class Predicted(_Note, frozen=True, kw_only=True):
     """Warning about a sensor's images, and the log event that reports it."""
 
     sensor: str
-    event: Literal["error_budget", "call_mismatch", "start_mismatch", "layout_mismatch", "coarse_grid", "check_failed"]
+    event: Literal[
+        "error_budget",
+        "call_mismatch",
+        "start_mismatch",
+        "layout_mismatch",
+        "sample_fault",
+        "coarse_grid",
+        "check_failed",
+    ]
     warning: str
 
 
