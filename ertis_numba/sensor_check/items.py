@@ -210,7 +210,8 @@ def of_call(match: CallMatch | None) -> CheckResult:
     if match.verdict == "matches":
         shown = "but do not show its start, which determines ranges"
         if match.start_error_s is not None:
-            shown = f"which determines ranges to within {50 * match.start_error_s * sound_speed_m_s(Air()):.1f} cm"
+            error_cm = 50 * match.start_error_s * sound_speed_m_s(Air())
+            shown = f"which determines ranges to within {error_cm:.1f} cm if the sample rate is right"
         texts = f"echoes match the call of the settings, {shown}", match.warning
         return CheckResult("ok", "; ".join(filter(None, texts)))
     text, _, rest = match.warning.partition(". ")
