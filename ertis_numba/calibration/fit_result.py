@@ -23,7 +23,7 @@ from ertis_numba.calibration.wavefronts import Target, locate_source, travel_tim
 from ertis_numba.geometry import Layout, unit_vectors
 from ertis_numba.geometry.air import absorption_db_m
 
-__all__ = ["image_contrast_db"]
+__all__ = ["NEPER_DB", "SCALE_S", "PreparedFit", "assembled", "image_contrast_db"]
 
 NEPER_DB: Final = 20 / math.log(10)
 

@@ -19,11 +19,17 @@ from ertis_numba.geometry.waveform import decimation_taps, integer_taps, matched
 from ertis_numba.settings import Processing, Recording, Settings
 
 __all__ = [
+    "PlannedBeams",
     "ahead_of",
+    "aperture_of",
     "beam_grid_of",
     "chain_taps",
     "delay_fit",
+    "estimated",
+    "estimated_errors",
     "few_delays",
+    "fitted",
+    "grid_points",
     "nearest_m_of",
     "ringing_db",
     "spectrum_of",
@@ -200,6 +206,7 @@ def estimated_errors(beams: PlannedBeams) -> tuple[NDArray[np.float64], float]:
 
 
 def estimated(beams: PlannedBeams) -> BeamGrid:
+    """Return a beam grid whose errors are estimated."""
     return BeamGrid(
         beams.aperture,
         beams.spectrum,

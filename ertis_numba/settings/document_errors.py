@@ -13,7 +13,7 @@ from ertis_numba.base import checks
 if TYPE_CHECKING:
     from ertis_numba.settings.documents import TomlDocument, TomlTable
 
-__all__ = []
+__all__ = ["document_error", "line_of_error", "type_error"]
 
 _HEADER = re.compile(r"\s*\[[\w\[. -]*\]")
 

@@ -15,7 +15,7 @@ from ertis_numba.storage._mounting import write_mounting
 from ertis_numba.storage.schema import RECORDING, RECORDING_OF_PCM, Variable
 from ertis_numba.storage.variables import create_variables, set_attributes
 
-__all__ = ["create_sensor_variables"]
+__all__ = ["AIR", "axis_sizes", "create_sensor_variables", "data_and_table", "layout_arrays"]
 
 AIR = {"temperature": "temperature_c", "humidity": "humidity_percent", "pressure": "pressure_pa"}
 

@@ -1,17 +1,22 @@
 """Emitters that are broken or stated wrongly, on platforms in random surroundings."""
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, Final
 
+import numpy as np
+
 from ertis_bench.markdown import table
 from ertis_bench.platform_trials.emitter_rooms import EmitterRoom
+from ertis_bench.platform_trials.known_posts import silence_ratio
 from ertis_bench.platform_trials.platform_scenes import EMITTERS_M
 from ertis_numba.fusion import Fused, Fuser
 
 __all__ = ["form", "run"]
 
 _N_PULSES: Final = 3  # within which a broken emitter is to be named
+_CERTAIN: Final = math.log(1e3)
 _STATED_EVERY: Final = 4  # One of so many platforms also serves for emitters that are stated wrongly.
 
 
@@ -43,7 +48,9 @@ def _healthy(drawn: EmitterRoom, diameter_m: float, other_m: float | None) -> di
     pulses = [drawn.images(pulse, diameter_m, is_broken=False) for pulse in range(_N_PULSES)]
     fuser = Fuser(drawn.mountings, emitter_diameter_m=diameter_m)
     every = [fuser(images) for images in pulses]
+    shown = sum(silence_ratio(drawn, each, diameter_m, pulse, "") for pulse, each in enumerate(pulses))
     found = {
+        "contrary": bool(np.any(np.asarray(shown) > _CERTAIN)),
         "pulses": len(every),
         "accused": sum(bool(each.unheard) for each in every),
         "doubted": len(every[-1].without_own_echo),
@@ -59,10 +66,15 @@ def _healthy(drawn: EmitterRoom, diameter_m: float, other_m: float | None) -> di
 def _broken(drawn: EmitterRoom, diameter_m: float) -> dict[str, int]:
     """Return whether the broken emitter is named, or stated as one without echo, and whether others are named."""
     fuser = Fuser(drawn.mountings, emitter_diameter_m=diameter_m)
-    every: list[Fused] = [fuser(drawn.images(pulse, diameter_m, is_broken=True)) for pulse in range(_N_PULSES)]
+    pulses = [drawn.images(pulse, diameter_m, is_broken=True) for pulse in range(_N_PULSES)]
+    every: list[Fused] = [fuser(images) for images in pulses]
+    shown = sum(silence_ratio(drawn, each, diameter_m, pulse, drawn.broken) for pulse, each in enumerate(pulses))
+    is_decidable = bool(np.asarray(shown)[[*drawn.mountings].index(drawn.broken)] > _CERTAIN)
     names = {name for each in every for name in each.unheard}
     is_named = drawn.broken in names
     return {
+        "decidable": is_decidable,
+        "decided": is_decidable and is_named,
         "named": is_named,
         "stated": is_named or drawn.broken in every[-1].without_own_echo,
         "others": bool(names - {drawn.broken}),
@@ -74,7 +86,9 @@ def form(report: dict[str, Any]) -> str:
     head = [
         "emitters",
         "sensors",
+        "decidable",
         "broken ones named",
+        "decidable ones named",
         "named, or without own echo",
         "others named then",
         "pulses of working emitters with a name",
@@ -86,7 +100,9 @@ def form(report: dict[str, Any]) -> str:
         [
             f"{1000 * row['diameter_m']:g} mm" if row["diameter_m"] else "omnidirectional",
             f"{row['sensors']}",
-            *(f"{row[key]} of {row['platforms']}" for key in ("named", "stated", "others")),
+            *(f"{row[key]} of {row['platforms']}" for key in ("decidable", "named")),
+            f"{row['decided']} of {row['decidable']}",
+            *(f"{row[key]} of {row['platforms']}" for key in ("stated", "others")),
             f"{row['accused']} of {row['pulses']}",
             f"{row['doubted']} of {row['sensors'] * row['platforms']}",
             *(f"{row.get(key, 0)} of {row.get('judged', 0)}" for key in ("contradicted", "found")),
@@ -98,5 +114,9 @@ def form(report: dict[str, Any]) -> str:
         f"seed {report['seed']}, {_N_PULSES} SYNC pulses each. The surroundings are four to eight posts, alone or with "
         "one or two walls, a corridor or a corner with posts, or two to four posts. Platforms move by up to 4 cm from "
         "pulse to pulse. A separate program renders the sound by sums of delayed calls, over at most two walls. "
-        "Sensors without own echo are those of `Fused.without_own_echo` after the last pulse."
+        "Sensors without own echo are those of `Fused.without_own_echo` after the last pulse. A broken emitter is "
+        "decidable for an observer who knows the places and strengths of all posts: at posts that at least two echoes "
+        "of other calls show, echoes of its call are missing, with a likelihood ratio of 1000 or more. This rule names "
+        f"a working emitter on {sum(row['contrary'] for row in report['emitters'])} of "
+        f"{sum(row['platforms'] for row in report['emitters'])} platforms."
     )

@@ -122,8 +122,6 @@ class CentralNode:
         self._next_tick_s = self._next_log_s = self._next_status_s = 0.0
         self.latest = self.status()
 
-    # Life cycle
-
     def __enter__(self) -> Self:
         self._condition.begun_s = time.monotonic()
         try:
@@ -307,8 +305,7 @@ class CentralNode:
         )
 
     def _on_data(self, data: Data, received: ReceivedMessage) -> None:
-        payload = [frame.buffer for frame in received.payload]
-        self._intake.measure(received.sender, data, payload, received.arrived_ns)
+        self._intake.measure(received.sender, data, [frame.buffer for frame in received.payload], received.arrived_ns)
 
     def _on_gap(self, gap: Gap, received: ReceivedMessage) -> None:
         self._intake.miss(received.sender, gap)
@@ -387,8 +384,6 @@ class CentralNode:
         if now_s >= self._next_log_s:
             self._next_log_s = now_s + _LOG_INTERVAL_S
             self._event_reporter.refused(self._server.refused)
-
-    # Properties
 
     @property
     def address(self) -> str:
