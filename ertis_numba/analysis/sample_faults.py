@@ -1,18 +1,126 @@
-"""Faults of samples that a program can count in passing: dropouts, and measurements that repeat the one before."""
+"""Faults of samples: dropouts, in which no channel changes, and measurements that repeat the one before."""
 
-from typing import Any
+import math
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.dropouts import Parts, describe_dropouts, dropouts
 from ertis_numba.frames import Measurement
+from ertis_numba.frames.sample_format import sample_format
+from ertis_numba.geometry import microphones
+from ertis_numba.settings import Settings
 
-__all__ = ["LINK", "SampleFaults", "are_copies"]
+__all__ = [
+    "LINK",
+    "MIN_DROPOUT_NUMBERS",
+    "MIN_DROPOUT_WORDS",
+    "Parts",
+    "SampleFaults",
+    "are_copies",
+    "constant_parts",
+    "describe_dropouts",
+    "dropouts",
+]
 
-LINK = "check the link to the sensor, and record again"
+Parts = list[tuple[int, int]]
+
+MIN_DROPOUT_NUMBERS: Final = 32
+MIN_DROPOUT_WORDS: Final = 1024
+"""Length for PDM; a call of 1 kHz that overloads all modulators changes their bits more often."""
+_CHANCE: Final = 1e-6  # Probability that a record without dropouts has as long a stretch.
+_NEAR: Final = 8  # Samples on either side that are compared with the rest of the record.
+_LEAST_POWER: Final = 0.1  # Power of the changes there, relative to the quiet tenth of the record.
+_AT_ONCE: Final = 0.75  # Share of the channels that must change there.
+LINK: Final = "check the link to the sensor, and record again"
 """Remedy."""
-_FEW = 64  # Samples that are compared first.
+_FEW: Final = 64  # Samples that are compared first.
+
+
+def dropouts(measurement: Measurement, settings: Settings | None = None) -> Parts:
+    """Return the parts (first, stop) of a measurement that are dropouts, without zeros at either end.
+
+    Recorders with a trigger write zeros there.
+    """
+    settings = settings or measurement.settings
+    rows = sample_format(settings).validated(measurement.data, any_length=True)
+    enabled = np.flatnonzero(microphones(settings.array).enabled)
+    parts = constant_parts(rows, enabled, is_pdm=settings.recording.is_pdm)
+    columns = slice(None) if settings.recording.is_pdm else enabled
+    return [
+        (first, stop)
+        for first, stop in parts
+        if (first > 0 and stop < len(rows)) or settings.recording.is_pdm or rows[first, columns].any()
+    ]
+
+
+def constant_parts(rows: NDArray[Any], enabled: NDArray[np.intp], *, is_pdm: bool) -> Parts:
+    """Return the parts (first, stop) of a record, (sample, word), in which no enabled channel changes.
+
+    Such a part is longer than chance permits, and begins and ends within noise or sound: a record without noise is
+    constant between its echoes, which rise and decay gradually. All channels of a part at their extremes are saturated.
+    """
+    shortest = MIN_DROPOUT_WORDS if is_pdm else MIN_DROPOUT_NUMBERS
+    stride = shortest // 2
+    kept = _enabled_bits(rows, enabled) if is_pdm else rows
+    columns = slice(None) if is_pdm or len(enabled) == rows.shape[1] else enabled
+    few = kept[::stride, columns]
+    if not (few[1:] == few[:-1]).all(axis=1).any():  # Every long part contains two of these samples.
+        return []
+    kept = kept[:, columns]
+    changes = np.flatnonzero((kept[1:] != kept[:-1]).any(axis=1))
+    if not len(changes):
+        return []
+    ends = np.concatenate(([-1], changes, [len(kept) - 1]))
+    long = np.flatnonzero(np.diff(ends) >= shortest)
+    parts = [(int(ends[place]) + 1, int(ends[place + 1]) + 1) for place in long]
+    n_outside = len(kept) - sum(stop - first for first, stop in parts)
+    still = max(n_outside - len(changes), 1) / (n_outside + 1)
+    lone = [(first, stop) for first, stop in parts if (stop - first) * math.log(still) < math.log(_CHANCE / len(kept))]
+    return lone if is_pdm else _abrupt(kept, lone, parts)
+
+
+def _enabled_bits(rows: NDArray[Any], enabled: NDArray[np.intp]) -> NDArray[Any]:
+    """Return words with the bits of disabled channels set to 0."""
+    octets = np.zeros(rows.shape[1] * rows.itemsize, np.uint8)
+    np.bitwise_or.at(octets, enabled // 8, np.left_shift(1, enabled % 8).astype(np.uint8))
+    return np.asarray(rows & octets.view(rows.dtype))
+
+
+def _abrupt(rows: NDArray[Any], parts: Parts, others: Parts) -> Parts:
+    """Return the parts of a record that begin and end within noise or sound, with most channels at once."""
+    if not parts:
+        return []
+    steps = np.diff(rows.astype(np.float32), axis=0)
+    moves = np.zeros(len(steps), bool)
+    for first, stop in others:
+        moves[max(first - 1, 0) : stop] = True
+    outside = np.flatnonzero(~moves)
+    power = np.square(steps, out=np.empty_like(steps)).sum(axis=1, dtype=np.float64)
+    blocks = power[outside[: len(outside) // _NEAR * _NEAR]].reshape(-1, _NEAR).mean(axis=1)
+    if not len(blocks):
+        return []
+    quiet, lowest, highest = float(np.quantile(blocks, 0.1)), rows.min(axis=0), rows.max(axis=0)
+    found = []
+    for first, stop in parts:
+        beside = [slice(max(first - _NEAR, 0), first), slice(stop - 1, stop - 1 + _NEAR)]
+        beside = [each for each in beside if len(power[each])]
+        value = rows[first]
+        is_saturated = np.mean((value == lowest) | (value == highest)) > 1 - _AT_ONCE
+        if not is_saturated and all(
+            power[each].mean() >= _LEAST_POWER * quiet > 0 and (steps[each] != 0).any(axis=0).mean() >= _AT_ONCE
+            for each in beside
+        ):
+            found.append((first, stop))
+    return found
+
+
+def describe_dropouts(parts: Sequence[tuple[int, int]]) -> str:
+    """Return a clause on the longest of some dropouts."""
+    first, stop = max(parts, key=lambda part: part[1] - part[0])
+    more = f", and {len(parts) - 1} shorter part{'s' * (len(parts) > 2)}" if len(parts) > 1 else ""
+    return f"samples {first}-{stop - 1}{more} have one value in every channel"
 
 
 class SampleFaults:

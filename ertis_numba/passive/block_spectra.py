@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from ertis_numba.analysis.dropouts import dropouts
+from ertis_numba.analysis.sample_faults import dropouts
 from ertis_numba.base.errors import ArgumentError, DataError
 from ertis_numba.frames import Measurement
 from ertis_numba.kernels import KernelSet, fft

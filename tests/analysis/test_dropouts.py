@@ -6,9 +6,8 @@ from click.testing import CliRunner
 from ertis_cli.main import cli
 
 import ertis_numba as ertis
-from ertis_numba.analysis.dropouts import dropouts
 from ertis_numba.analysis.health import health
-from ertis_numba.analysis.sample_faults import SampleFaults
+from ertis_numba.analysis.sample_faults import SampleFaults, dropouts
 from ertis_numba.analysis.sound_checks import SoundChecks
 from ertis_numba.sensor_check import check_recording
 from ertis_numba.settings import Array, Call, Passive, Processing, Recording, Settings

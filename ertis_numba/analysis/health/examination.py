@@ -10,13 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ertis_numba.analysis import _bits
-from ertis_numba.analysis.dropouts import (
-    MIN_DROPOUT_NUMBERS,
-    MIN_DROPOUT_WORDS,
-    Parts,
-    constant_parts,
-    describe_dropouts,
-)
 from ertis_numba.analysis.health.bits import by_bits
 from ertis_numba.analysis.health.kinds import kind_of
 from ertis_numba.analysis.health.limits import (
@@ -36,6 +29,13 @@ from ertis_numba.analysis.health.repeats import duplicates, hum, repeated_blocks
 from ertis_numba.analysis.health.report import ChannelHealth, Finding, Health
 from ertis_numba.analysis.health.spectra import by_spectra
 from ertis_numba.analysis.health.wavefront import by_wavefront
+from ertis_numba.analysis.sample_faults import (
+    MIN_DROPOUT_NUMBERS,
+    MIN_DROPOUT_WORDS,
+    Parts,
+    constant_parts,
+    describe_dropouts,
+)
 from ertis_numba.base import checks
 from ertis_numba.frames import Measurement
 from ertis_numba.frames.sample_format import sample_format
