@@ -21,7 +21,8 @@ def require_plan(method: str | None) -> None:
     """Raise an error for options that need a plan if the method has none."""
     context = click.get_current_context()
     for name in ("explain", "verify", "max_error_db", "plan") if method == "paper" else ():
-        if typed(name) if name == "plan" else context.params.get(name) not in {None, False}:
+        value = context.params.get(name)
+        if typed(name) if name == "plan" else value is not None and value is not False:  # 0 dB is a budget.
             spelling = f"--{name.removesuffix('_db').replace('_', '-')}"
             raise click.UsageError(f"{spelling} needs --method fast; method 'paper' has no plan", context)
 

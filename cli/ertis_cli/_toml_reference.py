@@ -137,7 +137,7 @@ def _default(kind: type[TomlTable], field: msgspec.structs.FieldInfo) -> Any:
 
 def _key(field: msgspec.structs.FieldInfo, default: Any, kind: str, about: str, example: Any) -> KeyReference:
     kind = kind.partition(", default")[0]
-    parts = None if get_origin(field.type) is Literal else _PARTS.search(kind)
+    parts = None if "Literal" in str(field.type) else _PARTS.search(kind)
     return KeyReference(
         name=field.name,
         about=about,

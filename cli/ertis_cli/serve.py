@@ -170,7 +170,7 @@ def _require_threads(workers: int | str | None) -> None:
     """Refuse a number of threads for the workers of a cluster, which have their own."""
     if isinstance(workers, str) and typed("threads"):
         raise click.UsageError(
-            "--threads is for processes on this machine; remove it with --workers tcp://HOST:PORT",
+            "--threads applies to processes on this machine, not to a dask cluster; remove it, or use --workers N",
             click.get_current_context(),
         )
 

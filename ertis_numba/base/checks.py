@@ -25,6 +25,7 @@ __all__ = [
     "length",
     "positive",
     "reason_unreadable",
+    "scheduler",
     "sensor_name",
     "shape",
     "unknown_choice",
@@ -78,6 +79,16 @@ def integer(name: str, value: int, low: int, high: int | None = None) -> int:
         wanted = f"of at least {low}" if high is None else f"from {low} to {high}"
         raise ArgumentError(f"{name} is {value}; use a whole number {wanted}")
     return int(value)
+
+
+def scheduler(name: str, value: str) -> str:
+    """Check the address of a dask scheduler."""
+    if "://" not in value:
+        raise ArgumentError(
+            f"{name} is {value!r}; pass a number of processes, or the address of a dask scheduler, as in "
+            "'tcp://127.0.0.1:8786'"
+        )
+    return value
 
 
 def length(name: str, value: str, largest: int) -> None:

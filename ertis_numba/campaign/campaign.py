@@ -87,7 +87,7 @@ class Campaign:
         *,
         workers: int | str | None = None,
     ) -> None:
-        self._scheduler = workers if isinstance(workers, str) else None
+        self._scheduler = checks.scheduler("workers", workers) if isinstance(workers, str) else None
         self._workers = None if isinstance(workers, str | None) else checks.integer("workers", workers, 1)
         self.folder, self._options = Path(folder), options or CampaignOptions()
         targets = output_paths(recordings, self.folder, self._options.result)

@@ -239,10 +239,11 @@ class FusionTables:
         return frozenset({*self._emitting} & group.keys() - _key(group)[1])
 
     def evidence(self, group: Mapping[int, Energyscape], solve: Callable[[], PulseReflectors]) -> PulseEvidence:
-        """Return how much better emission of each sensor explains the echoes than its silence; 0 if equally well.
+        """Return the evidence of a pulse on its emitters, which is computed when it is first read.
 
-        Infinite for emitters that echoes prove to work; negatively infinite for unheard ones, and for those without a
-        located echo of their own call.
+        It is how much better emission of each sensor explains the echoes than its silence; 0 if equally well. It is
+        infinite for emitters that echoes prove to work, and negatively infinite for unheard ones, and for those without
+        a located echo of their own call.
         """
         return PulseEvidence(
             self.emitters(group),

@@ -146,9 +146,10 @@ def height_note(array: Array) -> str:
     The azimuth of another reflector is that of the wave at elevation 0 that fits its wave best at the microphones. The
     note has the largest error 5° above or below, at azimuths up to 45°.
     """
+    wrong_deg = math.degrees(_azimuth_error_rad(array))
     return (
-        "directions lie at one elevation, so places and standard deviations are those of reflectors at the height of "
-        f"the sensors; 5° above or below, azimuths are up to {math.degrees(_azimuth_error_rad(array)):.1f}° off"
+        "all directions have elevation 0°, so positions and standard deviations hold for reflectors at the height of "
+        f"the sensors; the azimuth of one 5° above or below is wrong by up to {wrong_deg:.1f}°"
     )
 
 

@@ -63,7 +63,7 @@ class BlockSpectra:
         self._sums = self._memory.zeros((len(self.bins), n_mics, n_mics), np.complex64)
 
     def products(self, measurement: Measurement, *, masked: bool) -> Products:
-        """Return the sums over the blocks of a measurement without dropouts, and of the call if masked."""
+        """Return the sums over the blocks without dropouts; if masked, without those of the call."""
         heard = self._read(measurement, out=self._heard)
         hop = self._n_block // 2
         first = self._read.n_masked if masked else 0

@@ -31,7 +31,7 @@ _LEAKED_SHARES: Final = (0.5, 0.1, *(1e-3 * (3 / apart) ** 6 for apart in range(
 _MAX_COHERENCE: Final = 1 - 1e-9
 _FALSE_SHARE: Final = 5e-4  # Share of frequencies by chance among the coherent ones.
 _ALONE: Final = 0.01  # Probability by chance of coherent neighbours.
-_SINGLE_EVENT: Final = 2.2
+_LEAST_LOUD: Final = 2.2  # Effective number of loud blocks, below which the sound may be a single click.
 _DISTORTION: Final = 0.3  # Error of the delay of signals of one step, in samples …
 _COARSE: Final = 1 / 6  # … and the step relative to their deviation that has no effect.
 _LIMITED: Final = 5e-3  # Share of samples at the extremes of a limited signal.
@@ -288,7 +288,7 @@ class _Correlator:
         # A coherence that noise may reach by chance does not tell which of several maxima is right.
         by_chance = 1 - _BY_CHANCE ** (1 / n_free)
         evidence = np.maximum(1 - by_chance / np.maximum(coherence, _TINY), 0.0)
-        is_known = is_coherent and n_blocks > 2 and self._n_loud(first, second) > _SINGLE_EVENT
+        is_known = is_coherent and n_blocks > 2 and self._n_loud(first, second) > _LEAST_LOUD
         return Bins(self._n_block, cross, weights, most, ratio / (1 + ratio), evidence, is_known)
 
     def _n_loud(self, *spectra: NDArray[np.complex64]) -> float:

@@ -20,7 +20,7 @@ from ertis_numba.journal.storage_processes import FromSealing, Sealed, SealingPr
 from ertis_numba.processes import connect, is_child
 from ertis_numba.storage.sealing import PART_TOKEN, seal
 
-__all__ = ["FAILED", "INTERRUPTED", "IN_USE", "NO_MEASUREMENTS", "GradualSync", "gradual_unlink", "main"]
+__all__ = ["FAILED", "INTERRUPTED", "IN_USE", "NO_MEASUREMENTS", "main"]
 
 FAILED, INTERRUPTED = 1, 130
 
@@ -31,6 +31,11 @@ IN_USE = 75
 """Exit code for a journal that another process has open: EX_TEMPFAIL of sysexits.h, try again later."""
 
 _STEPS = 100  # Number of progress reports.
+
+_NICE: Final = 19  # The lowest priority.
+_STEP_BYTES: Final = 4_000_000
+_SHRINK_BYTES: Final = 32_000_000
+_MAX_PAUSE_S: Final = 0.5
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -64,7 +69,7 @@ def _serve() -> int:
 
 def _seal(request: SealJournal, report: Callable[[FromSealing], None]) -> int:
     recording = request.journal.with_name(request.journal.name.removesuffix(SUFFIX))
-    pace = None if request.rests is None else GradualSync(temporary_path(recording, PART_TOKEN), request.rests)
+    pace = None if request.rests is None else _GradualSync(temporary_path(recording, PART_TOKEN), request.rests)
 
     def progress(done: int, of: int) -> None:
         if pace is not None:
@@ -73,7 +78,7 @@ def _seal(request: SealJournal, report: Callable[[FromSealing], None]) -> int:
             report(SealingProgress(done, of))
 
     try:
-        with nullcontext() if request.rests is None else gradual_unlink(request.journal, request.rests):
+        with nullcontext() if request.rests is None else _gradual_unlink(request.journal, request.rests):
             sealed = seal(request.journal, overwrite=request.overwrite, progress=progress)
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -119,17 +124,7 @@ def _printable(text: str) -> str:
     return text.encode(errors="backslashreplace").decode()
 
 
-if __name__ == "__main__":
-    sys.exit(_serve() if is_child() else main())
-
-
-_NICE: Final = 19  # The lowest priority.
-_STEP_BYTES: Final = 4_000_000
-_SHRINK_BYTES: Final = 32_000_000
-_MAX_PAUSE_S: Final = 0.5
-
-
-class GradualSync:
+class _GradualSync:
     """Gradual sync of a growing file, which need not exist yet, with a pause of ``rests`` times each step's duration.
 
     A single sync would write all buffered data at once, and the sync of another small file would have to wait. A
@@ -165,7 +160,7 @@ def _sync_data(path: Path) -> None:
 
 
 @contextmanager
-def gradual_unlink(path: Path, rests: float) -> Iterator[None]:
+def _gradual_unlink(path: Path, rests: float) -> Iterator[None]:
     """Truncate a file in steps if the block removes it, because freeing gigabytes at once blocks the disk."""
     if os.name != "posix" or not path.exists():
         yield
@@ -181,3 +176,7 @@ def gradual_unlink(path: Path, rests: float) -> Iterator[None]:
             time.sleep(min(rests * (time.monotonic() - begun_s), _MAX_PAUSE_S))
     finally:
         os.close(descriptor)
+
+
+if __name__ == "__main__":
+    sys.exit(_serve() if is_child() else main())

@@ -104,12 +104,12 @@ def test_damage_within_a_batch_is_reported_and_leaves_no_file(recording, tmp_pat
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]
 
 
-def test_failure_within_a_batch_leaves_no_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(sensor_processing, "MAX_WAITING_BYTES", 1)  # one image at a time
+def test_failure_within_a_batch_leaves_no_file(recording, tmp_path, limit):
+    limit(2)
     measurements = noise(count=5)
     warm = SMALL.replace(air=Air(temperature_c=35.0))
     measurements[3] = noise(warm, count=5)[3]
-    recording = write_recording(tmp_path / "rec.h5", measurements)
+    write_recording(recording, measurements, overwrite=True)
     done = run(recording, "-o", tmp_path / "img.h5", *FAST, code=1)
     assert "measurement 13 was taken at 35 °C" in done.stderr
     assert [item.name for item in tmp_path.iterdir()] == ["rec.h5"]

@@ -252,10 +252,11 @@ def test_sealing_follows_no_link(tmp_path, name):
     assert (tmp_path / "victim").read_text() == "precious"
 
 
-def test_sealing_runs_in_its_own_process(tmp_path):
+@pytest.mark.parametrize("options", [(), ("--rests", "0.5")], ids=["at once", "in steps"])
+def test_sealing_runs_in_its_own_process(tmp_path, options):
     path, _ = two_sensors(tmp_path)
     code = "import runpy; runpy.run_module('ertis_numba.storage.sealing_process', run_name='__main__')"
-    done = python(code, path, "--json")
+    done = python(code, path, "--json", *options)
     assert (done.returncode, done.stderr) == (0, "")
     *progress, result = map(json.loads, done.stdout.splitlines())
     assert progress == [{"done": number + 1, "of": 5} for number in range(5)]

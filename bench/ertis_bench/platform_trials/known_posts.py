@@ -1,4 +1,4 @@
-"""Broken emitters as an observer sees them who knows all posts: the limit of what images can show.
+"""Detection of broken emitters by an observer that knows all posts, as a limit for detection from images.
 
 Amplitudes of echoes follow from the places and strengths of posts, from the call and from the emitters. A rendered
 post determines their scale.

@@ -42,7 +42,9 @@ class ProcessingOptions:
         checks.positive("prepare_s", self.prepare_s)
         for name in ("workers", "threads"):
             value = getattr(self, name)
-            if value is not None and not (name == "workers" and isinstance(value, str)):
+            if name == "workers" and isinstance(value, str):
+                checks.scheduler(name, value)
+            elif value is not None:
                 checks.integer(name, value, 1, 256)
         if self.quarantine is not None and not self.quarantine.is_dir():
             raise ArgumentError(f"quarantine folder {self.quarantine} does not exist; create it first")
