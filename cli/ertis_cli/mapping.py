@@ -139,7 +139,7 @@ def mapping(
                 mapper.add(images.values(), trajectory)
                 truth.add(images, {name: place.index for name, place in group.items()})
     occupancy = mapper.map
-    contradiction = _note_echoes(mapper, len(located), quiet=quiet)
+    warned = _warn(mapper, len(located), quiet=quiet)
     if height_m is not None and not mapper.n_points and mapper.n_empty < len(located):
         _report_heights(occupancy, height_m, quiet=quiet)
     _pulses.note_truth(truth, quiet=quiet)
@@ -154,21 +154,23 @@ def mapping(
         "without_own_echo": mapper.without_own_echo,
         "simulated": placed is not None and target.suffix.lower() == ".h5",
         "notes": list(trajectory.notes),
-        "warnings": [] if contradiction is None else [contradiction],
+        "warnings": warned,
     }
     options.say(_summary(target, len(located), report), quiet=quiet)
     if as_json:
         options.print_json(report)
 
 
-def _note_echoes(mapper: "Mapper", n_pulses: int, *, quiet: bool) -> str | None:
-    """Report pulses and sensors without echoes, and return the warning of wrong emitters, or None."""
-    if contradiction := mapper.emitter_warning():
-        options.warn(contradiction)
+def _warn(mapper: "Mapper", n_pulses: int, *, quiet: bool) -> list[str]:
+    """Report pulses and sensors without echoes, and return the warnings of wrong emitters and poses."""
+    contradiction = mapper.emitter_warning()
+    warned = [each for each in (contradiction, mapper.pose_warning()) if each]
+    for each in warned:
+        options.warn(each)
     _pulses.note_empty(mapper.n_empty, n_pulses, quiet=quiet)
     if mapper.n_empty < n_pulses and not contradiction:
         _pulses.note_without_own_echo(mapper.without_own_echo, n_pulses, quiet=quiet)
-    return contradiction
+    return warned
 
 
 def _report_heights(occupancy: "OccupancyMap", height_m: tuple[float, float], *, quiet: bool) -> None:

@@ -21,6 +21,7 @@ from ertis_numba.mapping.coverage import Coverage, heard_m
 from ertis_numba.mapping.echoes import LocatedEchoes, UsualAmplitude, View, displaced_covariance, echoes_of
 from ertis_numba.mapping.sensor_model import add_evidence
 from ertis_numba.motion import compensate_motion
+from ertis_numba.motion.pose_check import PoseCheck
 
 if TYPE_CHECKING:
     from ertis_numba.settings import Air, Call
@@ -112,7 +113,7 @@ class Mapper:
         self._emitters: dict[tuple[Call, Air], Emitters] = {}
         self._n_groups, self._time_ns, self._n_points, self._n_empty = 0, 0, 0, 0
         self._without_own_echo: Counter[str] = Counter()
-        self._attitude = AttitudeCheck()
+        self._attitude, self._motion = AttitudeCheck(), PoseCheck(mountings)
 
     @property
     def map(self) -> OccupancyMap:
@@ -141,6 +142,10 @@ class Mapper:
         It is None if fused pulses were added; ask their `Fuser`.
         """
         return self._fuser.emitter_warning()
+
+    def pose_warning(self) -> str | None:
+        """Return a warning if the echoes of some pulses contradict the motion of the trajectory, with likely causes."""
+        return self._motion.warning()
 
     def add(self, images: Iterable[Energyscape], pose: Pose, *, fused: Fused | None = None) -> None:
         """Add the images of one SYNC pulse.
@@ -181,6 +186,8 @@ class Mapper:
         time_ns = fused.stamp.timestamp_ns
         translation_m, rotation, covariance = _pose(pose, time_ns)
         self._attitude(pose, translation_m, rotation)
+        if isinstance(pose, Trajectory):
+            self._motion.add(group, pose)
         view = self._view(translation_m, rotation, covariance)
         points = _at_rest(fused.points, pose, rotation) if isinstance(pose, Trajectory) else fused.points
         echoes = self._echoes(points, translation_m, rotation, view)
