@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import click
 
 from ertis_cli import _image_options, _tables, options
-from ertis_cli.completion import completion
 
 if TYPE_CHECKING:
     from ertis_cli._toml_reference import TableReference
@@ -18,6 +17,22 @@ if TYPE_CHECKING:
 __all__ = ["reference"]
 
 _WIDTH = 100
+
+
+@click.command()
+@click.argument("shell", type=click.Choice(["bash", "fish", "zsh"]))
+@click.pass_context
+def completion(ctx: click.Context, *, shell: str) -> None:
+    """Print a script that completes commands and options in a shell.
+
+    For bash, add eval "$(ertis reference completion bash)" to ~/.bashrc. For zsh, add eval "$(ertis reference
+    completion zsh)" to ~/.zshrc, after 'autoload -U compinit; compinit'. For fish, save the output as
+    ~/.config/fish/completions/ertis.fish.
+    """
+    from click.shell_completion import BashComplete, FishComplete, ZshComplete
+
+    how = {"bash": BashComplete, "fish": FishComplete, "zsh": ZshComplete}[shell]
+    click.echo(how(ctx.find_root().command, {}, "ertis", "_ERTIS_COMPLETE").source())
 
 
 @click.command()

@@ -1,7 +1,7 @@
 # Public names; __init__.py imports each of them at its first use.
 
-from .campaign import Campaign as Campaign
-from .events import (
+from .campaign import (
+    Campaign as Campaign,
     Event as Event,
     RecordingEnded as RecordingEnded,
     RecordingProgress as RecordingProgress,

@@ -5,13 +5,12 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from ertis_numba.base import checks
 from ertis_numba.base.errors import ErtisError
 from ertis_numba.base.forks import usable_cores
 from ertis_numba.campaign.echo_measurements import count_images, no_images, passive_note, require_images
-from ertis_numba.campaign.events import Event, Outcome, RecordingEnded, RecordingProgress, RecordingStarted
 from ertis_numba.campaign.existing_output import difference
 from ertis_numba.campaign.folder import clear_parts, exclusive_folder
 from ertis_numba.campaign.plans import Plans
@@ -32,6 +31,52 @@ __all__ = ["Campaign"]
 
 _WAIT_S: Final = 0.5
 _N_INSPECTED_AHEAD: Final = 2  # Recordings inspected in advance, so that no worker waits.
+
+
+Outcome = Literal["made", "kept", "skipped", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingStarted:
+    """Processing of a recording has begun."""
+
+    recording: Path
+    measurements: int
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingProgress:
+    """Number of processed measurements of a recording."""
+
+    recording: Path
+    done: int
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingEnded:
+    """Result of a recording.
+
+    Attributes
+    ----------
+    recording, output : Path
+        Recording, and its energyscape file or file of acoustic maps.
+    outcome : {"made", "kept", "skipped", "failed"}
+        ``kept`` means that the output exists, made with the same settings and versions. ``skipped`` means a
+        result of processing, or a recording without images, that was not given by name.
+    error : str
+        Reason of a failure in one line; empty otherwise.
+    made : dict
+        Measurements, times and other results of a processed recording; results of the checks for an existing output.
+    """
+
+    recording: Path
+    output: Path
+    outcome: Outcome
+    error: str = ""
+    made: dict[str, Any] = field(default_factory=dict)
+
+
+Event = RecordingStarted | RecordingProgress | RecordingEnded
 
 
 @dataclass(slots=True, eq=False)
