@@ -68,7 +68,7 @@ class PositionUncertainty:
       weighted beam, at the same power of noise in the image.
 
     The images of other points at about the same range disturb a point, like noise of their amplitude there, and so do
-    echoes on the slopes of its pulse: see `ertis_numba.analysis.other_echoes`. A deviation of the bins that neither
+    echoes on the slopes of its pulse: see `listed_echoes`. A deviation of the bins that neither
     these nor noise explain is a sign of two echoes in one maximum. It adds errors as measured
     for random pairs of echoes, 6° to 10° apart for an eRTIS: about half of their distance. Pairs whose sum has the
     shape of one echo are not recognised.
