@@ -204,8 +204,10 @@ def _usual(source: str, rows: _Rows, *, has_index: bool) -> list[ColumnHeading]:
             f"{source}, line {rows[0][0]}: {', '.join(rows[0][1])} may be column numbers or a position; replace the "
             f"line by a header, such as {HEADER_EXAMPLES}, or write the position with decimal points"
         )
-    for place, axis in enumerate(AXES[-n_axes:], int(has_labels)):
-        require_no_count(source, [cells[place] for _, cells in rows], place, axis)
+    columns = list(zip(*(cells for _, cells in rows), strict=True))[has_labels:]
+    if all(_is_number(cell) and math.isfinite(float(cell)) for column in columns for cell in column):
+        for place, (column, axis) in enumerate(zip(columns, AXES[-n_axes:], strict=True), int(has_labels)):
+            require_no_count(source, column, place, axis)
     return [ColumnHeading()] * has_labels + [ColumnHeading(axis, axis) for axis in AXES[-n_axes:]]
 
 

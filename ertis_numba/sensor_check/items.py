@@ -171,12 +171,16 @@ def of_storage(stored: SensorReport) -> CheckResult:
         add(f"{count} of {stored.measurements} measurements {'is' if count == 1 else 'are'} damaged", COPY)
     if stored.out_of_order:
         add(f"{counted(len(stored.out_of_order), 'measurement')} out of order", "record again")
-    if stored.copies:
-        count = len(stored.copies)
+    count = len(stored.copies)
+    all_equal = 0 < count == stored.measurements - 1
+    if count and not all_equal:
         kind = "are copies" if count > 1 else "is a copy"
         add(f"{count} of {stored.measurements} measurements {kind} of the one before in every sample", LINK_REMEDY)
     if stored.remark:
         add(stored.remark, COPY)
+    if all_equal and not faults:  # An emulated sensor repeats the measurement of its scene.
+        text = f"all {stored.measurements} measurements are equal in every sample, as those of an emulated sensor are"
+        return CheckResult("not known", f"{text}; a real one that sends them has stopped")
     return _result_of(faults, f"{stored.measurements} stored, none missing or damaged")
 
 

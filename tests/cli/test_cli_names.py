@@ -52,7 +52,7 @@ USAGE = {
     "sensors emulate r.h5 --unplug nan:5": "Invalid value for '--unplug': 'nan:5' is not an absence; use two times",
     "sensors emulate r.h5 --unplug -1:5": "Invalid value for '--unplug': '-1:5' is not an absence; use two times",
     "serve --method paper --plan measured": "--plan needs --method fast; method 'paper' has no plan",
-    "serve --workers tcp://127.0.0.1:9 --threads 2": "--threads is for processes on this machine; remove it with --w",
+    "serve --workers tcp://127.0.0.1:9 --threads 2": "--threads applies to processes on this machine, not",
     "view i.h5 --clean within=nan": "Invalid value for '--clean': 'within=nan': use a finite number",
     "view i.h5 --clean above-mean=6": (
         "Invalid value for '--clean': 'above-mean=6' is not an option of --clean; use within=DB,above_mean=DB, or one"
