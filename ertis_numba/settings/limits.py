@@ -47,7 +47,10 @@ def checker(kind: Any) -> _Check | None:
 
         return lambda name, value: checks.choice(name, value, parts)
     if origin in {Union, types.UnionType}:
-        found = {get_origin(part) is Literal: check for part in parts if (check := checker(part)) is not None}
+        every = [(get_origin(part) is Literal, check) for part in parts if (check := checker(part)) is not None]
+        found = dict(every)
+        if len(found) < len(every):
+            raise TypeError(f"{kind} has two parts with limits; declare one of them only")
         return _of_kind(found.get(True), found.get(False)) if found else None
     if origin is tuple:
         return _of_items(parts)

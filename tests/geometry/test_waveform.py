@@ -180,6 +180,20 @@ def test_band_edges_change_an_echo_as_documented(row, duration_s, ramp_fraction)
     assert " | ".join((f"| {row}", *(f"−{-each:.0f} dB" for each in found_db), "")).strip() in page("accuracy")
 
 
+@pytest.mark.parametrize(
+    ("call", "band_edges_hz", "difference_db"),
+    [
+        (LOW, None, -58.0),
+        (LOW, (5e3, 90e3), -81.2),
+        (Call(duration_s=2e-4), None, -24.1),
+        (Call(duration_s=2e-4), (5e3, 90e3), -37.6),
+    ],
+    ids=["default", "default, wide band", "0.2 ms", "0.2 ms, wide band"],
+)
+def test_errors_of_band_edges_stay_the_same(call, band_edges_hz, difference_db):
+    assert band_edge_error_db(call, band_edges_hz) == pytest.approx(difference_db, abs=0.2)
+
+
 def band_edge_error_db(call, band_edges_hz):
     """The comparison is with the textbook matched filter, which has no band limits."""
     n_fft = 2**17

@@ -52,4 +52,4 @@ def test_pictures_are_the_outputs_of_their_commands(scene, tmp_path):
         size = kept.width // BLOCK_PX, kept.height // BLOCK_PX
         first, second = (np.asarray(each.resize(size, Image.Resampling.BOX), float) for each in (kept, drawn))
         assert np.corrcoef(first.ravel(), second.ravel())[0, 1] > 0.995, name
-        assert np.corrcoef(first.ravel(), second[:, ::-1].ravel())[0, 1] < 0.7, name
+        assert np.corrcoef(first.ravel(), second[:, ::-1].ravel())[0, 1] < 0.6, name
