@@ -35,6 +35,7 @@ _LEAST_POWER: Final = 0.1  # Power of the changes there, relative to the quiet t
 _AT_ONCE: Final = 0.75  # Share of the channels that must change there.
 LINK: Final = "check the link to the sensor, and record again"
 """Remedy."""
+_AT_A_TIME: Final = 2**16  # Rows.
 _FEW: Final = 64  # Samples that are compared first.
 
 
@@ -69,16 +70,29 @@ def constant_parts(rows: NDArray[Any], enabled: NDArray[np.intp], *, is_pdm: boo
     if not (few[1:] == few[:-1]).all(axis=1).any():  # Every long part contains two of these samples.
         return []
     kept = kept[:, columns]
-    changes = np.flatnonzero((kept[1:] != kept[:-1]).any(axis=1))
-    if not len(changes):
+    parts, n_changes = _still_parts(kept, shortest)
+    if not n_changes:
         return []
-    ends = np.concatenate(([-1], changes, [len(kept) - 1]))
-    long = np.flatnonzero(np.diff(ends) >= shortest)
-    parts = [(int(ends[place]) + 1, int(ends[place + 1]) + 1) for place in long]
     n_outside = len(kept) - sum(stop - first for first, stop in parts)
-    still = max(n_outside - len(changes), 1) / (n_outside + 1)
+    still = max(n_outside - n_changes, 1) / (n_outside + 1)
     lone = [(first, stop) for first, stop in parts if (stop - first) * math.log(still) < math.log(_CHANCE / len(kept))]
     return lone if is_pdm else _abrupt(kept, lone, parts)
+
+
+def _still_parts(rows: NDArray[Any], shortest: int) -> tuple[Parts, int]:
+    """Return the long parts in which no channel changes, and the number of changes, with little memory."""
+    parts, n_changes, begun = [], 0, 0
+    for start in range(0, len(rows) - 1, _AT_A_TIME):
+        piece = rows[start : start + _AT_A_TIME + 1]
+        ends = start + 1 + np.flatnonzero((piece[1:] != piece[:-1]).any(axis=1))
+        n_changes += len(ends)
+        edges = np.concatenate(([begun], ends))
+        long = np.flatnonzero(np.diff(edges) >= shortest)
+        parts += [(int(edges[place]), int(edges[place + 1])) for place in long]
+        begun = int(edges[-1])
+    if len(rows) - begun >= shortest:
+        parts.append((begun, len(rows)))
+    return parts, n_changes
 
 
 def _enabled_bits(rows: NDArray[Any], enabled: NDArray[np.intp]) -> NDArray[Any]:

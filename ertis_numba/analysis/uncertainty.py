@@ -15,7 +15,7 @@ from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.geometry.waveform import matched_noise_spectrum
 from ertis_numba.settings import Settings
 
-__all__ = ["PositionUncertainty", "Uncertainty"]
+__all__ = ["PositionUncertainty", "Uncertainty", "listed_echoes", "unlisted_echoes"]
 
 _WAVES = 64  # Number of frequencies of the call's band from which its widths are computed.
 # Errors of a maximum that is two echoes, relative to the widths of pulse and main lobe, and to the root of the misfit.

@@ -27,7 +27,7 @@ from ertis_numba.campaign.tasks import (
 from ertis_numba.geometry import self_contained
 from ertis_numba.settings import Accuracy, Settings
 
-__all__ = ["Campaign"]
+__all__ = ["Campaign", "Event", "RecordingEnded", "RecordingProgress", "RecordingStarted"]
 
 _WAIT_S: Final = 0.5
 _N_INSPECTED_AHEAD: Final = 2  # Recordings inspected in advance, so that no worker waits.

@@ -27,6 +27,7 @@ __all__ = [
     "natural_order",
     "per_file",
     "require_alike",
+    "true_rate_hz",
 ]
 
 _ACOULAR: Final = {".h5", ".hdf5", ".hdf"}

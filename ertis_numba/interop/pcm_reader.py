@@ -14,7 +14,7 @@ from ertis_numba.interop.pcm_cuts import Cuts
 from ertis_numba.interop.pcm_files import PcmFile, per_file
 from ertis_numba.settings import Settings
 
-__all__ = ["PcmReader"]
+__all__ = ["PcmReader", "SampleLevels"]
 
 
 _MIN_CLIPPED: Final = 5  # Fewer samples at full scale may be the single peaks of a normalised file.

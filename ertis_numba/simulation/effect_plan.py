@@ -20,7 +20,7 @@ from ertis_numba.simulation.snapshot import Snapshot, snapshot
 from ertis_numba.simulation.source_paths import AnySource, SourceInScene, all_sources
 from ertis_numba.simulation.sources import Sonar
 
-__all__ = ["EffectPlan", "Verdict", "make_plan"]
+__all__ = ["EffectPlan", "Verdict", "change_of_sources", "make_plan"]
 
 ABRender = Callable[[int, str, frozenset[str], str], float | None]
 RenderAB = Callable[[], ABRender]

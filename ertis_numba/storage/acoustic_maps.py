@@ -19,7 +19,14 @@ from ertis_numba.storage.recording import Mounting, RecordingReader
 from ertis_numba.storage.schema import ACOUSTIC_MAP, BEARINGS, POSES, Variable
 from ertis_numba.storage.variables import create_variables, set_attributes, to_python
 
-__all__ = ["AcousticMapReader", "AcousticMapWriter", "open_acoustic_maps", "write_acoustic_maps"]
+__all__ = [
+    "AcousticMapReader",
+    "AcousticMapWriter",
+    "BearingReader",
+    "open_acoustic_maps",
+    "write_acoustic_maps",
+    "write_bearings",
+]
 
 BEARING_SIZES: Final = {"angle": 2, "edge": 2}
 """Lengths of the axes of bearings."""
@@ -68,6 +75,7 @@ class BearingReader:
             raise DamagedError(f"{path}: bearing_count does not match the number of bearings; copy the file again")
 
     def __call__(self, index: int) -> tuple[Bearing, ...]:
+        """Return the bearings of a map."""
         return tuple(self._bearing(row) for row in range(self._bounds[index], self._bounds[index + 1]))
 
     def _bearing(self, row: int) -> Bearing:

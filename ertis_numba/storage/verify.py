@@ -18,7 +18,7 @@ from ertis_numba.storage.recording import JOURNAL_DAMAGE, RecordingReader, open_
 from ertis_numba.storage.schema import POSES, RECORDING, RECORDING_OF_PCM
 from ertis_numba.storage.structure import require_attributes, stored_bytes
 
-__all__ = ["DamagedMeasurement", "SensorReport", "verify"]
+__all__ = ["DamagedMeasurement", "SensorReport", "find_damage", "verify"]
 
 _MAX_BYTES: Final = 16 * 2**20  # Limit for a dataset that no table names.
 _DIMS: Final = {variable.name: variable.dims for variable in (*RECORDING, *RECORDING_OF_PCM, *POSES)}

@@ -38,10 +38,16 @@ def run(*arguments, code=0):
     return done
 
 
+def numbered(measurement, number, behaviour="active"):
+    """A measurement with its stamp, and with a bit that tells it from others, because sound never repeats itself."""
+    words = measurement.data.copy()
+    words[number] ^= 1
+    return dataclasses.replace(measurement, data=words, stamp=dataclasses.replace(stamp(number), behaviour=behaviour))
+
+
 def stored(path, *measurements, **options):
     """Write measurements with regular stamps."""
-    given = [dataclasses.replace(each, stamp=stamp(number)) for number, each in enumerate(measurements)]
-    return write_recording(path, given, **options)
+    return write_recording(path, [numbered(each, number) for number, each in enumerate(measurements)], **options)
 
 
 def verdict_of(path):
@@ -92,7 +98,7 @@ def test_healthy_recordings_are_fit_for_use(tmp_path):
 def passive(path, *measurements, active=()):
     """Write measurements without a call, after others with a call."""
     given = [
-        dataclasses.replace(each, stamp=dataclasses.replace(stamp(number), behaviour=behaviour))
+        numbered(each, number, behaviour)
         for number, (each, behaviour) in enumerate(
             [*((each, "active") for each in active), *((each, "passive") for each in measurements)]
         )

@@ -19,7 +19,7 @@ from ertis_numba.geometry import Layout, microphones
 from ertis_numba.geometry.air import sound_speed_m_s
 from ertis_numba.settings import Settings
 
-__all__ = ["by_array", "by_wavefront"]
+__all__ = ["Coherence", "aligned", "by_array", "by_wavefront", "correlate", "half_bands", "mean_of"]
 
 _COMPACT_SHARE = 0.75  # Minimum share of the microphones that a wavefront must fit.
 _MIN_PATH_M = 0.2  # Minimum path of an echo; shorter paths are indistinguishable from the direct sound.

@@ -11,7 +11,7 @@ from ertis_numba.simulation.estimates import Estimate, noise
 from ertis_numba.simulation.image_estimate import Sight
 from ertis_numba.simulation.snapshot import Snapshot
 
-__all__ = ["estimate", "loudness", "sounds"]
+__all__ = ["OverlappingFrames", "band_bins", "drawn", "estimate", "loudness", "sounds", "window"]
 
 Floats = NDArray[np.float64]
 
