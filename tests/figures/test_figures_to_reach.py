@@ -32,6 +32,16 @@ def ratio(command, *, times, promised, **options):
     return best_ratio(once, times=times, promised=promised), stated[-1]
 
 
+@pytest.fixture(autouse=True)
+def _environment_of_a_user(monkeypatch):
+    """Give child processes the threads of BLAS that users have.
+
+    Tests that import ``ertis bench`` set one thread for it, which takes a third off the imports, and nothing off other
+    commands.
+    """
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+
+
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """One default measurement."""
