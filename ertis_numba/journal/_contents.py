@@ -24,11 +24,7 @@ _SELECTION: Final = select_statement("measurements", "WHERE id = ?")
 
 
 def _recording_name(journal: str, target: str) -> str:
-    """Return the name of the recording to be made from a journal, in the folder of the journal.
-
-    The path stored in a journal may be malicious: it is used only if the journal's own name lacks the suffix, and then
-    only its last part.
-    """
+    """Return the name of the recording to be made from a journal, in the folder of the journal."""
     if journal.endswith(SUFFIX) and journal != SUFFIX:
         return journal.removesuffix(SUFFIX)
     name = re.split(r"[/\\\0]", target)[-1]

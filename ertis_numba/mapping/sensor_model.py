@@ -202,11 +202,7 @@ def _log_odds(window: Window, view: View, offset_m: Floats) -> Singles:
 
 
 def _occupied(window: Window, view: View, echoes: LocatedEchoes, log_odds: Floats, trust: Trust) -> Singles:
-    """Return the evidence for occupied cells: (layer, row, column).
-
-    Each echo is normally distributed, and the evidence of a cell is proportional to the density at its middle. An
-    uncertain pose spreads the evidence of an echo: the sum over all cells remains, and the highest value falls.
-    """
+    """Return the evidence for occupied cells: (layer, row, column)."""
     n_axes = 2 if window.is_planar else 3
     offset_m = echoes.offset_m @ view.rotation.T
     # Places within a cell are uniformly distributed.

@@ -39,11 +39,7 @@ def twist_of(displacement: Floats, time_s: float) -> Floats:
 def _predicted(
     displacement: Floats, before: GroupEchoes, offset_m: Floats, first: Floats, second: Floats
 ) -> tuple[Floats, Floats]:
-    """Return range and azimuth of echoes after trial displacements (trial, 3): two (trial, echo).
-
-    Echoes are placed where they were at the first emission, and then where they appear after the second one, as
-    `compensate_motion` describes. Twists at both groups are (trial, 3) or (1, 3).
-    """
+    """Return range and azimuth of echoes after trial displacements (trial, 3): two (trial, echo)."""
     from_sensor_m = before.position_m - offset_m
     x_m, y_m = _turned(from_sensor_m[:, 0], from_sensor_m[:, 1], first[:, 2:] * before.arrival_s)
     way_x_m, way_y_m = _way_m(x_m, y_m, first, offset_m, before.range_m, before.delay_s, before.arrival_s)

@@ -220,11 +220,7 @@ class RosPublisher:
         return 1
 
     def _publish_points(self, item: Energyscape | PointCloud) -> int:
-        """Publish the points of a sensor; return the number of published messages.
-
-        If only points arrive, those of all sensors of a pulse are published once they are complete. Their rate is
-        limited afterwards, because messages that are left out of the topics of sensors need not be of the same pulses.
-        """
+        """Publish the points of a sensor; return the number of published messages."""
         stamp, place = item.stamp, self._frames[item.stamp.sensor]
         is_due = self._is_due("points", stamp.sensor, stamp.timestamp_ns)
         is_joined = isinstance(item, PointCloud) and len(self._known_mountings) > 1 and place is not None

@@ -42,11 +42,7 @@ def _near_targets(shot: Snapshot) -> list[str]:
 
 
 def _near_discs(shot: Snapshot) -> list[str]:
-    """Return a note for each disc that is too close for Fresnel's approximation.
-
-    The first neglected term is a phase of ``k a⁴ / (4 r³)`` at the edge of a disc of radius a. It must not exceed an
-    eighth of a turn.
-    """
+    """Return a note for each disc that is too close for Fresnel's approximation."""
     targets = shot.targets
     wave = 2 * math.pi * shot.sensor.call.high_frequency_hz / shot.speed_m_s
     apart_m = np.linalg.norm(targets.positions_m - shot.receiver.centre_m, axis=1)

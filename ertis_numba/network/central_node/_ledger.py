@@ -194,11 +194,7 @@ class Ledger:
 
 
 def _newest(acked_through: Mapping[SensorSession, int]) -> dict[SensorSession, int]:
-    """Return the newest sessions of each sensor, in their order.
-
-    A discarded session matters only if its sensor resumes it after that many others: numbers whose ack the node has
-    missed are then stored a second time.
-    """
+    """Return the newest sessions of each sensor, in their order."""
     counts: Counter[str] = Counter()
     kept: list[SensorSession] = []
     for run in list(acked_through)[: -_ALL_RUNS_KEPT - 1 : -1]:
