@@ -7,7 +7,7 @@ from ertis_cli.main import cli
 
 import ertis_numba as ertis
 from ertis_numba.analysis.health import health
-from ertis_numba.analysis.sample_faults import SampleFaults, dropouts
+from ertis_numba.analysis.sample_faults import SampleFaults, _still_parts, dropouts
 from ertis_numba.analysis.sound_checks import SoundChecks
 from ertis_numba.sensor_check import check_recording
 from ertis_numba.settings import Array, Call, Passive, Processing, Recording, Settings
@@ -191,3 +191,11 @@ def test_odometry_of_frozen_images_is_unknown():
         assert odometry.add([image.replace(stamp=stamp)]) is None
     assert [pose.doubt for pose in odometry.poses] == ["", "copies", "copies", "few echoes"]
     assert odometry.poses[-1].covariance[0, 0] > 0.01**2
+
+
+@pytest.mark.parametrize("first", [0, 65_400, 65_535, 65_536, 65_537, 131_000])
+def test_still_parts_across_pieces_are_those_of_the_whole_record(first):
+    rows = np.random.default_rng(first).integers(1, 9, (140_000, 2)).astype(np.int16)
+    rows[first : first + 300] = 0
+    changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1))
+    assert _still_parts(rows, 100) == ([(first, first + 300)], len(changes))
